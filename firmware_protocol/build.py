@@ -37,10 +37,7 @@ class Build(NamedTuple):
 
 
 class FromSource:
-    """A finder for `sys.meta_path` that loads the given modules from their sources, never from what was compiled.
-
-    It does not derive from `MetaPathFinder`, whose import takes a tenth of the time that a command takes to answer.
-    """
+    """A finder for `sys.meta_path` that loads the given modules from their sources, never from what was compiled."""
 
     def __init__(self, modules: frozenset[str]) -> None:
         self._modules = modules
@@ -48,10 +45,7 @@ class FromSource:
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return the spec of a module's source file; None for another module, and where the source is missing.
-
-        As `importlib.abc.MetaPathFinder.find_spec`.
-        """
+        """Return the spec of a module's source file; None for another module, and where the source is missing."""
         if fullname not in self._modules or path is None:
             return None
         sources = [Path(folder, fullname.rpartition(".")[2]).with_suffix(".py") for folder in path]
@@ -60,11 +54,7 @@ class FromSource:
 
 
 def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
-    """Return which build of the packages in `root` may run, and the names of the modules that were compiled.
-
-    Interpreted where there is no record of a compilation, or one for another Python, and where a source was edited
-    since. Also where TORMAG_COMPILED (`switch`, None where not set) is 0. Reads all of the sources.
-    """
+    """Return which build of the packages in `root` may run, and the names of the modules that were compiled."""
     try:
         record = json.loads((root / "firmware_protocol" / "core.json").read_bytes())
         sources: dict[str, int] = record["sources"]
@@ -86,10 +76,7 @@ def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
 
 
 def check_sum(path: Path) -> int:
-    """Return the CRC-32 of a source file, -1 where it cannot be read.
-
-    It has to show edits, not attacks: a cryptographic hash would take as long to import as all else here.
-    """
+    """Return the CRC-32 of a source file, -1 where it cannot be read."""
     try:
         return zlib.crc32(path.read_bytes())
     except OSError:
@@ -98,11 +85,7 @@ def check_sum(path: Path) -> int:
 
 @cache
 def settle() -> Build:
-    """Decide which build this process runs, and return it; call this before any module of the core is imported.
-
-    For an interpreted core of which compiled modules exist, puts a finder of their sources into `sys.meta_path`. Warns
-    with RuntimeWarning where a source was edited. Later calls return the first one's answer.
-    """
+    """Decide which build this process runs, and return it; call this before any module of the core is imported."""
     build, modules = judged(_HERE.parent, os.environ.get(SWITCH))
     if not build.is_compiled and modules:
         sys.meta_path.insert(0, FromSource(modules))

@@ -62,11 +62,7 @@ class EncodeError(ValueError):
 
 
 class DecodeError(ValueError):
-    """Bytes from the wire are not a message. The text names what was expected and what was received.
-
-    `name` is the message of this function, empty where there is none. `check` is the check that the bytes did not pass:
-    "function", "length", "CRC-8" or "range".
-    """
+    """Bytes from the wire are not a message. The text names what was expected and what was received."""
 
     def __init__(self, text: str = "", name: str = "", check: str = "") -> None:
         super().__init__(text)
@@ -81,25 +77,19 @@ FUNCTION: Final[dict[type[Message], int]] = {layout.message: layout.function for
 
 
 def can_identifier(function: int, node: int = 1) -> int:
-    """Return the 11-bit CAN identifier of a function (1..127) of a node (0..15). Raises EncodeError for others."""
+    """Return the 11-bit CAN identifier of a function (1..127) of a node (0..15)."""
     if not (1 <= function <= 0x7F and 0 <= node <= 0xF):
         raise EncodeError(f"CAN function {function}, node {node}: allowed are functions 1 to 127, nodes 0 to 15")
     return function << 4 | node
 
 
 def period(message: type[Message], signal: str) -> float:
-    """Return the period of a wrapping signal of a message, in the signal's unit (mm, s).
-
-    Raises KeyError for a signal that does not wrap.
-    """
+    """Return the period of a wrapping signal of a message, in the signal's unit (mm, s)."""
     return {s.name: s.period for s in _BY_TYPE[message].signals if s.wraps}[signal]
 
 
 def encode(message: Message) -> bytes:
-    """Return the payload of a message; physical values go to the nearest step, wrapping signals modulo their period.
-
-    Raises EncodeError for a value that is not finite, not in range or, where a whole number is due, not whole.
-    """
+    """Return the payload of a message; physical values go to the nearest step, wrapping signals modulo their period."""
     try:
         payload = wire.pack(message)
     except (TypeError, ValueError, OverflowError, struct.error) as error:  # not a number, NaN, infinite
@@ -110,11 +100,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(function: int, payload: bytes | bytearray) -> Message:
-    """Return the message in the payload of a function.
-
-    Raises DecodeError for an unknown function, a wrong length or CRC-8, an undefined enumeration value or flag, or a
-    value outside its range. Raises nothing else, whatever the bytes.
-    """
+    """Return the message in the payload of a function."""
     data = payload if isinstance(payload, bytes) else bytes(payload)
     message = wire.unpack(function, data)
     if message is None:

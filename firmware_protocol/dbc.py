@@ -61,22 +61,18 @@ class MessageSource(NamedTuple):
 
     @property
     def function(self) -> int:
-        """The function code: the upper part of the CAN identifier."""
         return self.frame_id >> 4
 
     @property
     def receiver(self) -> str:
-        """The other side than the sender: Device or Host."""
         return "Device" if self.sender == "Host" else "Host"
 
     @property
     def protected(self) -> bool:
-        """Whether the last byte is a CRC-8."""
         return self.signals[-1].kind == "Checksum"
 
     @property
     def fields(self) -> tuple[SignalSource, ...]:
-        """The signals that are fields of the Python message: all but the checksum."""
         return self.signals[:-1] if self.protected else self.signals
 
 
@@ -112,10 +108,7 @@ def steps_held(length: int, signed: bool) -> tuple[int, int]:
 
 
 def read_schema(path: Path = DBC) -> Schema:
-    """Read the schema of a DBC file, its messages by rising identifier.
-
-    Raises SchemaError where it breaks a rule of the byte layout, and the errors of cantools for a file that is no DBC.
-    """
+    """Read the schema of a DBC file, its messages by rising identifier."""
     database: Any = cantools.database.load_file(path, database_format="dbc", strict=True)
     kinds = database.dbc.attribute_definitions["Kind"].choices
     messages = tuple(_message(message, kinds) for message in sorted(database.messages, key=lambda m: int(m.frame_id)))
@@ -123,10 +116,7 @@ def read_schema(path: Path = DBC) -> Schema:
 
 
 def _message(message: Any, kinds: list[str]) -> MessageSource:
-    """Return a cantools message as a MessageSource; `kinds` are the names of the attribute Kind.
-
-    Raises SchemaError for another node's identifier, gaps or overlaps, over 8 bytes, and a checksum that is not last.
-    """
+    """Return a cantools message as a MessageSource; `kinds` are the names of the attribute Kind."""
     signals = tuple(_signal(message.name, signal, kinds) for signal in sorted(message.signals, key=lambda s: s.start))
     if message.frame_id & 0xF != NODE or not 1 <= message.frame_id >> 4 <= 0x7F or message.is_extended_frame:
         raise SchemaError(f"{message.name}: {message.frame_id:#x} is not (function << 4) | {NODE} in 11 bits")
@@ -150,10 +140,7 @@ def _message(message: Any, kinds: list[str]) -> MessageSource:
 
 
 def _signal(message_name: str, signal: Any, kinds: list[str]) -> SignalSource:
-    """Return a cantools signal as a SignalSource; `kinds` are the names of the attribute Kind.
-
-    Raises SchemaError for storage, ranges, value tables or flags that the codec cannot check.
-    """
+    """Return a cantools signal as a SignalSource; `kinds` are the names of the attribute Kind."""
     where = f"{message_name}.{signal.name}"
     attributes = signal.dbc.attributes
     kind = kinds[attributes["Kind"].value] if "Kind" in attributes else "Number"

@@ -74,10 +74,7 @@ class FramingStatistics(Value):
 
 @final
 class Succession:
-    """A count of the numbers that are missing from a sequence modulo 256.
-
-    A number that comes late, by less than OVERTAKEN, was overtaken and is not missing any more.
-    """
+    """A count of the numbers that are missing from a sequence modulo 256."""
 
     __match_args__: ClassVar = ("_missing", "newest")
     __slots__ = __match_args__
@@ -87,11 +84,7 @@ class Succession:
         self._missing = 0  # of the OVERTAKEN before the newest, a bit each, the nearest lowest
 
     def lost(self, number: int) -> int:
-        """Take the next number that came; return the change in how many are missing.
-
-        That is 0 for the next number, the first and a repetition, and -1 for one that was counted as missing. Else it
-        is how many were skipped.
-        """
+        """Take the next number that came; return the change in how many are missing."""
         ahead = (number - self.newest) % 256
         if ahead == 1:  # as nearly always
             self.newest = number
@@ -115,10 +108,7 @@ class Succession:
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Return `data` (under 254 bytes) without zeros, one byte longer.
-
-    Each zero, and one put before the start, becomes the distance to the next zero or the end.
-    """
+    """Return `data` (under 254 bytes) without zeros, one byte longer."""
     encoded = b""
     for run in data.split(DELIMITER):
         encoded += _DISTANCES[len(run)] + run
@@ -126,10 +116,7 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(data: bytes) -> bytes | None:
-    """Return the bytes that `cobs_encode` made `data` from; None if its distances do not end where it does.
-
-    `data` must hold no zeros.
-    """
+    """Return the bytes that `cobs_encode` made `data` from; None if its distances do not end where it does."""
     length = len(data)
     if length == 0:
         return b""
@@ -143,10 +130,7 @@ def cobs_decode(data: bytes) -> bytes | None:
 
 
 def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
-    """Return one frame with its delimiter.
-
-    Raises EncodeError for a payload over 8 bytes, and for a function or sequence outside 0..255.
-    """
+    """Return one frame with its delimiter."""
     if not (0 <= function <= 0xFF and 0 <= sequence <= 0xFF and len(payload) <= MAX_PAYLOAD):
         raise EncodeError(
             f"frame of function {function}, sequence {sequence}, {len(payload)} bytes: "
@@ -159,12 +143,7 @@ def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
 
 @final
 class FrameDecoder:
-    """Decoder of a byte stream, in pieces of any size, into frames.
-
-    Between calls it holds at most one frame's worth of bytes. A frame that repeats the one before it byte for byte is
-    counted and not returned. A frame that repeats only the sequence number comes from a sender that began anew; it is
-    counted and returned.
-    """
+    """Decoder of a byte stream, in pieces of any size, into frames."""
 
     __match_args__: ClassVar = ("_last", "_pending", "_succession", "_synchronised", "statistics")
     __slots__ = __match_args__
@@ -177,7 +156,7 @@ class FrameDecoder:
         self._synchronised = True
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that `data` completes, in order. Never raises, whatever the bytes."""
+        """Return the frames that `data` completes, in order."""
         self.statistics.bytes += len(data)
         stretches = data.split(DELIMITER)
         rest = stretches.pop()

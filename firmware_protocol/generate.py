@@ -54,11 +54,7 @@ def _markdown_row(signal: SignalSource) -> str:
 
 
 def generated_files(room: Path) -> dict[Path, str]:
-    """Return the text that each generated file of a folder should have, by its path; writes nothing.
-
-    `room` holds tormag.dbc and README.md. Raises SchemaError for a DBC that breaks a rule of the byte layout, and
-    where the README has no markers.
-    """
+    """Return the text that each generated file of a folder should have, by its path; writes nothing."""
     schema = read_schema(room / DBC.name)
     readme = (room / "README.md").read_text(encoding="utf-8")
     before, begin, rest = readme.partition(TABLE_BEGIN)
@@ -72,10 +68,7 @@ def generated_files(room: Path) -> dict[Path, str]:
 
 
 def main(arguments: list[str] | None = None, room: Path = DBC.parent) -> int:
-    """Write the generated files of a folder that are out of date, or with `--check` print how they differ.
-
-    Returns the exit code: 1 where `--check` found a difference, else 0.
-    """
+    """Write the generated files of a folder that are out of date, or with `--check` print how they differ."""
     parser = argparse.ArgumentParser(prog="python -m firmware_protocol.generate", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is out of date")
     check: bool = parser.parse_args(arguments).check

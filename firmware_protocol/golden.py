@@ -93,11 +93,7 @@ def _packed(message: MessageSource, steps: dict[str, int], database: Any) -> byt
 
 
 def _invalid_payloads(schema: Schema, valid: list[Json]) -> Iterator[Json]:
-    """Yield payloads to refuse, with the reason.
-
-    Unknown functions, wrong lengths, bits flipped under a CRC-8, messages taken for another, and steps out of range
-    under a right CRC-8.
-    """
+    """Yield payloads to refuse, with the reason."""
 
     def refused(function: int, payload: bytes, reason: str) -> Json:
         return {"function": function, "payload": payload.hex(), "reason": reason}
@@ -132,7 +128,6 @@ def _invalid_payloads(schema: Schema, valid: list[Json]) -> Iterator[Json]:
 
 
 def _checked(function: int, sequence: int, payload: bytes) -> bytes:
-    """Return a frame's bytes with their CRC-16, before COBS."""
     body = bytes((function, sequence)) + payload
     return body + bitwise_crc16(body).to_bytes(2, "big")
 
@@ -142,12 +137,10 @@ def _ended(checked: bytes) -> bytes:
 
 
 def _stuffed(function: int, sequence: int, payload: bytes) -> bytes:
-    """Return a whole frame with its delimiter."""
     return _ended(_checked(function, sequence, payload))
 
 
 def _valid_frames(messages: list[Json]) -> list[Json]:
-    """Return the valid messages in frames, their sequence counting from 0."""
     return [
         {
             "function": vector["function"],

@@ -112,10 +112,7 @@ def _message(message: MessageSource) -> str:
 
 
 def _call(before: str, arguments: list[str], after: str = "") -> str:
-    """Return `before(arguments)after`, broken where it is too long for a line of a block.
-
-    The first line comes without the block's indentation.
-    """
+    """Return `before(arguments)after`, broken where it is too long for a line of a block."""
     whole = f"{before}({', '.join(arguments)}){after}"
     if len(whole) <= LINE_WIDTH - 4:
         return whole
@@ -172,12 +169,10 @@ def _wire_module(schema: Schema) -> str:
 
 
 def _constant(name: str) -> str:
-    """Return a class's name as a constant's: DRIVE_MODE for DriveMode."""
     return "".join(f"_{letter}" if letter.isupper() and place else letter for place, letter in enumerate(name)).upper()
 
 
 def _codes(message: MessageSource) -> str:
-    """Return the `struct` codes of a message's fields; a wrapping one without its sign, the CRC-8 left out."""
     return "".join(s.struct_code.upper() if s.kind == "Wrapping" else s.struct_code for s in message.fields)
 
 
@@ -186,7 +181,6 @@ def _mask(value: int) -> str:
 
 
 def _is_wide(signal: SignalSource) -> bool:
-    """Tell whether a signal is a whole number of over 8 bits."""
     return signal.python_type != "float" and signal.length > 8
 
 

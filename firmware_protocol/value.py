@@ -15,7 +15,6 @@ class Value:
     __match_args__: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
-        """Set `__match_args__`, unless the class has it: a compiled class's attributes, or `__init__`'s parameters."""
         code = getattr(cls.__init__, "__code__", None)
         names = code.co_varnames[1 : code.co_argcount] if code else getattr(cls, "__mypyc_attrs__", ())
         if "__match_args__" not in vars(cls):
@@ -37,10 +36,7 @@ class Value:
         return type(self), tuple([getattr(self, name) for name in self.__match_args__])
 
     def replaced(self, **changes: Any) -> Self:
-        """Return a copy with the given fields changed. Raises TypeError for a name that is no field.
-
-        Code that runs every tick calls the constructor instead: it is faster, and checked by name and type.
-        """
+        """Return a copy with the given fields changed."""
         fields: dict[str, Any] = {name: getattr(self, name) for name in self.__match_args__}
         fields.update(changes)
         return type(self)(**fields)

@@ -59,8 +59,7 @@ def c_compiler() -> str:
 
 @pytest.fixture(scope="session")
 def library(c_compiler: str) -> ctypes.CDLL:
-    """The firmware's C sources as a shared library. What does not compile fails the test; only a missing compiler
-    skips it."""
+    """The firmware's C sources as a shared library."""
     return load_library()
 
 
@@ -77,8 +76,7 @@ class HostWarning(UserWarning):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Runs a test that is a coroutine; runs a live test, again after a failure that the host explains. What it asserts
-    stays the same."""
+    """Runs a test that is a coroutine; runs a live test, again after a failure that the host explains."""
     call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
     if inspect.iscoroutinefunction(pyfuncitem.obj):
         asyncio.run(pyfuncitem.obj(**call))
@@ -108,8 +106,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def host_watch(config: pytest.Config) -> HostWatch:
-    """The bare timers of this session, which outlive a test: to start them for each costs more than some tests do. They
-    say what they saw when they end, so after a failure there are others."""
+    """The bare timers of this session, which outlive a test: to start them for each costs more than some tests do."""
     if WATCHED not in config.stash:
         with contextlib.ExitStack() as stack:
             nowhere = stack.enter_context(Path(os.devnull).open("w"))

@@ -82,7 +82,6 @@ def test_a_handle_that_has_just_turned_feels_no_whole_force_and_does_not_count()
 
 
 def test_what_status_and_a_recording_say_of_the_same_ticks_is_the_same() -> None:
-    """All errors are alike here, so it does not matter that status forgets."""
     runs = [list(ticks(1.0, measured_cf=0.5)), list(ticks(20.0, 0.1))]
     assert recorded(*runs).delay_ms == reported(*runs).delay_ms == 100.0
     assert recorded(*runs).rms_N == pytest.approx(reported(*runs).rms_N, rel=0.1)

@@ -95,7 +95,7 @@ TOOL_ROOMS = {
     "endurance": {"machines"},
     "benchmarks": {"machines", "rendering"},
 }
-"""Of the tools; beside them stand the scripts, which no room imports. What is the product's is open to all."""
+"""Of the tools; beside them stand the scripts, which no room imports."""
 
 
 def sources() -> Iterator[Path]:

@@ -160,9 +160,7 @@ def felt_stiffness_ratio(touch: Touch, wall_N_mm: float) -> float | None:
 
 
 def held_ms(touch: Touch, waiting_N: float) -> float:
-    """How long a brake that gives more than W holds the handle back while the hand draws it back.
-
-    What sticks at W holds more than W, and does not count."""
+    """How long a brake that gives more than W holds the handle back while the hand draws it back."""
     held = np.minimum(-touch.force_N, touch.kinetic_N) > waiting_N + HELD_N
     return float(held[~pushing(touch)].sum())
 

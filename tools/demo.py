@@ -48,10 +48,9 @@ SHOWS = 3
 "The first, and two more where the host spoils one."
 MARGIN = 0.1
 """The control loop may keep this much less of its periods than the worst bare timer: it computes, the timer does not.
-Measured: 0.4% less on a quiet machine, 3 to 9% less beside four busy loops, over 50% less with 2 ms more in a tick."""
+"""
 MAX_SPACING = 1.5
-"""Time between the fastest ticks, periods, above which the software itself is slow. A host takes at times, and between
-them even software that starves keeps the period."""
+"""Time between the fastest ticks, periods, above which the software itself is slow."""
 THESIS_GAP_SPEED_MM_S = 8.33
 SCENES = Path(__file__).parents[1] / "examples" / "scenes"
 ORDERED = {"torch, one batch, 500 Hz": "torch", "thesis, row by row, 83 Hz, 8.33 mm/s": "thesis"}
@@ -107,10 +106,7 @@ def main() -> int:
 
 
 def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
-    """The verdict on one show, and one sentence with cause and remedy where it is not MET.
-
-    The host is to blame only where the kernel and bare timers say so, never because the daemon was late.
-    """
+    """The verdict on one show, and one sentence with cause and remedy where it is not MET."""
     if isinstance(shown, Aborted):
         what, is_of_time = str(shown.error), shown.error.is_of_time
         by_host, otherwise = f", and the show ended early ({shown.error.cause})", what
@@ -169,7 +165,7 @@ def lost_frames(link: dict[str, Any]) -> int:
 
 
 def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> Rehearsals:
-    """Every case, on two processors. One that fails is said, and left out."""
+    """Every case, on two processors."""
     done: Rehearsals = {}
     with concurrent.futures.ProcessPoolExecutor(max_workers=2) as pool:
         waiting = [pool.submit(rehearse, config, case, times_s, forces_N) for case in CASES]

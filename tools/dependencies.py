@@ -11,7 +11,7 @@ PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
 def requirements(extras: list[str]) -> list[str]:
     """What `pip install ./client '.[extras]'` would fetch, but for the project and its client, which no registry has to
-    give. Raises KeyError for an extra that is none."""
+    give."""
     project = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
     ours = re.compile(rf"{project['name']}\[(.*)\]")
     found = [requirement for requirement in project["dependencies"] if not requirement.startswith("tormagd-client==")]

@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measured(name: str, count: int, seed: int) -> dict[str, Any]:
-    """What a case came to. Only its own module is loaded: some measure memory, and what they begin starts with ours."""
+    """What a case came to."""
     case = CASES[name]
     run = import_module(f"endurance.{case.module}").run
     figures = _watched(run, count, seed) if case.on_stand else run(*case.more, count, seed)

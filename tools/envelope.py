@@ -48,8 +48,7 @@ STILL_MM_S = 1e-6
 GAP_MM_S, GAP_MM_S2, STROKE_MM = 38.0, 1600.0, 30.0
 "An ideal carriage takes the way from 0.7 to 2 N, the longest asked for at once, with the configured speed."
 BOUNDS = {"over_N": 0.25, "over_sample_1_N": 0.15, "peak_N": 2.6, "settled_N": 0.1, "low_hold_faults": 0}
-"""What has to hold: bounds of the excess over what was asked, on any device and on sample 1. Then come the greatest
-force at all (1.25 times the scene's and 0.1 N), the error after SETTLED_S of sliding, and the faults below F_min."""
+"""What has to hold: bounds of the excess over what was asked, on any device and on sample 1."""
 LOW_HOLD_S = 600.0
 LOW_N = (0.2, 0.5)
 "Forces under F_min."
@@ -84,14 +83,7 @@ class Case(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """What one run showed.
-
-    over_N    the greatest excess over what was asked for more than OVER_S, arrived
-    peak_N    the greatest force at all while the handle moves
-    settled   error by speed and force after SETTLED_S of sliding: mm/s, N, N
-    slow_N    the same at slower handles
-    steps_N   of a steady hand: the error 1 s after the step to 2 N, after the next, and how far the first overshoots
-    """
+    """What one run showed."""
 
     over_N: float
     under_N: float
@@ -252,8 +244,7 @@ def worst(found: list[tuple[Case, Figures]]) -> Json:
 
 
 def settled(found: list[tuple[Case, Figures]]) -> list[tuple[float, float, float]]:
-    """Speed, force and error of those that were asked for as it is. Where a publisher says another motion than the
-    handle's, it gets the force for that."""
+    """Speed, force and error of those that were asked for as it is."""
     as_it_is = [figures for case, figures in found if case.displacement_mm is None and case.rate_mm_s is None]
     return [point for figures in as_it_is for point in figures.settled]
 
@@ -286,8 +277,7 @@ def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None
 
 
 def main() -> int:
-    """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted. Of models it is 0 if none falls
-    with the field anywhere in its box."""
+    """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")

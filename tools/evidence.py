@@ -120,7 +120,7 @@ def collect(parts: Mapping[str, Part], folder: Path) -> int:
 
 
 def run(name: str, part: Part, folder: Path) -> tuple[str, str]:
-    """Whether a part held, as the table says it, and its figures in a line. Its progress goes to our stderr."""
+    """Whether a part held, as the table says it, and its figures in a line."""
     command, environment = [sys.executable, *shlex.split(part.command)], os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, env=environment, check=False)
     try:

@@ -150,8 +150,7 @@ def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:
 
 
 def _follow(rig: Rig) -> tuple[bool, set[str]]:
-    """Whether the force is as asked at the end of the next seconds, and which limits are told then. It is not where a
-    fault shows, or nothing is enabled."""
+    """Whether the force is as asked at the end of the next seconds, and which limits are told then."""
     off_N: list[float] = []
     told: set[str] = set()
     for _ in rig.run(FOLLOWED_S - JUDGED_S):
@@ -166,8 +165,7 @@ def _follow(rig: Rig) -> tuple[bool, set[str]]:
 
 
 def armed(rig: Rig, patience_s: float) -> str:
-    """Says `arm`, again and again for so long. Returns the commands that were taken and what came in the way of the
-    last one, empty where nothing did."""
+    """Says `arm`, again and again for so long."""
     until_s = rig.loop.now_s + patience_s
     while True:
         commands, arming = next_commands(rig.safety, rig.is_homed), Arming(rig.loop.now_s, rig.safety.faults)
@@ -184,7 +182,6 @@ def armed(rig: Rig, patience_s: float) -> str:
 
 
 def _named(injection: Injection, told: set[str]) -> str:
-    """The code of the injection that is told."""
     return next((name for name in injection.names if name in told), "")
 
 

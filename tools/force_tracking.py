@@ -180,8 +180,7 @@ def track(
     *,
     is_ideal: bool = False,
 ) -> Followed:
-    """Plays a signal behind an approach; time counts from its first force. Carriages that lose no time move the gap
-    where `is_ideal`. Raises RuntimeError for a fault."""
+    """Plays a signal behind an approach; time counts from its first force."""
     loop = armed(build_core(Config(scene=scene)), plant, SteadyHand(), is_ideal=is_ideal)
     flat = np.array([0.0, 1.0 / RATE_HZ]), np.full(2, signal.force_N[0])
     approach_s, approach_N = with_approach(*flat, START_N, RAMP_S, HOLD_S)
@@ -210,8 +209,7 @@ def compared(found: Followed, best: Bound, start_s: float) -> Json:
 
 
 def samples(pool: Executor) -> Json:
-    """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S.
-    Beside it is the RMS error of the same core with carriages that lose no time."""
+    """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S."""
     rows, played, names = [], pulse_signal(PULSE_S), judging(0)
     cases = [(name, preview_s) for name in names for preview_s in (PREVIEW_S, 0.0)]
     runs, bounds = (

@@ -142,7 +142,6 @@ def nonfinite(values: dict[str, FloatArray]) -> int:
 
 
 def _inside(batch: Batch, x: FloatArray) -> Mask:
-    """Rounding to float32 may carry a gap to 95 mm, where the slope of Eq. 7 is zero."""
     return x < np.float32(95.0) if isinstance(batch.field, ThesisFieldLaw) else np.isfinite(x)
 
 

@@ -41,7 +41,7 @@ def forbidden_words(glossary: str) -> re.Pattern[str]:
 
 
 def findings(file: Path, forbidden: re.Pattern[str]) -> Iterator[str]:
-    """Yield `LINE: what breaks a rule` for a Python file or a page. Raises SyntaxError where it is no Python."""
+    """Yield `LINE: what breaks a rule` for a Python file or a page."""
     text = file.read_text(encoding="utf-8")
     tree = ast.parse(text if file.suffix == ".py" else "")
     for line, prose in docstrings(tree) if file.suffix == ".py" else [(1, text)]:
@@ -63,7 +63,7 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def sentences(markdown: str) -> Iterator[tuple[int, str]]:
-    """Yield each sentence, and after how many lines its paragraph begins. Code is one word, its blocks are none."""
+    """Yield each sentence, and after how many lines its paragraph begins."""
     for block in MARKDOWN.parse(markdown):
         if block.type == "inline" and block.map:
             words = ("`code`" if each.type == "code_inline" else each.content or " " for each in block.children or ())
@@ -71,10 +71,7 @@ def sentences(markdown: str) -> Iterator[tuple[int, str]]:
 
 
 def unnamed_errors(function: Function, owner: Scope) -> Iterator[str]:
-    """Yield each error that `function` raises and its docstring does not name; without a docstring, none.
-
-    The class's docstring serves its special methods, too.
-    """
+    """Yield each error that `function` raises and its docstring does not name; without a docstring, none."""
     speakers = (function, owner) if isinstance(owner, ast.ClassDef) and function.name.startswith("__") else (function,)
     said = "".join(ast.get_docstring(each) or "" for each in speakers)
     for line, error in raised(function) if said else ():

@@ -67,8 +67,7 @@ def tables(kind: type[msgspec.Struct], path: str) -> Iterator[tuple[str, type[ms
 
 
 def keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str, str]]:
-    """The keys of one table, without the tables in it. A row has name, default as TOML has it, what is allowed, and
-    why, which is empty where the source says nothing."""
+    """The keys of one table, without the tables in it."""
     says = _field_docs(kind)
     hints = get_type_hints(kind, include_extras=True)
     return [
@@ -151,7 +150,6 @@ def _allowed(hint: Any) -> str:
 
 
 def _field_docs(kind: type[msgspec.Struct]) -> dict[str, str]:
-    """The string below each field: Python keeps it in the source only."""
     (body,) = (node.body for node in ast.parse(inspect.getsource(kind)).body if isinstance(node, ast.ClassDef))
     return {
         field.target.id: " ".join(says.value.value.split())

@@ -48,10 +48,7 @@ within 0.15 N.
 
 
 def main() -> int:
-    """Writes the pages, and names the red rows. Returns 1 where docs/risk.toml judges what is no row, or not as it may.
-
-    Nothing has been written then.
-    """
+    """Writes the pages, and names the red rows."""
     record = json.loads(EVIDENCE.read_text(encoding="utf-8"))
     try:
         risks = risk_rows(record)
@@ -67,7 +64,7 @@ def main() -> int:
 
 
 def risk_rows(record: dict[str, Any]) -> list[Row]:
-    """The rows of the risk page, of a run of the matrix. Raises ValueError where docs/risk.toml does not fit."""
+    """The rows of the risk page, of a run of the matrix."""
     return rows(named_tests(ROOT / "tests"), record["figures"]["cells"], judgement(DOCS / "risk.toml"))
 
 

@@ -13,11 +13,7 @@ from tormagd_client.regular_file import require_regular
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """Return all bytes of a regular file of at most `most_bytes`; a link is followed.
-
-    Raises OSError where there is none, it cannot be read, is of another kind, or has more; its `strerror` says what is
-    allowed. Never waits, and opens nothing that acts on being opened, as a port does.
-    """
+    """Return all bytes of a regular file of at most `most_bytes`; a link is followed."""
     require_regular(path, most_bytes)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
@@ -29,14 +25,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 
 @contextlib.contextmanager
 def in_place_of(path: Path) -> Iterator[Path]:
-    """Give a path beside `path` to write to, which replaces `path` at the end. The folder must exist.
-
-    The caller makes that file, `path` with `.part` behind it. What another left there is removed first, a pipe or a
-    link too. To write to a pipe would wait for its reader, and a link's file is another's. After an error, inside or at
-    the end, that file is removed and `path` stays as it was. It is on the disk before it replaces `path`. Raises
-    IsADirectoryError where `path` is a folder, before anything is written, and OSError where nothing was made or `path`
-    cannot be replaced.
-    """
+    """Give a path beside `path` to write to, which replaces `path` at the end."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))
     beside = path.with_name(f"{path.name}.part")

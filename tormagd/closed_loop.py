@@ -42,15 +42,7 @@ MAX_UNREAD_FRAMES: Final = 512
 
 @final
 class Sample(Value):
-    """One control tick: what was asked, what the controller knew, and the plant's true state.
-
-    measured      what the core measured; None while the device has said nothing
-    reference     where the gap is driven; None while nothing is driven
-    output        the duties sent
-    plan          the plan that the step used
-    truth         the plant's state
-    measurement   what the step was given, None without a link; the connection's may be newer by now
-    """
+    """One control tick: what was asked, what the controller knew, and the plant's true state."""
 
     def __init__(
         self,
@@ -74,10 +66,7 @@ class Sample(Value):
 
 
 class VirtualPort:
-    """Backend to the simulated device over serial bytes; `device` may be replaced by one that behaves badly.
-
-    Holds the time that it was last let run until, the codec, and the bytes that wait for their reader.
-    """
+    """Backend to the simulated device over serial bytes; `device` may be replaced by one that behaves badly."""
 
     def __init__(self, device: SerialDevice) -> None:
         self.now_s = 0.0
@@ -91,33 +80,22 @@ class VirtualPort:
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let the device run until `now_s`, which must not fall.
-
-        Its bytes wait for their reader: all new ones, and of those from before the last MAX_UNREAD_BYTES.
-        """
+        """Let the device run until `now_s`, which must not fall."""
         self.now_s = now_s
         self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Counters since the port was opened."""
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
         """Return the valid messages in the bytes that wait, oldest first, and drop these bytes; empty where nothing
-        waits.
-
-        Does not let the device run: see `advance`. A frame that does not decode is left out and counted in
-        `statistics`; an incomplete one is kept for the next call.
-        """
+        waits."""
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
 
     def send(self, message: Message) -> None:
-        """Hand one message to the device's line at the time of the last `advance`.
-
-        Raises EncodeError for a value that does not fit the wire.
-        """
+        """Hand one message to the device's line at the time of the last `advance`."""
         self.device.receive(self.now_s, self.stream.pack(message))
 
     def close(self) -> None:
@@ -125,10 +103,7 @@ class VirtualPort:
 
 
 class VirtualBus:
-    """Backend to a simulated device on a CAN bus, with the real backend's codec of frames.
-
-    Holds the time that it was last let run until, the codec, and the frames that wait for their reader.
-    """
+    """Backend to a simulated device on a CAN bus, with the real backend's codec of frames."""
 
     def __init__(self, device: CanLine) -> None:
         self.now_s = 0.0
@@ -143,38 +118,24 @@ class VirtualBus:
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let bus and device run until `now_s`, which must not fall.
-
-        The device's newest MAX_UNREAD_FRAMES frames wait for their reader; older ones, and frames of other senders, are
-        dropped.
-        """
+        """Let bus and device run until `now_s`, which must not fall."""
         self.now_s = now_s
         arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
         self._unread = [*self._unread, *arrived][-MAX_UNREAD_FRAMES:]
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Counters since the bus was opened."""
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
         """Return the device's valid messages in the frames that wait, oldest first, and drop these frames; empty where
-        none wait.
-
-        Does not let the device run: see `advance`. A frame that does not decode is left out and counted in
-        `statistics`. `stream.received` is begun anew and holds the frames. Raises SecondHostError as
-        `CanStream.unpack_all`.
-        """
+        none wait."""
         arrived, self._unread = self._unread, []
         self.stream.received = []
         return self.stream.unpack_all(arrived)
 
     def send(self, message: Message) -> None:
-        """Hand one message to the bus as a frame at the time of the last `advance`.
-
-        Raises EncodeError for a value that does not fit the wire. A full queue loses the frame, and the device counts
-        it.
-        """
+        """Hand one message to the bus as a frame at the time of the last `advance`."""
         identifier, data = self.stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
 
@@ -183,18 +144,12 @@ class VirtualBus:
 
 
 class ClosedLoop:
-    """A daemon's core and its simulated device in one process and one virtual time, which starts at 0.
-
-    Holds the stages, the connection, the port, the count of periods, the newest duties, and the question to a search.
-    """
+    """A daemon's core and its simulated device in one process and one virtual time, which starts at 0."""
 
     def __init__(
         self, config: Config, stepper: Stepper, planner: Planner | None, device: SerialDevice | VirtualBus
     ) -> None:
-        """Connect the core with `device`, which is behind a serial line or comes with its bus.
-
-        `planner` is None where every tick is given its plan.
-        """
+        """Connect the core with `device`, which is behind a serial line or comes with its bus."""
         self._config, self.stepper, self.planner = config, stepper, planner
         self._period_s = 1.0 / config.rates.control_hz
         self._inference_s = 1.0 / config.rates.inference_hz
@@ -207,41 +162,32 @@ class ClosedLoop:
 
     @property
     def now_s(self) -> float:
-        """Virtual time, s."""
         return self._ticks * self._period_s
 
     @property
     def device(self) -> SerialDevice:
-        """What is at the other end of the serial line. Raises TypeError where it is a bus."""
+        """What is at the other end of the serial line."""
         if isinstance(self._port, VirtualBus):
             raise TypeError("this device is on a bus: allowed are `simulated` and `truth`")
         return self._port.device
 
     @device.setter
     def device(self, device: SerialDevice) -> None:
-        """The device at the other end of the serial line. Raises TypeError where it is on a bus."""
+        """The device at the other end of the serial line."""
         if isinstance(self._port, VirtualBus):
             raise TypeError("this device is on a bus")
         self._port.device = device
 
     @property
     def simulated(self) -> MessageDevice:
-        """The simulated device itself, whatever carries its messages."""
         return self._port.device.messages
 
     @property
     def measurement(self) -> Measurement | None:
-        """The newest measurement while the link runs; None otherwise."""
         return self.connection.measurement
 
     def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
-        """Run one control period, and return what happened in it: the device runs on, then read, plan, step and send.
-
-        `setpoint` is the newest; None: no publisher. It is planned for where it is new, or the inference period is
-        over. With a `plan` nothing is planned, and this one is used: a bench sweep asks for gaps, not forces. Time has
-        moved on by a period also where it raises. Raises ValueError without a plan in a loop without a planner, and
-        DomainError where planning fails, as `Planner.plan`.
-        """
+        """Run one control period, and return what happened in it: the device runs on, then read, plan, step and send."""
         self._ticks += 1
         now_s = self.now_s
         self._port.advance(now_s)
@@ -257,22 +203,16 @@ class ClosedLoop:
         return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
 
     def skip(self) -> None:
-        """Let one control period pass in which the daemon, stopped or killed, does nothing.
-
-        The device runs on, and what it sends waits for the next tick.
-        """
+        """Let one control period pass in which the daemon, stopped or killed, does nothing."""
         self._ticks += 1
         self._port.advance(self.now_s)
 
     def command(self, name: str) -> None:
-        """Carry out the operator's command `name` under the present conditions. Raises RefusedError."""
+        """Carry out the operator's command `name` under the present conditions."""
         self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
-        """Return the conditions on which commands are taken or refused, as of now: after the newest tick.
-
-        Without a planner the force sensor counts as believed.
-        """
+        """Return the conditions on which commands are taken or refused, as of now: after the newest tick."""
         doubted = self.planner is not None and self.planner.believe.sensor.is_doubted
         connection, stepper = self.connection, self.stepper
         return conditions(self.now_s, self._config, connection, stepper, self._output, sensor_doubted=doubted)
@@ -281,21 +221,12 @@ class ClosedLoop:
         self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
     ) -> Iterable[Sample]:
         """Run the ticks of the next `duration_s` one by one, and yield their samples: `duration_s` over the period,
-        rounded.
-
-        A tick runs when its sample is asked for: who stops asking stops the loop. `setpoint` is called before each tick
-        with the time, s, of the one before, and returns the newest setpoint or None: no publisher. Raises as `tick`.
-        """
+        rounded."""
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
     def arm(self, plan: Plan | None = None) -> None:
-        """Connect, home and enable, as an operator does; the ticks that this takes run at once.
-
-        `plan` is used in every tick, as in `tick`; None lets the planner plan, without a setpoint. Raises RuntimeError
-        where the device does not answer, begin to home, or home within HOMING_S each, or is not enabled. Raises
-        RefusedError for a refused command.
-        """
+        """Connect, home and enable, as an operator does; the ticks that this takes run at once."""
         self._until(lambda m: True, "answer", plan)
         self.command("home")
         self._until(lambda m: m.is_busy, "start homing", plan)
@@ -305,12 +236,7 @@ class ClosedLoop:
             raise RuntimeError(f"not enabled: {self.stepper.safety}")
 
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> Plan:
-        """Plan at `now_s` where the setpoint is new or the inference period is over; return the newest plan.
-
-        `setpoint` is the newest; None: no publisher. A new plan is preceded by a search's answer, if one is due, and
-        followed by a forecast. Its question to a search is noted, unless one is pending. Raises ValueError without a
-        planner, and DomainError where planning fails.
-        """
+        """Plan at `now_s` where the setpoint is new or the inference period is over; return the newest plan."""
         planner = self.planner
         if planner is None:
             raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
@@ -324,22 +250,14 @@ class ClosedLoop:
 
     def _answer_question(self, planner: Planner, now_s: float) -> None:
         """Answer the pending question once SEARCH_S is over, as a search in a process of its own would; else do
-        nothing.
-
-        The answer goes to `planner`, and no question is pending then. Raises DomainError as `Aim.answer_to`, and the
-        question stays.
-        """
+        nothing."""
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
             planner.answered(planner.aim.answer_to(asked))
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
-        """Run ticks without a setpoint until `reached` is true of a measurement, at least one.
-
-        `plan` is used in each, or the planner's where that is None. Raises RuntimeError after HOMING_S: the device did
-        not `what`, a verb for the message. Raises as `tick`.
-        """
+        """Run ticks without a setpoint until `reached` is true of a measurement, at least one."""
         for _ in range(round(HOMING_S / self._period_s)):
             self.tick(plan=plan)
             if self.measurement is not None and reached(self.measurement):
@@ -349,12 +267,7 @@ class ClosedLoop:
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
-    """Return a publisher in virtual time: a function from the time, s, to the newest setpoint, None before the first.
-
-    `forces_N` (n) are sent at the rising `times_s` (n), each valid for `valid_for_s`. The last stays the newest for
-    ever. Each call makes a new setpoint, stamped with its time. Without times it always gives None. Nothing is checked:
-    times that do not rise give setpoints in another order, fewer forces than times IndexError.
-    """
+    """Return a publisher in virtual time: a function from the time, s, to the newest setpoint, None before the first."""
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()
     sent = 0

@@ -22,18 +22,12 @@ class UsageError(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that raises UsageError in place of ending the process.
-
-    `options` are those that may have been meant by an unknown one; empty: this parser's own.
-    """
+    """A parser that raises UsageError in place of ending the process."""
 
     options: tuple[str, ...] = ()
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError with this message, cut to LONGEST characters, and `PROGRAM --help` as the hint.
-
-        For an unknown option the message also says what may have been meant. What is unprintable is escaped.
-        """
+        """Raise UsageError with this message, cut to LONGEST characters, and `PROGRAM --help` as the hint."""
         if message.startswith(UNKNOWN_OPTION):
             known = self.options or tuple(self._option_string_actions)
             message += did_you_mean(message.removeprefix(UNKNOWN_OPTION).split()[0], known)

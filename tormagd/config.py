@@ -294,12 +294,7 @@ class Calibration(Strict, frozen=True):
 
 
 def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
-    """Return `config` with what the calibration file `path` states in place of its own motor, position and trim.
-
-    Keys that it does not state stay. Raises ConfigError naming file, key, value and what is allowed, also where the
-    file cannot be read. Refused are another device than `serial_number`, and values that no configuration may have.
-    Whether the position loop is stable with them is not checked.
-    """
+    """Return `config` with what the calibration file `path` states in place of its own motor, position and trim."""
     found = convert(path, Calibration)
     stated = msgspec.to_builtins(found)
     try:
@@ -313,12 +308,7 @@ def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
 
 
 def load_config(path: Path | None) -> Config:
-    """Read the configuration file `path`; None: take the defaults.
-
-    Where neither rates.control_hz, rates.inference_hz nor rates.of_scene is stated, `rates.of_scene` becomes true: the
-    caller is then to take the scene's rates. Whether scene, backend and keys exist is not checked. Raises ConfigError
-    naming file, key, value and what is allowed, also where the file cannot be read.
-    """
+    """Read the configuration file `path`; None: take the defaults."""
     stated: set[str] = set()
 
     def kind_of(tables: dict[str, Any]) -> type[Config]:

@@ -10,11 +10,7 @@ INTERRUPTED = 130
 
 
 def _run(module: str) -> int:
-    """Import `module`, run its `main` and return the exit code; Ctrl-C while importing ends the process.
-
-    `main` handles SIGINT itself; a KeyboardInterrupt that leaves it becomes the exit code INTERRUPTED. Any other error
-    is raised, SystemExit and ImportError among them.
-    """
+    """Import `module`, run its `main` and return the exit code; Ctrl-C while importing ends the process."""
     interrupt = signal.getsignal(signal.SIGINT)
     if interrupt is signal.default_int_handler:  # a shell's background job ignores it, and goes on doing so
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -5,11 +5,6 @@ Plain data are what msgpack holds. Any other thing is a map with one key, its ty
     a value        {"Turn": {"direction": 1.0, ...}}
     an enumerator  {"Limit": "RATE"}
     a list         {"list": [...]}, as a bare one is a tuple; a deque, too
-
-Two equal values come back as two: nothing in the core asks whether a value is the very one that it made before. What
-changes in place, such as a stage of the core or the device's link, is written like a value. It is read back into an
-existing object. Fields are those that a class annotates, or its methods make; a name with a leading underscore is a
-constant.
 """
 
 from collections import deque
@@ -42,12 +37,7 @@ def kinds(*types: type[Value] | type[Enum]) -> Kinds:
 
 def plain(thing: object) -> Any:
     """Return `thing` as plain data: a value, or what changes in place, becomes a map of its fields, a tuple becomes a
-    list.
-
-    The module says which. `thing` stays as it is, and nothing of it is shared but what cannot change. Raises TypeError
-    for what has no fields, and is neither plain, an enumerator, a tuple, a list nor a deque; RecursionError for what
-    contains itself.
-    """
+    list."""
     if type(thing) in _AS_THEY_ARE:
         return thing
     names = _fields(thing)
@@ -65,11 +55,7 @@ def plain(thing: object) -> Any:
 
 
 def _fields(thing: object) -> tuple[str, ...]:
-    """Return the names of the fields of `thing`, an object; empty for an enumerator and for what has none.
-
-    They are those of `__match_args__` in that order. Without it they are, in the order of the alphabet, its attributes
-    without a leading underscore.
-    """
+    """Return the names of the fields of `thing`, an object; empty for an enumerator and for what has none."""
     if isinstance(thing, Enum):
         return ()
     if hasattr(thing, "__match_args__"):
@@ -83,11 +69,7 @@ def _fields(thing: object) -> tuple[str, ...]:
 
 def restored(data: Any, known: Kinds) -> Any:
     """Return the value that `data` stand for, of the types in `known`; an array becomes a tuple, `{"list": [...]}` a
-    list.
-
-    `data` are as `plain` makes them. Raises InexactError for an unknown type, other fields than the type's, or values
-    that it refuses. Raises RecursionError for data nested without end.
-    """
+    list."""
     if type(data) in _AS_THEY_ARE:
         return data
     if isinstance(data, list | tuple):
@@ -115,11 +97,7 @@ def restored(data: Any, known: Kinds) -> Any:
 
 
 def restore(thing: Any, data: Any, known: Kinds) -> None:
-    """Give `thing`, which changes in place, the fields that `data` stand for, in place.
-
-    What changes in place inside it is kept, and filled; all else is replaced. `data` are as `plain` makes them of a
-    thing of its type. Raises InexactError for another type, other fields or values; some may be set by then.
-    """
+    """Give `thing`, which changes in place, the fields that `data` stand for, in place."""
     name = type(thing).__name__
     fields = data.get(name) if isinstance(data, dict) else None
     if not isinstance(fields, dict) or set(fields) != set(_fields(thing)):
@@ -139,22 +117,12 @@ def restore(thing: Any, data: Any, known: Kinds) -> None:
 
 
 def packed(data: Any) -> bytes:
-    """Return plain data as msgpack: equal bytes for the same values, types and order, and for no others.
-
-    So 1 and 1.0 differ, as do 0.0 and -0.0, and two maps with their keys in another order. A tuple is taken for a list.
-    Raises TypeError for what msgpack does not hold, OverflowError for an integer beyond 64 bits, RecursionError for
-    data nested without end.
-    """
+    """Return plain data as msgpack: equal bytes for the same values, types and order, and for no others."""
     return _ENCODER.encode(data)
 
 
 def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
-    """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with the value of each there.
-
-    None where they are the same to the bit. Maps are compared in the order of their keys. Where the right one has no
-    such place, its value is None. Where one only ends earlier, the place is "length", with both counts of values. So it
-    is, with equal counts, where only names of types or empty parts differ. Raises as `packed`.
-    """
+    """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with the value of each there."""
     if packed(left) == packed(right):
         return None
     for (path, one), (other_path, other) in zip(_leaves("", left), _leaves("", right), strict=False):
@@ -164,10 +132,7 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
 
 
 def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
-    """Yield path and value of each plain value in `data`, depth first; `path` is that of `data`, empty for the whole.
-
-    Parts of a path are keys, and indices from 0. A type's name is no part. An empty map or array yields nothing.
-    """
+    """Yield path and value of each plain value in `data`, depth first; `path` is that of `data`, empty for the whole."""
     if not isinstance(data, dict | list | tuple):
         yield path, data
         return

@@ -27,14 +27,10 @@ NOT_FOLLOWED: Final = frozenset({"RANGE", "STANDBY", "F_MIN", "F_MAX", "TAKEOVER
 
 
 class Following:
-    """Measures how well the force is followed: RMS error, and the delay that explains most of it.
-
-    Give it the state, limits, forces and handle every `period_s` by `look`. It keeps the forces asked for in the last
-    MAX_DELAY_S, and a sum of squared errors for each delay.
-    """
+    """Measures how well the force is followed: RMS error, and the delay that explains most of it."""
 
     def __init__(self, period_s: float = PERIOD_S, forgets_s: float = math.inf) -> None:
-        """Begin without figures. After `forgets_s` an error counts a third (1/e); infinite: all count alike."""
+        """Begin without figures."""
         self._period_s = period_s
         self._kept = math.exp(-period_s / forgets_s)
         count = round(MAX_DELAY_S / period_s) + 1
@@ -45,7 +41,6 @@ class Following:
 
     @property
     def counted_s(self) -> float:
-        """Return the time that counted, s, less what was forgotten."""
         return self._weight * self._period_s
 
     def look(
@@ -57,13 +52,7 @@ class Following:
         handle_mm: float | None,
         rate_mm_s: float | None,
     ) -> None:
-        """Look once, and add the error for each delay where it counts.
-
-        It counts ENABLED, with a sliding handle, a measured force, and no limit of NOT_FOLLOWED. It does not before the
-        force has once come within NEAR_N, nor in the MAX_DELAY_S after that. A state of None counts as ENABLED, a
-        handle without place or rate (None) as sliding. Out of ENABLED or without a setpoint (`asked_N` None), the way
-        begins anew. With a finite `forgets_s` earlier errors fade at each look.
-        """
+        """Look once, and add the error for each delay where it counts."""
         if self._kept < 1.0:
             self._weight *= self._kept
             self._squares = [self._kept * known for known in self._squares]
@@ -89,11 +78,7 @@ class Following:
         self._has_arrived = False
 
     def _slides(self, rate_mm_s: float | None, place_mm: float | None) -> bool:
-        """Tell whether the handle has slid SLID_MM since it last turned or was slower than about SLIDES_MM_S.
-
-        True for a handle whose rate or place is None, which is not kept. Keeps the rate, and where the handle turned,
-        for the next look.
-        """
+        """Tell whether the handle has slid SLID_MM since it last turned or was slower than about SLIDES_MM_S."""
         if rate_mm_s is None or place_mm is None:
             return True
         if rate_mm_s * self._rate_mm_s < SLIDES_MM_S**2:
@@ -102,11 +87,7 @@ class Following:
         return abs(place_mm - self._turned_mm) >= SLID_MM
 
     def report(self) -> FollowingReport | None:
-        """Return the RMS error, N, the RMS error with the best delay taken out, N, and that delay, ms.
-
-        The delay is one of 0..MAX_DELAY_S in steps of `period_s`. None where fewer looks count than fill MIN_S: at
-        first, and where they are forgotten.
-        """
+        """Return the RMS error, N, the RMS error with the best delay taken out, N, and that delay, ms."""
         if self.counted_s < MIN_S:
             return None
         least = min(self._squares)

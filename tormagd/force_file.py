@@ -33,18 +33,12 @@ class ForceFileError(ValueError):
 
 
 def read_forces(path: Path) -> dict[str, "array[float]"]:
-    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has, into arrays by name.
-
-    Times rise from row to row. Raises ForceFileError as `read_table`, also for any other column.
-    """
+    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has, into arrays by name."""
     return read_table(path, ALLOWED, OPTIONAL_COLUMNS)
 
 
 def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"]:
-    """Read `t_s` and one `column` more, and return both as arrays (n each); pass over the rest.
-
-    The column's numbers have no unit, and may be any from -1e9 to 1e9. Raises ForceFileError as `read_table`.
-    """
+    """Read `t_s` and one `column` more, and return both as arrays (n each); pass over the rest."""
     table = read_table(path, {"t_s": TIME, column: (-1e9, 1e9, "")}, has_others=True)
     return table["t_s"], table[column]
 
@@ -52,15 +46,7 @@ def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"
 def read_table(
     path: Path, allowed: Allowed, optional: tuple[str, ...] = (), *, has_others: bool = False
 ) -> dict[str, "array[float]"]:
-    """Read a CSV file's columns into arrays of equal length, by name; a million rows fit.
-
-    `allowed` names the columns with their least, most and unit; they may come in any order. `t_s` must be one of them,
-    and rises from row to row, from any zero. A file may lack the `optional` ones, which the result then lacks, too.
-    Other columns are passed over where it `has_others`, and refused otherwise. Empty lines are passed over.
-
-    Raises ForceFileError for a header or row that is not so, and a cell that is no finite number within its bounds. It
-    is raised, too, for a file that cannot be read, over MAX_FILE_BYTES, not UTF-8, or under MIN_ROWS.
-    """
+    """Read a CSV file's columns into arrays of equal length, by name; a million rows fit."""
     try:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
         with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as file:
@@ -86,11 +72,7 @@ def read_table(
 
 
 def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> None:
-    """Check `columns`, the names in the first row of the file at `path`; any order is allowed.
-
-    `known` names all allowed columns; those of them that are in `optional` may be missing. Raises ForceFileError for
-    another column that is missing, for an unknown one, and for one that is there twice.
-    """
+    """Check `columns`, the names in the first row of the file at `path`; any order is allowed."""
     required = [name for name in known if name not in optional]
     also = f" and optionally {','.join(optional)}" if optional else ""
     allowed = f"allowed is {','.join(required)}{also}"
@@ -108,12 +90,7 @@ def _check_row(
     path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]", allowed: Allowed
 ) -> list[float]:
     """Return the numbers of the row `cells` in the order of `columns`; columns that `allowed` does not name are left
-    out.
-
-    `line` is the row's last line in the file, from 1; `allowed` bounds each column. `before_s` holds the time of the
-    row before; it is empty in the first row. Raises ForceFileError, naming `path` and `line`, for another number of
-    cells, a cell out of bounds, and a time that does not rise.
-    """
+    out."""
     if len(cells) != len(columns):
         raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
     known = [(name, text) for name, text in zip(columns, cells, strict=True) if name in allowed]
@@ -127,11 +104,7 @@ def _check_row(
 
 
 def _number(path: Path, line: int, name: str, text: str, least: float, most: float, unit: str) -> float:
-    """Return `text` as a finite number from `least` to `most`, both allowed.
-
-    Raises ForceFileError for any other text, also for digits with underscores. Its message names the file at `path`,
-    the row `line` and the column `name`. For a number out of range it has also what is allowed, in `unit`.
-    """
+    """Return `text` as a finite number from `least` to `most`, both allowed."""
     try:
         value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else
     except ValueError:

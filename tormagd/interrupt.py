@@ -8,11 +8,7 @@ from types import FrameType
 
 @contextmanager
 def interrupted_by(*signals: signal.Signals) -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether one of `signals` has come since; put the earlier handlers back at the end.
-
-    In between these signals do nothing else: SIGINT raises no KeyboardInterrupt. For the main thread alone: Python
-    allows signal handlers nowhere else (ValueError).
-    """
+    """Give a function that says whether one of `signals` has come since; put the earlier handlers back at the end."""
     arrived: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:

@@ -25,10 +25,7 @@ Allowed = Mapping[str, Listed]
 
 class KeyRing:
     """The daemon's own key pair `server`, and the accepted public keys of each role, as read when it was made, in
-    `allowed`.
-
-    Raises ConfigError naming file and remedy where keys are missing, damaged, or open to others.
-    """
+    `allowed`."""
 
     def __init__(self, endpoints: Endpoints) -> None:
         curve = endpoints.curve
@@ -40,11 +37,7 @@ class KeyRing:
         self.allowed: Allowed = self.load_allowed()
 
     def load_allowed(self) -> Allowed:
-        """Read the key folders of all roles again and return the accepted keys; `allowed` stays as it is.
-
-        A key in several folders has all their roles, and the name of the last, of publish, operate and observe. An
-        empty folder gives no keys. Raises ConfigError as `load_folder`, also for a missing one.
-        """
+        """Read the key folders of all roles again and return the accepted keys; `allowed` stays as it is."""
         found: dict[str, Listed] = {}
         for role, folder in self._folders.items():
             for name, public in load_folder(folder):
@@ -54,12 +47,7 @@ class KeyRing:
 
 
 def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
-    """Yield name and public key of every `NAME.key` in `folder`, sorted by name; nothing for a folder without any.
-
-    The name is NAME, the key 40 characters (Z85). Nothing is read or refused before the first is asked for, and a bad
-    key shows at its turn. Raises ConfigError for an unreadable folder, more than MAX_KEYS keys, and a damaged key. It
-    is raised, too, for a folder or key that others can write: they could let themselves in.
-    """
+    """Yield name and public key of every `NAME.key` in `folder`, sorted by name; nothing for a folder without any."""
     try:
         information = folder.stat()
         paths = sorted(path for path in folder.iterdir() if path.suffix == PUBLIC)
@@ -76,7 +64,6 @@ def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
 
 
 def _refuse_writable(path: Path, mode: int) -> None:
-    """Raise ConfigError, naming `path` and the remedy, if `mode` lets the group or others write to it."""
     if mode & 0o022:
         raise ConfigError(
             f"{path} can be written by others (mode {stat.S_IMODE(mode):04o}): they could let themselves in; "

@@ -9,20 +9,12 @@ from tormagd_client.printable import in_short
 
 
 def shipped(folder: Traversable, ending: str) -> tuple[str, ...]:
-    """Return the names of a package folder's files that end with `ending`, sorted and without it; empty where none do.
-
-    Raises OSError where there is no such folder.
-    """
+    """Return the names of a package folder's files that end with `ending`, sorted and without it; empty where none do."""
     return tuple(sorted(each.name.removesuffix(ending) for each in folder.iterdir() if each.name.endswith(ending)))
 
 
 def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = Path()) -> Path:
-    """Return the path of a shipped file by its name, or else of what exists at the path `name`, relative to `beside`.
-
-    Shipped are the files of `folder` that end with `ending`; their names go before a file of that name. What is there
-    is not opened: it may be a folder, or unreadable. Raises ConfigError naming `key`, its value and the shipped names
-    where there is neither; it also says which of these may have been meant.
-    """
+    """Return the path of a shipped file by its name, or else of what exists at the path `name`, relative to `beside`."""
     names, reason = shipped(folder, ending), ""
     if name in names:
         return Path(str(folder / f"{name}{ending}"))
@@ -36,10 +28,7 @@ def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = 
 
 
 def did_you_mean(word: str, allowed: Iterable[str]) -> str:
-    """Return `; did you mean ...?` with the allowed word that is nearest to `word`; an empty text where none is near.
-
-    It is to stand at the end of a sentence. Upper and lower case differ.
-    """
+    """Return `; did you mean ...?` with the allowed word that is nearest to `word`; an empty text where none is near."""
     import difflib  # takes a moment, and most configurations are right
 
     near = difflib.get_close_matches(word, list(allowed), n=1)

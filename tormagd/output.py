@@ -22,10 +22,7 @@ _ALIKE = {"±": "+-", "·": "-", "…": "~"} | dict(zip("▁▂▃▄▅▆▇�
 
 def _alike(error: UnicodeError) -> tuple[str, int]:
     """Return what a stream writes for characters that its encoding lacks, and where it goes on: an error handler of
-    codecs.
-
-    It is what is alike, or JSON's escapes. Raises `error` itself where it is none of encoding.
-    """
+    codecs."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
@@ -36,24 +33,14 @@ codecs.register_error("alike", _alike)
 
 
 def write_in_any_encoding() -> None:
-    """Make stdout and stderr take any text from here on, for the whole process.
-
-    What their encoding lacks becomes what is alike, or JSON's escapes. A stream that is None, or no text wrapper, stays
-    as it is.
-    """
+    """Make stdout and stderr take any text from here on, for the whole process."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="alike")
 
 
 def write_line(text: str, stream: TextIO | None) -> OSError | None:
-    """Write `text`, escaped, and a line end at once; return the error that kept this from being done, or None.
-
-    Nothing is written to a `stream` of None, which Python has for a descriptor closed at its start; None is returned.
-    After an error the stream is redirected to /dev/null: it takes everything from then on and drops it. Raises
-    UnicodeEncodeError for what its encoding lacks, unless `write_in_any_encoding` was called, and ValueError for a
-    closed stream.
-    """
+    """Write `text`, escaped, and a line end at once; return the error that kept this from being done, or None."""
     if stream is None:
         return None
     try:
@@ -68,11 +55,7 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
 
 
 def write_answer(text: str, program: str) -> bool:
-    """Write to stdout what `program` was asked for; False where that could not be, which stderr is told.
-
-    The text is escaped, and a line end added. True also where stdout is closed, or its reader has gone: it meant to.
-    Only an OSError is told: call `write_in_any_encoding` before.
-    """
+    """Write to stdout what `program` was asked for; False where that could not be, which stderr is told."""
     lost = write_line(text, sys.stdout)
     # a reader that stopped reading meant to; a disk that is full did not
     if lost is None or isinstance(lost, BrokenPipeError):

@@ -32,11 +32,7 @@ class _Attributes(ctypes.Structure):
 
 
 def ask_for_slices(slice_ns: int = SHORTEST_NS) -> None:
-    """Ask the kernel for slices of `slice_ns`, 0 for its own length, for this thread and those that it begins.
-
-    Nothing is asked on an unknown processor or for a thread of another policy than SCHED_OTHER. A refusal goes
-    unnoticed, as an older kernel's does; nothing is raised. Policy and niceness stay.
-    """
+    """Ask the kernel for slices of `slice_ns`, 0 for its own length, for this thread and those that it begins."""
     number = _SYSTEM_CALL.get(os.uname().machine)
     if number is None or sys.maxsize < 2**32 or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return

@@ -44,11 +44,7 @@ class TomlError(ValueError):
 
 
 def toml_text(path: Path) -> str:
-    """Read a text file of at most MAX_BYTES, in UTF-8, and return its text, without a byte order mark.
-
-    Whether it is TOML is not looked at. Raises OSError, whose `strerror` says why it cannot be read, and TomlError for
-    bytes that are not UTF-8.
-    """
+    """Read a text file of at most MAX_BYTES, in UTF-8, and return its text, without a byte order mark."""
     try:
         return read_bounded(path, MAX_BYTES).decode("utf-8-sig")  # editors on Windows put a byte order mark first
     except UnicodeDecodeError as error:
@@ -56,11 +52,7 @@ def toml_text(path: Path) -> str:
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """Parse `text` as TOML and return its tables. Raises TomlError where it is not TOML.
-
-    Also refused are lines beyond LONGEST_LINE, too deep nesting, numbers that are not finite, and integers beyond 64
-    bits. What the tables hold is not checked.
-    """
+    """Parse `text` as TOML and return its tables."""
     import tomllib  # not above: most commands of tormagctl read no file, and need not wait for it
 
     for number, line in enumerate(text.splitlines(), start=1):
@@ -83,19 +75,12 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def convert(path: Path, kind: type[T]) -> T:
-    """Read a TOML file as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line's number.
-
-    It also raises ConfigError for a file that cannot be read, or is no TOML.
-    """
+    """Read a TOML file as a `kind`."""
     return convert_as(path, lambda _tables: kind)
 
 
 def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
-    """Read a TOML file as the kind that `kind_of` returns for its tables, which have been parsed, but not checked.
-
-    Raises ConfigError, as `convert` does. Where `kind_of` raises ConfigError, the file's name is put before its
-    message, and the line's number after it, as in `placed`. Without such a line only the name is.
-    """
+    """Read a TOML file as the kind that `kind_of` returns for its tables, which have been parsed, but not checked."""
     try:
         text = toml_text(path)
         try:
@@ -110,22 +95,13 @@ def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
 
 
 def placed(path: Path | None, message: str) -> str:
-    """Return `message`, a refusal of what the file at `path` says, as `PATH: message (line N)`.
-
-    N, from 1, is the line of the key that the message names, or of the nearest table above it that the file has. Where
-    it has neither, the message names no key, or `path` is None, returns `message` itself. Reads the file again, and
-    raises OSError and TomlError as `toml_text` does.
-    """
+    """Return `message`, a refusal of what the file at `path` says, as `PATH: message (line N)`."""
     where = "" if path is None else _line(toml_text(path), message)
     return f"{path}: {message}{where}" if where else message
 
 
 def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
-    """Convert tables to a `kind`, a msgspec struct, and return it. Raises ConfigError naming key, value and what is
-    allowed.
-
-    `where` is the path of these tables in the whole, as `$.a.b`, for the message. The message has no file and no line.
-    """
+    """Convert tables to a `kind`, a msgspec struct, and return it."""
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
@@ -137,20 +113,13 @@ def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
 
 
 def table_in(kind: Any) -> type[msgspec.Struct] | None:
-    """Return the struct, optional or not, that a field of type `kind` holds; None where it holds a plain value.
-
-    Of a union the first struct counts.
-    """
+    """Return the struct, optional or not, that a field of type `kind` holds; None where it holds a plain value."""
     structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
     return next(structs, None)
 
 
 def _known_key(kind: Any, message: str) -> str:
-    """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key in GONE.
-
-    `kind` is what the whole was read as. Empty where the message names no unknown key, or where no key of `kind` at
-    that place is near.
-    """
+    """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key in GONE."""
     if (unknown := _UNKNOWN.search(message)) is None or unknown[1] in GONE:
         return GONE[unknown[1]] if unknown else ""
     table = table_in(kind)
@@ -168,11 +137,7 @@ def _line(text: str, message: str) -> str:
 
 
 def _key_in(message: str) -> list[str]:
-    """Return the key that a refusal names, as its parts; empty where it names none.
-
-    A refusal of ours begins with the key. One of msgspec ends with a place, and may name an unknown key in it. A place
-    in an array ends with the array's key; an unknown key there follows that at once.
-    """
+    """Return the key that a refusal names, as its parts; empty where it names none."""
     if ours := _OURS.match(message):
         return ours[1].split(".")
     place, unknown = _PLACE.search(message), _UNKNOWN.search(message)
@@ -181,11 +146,7 @@ def _key_in(message: str) -> list[str]:
 
 
 def _value_at(tables: dict[str, Any], message: str) -> str:
-    """Return ` (it is VALUE)` for the path `$.a.b` at the end of a message of msgspec, which leaves the value out.
-
-    Empty without such a path, and for a table. An element of an array, `$.a[...]`, has no index there: the value is
-    then the array.
-    """
+    """Return ` (it is VALUE)` for the path `$.a.b` at the end of a message of msgspec, which leaves the value out."""
     if "`$." not in message:
         return ""
     value = _at(tables, message.rsplit("`$.", 1)[1].rstrip("`").split("[")[0].split("."))
@@ -200,11 +161,7 @@ def _at(table: Any, key: Sequence[str]) -> Any:
 
 
 def line_of(text: str, key: Sequence[str]) -> int | None:
-    """Return the number, from 1, of the line of `text`, which is TOML, that gives `key`, a path through its tables.
-
-    None where no line does, for an empty key, or where none of the first MAX_GUESSES lines that contain its name does.
-    The parser keeps no lines. So the text up to each of those lines is parsed, until the key is known.
-    """
+    """Return the number, from 1, of the line of `text`, which is TOML, that gives `key`, a path through its tables."""
     lines = text.splitlines()
     guesses = (number for number, line in enumerate(lines, start=1) if key and key[-1] in line)
     return next((number for number in islice(guesses, MAX_GUESSES) if _is_known(lines, number, key)), None)
@@ -212,10 +169,7 @@ def line_of(text: str, key: Sequence[str]) -> int | None:
 
 def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
     """Tell whether `key` is known after line `number`, from 1, or after up to MAX_LINES more that its value may go on
-    in.
-
-    False also where the text up to none of these is TOML.
-    """
+    in."""
     import tomllib
 
     for end in range(number, min(number + MAX_LINES, len(lines)) + 1):  # a value may go on in the lines below
@@ -227,10 +181,7 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
 
 
 def _require_numbers(value: Any, key: str) -> None:
-    """Raise TomlError for a number in `value`, however deep, that is not finite or not of 64 bits, with its key.
-
-    `key` is the path of `value` in the whole, empty for the whole. Raises RecursionError for too deep a `value`.
-    """
+    """Raise TomlError for a number in `value`, however deep, that is not finite or not of 64 bits, with its key."""
     if isinstance(value, float) and not math.isfinite(value):
         raise TomlError(f"{key} = {value}: allowed is a finite number")
     if isinstance(value, int) and not -(2**63) <= value < 2**63:

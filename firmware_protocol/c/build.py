@@ -63,7 +63,7 @@ class Target(Enum):
 
 
 def compiler() -> str:
-    """Return the path of the C compiler: `CC` from the environment, else `cc`. Raises BuildError without one."""
+    """Return the path of the C compiler: `CC` from the environment, else `cc`."""
     wanted = os.environ.get("CC", "cc")
     found = shutil.which(wanted)
     if found is None:
@@ -72,7 +72,7 @@ def compiler() -> str:
 
 
 def debian_tool(name: str) -> str:
-    """Return the path of a program of DEBIAN. Raises BuildError, naming its packages, where it is not on the path."""
+    """Return the path of a program of DEBIAN."""
     found = shutil.which(name)
     if found is None:
         raise BuildError(f"{name} is not on the path; install the Debian packages {DEBIAN[name]}")
@@ -80,10 +80,7 @@ def debian_tool(name: str) -> str:
 
 
 def build(target: Target) -> Path:
-    """Build a target, unless the cache has it from the present sources, and return the path of its file.
-
-    Raises BuildError where there is no compiler, where it fails or takes too long, and where the cache is not writable.
-    """
+    """Build a target, unless the cache has it from the present sources, and return the path of its file."""
     command = [debian_tool(target.needs) if target.needs else compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     path = user_cache / "tormagd" / f"{target.name.lower()}-{_fingerprint(command)}"
@@ -103,7 +100,7 @@ def build(target: Target) -> Path:
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """Load the shared library, built first where need be; later calls return the same. Raises BuildError."""
+    """Load the shared library, built first where need be; later calls return the same."""
     path = build(Target.LIBRARY)
     try:
         return ctypes.CDLL(str(path))
@@ -121,7 +118,7 @@ def _fingerprint(command: list[str]) -> str:
 
 
 def _compile(command: list[str]) -> None:
-    """Run the compiler. Raises BuildError with what it says where it fails, and after TIME_LIMIT_S."""
+    """Run the compiler."""
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False)
     except subprocess.TimeoutExpired as error:
@@ -131,7 +128,7 @@ def _compile(command: list[str]) -> None:
 
 
 def main() -> int:
-    """Build the library and print its path. Returns the exit code, 1 where it cannot be built."""
+    """Build the library and print its path."""
     try:
         print(build(Target.LIBRARY))
     except BuildError as error:

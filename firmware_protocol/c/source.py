@@ -35,7 +35,6 @@ def c_files(schema: Schema, dbc: Path) -> dict[str, str]:
 
 
 def _undated(text: str) -> str:
-    """Return a C file of cantools without the time of day, so that equal schemas give equal files."""
     return "\n".join(line.rstrip() for line in _STAMP.sub(r"\1 from tormag.dbc.", text).splitlines()).rstrip() + "\n"
 
 

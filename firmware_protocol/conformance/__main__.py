@@ -29,11 +29,7 @@ motors' supply switch in reach, take hands and patient's side off the brake, and
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Examine the device on a line, once the user has agreed that its motors move, and print the results.
-
-    Returns the exit code: 0 where all checks passed, 1 where one did not, 2 where nothing could be sent. `--list` only
-    prints the checks. Raises SystemExit for wrong arguments.
-    """
+    """Examine the device on a line, once the user has agreed that its motors move, and print the results."""
     command = parser()
     options = command.parse_args(arguments)
     if options.list:
@@ -93,10 +89,7 @@ def told(result: Result) -> str:
 
 
 def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
-    """Perform the chosen checks, print each result, and return all; none where they were ended or the line is gone.
-
-    SIGINT and SIGTERM end the checks and then open the gap. Raises ValueError for an unknown name in `--only`.
-    """
+    """Perform the chosen checks, print each result, and return all; none where they were ended or the line is gone."""
     checks = _chosen(checks_on(line), options.only)
     out = sys.stderr if options.json else sys.stdout
     host = Host(
@@ -138,10 +131,7 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
 
 
 def _resetter(options: argparse.Namespace) -> Callable[[str], None] | None:
-    """Return what resets the device: the command of `--reset`, or a person at the terminal; None without either.
-
-    It raises OSError where the command fails.
-    """
+    """Return what resets the device: the command of `--reset`, or a person at the terminal; None without either."""
     if options.reset:
         return lambda how: _call([*shlex.split(options.reset), how])
     if options.yes or not sys.stdin.isatty():
@@ -150,7 +140,7 @@ def _resetter(options: argparse.Namespace) -> Callable[[str], None] | None:
 
 
 def _call(command: Sequence[str]) -> None:
-    """Run a command. Raises OSError where it is not there, fails, or takes over RESET_S."""
+    """Run a command."""
     try:
         done = subprocess.run(command, check=False, timeout=RESET_S, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired as error:
@@ -160,14 +150,13 @@ def _call(command: Sequence[str]) -> None:
 
 
 def _ask_for_reset(how: str) -> None:
-    """Ask a person for a reset, and wait until it is done. By then the device has opened, as after any silence."""
+    """Ask a person for a reset, and wait until it is done."""
     ways = {"warm": "by its reset pin", "cold": "by its supply, off and on"}
     print(f"Reset the device {ways[how]}, then press Enter: ", end="", file=sys.stderr, flush=True)
     sys.stdin.readline()
 
 
 def _say(text: str, out: TextIO) -> None:
-    """Print a line. A reader that has gone is ignored: the device must not stay as it is because of that."""
     with contextlib.suppress(OSError):
         print(text, file=out, flush=True)
 
@@ -182,10 +171,7 @@ def _name(host: Host) -> str:
 
 
 def _chosen(checks: Sequence[Check], only: Sequence[str]) -> Sequence[Check]:
-    """Return the checks that `only` names, all where it is empty, and always the one that leaves the gap open.
-
-    Raises ValueError for a name that is no check.
-    """
+    """Return the checks that `only` names, all where it is empty, and always the one that leaves the gap open."""
     names = {one.name for one in checks}
     if unknown := [name for name in only if name not in names]:
         raise ValueError(f"--only {unknown[0]}: checks on this line are {', '.join(sorted(names))}")
@@ -238,7 +224,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _positive(text: str) -> float:
-    """Return a word of the command line as a number over 0. Raises ArgumentTypeError."""
+    """Return a word of the command line as a number over 0."""
     try:
         value = float(text)
     except ValueError:

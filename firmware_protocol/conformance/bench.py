@@ -26,11 +26,7 @@ TO_TURN_S: Final = 0.5
 
 
 def _is_new(host: Host, how: str) -> str:
-    """Reset a device in RUN, FAR_INSIDE_MM in, and hold it against a new one.
-
-    Raises Unmet unless it is IDLE, without zero, fault and host, opens slowly, and runs only after Home and Hello.
-    Raises Untested where nobody can reset it.
-    """
+    """Reset a device in RUN, FAR_INSIDE_MM in, and hold it against a new one."""
     if host.reset is None:
         raise Untested(f"nobody can reset the device: --reset COMMAND, which is called with {how}")
     host.running(FAR_INSIDE_MM)

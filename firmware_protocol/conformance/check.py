@@ -22,10 +22,7 @@ class Hazard(Enum):
 
 
 class Check(NamedTuple):
-    """One rule of the page as a test. `perform` returns what was seen.
-
-    It raises Unmet with what was seen instead, or Untested where the rule cannot be tested here.
-    """
+    """One rule of the page as a test. `perform` returns what was seen."""
 
     name: str
     hazard: Hazard
@@ -55,10 +52,7 @@ def check(
 
 
 def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = lambda result: None) -> Sequence[Result]:
-    """Perform checks one after the other, hand each result to `tell`, and return all results.
-
-    After a gate has failed, checks that move the device fail untried. Raises OSError when the line is gone.
-    """
+    """Perform checks one after the other, hand each result to `tell`, and return all results."""
     results: list[Result] = []
     closed_by = ""
     for one in checks:

@@ -34,7 +34,6 @@ Send = Callable[[int], None]
 
 
 def _raw_drive(duty_steps: int, mode: int, counter: int) -> bytes:
-    """Return the payload of a Drive that the codec would refuse, with the right CRC-8."""
     body = struct.pack("<hhBB", duty_steps, 0, mode, counter)
     return body + bytes((crc8(bytes((DRIVE,)) + body),))
 
@@ -44,15 +43,11 @@ def _drive(counter: int) -> bytes:
 
 
 def _command(kind: type[Message], nonce: int) -> bytes:
-    """Return the payload of a command; a Hello is of no schema: a device that takes it does no more than latch."""
     return encode(Hello(0, 0, nonce)) if kind is Hello else bytes((nonce,))
 
 
 def _ignores(host: Host, put: Iterable[Send]) -> str:
-    """Send bad Drives, each by a function of `put` that takes the counter, and a good Drive after each.
-
-    Raises Unmet where a bad Drive is answered or shows in Status, and where the good Drive after it is not answered.
-    """
+    """Send bad Drives, each by a function of `put` that takes the counter, and a good Drive after each."""
     tried = 0
     for send in put:
         host.pass_time(3 * PERIOD_S, Beat.OFF)
@@ -76,10 +71,7 @@ def _ignores(host: Host, put: Iterable[Send]) -> str:
 
 
 def _refuses(host: Host, put: Iterable[tuple[str, Send]]) -> str:
-    """Send bad commands to an idle device, each by a function that takes the nonce, and a good Clear after each.
-
-    Raises Unmet where a bad command leaves a trace, and where the good one after it does not.
-    """
+    """Send bad commands to an idle device, each by a function that takes the nonce, and a good Clear after each."""
     tried = 0
     host.idle()
     for what, send in put:

@@ -29,7 +29,7 @@ JUMP_MM = 0.2
 
 
 def _homings(host: Host) -> list[Homing]:
-    """Return the homings so far; without any, home a device without a zero. The first after a boot shows the most."""
+    """Return the homings so far; without any, home a device without a zero."""
     if not host.homings:
         host.without_zero()
         host.home()

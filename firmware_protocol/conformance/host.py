@@ -124,11 +124,7 @@ class Homing(NamedTuple):
 
 
 class Host:
-    """One conversation with a device.
-
-    `heard` are the messages since `forget`, `newest` is the last message of each type. All methods that wait or send
-    raise OSError when the line is gone.
-    """
+    """One conversation with a device."""
 
     def __init__(
         self,
@@ -139,11 +135,7 @@ class Host:
         uptime_s: float | None = None,
         reset: Callable[[str], None] | None = None,
     ) -> None:
-        """Begin a conversation with a device that opens at `opening_mm_s` and has ways of `stroke_mm`.
-
-        `uptime_s` is how long it has been up, None where nobody knows; `reset` resets it, "warm" or "cold", None where
-        nothing can.
-        """
+        """Begin a conversation with a device that opens at `opening_mm_s` and has ways of `stroke_mm`."""
         self.line = line
         self.opening_mm_s = opening_mm_s
         self.stroke_mm = stroke_mm
@@ -171,12 +163,10 @@ class Host:
 
     @property
     def now_s(self) -> float:
-        """The clock of the line's port."""
         return self.line.port.now_s()
 
     @property
     def uptime_s(self) -> float | None:
-        """How long the device has been up; None where nobody knows."""
         return None if self._booted_s is None else self.now_s - self._booted_s
 
     # -- what is sent ------------------------------------------------------------------------------------------------
@@ -223,7 +213,7 @@ class Host:
         return True
 
     def obeyed(self, kind: Command, beat: Beat = Beat.OFF) -> None:
-        """Send a command as `command` does. Raises Unmet where it is not acknowledged."""
+        """Send a command as `command` does."""
         if not self.command(kind, beat):
             raise Unmet(f"{kind.__name__} not acknowledged: {shown(self.status)}")
 
@@ -232,10 +222,7 @@ class Host:
         return not self.command(kind, beat, SEEN_S)
 
     def refuses(self, kind: Command, mode: DeviceMode, beat: Beat = Beat.OFF, *, homed: bool | None = None) -> str:
-        """Send a command that the device must refuse, and return what the next Status shows, as `shows`.
-
-        Raises Unmet where the command is acknowledged, or the device is not in `mode` and, unless None, `homed` so.
-        """
+        """Send a command that the device must refuse, and return what the next Status shows, as `shows`."""
         is_refused = self.is_refused(kind, beat)
         besides = f"{kind.__name__} {told(not is_refused)}"
         return self.shows(mode, beat, homed=homed, besides=besides, wrong=not is_refused)
@@ -279,7 +266,7 @@ class Host:
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
 
     def last(self, kind: type[M]) -> M:
-        """Return the newest message of a type. Raises Unmet where none ever came."""
+        """Return the newest message of a type."""
         message = self.newest[kind].message if kind in self.newest else None
         if not isinstance(message, kind):
             raise Unmet(f"no {kind.__name__} ever came")
@@ -287,13 +274,13 @@ class Host:
 
     @property
     def status(self) -> Status:
-        """The newest Status; waits for the first one. Raises Unmet where none comes."""
+        """The newest Status; waits for the first one."""
         if Status not in self.newest:
             self.until(lambda: Status in self.newest, 10 * STATUS_S, Beat.NOTHING)
         return self.last(Status)
 
     def next_status(self, beat: Beat) -> Status:
-        """Wait for a Status that comes from now on, and return it. Raises Unmet where none comes."""
+        """Wait for a Status that comes from now on, and return it."""
         before = self.newest.get(Status)
         if not self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat):
             raise Unmet(f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
@@ -310,11 +297,7 @@ class Host:
         besides: str = "",
         wrong: object = False,
     ) -> str:
-        """Return what the next Status shows, in words, behind what was seen `besides`.
-
-        Raises Unmet with these words unless the Status shows `mode` and all that is not None; `fault` are all the
-        faults. Raises it also where `wrong` is true: something else went wrong before.
-        """
+        """Return what the next Status shows, in words, behind what was seen `besides`."""
         status = self.next_status(beat)
         is_right = (
             status.mode is mode
@@ -325,7 +308,6 @@ class Host:
         return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
 
     def _shown_nonce(self) -> int:
-        """Return the nonce in the newest Status; 0 before the first."""
         return self.last(Status).command_nonce if Status in self.newest else 0
 
     def _listen(self, period_s: float) -> None:
@@ -357,10 +339,7 @@ class Host:
         self.newest[type(message)] = heard
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
-        """Return the end switches in a Status that do not fit a State just before it.
-
-        None for a device that was not homed: its origin is another.
-        """
+        """Return the end switches in a Status that do not fit a State just before it."""
         state = self.newest.get(State)
         is_usable = Status in self.newest and is_homed(self.last(Status)) and is_homed(status)
         if state is None or not is_usable or time_s - state.time_s > FRESH_S:
@@ -376,7 +355,7 @@ class Host:
     # -- where a check begins ----------------------------------------------------------------------------------------
 
     def idle(self) -> None:
-        """Bring the device to IDLE without a fault, by a Hello, Drive OFF and, in LATCHED, a Clear. Raises Unmet."""
+        """Bring the device to IDLE without a fault, by a Hello, Drive OFF and, in LATCHED, a Clear."""
         self.hello()
         self.pass_time(SEEN_S, Beat.OFF)
         if not self.until(self.is_resting, HOMED_S):
@@ -388,15 +367,12 @@ class Host:
             raise Unmet(f"not IDLE without a fault after Hello, Drive OFF and Clear: {shown(status)}")
 
     def without_zero(self) -> None:
-        """Take the device's zero away by a mismatched Hello, and bring it to IDLE; nothing moves. Raises Unmet.
-
-        A device that breaks this rule is still homed.
-        """
+        """Take the device's zero away by a mismatched Hello, and bring it to IDLE; nothing moves."""
         self.hello(SCHEMA_HASH ^ 1)
         self.idle()
 
     def homed(self) -> None:
-        """Bring the device to IDLE, homed, at both open switches. Raises Unmet."""
+        """Bring the device to IDLE, homed, at both open switches."""
         self.idle()
         if not is_homed(self.status):
             self.home()
@@ -406,10 +382,7 @@ class Host:
             raise Unmet(f"Retract does not open: {shown(self.status)}")
 
     def home(self, beat: Beat = Beat.OFF) -> Homing:
-        """Home an idle device; return how it went, well or not, and add this to `homings`.
-
-        Raises Unmet only where no Status ever came.
-        """
+        """Home an idle device; return how it went, well or not, and add this to `homings`."""
         start_s = self._next_s
         first_heard = len(self.heard)
         was_acknowledged = self.command(Home, beat)
@@ -427,7 +400,7 @@ class Host:
         return homing
 
     def running(self, inside_mm: float = 0.0) -> None:
-        """Bring the device to RUN, duties 0, the carriages `inside_mm` from their open switches. Raises Unmet."""
+        """Bring the device to RUN, duties 0, the carriages `inside_mm` from their open switches."""
         self.homed()
         self.pass_time(2 * PERIOD_S, Beat.OFF)
         if not self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, Beat.RUN):
@@ -439,10 +412,7 @@ class Host:
     def bring(
         self, left_mm: float, right_mm: float, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
     ) -> None:
-        """Bring the carriages in RUN to places from home, at this speed, unless `ends()` becomes true before.
-
-        Raises Unmet where RUN ends before, and where they are late by MOVED_S.
-        """
+        """Bring the carriages in RUN to places from home, at this speed, unless `ends()` becomes true before."""
         goals = left_mm, right_mm
         targets = places(self.last(State))
         way_mm = max(abs(goal - at) for goal, at in zip(goals, targets, strict=True))
@@ -461,11 +431,7 @@ class Host:
                 raise Unmet(f"on the way to left {left_mm:+.1f} mm, right {right_mm:+.1f} mm: {seen}")
 
     def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] | None = None) -> float:
-        """Send no Drive in RUN for a time, then a Drive RUN; return how long the device's clock says that this was, s.
-
-        The silence begins at a random time after a Status. `meanwhile` is called every millisecond, to send other
-        things. Raises Unmet where no State answers.
-        """
+        """Send no Drive in RUN for a time, then a Drive RUN; return how long the device's clock says that this was, s."""
         self.next_status(Beat.RUN)
         self.pass_time(self.random.randrange(20) * PERIOD_S, Beat.RUN)
         self._answered(Beat.RUN)
@@ -477,7 +443,7 @@ class Host:
         return (self._answered(Beat.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
 
     def _answered(self, beat: Beat) -> State:
-        """Send a Drive and return the State that answers it. Raises Unmet without one."""
+        """Send a Drive and return the State that answers it."""
         before = self.newest.get(State)
         self.beat(beat)
         if not self.until(lambda: self.newest.get(State) is not before, ANSWER_S, Beat.NOTHING):
@@ -485,7 +451,7 @@ class Host:
         return self.last(State)
 
     def latched(self) -> None:
-        """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN; at once where it is. Raises Unmet."""
+        """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN; at once where it is."""
         status = self.next_status(Beat.NOTHING)
         if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults:
             self.running(INSIDE_MM)
@@ -495,10 +461,7 @@ class Host:
                 raise Unmet(f"silence in RUN does not lead to LATCHED: {shown(self.status)}")
 
     def leave_open(self) -> str:
-        """Open the gap, whatever the device was doing; return what hinders it, in words, or "" for an open gap.
-
-        Raises Unmet where Status stops coming.
-        """
+        """Open the gap, whatever the device was doing; return what hinders it, in words, or "" for an open gap."""
         self.hello()
         for _ in range(2):
             if Status not in self.newest and not self.until(lambda: Status in self.newest, 0.2):

@@ -52,11 +52,7 @@ class FramePort(Protocol):
 
 
 class SerialLine:
-    """One conversation with one device, in frames of COBS and CRC-16 on a serial port.
-
-    Its `port` has the clock, and is closed by whoever opened it. Every method that uses the port raises OSError when it
-    is gone.
-    """
+    """One conversation with one device, in frames of COBS and CRC-16 on a serial port."""
 
     def __init__(self, port: BytePort) -> None:
         self.port = port
@@ -70,10 +66,7 @@ class SerialLine:
         self.port.write(self._frame(function, payload))
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """Return damaged forms of a frame, by the kind of damage, for `send_damaged`; a device has to ignore each.
-
-        Every form ends with a delimiter, so that the frame after it is whole. Takes one sequence number.
-        """
+        """Return damaged forms of a frame, by the kind of damage, for `send_damaged`; a device has to ignore each."""
         frame = self._frame(function, payload)
         body = frame[:-1]
         middle = len(body) // 2
@@ -114,10 +107,7 @@ class SerialLine:
 
     @property
     def frame_errors(self) -> dict[str, int]:
-        """What was wrong with the device's frames, and how often; empty where nothing was.
-
-        Counted from the first whole frame on: before it, the line carried something else.
-        """
+        """What was wrong with the device's frames, and how often; empty where nothing was."""
         statistics = self._decoder.statistics
         now = statistics.corrupt, statistics.lost, statistics.repeated
         corrupt, lost, repeated = (count - before for count, before in zip(now, self._before or (1, 0, 0), strict=True))
@@ -130,21 +120,16 @@ class SerialLine:
 
 
 class CanLine:
-    """One conversation with one device, a node on a CAN bus: payloads are the data of CAN frames.
-
-    Its `port` is the bus, which has the clock, and is closed by whoever opened it. Every method that uses the bus
-    raises OSError when it is gone.
-    """
+    """One conversation with one device, a node on a CAN bus: payloads are the data of CAN frames."""
 
     def __init__(self, port: FramePort, node: int) -> None:
-        """Begin a conversation with `node`. Raises EncodeError for a node outside 0..15."""
+        """Begin a conversation with `node`."""
         can_identifier(1, node)
         self.port, self._node = port, node
         self._others: set[int] = set()
 
     @property
     def frame_errors(self) -> dict[str, int]:
-        """Always empty: the CAN controllers check frames, and what they discard is not seen."""
         return {}
 
     def send(self, function: int, payload: bytes) -> None:
@@ -152,10 +137,7 @@ class CanLine:
         self.port.write(can_identifier(function, self._node), payload)
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """Return whole frames to other nodes, for `send_damaged`; the device has to ignore them.
-
-        Only to nodes that no frame has come from: a Drive to another brake would be obeyed there. Empty without such.
-        """
+        """Return whole frames to other nodes, for `send_damaged`; the device has to ignore them."""
         free = [node for node in range(NODES) if node != self._node and node not in self._others]
         frames = tuple(can_identifier(function, node).to_bytes(2, "big") + payload for node in free[:2])
         return {"other_node": frames} if frames else {}

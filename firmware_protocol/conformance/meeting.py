@@ -53,7 +53,7 @@ def hello_nonce(host: Host) -> str:
 
 
 def _mismatch(host: Host, schema: int, version: int) -> str:
-    """Send an idle device a Hello of this schema and version. Raises Unmet unless it answers once and latches."""
+    """Send an idle device a Hello of this schema and version."""
     host.idle()
     host.forget()
     host.hello(schema, version)

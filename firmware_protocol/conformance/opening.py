@@ -34,11 +34,7 @@ NEARLY: Final = f"in RUN, {NEARLY_MM:g} mm from the closed switches, "
 
 
 def opens_fully(host: Host, fault: DeviceFault, beat: Beat = Beat.OFF) -> str:
-    """Watch a device open that has begun, and judge each carriage's speed on the device's clock.
-
-    Raises Unmet where the mean is under MIN_SHARE or a window over MAX_SHARE of the device's speed. Raises it, too,
-    unless it ends at rest at both open switches with just this fault.
-    """
+    """Watch a device open that has begun, and judge each carriage's speed on the device's clock."""
     host.forget()
     starts_mm = places(host.last(State))
     host.until(host.is_resting, OPENED_S, beat)
@@ -82,7 +78,6 @@ def _from_inside(host: Host, ends_run: Callable[[], object], fault: DeviceFault,
 
 
 def _lets_go(host: Host) -> None:
-    """Send Drive OFF with closing duties for SEEN_S. Raises Unmet where the device is not opening by then."""
     host.pass_time(SEEN_S, Beat.OFF, duty=CLOSING_DUTY)
     unless(host.status.mode is not DeviceMode.RETRACTING, f"Drive OFF with duties: {shown(host.status)}")
 

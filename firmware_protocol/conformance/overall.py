@@ -31,10 +31,7 @@ def no_reset(host: Host) -> str:
 
 @check(Hazard.MISLED, "Modes", ALL, "Status does not contradict itself")
 def status_consistent(host: Host) -> str:
-    """Check that no Status contradicts itself.
-
-    No carriage is at both ends, LATCHED is never without a fault or with a zero, IDLE and RUN are never with a fault.
-    """
+    """Check that no Status contradicts itself."""
     return unless(host.contradictions, listed(host.contradictions) or f"at last {shown(host.status)}")
 
 

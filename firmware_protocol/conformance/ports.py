@@ -26,7 +26,7 @@ class SerialPort:
     """An open, exclusively held serial port: a `BytePort`."""
 
     def __init__(self, path: str, baud: int) -> None:
-        """Open the port at `path`, with its latency timer at 1 ms where it has one. Raises OSError."""
+        """Open the port at `path`, with its latency timer at 1 ms where it has one."""
         try:
             self._port = serial.Serial(path, baud, timeout=0, write_timeout=PATIENCE_S, exclusive=True)
             self._port.reset_input_buffer()
@@ -41,11 +41,11 @@ class SerialPort:
         return time.monotonic()
 
     def write(self, data: bytes) -> None:
-        """Send bytes. Raises OSError when the port is gone, or takes nothing for PATIENCE_S."""
+        """Send bytes."""
         self._port.write(data)
 
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Wait until `until_s`; return what came, with its times. Raises OSError when the device was unplugged."""
+        """Wait until `until_s`; return what came, with its times."""
         came: list[tuple[float, bytes]] = []
         while (left_s := until_s - time.monotonic()) > 0.0 or not came:
             if select.select([self._port.fileno()], [], [], max(left_s, 0.0))[0]:
@@ -58,7 +58,7 @@ class SerialPort:
         return came
 
     def close(self) -> None:
-        """Close the port without waiting for unsent bytes. Errors of a port that is gone are ignored."""
+        """Close the port without waiting for unsent bytes."""
         with contextlib.suppress(OSError, termios.error):  # it may be gone
             self._port.reset_output_buffer()
             self._port.close()
@@ -69,7 +69,7 @@ class CanPort:
     """An open CAN bus: a `FramePort`."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
-        """Open a bus by python-can; `baud` is of an adapter's serial port. Raises OSError."""
+        """Open a bus by python-can; `baud` is of an adapter's serial port."""
         settings: dict[str, Any] = {}
         if interface == "slcan":  # by default it sleeps for 2 s when it opens
             settings = {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0}
@@ -88,14 +88,14 @@ class CanPort:
         return time.monotonic()
 
     def write(self, identifier: int, data: bytes) -> None:
-        """Send a frame. Raises OSError when the bus is gone, or takes nothing for PATIENCE_S."""
+        """Send a frame."""
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=PATIENCE_S)
         except can.CanError as error:
             raise OSError(str(error)) from error
 
     def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
-        """Wait until `until_s`; return the time, identifier and data of each frame. Raises OSError for a lost bus."""
+        """Wait until `until_s`; return the time, identifier and data of each frame."""
         came: list[tuple[float, int, bytes]] = []
         while True:
             left_s = until_s - time.monotonic()
@@ -107,15 +107,12 @@ class CanPort:
                 return came
 
     def close(self) -> None:
-        """Close the bus. Errors of a bus that is gone are ignored."""
+        """Close the bus."""
         with contextlib.suppress(can.CanError, OSError):  # it may be gone
             self._bus.shutdown()
 
     def _received(self) -> can.Message | None:
-        """Return a classical data frame with an 11-bit identifier; None for any other, and where none is there.
-
-        Raises OSError when the bus is gone.
-        """
+        """Return a classical data frame with an 11-bit identifier; None for any other, and where none is there."""
         try:
             frame = self._bus.recv(0)
         except (can.CanError, OSError) as error:
@@ -131,10 +128,7 @@ class CanPort:
 
 
 def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:
-    """Open a line: a serial port by its path, a CAN bus as INTERFACE:CHANNEL. Raises OSError saying why not.
-
-    Also EncodeError for a node outside 0..15.
-    """
+    """Open a line: a serial port by its path, a CAN bus as INTERFACE:CHANNEL."""
     interface, colon, channel = name.partition(":")
     if colon and interface in BACKENDS:
         return CanLine(CanPort(interface, channel, bitrate, baud), node)

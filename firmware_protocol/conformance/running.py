@@ -95,7 +95,7 @@ def right_duty(host: Host) -> str:
 
 
 def _duty_moves(host: Host, *, is_left: bool) -> str:
-    """Lower one duty slowly. Raises Unmet unless its carriage goes in by MOVED_MM while the other one stays."""
+    """Lower one duty slowly."""
     host.running()
     start = host.last(State)
     for step in range(round(MAX_DUTY / RAMP_PER_S / PERIOD_S)):
@@ -142,7 +142,6 @@ def open_switch_stops(host: Host) -> str:
 
 
 def _moved_mm(host: Host, start: State) -> tuple[float, float]:
-    """Return how far the left and the right carriage are from their positions in `start`, mm; positive is out."""
     state = host.last(State)
     return state.left_position_mm - start.left_position_mm, state.right_position_mm - start.right_position_mm
 
@@ -175,7 +174,7 @@ def retract_opens(host: Host) -> str:
 
 
 def _opens(host: Host, beat: Beat) -> str:
-    """Watch the gap open, with `beat` going on. Raises Unmet where it does not begin, is late, or ends wrong."""
+    """Watch the gap open, with `beat` going on."""
     start = host.last(State)
     host.shows(DeviceMode.RETRACTING, beat, besides=f"from {positions(start)}")
     seen = f"from {positions(start)} to "
@@ -192,7 +191,6 @@ def _opens(host: Host, beat: Beat) -> str:
 
 
 def _given_up(host: Host, beat: Beat) -> str:
-    """Return what a device that does not open in time says of it, within GIVEN_UP_S; it has to say RETRACT_FAILED."""
     said = host.until(lambda: host.is_resting() or DeviceFault.RETRACT_FAILED in host.status.faults, GIVEN_UP_S, beat)
     return f"then {shown(host.status)}" if said else f"and says nothing of it in {GIVEN_UP_S:g} s"
 
@@ -213,10 +211,7 @@ def let_go_after_retract(host: Host) -> str:
 
 
 def has_to_let_go(host: Host) -> str:
-    """Send Drive RUN to an idle device, one Drive OFF, then Drive RUN again.
-
-    Raises Unmet where RUN comes before the Drive OFF, or not after it.
-    """
+    """Send Drive RUN to an idle device, one Drive OFF, then Drive RUN again."""
     host.hello(beat=Beat.RUN)  # a host says one every second
     start = host.last(State)
     host.pass_time(SEEN_S, Beat.RUN, duty=REFUSED_DUTY)
@@ -263,10 +258,7 @@ def homing_refuses_run(host: Host) -> str:
 
 
 def refuses_run(host: Host, mode: DeviceMode) -> str:
-    """Send closing Drive RUN to a device that must not run. Raises Unmet where it moves, answers not, or leaves `mode`.
-
-    `mode` is one in which the drives are off.
-    """
+    """Send closing Drive RUN to a device that must not run."""
     host.beat(Beat.OFF)
     host.pass_time(ANSWER_S)
     start = host.last(State)
@@ -280,7 +272,7 @@ def refuses_run(host: Host, mode: DeviceMode) -> str:
 
 
 def _mismatched(host: Host, beat: Beat, faults: DeviceFault = DeviceFault.SCHEMA_MISMATCH) -> str:
-    """Send a Hello of another schema. Raises Unmet unless the gap opens and the device latches just these faults."""
+    """Send a Hello of another schema."""
     host.hello(SCHEMA_HASH ^ 1, beat=beat)
     if (status := host.next_status(beat)).mode not in (DeviceMode.RETRACTING, DeviceMode.LATCHED):
         raise Unmet(shown(status))

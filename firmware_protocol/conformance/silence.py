@@ -58,10 +58,7 @@ TIMED_OUT: Final = DeviceFault.COMMAND_TIMEOUT
 
 
 def _ends(host: Host, silent_s: float) -> bool:
-    """Return whether a silence of a device in RUN ended RUN.
-
-    Raises Unmet where the device's clock says that it should not have, or should; and for any other fault.
-    """
+    """Return whether a silence of a device in RUN ended RUN."""
     silence_s = host.fall_silent(silent_s)
     status = host.next_status(Beat.RUN)
     has_ended = status.mode is not DeviceMode.RUN
@@ -198,7 +195,7 @@ def let_go_after_fault(host: Host) -> str:
 
 
 def _holds(host: Host, end_s: float) -> str:
-    """Hold RUN until then with Drives that come seldom, then fall silent. Raises Unmet where that is not noticed."""
+    """Hold RUN until then with Drives that come seldom, then fall silent."""
     host.running()
     while host.now_s < end_s:
         host.beat(Beat.RUN, period_s=SPARSE_S)

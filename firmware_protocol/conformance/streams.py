@@ -57,7 +57,7 @@ def status_with_host(host: Host) -> str:
 
 
 def _status_rate(host: Host, beat: Beat) -> str:
-    """Listen for LISTENED_S. Raises Unmet for a wrong rate of Status, or a gap of over two and a half periods."""
+    """Listen for LISTENED_S."""
     start_s = host.now_s
     host.pass_time(LISTENED_S, beat)
     times = [time_s for time_s, _ in host.all_of(Status)]
@@ -198,10 +198,7 @@ def device_time_is_fine(host: Host) -> str:
     "no leap over 1 mm, a force against the motion",
 )
 def handle_runs_on(host: Host) -> str:
-    """Check that the handle's position has no leaps, as of swapped bytes, and that the force is against its motion.
-
-    Raises Untested where it does not turn, Unmet for a leap or a force along the motion.
-    """
+    """Check that the handle's position has no leaps, as of swapped bytes, and that the force is against its motion."""
     host.pass_time(LISTENED_S, Beat.OFF)
     places = [sense.handle_position_mm for _, sense in host.all_of(Sense)]
     half = HANDLE_SPAN_MM / 2.0

@@ -19,7 +19,6 @@ def test_a_force_that_is_slow_or_stands_is_followed_exactly(rate_N_s: float) -> 
 
 
 def test_a_step_is_caught_up_with_at_top_speed() -> None:
-    """A step of 0.5 N: the error falls from there to 0 within a second, evenly, and its square has a third as mean."""
     found = missed(EVEN, [0.001 * tick for tick in range(1001)], [0.7] + [1.2] * 1000, SPEED_MM_S)
     assert (found.rms_N, found.share) == (pytest.approx(0.5 / np.sqrt(3.0), rel=2e-3), pytest.approx(1 / 1000))
     (worst,) = found.worst

@@ -22,7 +22,7 @@ Maker = Callable[..., ClosedLoop]
 
 @pytest.fixture(scope="session")
 def core() -> Core:
-    """Of the shipped coronary scene. Nothing in it changes."""
+    """Of the shipped coronary scene."""
     return build_core(Config())
 
 
@@ -49,7 +49,7 @@ def make(core: Core) -> Maker:
 
 @pytest.fixture(scope="session")
 def arm(make: Maker) -> Maker:
-    """A loop that is armed, at the open gap. Its device was left open: the way home is short."""
+    """A loop that is armed, at the open gap."""
 
     def armed(
         plant: str | PlantParameters = "sample_1", *hand: Hand, planned: bool = True, **options: object

@@ -63,7 +63,6 @@ def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
     [("sample_1", 0.0, 0.03, 1.0), ("sample_2", 1.5, 0.05, 0.8), ("sample_3", 1.5, 0.05, 0.85)],
 )
 def test_a_pulse_is_rendered(arm, plant: str, from_s: float, within_N: float, trim: float) -> None:
-    """The model was learned on sample 1; the trim makes up for what differs, given a second or two."""
     samples = publish(arm(plant), pulse_N, LEAD_IN_S + 2.5)
     assert faults_of(samples) == ()
     assert rms_N(samples, pulse_N, LEAD_IN_S + from_s) <= within_N
@@ -73,7 +72,6 @@ def test_a_pulse_is_rendered(arm, plant: str, from_s: float, within_N: float, tr
 
 
 def test_a_staircase_rises_at_every_step(armed: ClosedLoop, core: Core) -> None:
-    """The coronary scene: from the least force to 2 N, a tenth of a newton apart."""
     least = core.portrait.min_N
     steps = [least, *np.arange(math.ceil(10.0 * least) / 10.0, 2.05, 0.1)]
     rendered, gaps = [], []
@@ -88,8 +86,6 @@ def test_a_staircase_rises_at_every_step(armed: ClosedLoop, core: Core) -> None:
 
 
 def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
-    """A constant force: the friction that waits for the hand stays what was asked while the hand rests. Of it the
-    kinetic part is less the slower the hand is: Stribeck's comes on top."""
     samples = publish(arm(hand=ReversingHand()), lambda time_s: 1.0, 4.0, rate_hz=100)[1_500:]
     assert min(abs(sample.truth.handle_mm_s) for sample in samples) < 0.1
     assert all(-0.1 < sample.truth.kinetic_N - 1.0 < 0.08 for sample in samples)
@@ -182,7 +178,6 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
 
 
 def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
-    """Killed with the gap closed: the device opens by itself, and nothing shuts on the way."""
     loop = arm(faults=["worn_gearbox@2.5"])
     publish(loop, lambda time_s: 1.6, 1.5)
     closed_mm = loop.device.truth.gap_mm
@@ -203,7 +198,6 @@ def test_a_loop_without_a_planner_wants_plans(make) -> None:
 def test_a_force_is_found_on_a_plant_of_other_structure(
     arm: Callable[..., ClosedLoop], render: Callable[[ClosedLoop, float, float], list[Sample]]
 ) -> None:
-    """Generous: 50 mN after two seconds and a half at each level, ten times what it is, and no more than 0.1 N over."""
     loop = arm("second")
     for asked_N in (0.8, 2.0, 1.2):
         samples = render(loop, asked_N, 3.0)
@@ -229,7 +223,6 @@ def pad_core() -> Core:
 
 @pytest.mark.parametrize("plant", ["pad_1", "pad_2"])
 def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
-    """On the pad of the model, and on a weaker one that relaxes more."""
     time_s, force_N = asked(SCENE.signal, scene_path("radial_pulse").parent, (3.2, 3.9), PULSE_S, 100)
     loop = arm(plant, PressingHand(2.0), core=pad_core, config=CONFIG)
 
@@ -248,7 +241,6 @@ def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
 
 
 def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
-    """The first minutes of `tormag-lab tactile-hold --coarse`, frozen."""
     within, without = (hold(Case("pad_1", remembers, False, 200.0, coarse=True)) for remembers in (True, False))
     assert within["force_error"] < 0.01
     assert not within["fault"]
@@ -264,7 +256,6 @@ def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
 
 
 def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_core: Core) -> None:
-    """Its force is the finger's own: more than the scene's greatest by far, at any gap."""
     hand = RecordedHand((0.0, 3.0, 4.0), (0.0, 0.0, 4.0))
     last = list(
         arm("pad_1", hand, core=pad_core, config=CONFIG).run(4.5, lambda now_s: TimedSetpoint(3.6, now_s, 0.1))

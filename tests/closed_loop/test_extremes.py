@@ -86,7 +86,6 @@ def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:
 
 
 def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
-    """Sample 2 reaches less than the speed limit: over the stroke it falls behind, but never so far as a fault."""
     loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), AT_REST, seed=1))
     loop.arm(gap_plan(OPEN_MM))
     samples = on_the_way(loop, 47.0, 2_000) + on_the_way(loop, 93.0, 2_000)
@@ -157,7 +156,6 @@ def lag_mm(loop: ClosedLoop) -> float:
 
 
 def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm, hold_gap, gap_ticks) -> None:
-    """Without the pull in it the reference runs ahead of carriages that have no more voltage."""
     lags_mm, overshoots_mm = [], []
     for pull_V in (CONFIG.motor.pull_V, 0.0):
         config = msgspec.structs.replace(CONFIG, motor=msgspec.structs.replace(CONFIG.motor, pull_V=pull_V))
@@ -172,7 +170,6 @@ def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm, hold_gap, gap_tick
 
 
 def test_a_step_knows_nothing_of_the_stroke_before_it(arm, hold_gap) -> None:
-    """What the integral learned while closing is wrong for opening, and on target no error takes it away."""
     loop = arm(hand=AT_REST, planned=False)
     hold_gap(loop, 57.0, 2.0)
     assert max(abs(loop.stepper.move.left.integral), abs(loop.stepper.move.right.integral)) < 0.002

@@ -93,8 +93,6 @@ def test_a_sensor_that_is_frozen_from_the_beginning_is_named_as_the_gap_moves(ly
 def test_a_sensor_that_reads_too_little_presses_more_by_no_more_and_too_much_less(
     lying, render, lie: str, most_N: float
 ) -> None:
-    """As long as the handle goes one way the device may be a weaker one, or a stronger one with another field law, and
-    then what it does is on the safe side."""
     assert worst_N(render(lying(lie), ASKED_N, 3.0)) < most_N
 
 
@@ -108,7 +106,6 @@ def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(lying, render
 
 
 def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(arm, render) -> None:
-    """By 0.2 N a minute, forty times what the plant card has, and turning every second."""
     loop = arm("sample_3", ReversingHand(2.0))
     render(loop, ASKED_N, 2.0)
     start_s = loop.device.truth.time_s
@@ -165,7 +162,6 @@ def open_core(core: Core) -> Core:
 
 
 def test_the_governed_force_holds_alone(make, render, core: Core, open_core: Core) -> None:
-    """With no ceiling over gap and measured force, 1000 N asked give the scene's greatest."""
     loop = make(core=open_core)
     loop.planner.governor = core.planner().governor
     loop.arm()
@@ -201,7 +197,6 @@ def test_the_gap_holds_alone(make, render, core: Core, open_core: Core, sample: 
 
 @pytest.mark.parametrize("sample", WEAKEST_AND_STRONGEST)
 def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) -> None:
-    """A plan that closes the gap without any word of forces: the force over the ceiling opens it, at a bounded rate."""
     shut = hold_gap(arm(sample), 47.0, 4.0)
     assert shut[-1].safety.faults == (Fault.OVER_FORCE,)
     assert any(Limit.OVER_FORCE in sample.output.limits for sample in shut)
@@ -215,7 +210,6 @@ def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) 
 
 @pytest.mark.parametrize("sample", WEAKEST_AND_STRONGEST)
 def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
-    """Static friction is up to 1.25 times the kinetic one."""
     samples = render(arm(sample, ReversingHand(2.0)), MAX_N, 4.5)
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert worst_N(samples) < CEILING_N
@@ -234,7 +228,6 @@ SCALES, OFFSETS_N = (0.1, 2.0), (-1.0, 1.0)
 def test_a_profile_that_lies_never_presses_over_the_ceiling(
     arm, render, goes_mm_s: float, scale: float, offset_N: float
 ) -> None:
-    """Tampered, of another insert or outdated; the handle rests, then creeps or slides, or goes on resting."""
     draw = random.Random(f"{goes_mm_s} {scale} {offset_N}")
     hand = RecordedHand((0.0, RESTS_S, RESTS_S + 30.0), (0.0, 0.0, 30.0 * goes_mm_s))
     loop = arm(f"sample_{draw.randint(1, 3)}", hand)

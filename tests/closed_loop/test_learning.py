@@ -40,7 +40,6 @@ def test_noise_alone_hardly_moves_the_gap(arm, render, sample: str) -> None:
 
 
 def test_a_device_that_was_known_before_is_right_at_once(arm, render) -> None:
-    """What a profile brings: sample 2 is a quarter weaker than the model."""
     loop = arm("sample_2")
     render(loop, 0.7, 1.0)
     render(loop, 2.0, 2.0)
@@ -61,7 +60,6 @@ def frozen() -> Core:
 
 
 def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on(arm, render, frozen: Core) -> None:
-    """It knows what the elastomer has relaxed and how its field lags; nothing is learned."""
     loop = arm(core=frozen, config=PULSE)
     begins_s = loop.now_s
     render(loop, 1.55, 2.0)
@@ -145,13 +143,11 @@ def allowed_N(core: Core) -> float:
 
 
 def test_the_trim_takes_up_what_the_elastomer_relaxes(arm, allowed_N: float) -> None:
-    """So nothing needs to be fed forward, on a device that chose no constant of the learning."""
     time_s, error_N = errors_after_step(arm)
     held_N = error_N[time_s > TRIMMED_S]
     assert max(abs(second.mean()) for second in np.array_split(held_N, round(HOLD_S - TRIMMED_S))) < allowed_N
 
 
 def test_without_a_trim_the_relaxation_is_seen(arm, hold_gap, allowed_N: float) -> None:
-    """At a gap that is held, the force falls by more than the trim leaves of it."""
     forces_N = [sample.truth.force_N for sample in hold_gap(arm(planned=False), 65.0, HOLD_S)]
     assert forces_N[round(TRIMMED_S * 1e3)] - forces_N[-1] > 2.0 * allowed_N

@@ -34,7 +34,7 @@ Opens = Callable[..., ClosedLoop]
 
 @pytest.fixture(scope="module")
 def closed(core: Core) -> Opens:
-    """A loop that has driven the gap to a place, on either bus. The handle rests, or the force would be a fault."""
+    """A loop that has driven the gap to a place, on either bus."""
 
     def build(bus: str, plant: str | PlantParameters = "sample_1", gap_mm: float = HALF_MM, faults=()) -> ClosedLoop:
         parameters = load_plant(plant) if isinstance(plant, str) else plant
@@ -99,7 +99,6 @@ def test_a_retract_that_stops_half_way_is_named(closed: Opens) -> None:
 
 @pytest.mark.parametrize(("bus", "percent"), [("serial", -100), ("can", -200)])
 def test_motors_that_do_not_open_or_press_shut_are_named(closed: Opens, bus: str, percent: int) -> None:
-    """The device may say it before: it finds no current, or a carriage that slips."""
     loop = closed(bus, faults=[f"opening={percent}%"])
     loop.command("disable")
     begins_s, faults = loop.now_s, loop.stepper.safety.faults
@@ -149,7 +148,6 @@ HEALTHY = {
 
 @pytest.mark.parametrize("case", HEALTHY)
 def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
-    """From the closed end, while the carriages close at full speed, and again as it rests."""
     bus, plant, *faults = HEALTHY[case]
     loop = closed(bus, plant, CLOSED_MM, faults)
     held(loop, 70.0, 1.5)
@@ -177,7 +175,6 @@ def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: f
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("shift_mm", [-0.6, 0.6])
 def test_a_zero_that_has_shifted_is_named_at_the_open_switch(closed: Opens, side: str, shift_mm: float) -> None:
-    """As counts that are lost, or a firmware that remembers a zero over a reset, leave it."""
     loop = closed("serial")
     firmware, zero = loop.simulated.firmware, f"_{side}_zero_mm"
     setattr(firmware, zero, getattr(firmware, zero) - shift_mm)

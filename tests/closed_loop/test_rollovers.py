@@ -82,5 +82,4 @@ def stamped_s(base_ns: int) -> float:
 
 @pytest.mark.parametrize("at_ns", [2**53, 2**62, 2**63 - 1])
 def test_a_large_stamp_is_taken_as_any_other(at_ns: int) -> None:
-    """The last is the greatest that a setpoint may have."""
     assert stamped_s(at_ns - 10**7) == pytest.approx(stamped_s(10**9), abs=1e-9)

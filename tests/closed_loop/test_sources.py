@@ -206,7 +206,6 @@ def test_a_wrong_clock_makes_no_setpoint_stale_and_is_named(armed: ClosedLoop, n
 
 
 def test_a_way_that_takes_too_long_is_stale_and_says_why(armed: ClosedLoop) -> None:
-    """A queue of 0.3 s in the network: no clock is blamed for it."""
     done = run(armed, Publisher(swell_N, way_s=lambda t: WAY_S + 0.3 * (1.5 < t < 2.0)))
     stale_s = done.held_by(Limit.STALE)
     assert (stale_s[0], stale_s[-1]) == (pytest.approx(1.6, abs=0.02), pytest.approx(2.3, abs=0.05))
@@ -239,7 +238,6 @@ def aligned_rms_N(done: Run, from_s: float = 1.5) -> float:
 
 def test_a_playout_of_the_delays_p99_makes_jitter_as_good_as_a_steady_way(arm: Callable[[], ClosedLoop]) -> None:
     def jittery() -> Publisher:
-        """20 ms, and exponentially distributed 10 ms on top."""
         noise = random.Random(3)
         return Publisher(swell_N, way_s=lambda t: 0.02 + noise.expovariate(1.0 / 0.01))
 

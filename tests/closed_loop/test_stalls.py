@@ -43,7 +43,6 @@ class Stopped:
     """A device whose process is stopped: what comes waits for it, and its own time stands still."""
 
     def __init__(self, loop: ClosedLoop, stop_ms: int) -> None:
-        """It is stopped now, for so long."""
         self._device, self._behind_s, self.until_s = loop.device, stop_ms * 1e-3, loop.now_s + stop_ms * 1e-3
         self._waiting: list[bytes] = []
 
@@ -91,7 +90,6 @@ def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedL
 
 @pytest.mark.parametrize("stall_ms", [8, 47])
 def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int, render) -> None:
-    """Half way up a step the device goes on with the duty it has. No more than that comes of it."""
     render(holding, 1.7, 0.08)
     stall(holding, stall_ms)
     samples = render(holding, 1.7, 1.2)
@@ -152,7 +150,6 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
 def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(
     force_N: float, armed: ClosedLoop, render
 ) -> None:
-    """The switches close 0.2 mm before where they did at homing: the carriages coast on, but not all the way."""
     render(armed, 1.2, 0.8)
     armed.device.messages._home_m -= 2e-4
     move = armed.stepper.move

@@ -99,13 +99,9 @@ class BadLine:
         self._device, self.messages = device, device.messages
         self._unfinished = b""
         self.spells: dict[tuple[str, int], tuple[int, int]] = {}
-        "By direction and function, 0 for all: how many are hit yet, and the bit that turns; 0 where they are lost."
         self.period = self.daemons_period = 0
-        "All of them, and those in which the daemon was there."
         self.driven = 0
-        "The period in which the device last heard a Drive of RUN."
         self.came = dict.fromkeys(SILENT_MS, 0)
-        "By stream, the daemon's period in which the last whole frame came."
 
     @property
     def truth(self) -> Truth:

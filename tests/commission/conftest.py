@@ -49,7 +49,7 @@ class AlteringLine:
 
 
 class Bench:
-    """A core and its simulated device. A setpoint comes every 5 ms, as from `tormagctl`."""
+    """A core and its simulated device."""
 
     def __init__(
         self,

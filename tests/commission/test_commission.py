@@ -147,7 +147,6 @@ def test_weak_magnet_wrong_insert_and_sensor_gain_share_a_row_that_names_them(be
 
 @pytest.mark.parametrize("gain", [1.0, 0.55])
 def test_a_weight_tells_the_sensors_gain(bench, gain):
-    """2 N hang from the sensor from 10 s on."""
     hung = bench(
         SAMPLE,
         hand=SteadyHand(0.0),
@@ -192,7 +191,6 @@ def test_an_abort_at_any_time_opens_the_gap(bench):
 
 
 def test_a_step_with_a_row_that_was_not_measured_is_run_again():
-    """As one is left that the host stalled; its half width is none, so that the report can be read again."""
     seen = finding("supply", 12.0, "V", (11.0, 13.0), "look")
     unseen = finding("drag", math.nan, "N", (0.0, 1.0), "look", half_width=math.nan)
     findings = {"link and host": [seen], "homing": [seen], "steps": [seen, unseen], "memory": [seen]}

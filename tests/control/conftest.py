@@ -35,8 +35,7 @@ LOADED = "tormagd.assembly.build.load_model"
 
 
 def load_forgetful(path: Path, **meant: str) -> ForceModel:
-    """A model that remembers nothing: with it a gap and a force say the same at any time. What is remembered has tests
-    of its own."""
+    """A model that remembers nothing: with it a gap and a force say the same at any time."""
     model = load_model(path, **meant)
     return replace(model, metadata=msgspec.structs.replace(model.metadata, memory=NO_MEMORY))
 
@@ -63,7 +62,7 @@ def planner(core: Core) -> Planner:
 
 @pytest.fixture(scope="session")
 def measure() -> MeasurementMaker:
-    """A healthy homed device's measurement `number`, a millisecond apart, at a gap of 80 mm. All streams come."""
+    """A healthy homed device's measurement `number`, a millisecond apart, at a gap of 80 mm."""
 
     def make(number: int, **changes: object) -> Measurement:
         healthy = Measurement(
@@ -104,7 +103,6 @@ class Bench:
 
     @property
     def driven(self) -> tuple[DriveMode, float, float]:
-        """What the bridges are told."""
         return self.output.mode, self.output.left_duty, self.output.right_duty
 
     @property
@@ -113,7 +111,6 @@ class Bench:
 
     @property
     def is_held(self) -> bool:
-        """Whether the device is asked for an answer, and nothing is moved."""
         return self.driven == (DriveMode.RUN, 0.0, 0.0)
 
     @property
@@ -125,7 +122,6 @@ class Bench:
 
     @property
     def there(self) -> dict[str, float]:
-        """Of a measurement: carriages where they are wanted."""
         return self.gap(self.move.reference.gap_mm)  # type: ignore[union-attr]
 
     @staticmethod
@@ -139,7 +135,7 @@ class Bench:
         return at_rest.replaced(**fields)  # type: ignore[arg-type]
 
     def at(self, now_s: float, measurement: Measurement | None, aim: Plan | float = 80.0) -> Duty:
-        """One step, whenever that is. What a plan says besides the gap is said by the plan."""
+        """One step, whenever that is."""
         self.now_s = now_s
         self.output = self.stepper.step(now_s, measurement, aim if isinstance(aim, Plan) else self.plan(aim))
         return self.output
@@ -211,7 +207,7 @@ def running(bench: Bench) -> Bench:
 
 @pytest.fixture(scope="session")
 def moving() -> Callable[..., Measured]:
-    """A homed device whose handle has long moved, which gives what the shipped model says. Its Sense never ages."""
+    """A homed device whose handle has long moved, which gives what the shipped model says."""
 
     def make(gap_mm: float = 78.1, force_N: float = 1.0871, **changes: object) -> Measured:
         half_mm, handle = gap_mm / 2.0, Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, 100.0), 42.0)
@@ -223,7 +219,7 @@ def moving() -> Callable[..., Measured]:
 
 @pytest.fixture(scope="session")
 def planned() -> Callable[..., Plan]:
-    """The planner's next plan, a period later, for a setpoint of that moment. What was measured is news."""
+    """The planner's next plan, a period later, for a setpoint of that moment."""
 
     def plan(planner: Planner, force_N: float, measured: Measured | None = None, **setpoint: object) -> Plan:
         now_s = planner.planned.time_s + PLAN_PERIOD_S

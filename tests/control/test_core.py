@@ -23,7 +23,6 @@ CONFIG = Config()
 
 
 def test_enabling_is_bumpless(running) -> None:
-    """At the planned gap, at rest: the first duties are none, whatever was learned in an earlier run."""
     running.step(60.0, count=50)
     running.command("disable")
     running.step(count=3)
@@ -43,8 +42,6 @@ def test_enabling_wants_a_measurement(bench) -> None:
 
 @pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
 def test_counts_that_jump_and_come_back_do_no_harm(running, jump_mm: float) -> None:
-    """A burst on an encoder line, shorter than any motion: a push where a carriage may have gone so far, none where no
-    carriage goes; no fault, and nothing left of it soon."""
     pushed = running.step(left_mm=-7.5 + jump_mm)
     if abs(jump_mm) < LEAP_MM:
         assert -1.0 <= pushed.left_duty * math.copysign(1.0, jump_mm) < 0.0
@@ -58,15 +55,12 @@ def test_counts_that_jump_and_come_back_do_no_harm(running, jump_mm: float) -> N
 @pytest.mark.parametrize("side", ["left_mm", "right_mm"])
 @pytest.mark.parametrize("jump_mm", [-120.0, -37.4, 0.9, 1.5, 8.0])
 def test_counts_of_either_side_that_jump_away_are_held_and_a_fault(running, side: str, jump_mm: float) -> None:
-    """A lost or wrapped counter is not followed, and is a fault as soon as the device says that it was not reset. What
-    is less than 1 mm is no skew."""
     assert (running.step(**{side: -7.5 + jump_mm}).limits, running.is_held) == ((Limit.ENCODER,), True)
     assert running.run_into(Fault.ENCODER, **{side: -7.5 + jump_mm}) == 1
 
 
 @pytest.mark.parametrize("jump_mm", [-4.0, 0.5, 4.0])
 def test_counts_of_both_sides_that_jump_alike_are_a_fault_too(running, jump_mm: float) -> None:
-    """No skew shows them, and a gap that seems 8 mm wider is closed by as much."""
     jumped = running.gap(80.0 + 2.0 * jump_mm)
     running.step(**jumped, reported_s=0.0)
     assert not running.faults, "it may have been reset"
@@ -85,7 +79,6 @@ def test_counts_that_a_reset_sets_back_are_the_resets(running) -> None:
 @pytest.mark.parametrize("speed_mm_s", [-19.0, 19.0])
 @pytest.mark.parametrize("missing", [1, 5, 40])
 def test_what_a_carriage_does_at_full_speed_is_no_leap(bench, speed_mm_s: float, missing: int) -> None:
-    """Also where States are missing in between."""
     at_mm = -7.5
     for _ in range(10):
         bench.ticks += missing - 1
@@ -125,7 +118,6 @@ def test_homing_forgets_the_motion_before_it(bench) -> None:
 @pytest.mark.parametrize("names", [[], ["pause"]])
 @pytest.mark.parametrize("is_between", [False, True], ids=["nothing measured", "between two steps"])
 def test_a_lost_link_is_a_fault_while_driven(running, names: list[str], is_between: bool) -> None:
-    """However it went: nothing that was armed is still armed when measurements come back."""
     for name in names:
         running.command(name)
     if is_between:
@@ -285,7 +277,6 @@ def test_a_clock_that_stands_still_is_one_ordinary_period(make_moving, elapsed_s
     "has_more", [False, True], ids=["nothing came", "what came before the stall was read after it"]
 )
 def test_after_a_stall_one_drive_asks_and_moves_nothing(make_moving, elapsed_s: float, has_more: bool) -> None:
-    """Whatever is found then is older than the stall. The reference waits, and nothing is learned or concluded."""
     moving = make_moving()
     move, watch, later_s = plain(moving.move), moving.watch, moving.now_s + elapsed_s
     times_s = (watch.still_s, watch.straying_s)
@@ -303,7 +294,6 @@ def test_after_a_stall_one_drive_asks_and_moves_nothing(make_moving, elapsed_s: 
 
 @pytest.mark.parametrize("came_mm", [0.0, -1.7, 1.0])
 def test_the_answer_to_it_is_gone_on_from_without_a_kick(make_moving, came_mm: float) -> None:
-    """The device went on with its last duty meanwhile, and is not where it was wanted before."""
     moving = make_moving()
     # carriages that are where they are wanted at once pass for lively, and those are braked harder
     moving.move.acceleration_scale = 1.0
@@ -318,7 +308,6 @@ def test_the_answer_to_it_is_gone_on_from_without_a_kick(make_moving, came_mm: f
 
 
 def test_without_an_answer_in_time_the_measurement_is_stale(running) -> None:
-    """The device is given some milliseconds, whatever the stall has left of the timeout, and no more."""
     newest = running.measure(running.ticks)
     running.ticks += round(CONFIG.device.measurement_timeout_ms) - 2
     begun = running.ticks
@@ -358,7 +347,6 @@ def test_a_silent_device_is_held_where_it_is_and_named(running) -> None:
 
 @pytest.mark.parametrize(("stall_ms", "fault"), [(83, Fault.HOST_STALL), (36, Fault.DEVICE_COMMAND_TIMEOUT)])
 def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_ms: int, fault: Fault) -> None:
-    """One fault, though the device goes on saying that it heard nothing; a shorter stall cannot have done it."""
     running.ticks += stall_ms
     running.step(count=16)
     assert not running.faults
@@ -371,7 +359,6 @@ def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_
 @pytest.mark.long
 @given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
 def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:
-    """However they follow each other, held or moving; the duty right after each is none."""
     bench = make_bench().enabled()
     for stall_ms, ran_ms in stalls_ms:
         bench.ticks += stall_ms

@@ -22,7 +22,6 @@ class Look:
         self._stage = Measure(47.5, 0.003, turns=True, full_speed_mm_s=20.0, period_s=1e-3)
 
     def __call__(self, *measurements: Measurement) -> Measured:
-        """What is measured after these."""
         for measurement in measurements:
             measured = self._stage.update(0.0, 1e-3, measurement, needs_homing=False)
         assert measured is self._stage.measured
@@ -78,7 +77,6 @@ def test_speeds_are_those_of_a_steady_motion(measure, speed: float, dt_s: float)
 
 
 def test_late_delivery_is_not_slow_motion(measure) -> None:
-    """Speeds are over the device's clock: when a measurement was received does not matter."""
     came = []
     for delay_s in (0.0, 0.05):
         look = Look()
@@ -91,7 +89,6 @@ def test_late_delivery_is_not_slow_motion(measure) -> None:
 
 @pytest.mark.parametrize("missing", [1, 10, 100])
 def test_a_handle_that_nobody_hears_of_has_not_stopped(look: Look, measure, missing: int) -> None:
-    """States come without a Sense for a while; the handle goes on at 42 mm/s meanwhile."""
     before = look(*[measure(number) for number in range(300)]).handle
     assert before.rate_mm_s == pytest.approx(42.0, rel=0.01)
     old = measure(299)
@@ -103,7 +100,6 @@ def test_a_handle_that_nobody_hears_of_has_not_stopped(look: Look, measure, miss
 
 
 def test_one_encoder_count_is_filtered(look: Look, measure) -> None:
-    """A count in a millisecond is 1.8 mm/s of noise; the filter takes three quarters of it."""
     after = look(measure(0), measure(1, left_mm=-7.5 + COUNT_MM))
     assert (after.left_mm_s, after.right_mm_s) == (pytest.approx(COUNT_MM / 1e-3 / 4.0), 0.0)
 
@@ -152,7 +148,6 @@ def test_displacement_never_leaves_its_range(follow_handle, positions: list[floa
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_force_and_rate_are_positive_along_the_motion(follow_handle, way: float) -> None:
-    """The sensor's sign is the motion's; what is measured is resistance."""
     measured = follow_handle([way * 0.05 * k for k in range(200)], force_N=way * 0.6)
     assert (measured.force_N, measured.handle.rate_mm_s) == (0.6, pytest.approx(50.0, rel=0.05))
 

@@ -54,7 +54,6 @@ def test_a_finger_on_its_way_is_planned_for_at_the_scenes_depth() -> None:
 
 
 def test_a_finger_that_draws_back_is_still_pushed_out(measure) -> None:
-    """The force of a handle turns round with its motion; a pad's does not."""
     finger = Measure(47.5, 0.002, False, 100.0, 1e-3)
     for number in range(1, 60):
         depth_mm = 2.0 - 0.02 * number
@@ -88,7 +87,6 @@ def test_without_the_term_nothing_is_remembered() -> None:
 
 
 def test_a_finger_that_stands_while_the_force_rises_has_not_lost_its_encoder(pad_core: Core) -> None:
-    """On a brake it has: friction comes back only with a motion. A pad stiffens under a finger that does not move."""
     planner = pad_core.planner()
     for tick in range(1, 200):
         now_s, gap_mm = 0.01 * tick, 95.0 - 0.2 * tick

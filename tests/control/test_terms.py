@@ -127,7 +127,6 @@ def test_without_the_forecast_nothing_is_remembered(after) -> None:
 
 @pytest.mark.parametrize("names", [(), ("motor",)])
 def test_without_the_motor_late_carriages_stay_late(moving, planned, names: tuple[str, ...]) -> None:
-    """Carriages that are always a millimetre behind, while what comes is known."""
     core = core_without(*names)
     planner = core.planner()
     planner.governor.asked_N = 1.0

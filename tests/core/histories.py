@@ -68,7 +68,6 @@ class Digest:
 
     @property
     def text(self) -> str:
-        """Of all that was seen."""
         return self._hash.hexdigest()
 
 
@@ -76,8 +75,7 @@ class Digest:
 
 
 def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
-    """Measurements, setpoints and commands at random; a tenth of all numbers is none that a device gives. Raises
-    AssertionError where a step does what none may."""
+    """Measurements, setpoints and commands at random; a tenth of all numbers is none that a device gives."""
     rng = random.Random(12)
     for _ in range(episodes):
         strangeness = rng.choice([0.0, 0.0, 0.01, 0.1])

@@ -177,7 +177,7 @@ DESCRIPTION: dict[str, Any] = {
 
 
 class FakeDaemon(threading.Thread):
-    """Binds the four endpoints in `directory`. `answers[command]` makes the reply's fields; setpoints are kept."""
+    """Binds the four endpoints in `directory`."""
 
     def __init__(self, directory: Path) -> None:
         super().__init__(daemon=True)
@@ -189,9 +189,7 @@ class FakeDaemon(threading.Thread):
             "describe": lambda: {"ok": True, "result": DESCRIPTION},
         }
         self.taken_by_source = True
-        "Whether its status has the setpoints that it was sent."
         self.is_silent = False
-        "Publishes nothing, as one that has been killed."
         self.commands: list[str] = []
         self.requests: list[dict[str, Any]] = []
         self.setpoints: list[Setpoint] = []
@@ -347,8 +345,7 @@ def terminal() -> type[Terminal]:
 
 @pytest.fixture
 def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The daemon's own check of a scene, in this process: another takes longer to load than to check. That one does it
-    is asked where a scene is checked as the daemon does."""
+    """The daemon's own check of a scene, in this process: another takes longer to load than to check."""
 
     def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
         said, told = io.StringIO(), io.StringIO()

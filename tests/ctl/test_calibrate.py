@@ -207,7 +207,6 @@ def test_a_steady_handle_teaches_nothing_about_rate_and_displacement(table):
 
 
 def test_displacement_is_what_the_daemon_calls_it():
-    """Of a whole sweep or position by position: one law."""
     path = np.cumsum(np.random.default_rng(1).normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
     measure, handle = Measure(47.5, 0.01, True, 20.0, 1e-3), Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
     expected = []
@@ -424,7 +423,6 @@ def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon,
 
 
 def test_the_steps_that_are_run_are_numbered_one_by_one(monkeypatch, tmp_path, capsys) -> None:
-    """Without a weight there is no step for one."""
 
     def finds_nothing(known):
         yield from ()

@@ -126,7 +126,6 @@ def test_what_a_daemon_answers_decides_the_exit_code_and_is_told(
 
 @pytest.mark.parametrize(("code", "expected"), [("not_homed", 1), ("fault", 4), ("device_latched", 4)])
 def test_a_refusal_tells_code_message_and_hint(fake_daemon, ctl, code, expected):
-    """As keys for a script; for a person on stderr, with the next step last."""
     fake_daemon.refuse("enable", code)
     refused = ctl(*fake_daemon.at, "--json", "enable").ended(expected)
     assert refused.error == {"code": code, "message": "cannot enable", "hint": "do this first"}
@@ -400,7 +399,6 @@ def shown(status_with: Any) -> Any:
 
 @pytest.mark.parametrize(("changes", "blocks", "absent"), STATUS_TEXTS.values(), ids=STATUS_TEXTS)
 def test_status_text_shows(shown, changes, blocks, absent):
-    """Blocks of whole lines that are there, and words that are not."""
     text = shown(**changes)
     assert [block for block in blocks if f"\n{block}\n" not in text] == []
     assert [word for word in absent if word in text] == []
@@ -560,7 +558,6 @@ def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_i
 def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(
     tmp_path, ctl, checked_here, rate_hz, insert, is_told
 ):
-    """A weak device does not give 1.7 N with MRE-10-20, whose model gives 1.9."""
     forces, out = recording(tmp_path / "forces.csv", 1.4, 1.7, rate_hz), tmp_path / "mine.toml"
     told = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(0).result["unmet_if_weak"]
     assert ("force.most_N = 1.7: it gives 1.33" in told) == is_told
@@ -570,7 +567,6 @@ def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(
 
 
 def test_a_flank_near_the_gaps_speed_is_told_with_the_tolerance_that_a_weak_device_keeps(tmp_path, ctl, checked_here):
-    """Its carriages have mass: of recorded pulses the samples miss twice what speed alone does."""
     forces = recording(tmp_path / "f.csv", 0.9, 1.3, 3.0)
     result = ctl("scene", "new", str(tmp_path / "mine.toml"), "--force", str(forces), "--json").ended(0).result
     assert f"force.tolerance_rms_N = 0.026: it keeps {4.0 * result['missed_rms_N']:.2g}" in result["unmet_if_weak"]

@@ -209,7 +209,6 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
 
 
 def test_a_recording_shows_what_was_believed_then(tmp_path: Path, telemetry_with) -> None:
-    """Of the newest snapshot before, where that is no older than a break."""
     lag = BeliefReport(value=0.013, sd=None, unit="s", acts=False)
     with RecordingWriter(tmp_path / "b.mcap") as writer:
         for seq, at_s in enumerate((0.0, 0.02, 0.04, 1.0)):
@@ -266,7 +265,7 @@ LONGEST_S = 60.0
 
 
 class Page:
-    """One page. `complaints` are its errors, and what its content policy has refused."""
+    """One page."""
 
     def __init__(self, socket: ClientWebSocketResponse) -> None:
         self._socket, self._ids = socket, itertools.count(1)
@@ -304,7 +303,7 @@ class Page:
         return said["result"].get("value")
 
     async def until(self, expression: str) -> None:
-        """Waits for it to be true. Raises TimeoutError where it is not: a wrong page must not hang the suite."""
+        """Waits for it to be true."""
         async with asyncio.timeout(LONGEST_S):
             while not await self.ask(expression):
                 await asyncio.sleep(0.05)

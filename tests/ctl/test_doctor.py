@@ -124,7 +124,6 @@ CASES = [
 
 @pytest.mark.parametrize(("check", "config", "files", "verdict", "found"), CASES)
 def test_each_trouble_is_found_and_has_a_remedy(good, machine, check, config, files, verdict, found):
-    """What the configuration does not ask for only warns, and capabilities stand for limits."""
     machine.write(files)
     finding = check(config, Machine(good))
     assert (finding.verdict, bool(finding.remedy)) == (verdict, verdict != "ok")
@@ -150,7 +149,6 @@ def told(good, fake_daemon, status_with):
 
 
 def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
-    """Whatever whoever calls is allowed: nothing that was refused is unlimited, and nothing that is set recommended."""
     machine.write(SWAPPING | GROUPED)
     refused = told(REFUSED)
     assert [name for name, each in refused.items() if each["verdict"] == "fail"] == ["sched_fifo", "memlock"]

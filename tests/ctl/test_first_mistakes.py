@@ -201,7 +201,6 @@ JSON = [row for row in MISTAKES if row[0].startswith("tormagctl") and "--measure
 
 @pytest.mark.parametrize(("command", "code", "says", "files"), JSON, ids=[row[0][:60] for row in JSON])
 def test_with_json_it_is_one_object(command, code, says, files, tmp_path, monkeypatch, capsys, checked_here):
-    """Also where the command line itself is wrong."""
     monkeypatch.chdir(tmp_path)
     assert ended(f"{command} --json", files) == code
     out, err = capsys.readouterr()

@@ -116,7 +116,6 @@ def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
 
 
 async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever(guarded: str) -> None:
-    """A refusal ends the connection for good, and there is nobody to send to."""
     endpoints = Endpoints(control=guarded)
     with Client(endpoints, wait_s=0.2) as client:
         for _ in range(3):

@@ -104,7 +104,6 @@ def test_a_configured_port_that_is_not_there_is_said(root: Path, monkeypatch: py
 
 
 def test_a_real_lock_of_a_real_process_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ctl: Any) -> None:
-    """Another process holds a pty as the daemon holds its port."""
     far, near = os.openpty()
     tty.setraw(near)
     path = os.ttyname(near)

@@ -264,7 +264,6 @@ def test_what_is_not_rendered_is_no_success(fake_daemon, sent, changes, expected
 
 
 def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, sent, status_with):
-    """A publisher may be there before the brake is armed."""
 
     def states(*names: str) -> Any:
         each = chain(names, repeat(names[-1]))

@@ -13,5 +13,5 @@ from tormagd.config import Config
 
 @pytest.fixture(scope="session")
 def core() -> Core:
-    """Of the shipped coronary scene. Nothing in it changes."""
+    """Of the shipped coronary scene."""
     return build_core(Config())

@@ -59,7 +59,6 @@ class Rig:
         self.context = zmq.Context()
         self.answered: list[str] = []
         self.peers: list[zmq.Socket[bytes]] = []
-        "All of them: one that nobody holds is closed."
 
     def pair(self, name: str) -> KeyPair:
         return load_pair(self.keys / f"{name}.key_secret")
@@ -176,7 +175,6 @@ def test_an_operator_commands_and_an_observer_only_looks(rig: Rig) -> None:
 def test_who_was_answered_and_left_before_it_was_seen_was_not_refused(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a fast machine a command has ended before the event of its connection is read."""
     monkeypatch.setattr(admission, "_address", lambda _descriptor: "")
     admitted = rig.endpoint.admission._endpoints["control"].admitted
     for _ in range(3):

@@ -15,10 +15,8 @@ class Rig:
     def __init__(self) -> None:
         self.now_ns = 0
         self.stopped_ns = 0
-        "For how long the thread had no processor."
         self.took = {"read": 0, "drive": 0}
         self.waiting: dict[str, int] = {"first": 0, "second": 0}
-        "How often each slice still has something to do."
         self.ran: list[str] = []
         self.delays: list[Delay] = []
         self.errors: dict[str, Exception] = {}

@@ -74,9 +74,7 @@ class Rig:
         self.endpoint = Endpoint(Endpoints(**self.addresses))
         self.context = zmq.Context()
         self.idle = self.context.socket(zmq.PULL)
-        "Nobody sends to it."
         self.now_s = 0.0
-        "The control clock."
         self.answered: list[Request] = []
 
     def connect(self, kind: int, name: str) -> "zmq.Socket[bytes]":
@@ -119,7 +117,7 @@ class Rig:
         return {}
 
     def take_until(self, reached: Callable[[], bool]) -> list[str]:
-        """Takes requests, as the daemon does each tick, and serves none of those that wait. Names the answered."""
+        """Takes requests, as the daemon does each tick, and serves none of those that wait."""
         self.until(reached, lambda: self.endpoint.take_requests(self.answer))
         return [request.command for request in self.answered]
 
@@ -195,7 +193,6 @@ def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:
 
 
 def test_an_oversize_message_is_counted_when_its_peer_comes_back(rig: Rig) -> None:
-    """libzmq cuts the peer off; the peer connects again by itself, and goes on being heard."""
     publisher = rig.publisher()
     rig.look()
     publisher.send(b"\x00" * 10_000_000)
@@ -223,7 +220,6 @@ sys.stdin.read()
 
 
 def test_publishers_that_come_and_go_quickly_were_not_cut_off(rig: Rig) -> None:
-    """Of a process that ends the address is taken up by the next, on this clock at the same moment."""
     for number in range(1, 3):
         process = subprocess.Popen(
             [sys.executable, "-c", SHORT_SEND, rig.addresses["setpoint"]], stdin=subprocess.PIPE, text=True
@@ -531,7 +527,6 @@ def test_closing_leaves_nothing_and_what_a_killed_daemon_left_is_replaced(tmp_pa
 
 
 def test_sockets_that_somebody_has_put_in_their_place_are_left_to_him(tmp_path: Path) -> None:
-    """The directory was taken away while a daemon ran, and another began in a new one."""
     folder = tmp_path / "run"
     first = Rig(folder)
     shutil.rmtree(folder)

@@ -41,7 +41,6 @@ def test_every_beat_is_due_one_period_after_the_last(heartbeat: Heartbeat) -> No
 
 
 def test_missed_beats_are_merged_and_counted(heartbeat: Heartbeat) -> None:
-    """Nobody reads the timer until a second one, set to five periods later, has rung."""
     before_ns = heartbeat.due_ns
     with contextlib.closing(Heartbeat(5 * PERIOD_NS)) as other:
         wait(other)

@@ -30,7 +30,6 @@ class Publishing:
         self.inbox = SetpointInbox(Sources(priority=priority))
         self.now_s = 0.0
         self.step_s = 0.0
-        "By how much somebody has set the time of day forward."
 
     @property
     def realtime_ns(self) -> int:
@@ -222,7 +221,6 @@ def test_why_it_is_stale_is_said(publishing: Publishing) -> None:
 
 @pytest.mark.parametrize("step_s", [-3_600.0, -0.5, 0.5, 3_600.0])
 def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publishing, step_s: float) -> None:
-    """Publisher and daemon read the same clock: the ages stay what they are."""
     publishing.send(1, 1.0, "a", 0.01)
     publishing.step_s = step_s
     for tick in range(2, 5):

@@ -92,7 +92,6 @@ def test_what_the_daemon_does_before_its_first_beat_is_no_stall_of_planning(rig:
 
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), ZeroDivisionError(), RuntimeError()])
 def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(core: Core, error: Exception) -> None:
-    """The one that makes planning fail would make it fail again and again."""
     rig = Rig(core)
     inbox, rejected = rig.inbox, TimedSetpoint(1.0, 0.0, 0.1)
     inbox.playout.in_force = Taken(rejected, "a", 1)

@@ -38,8 +38,7 @@ class Rig:
         return self.believe.learned()
 
     def look(self, serial_number: int, *driven: bool, learned: Learned | None = None) -> None:
-        """Looks once for each of `driven`, and waits until the other thread has read and written. Before the last,
-        `learned` has been."""
+        """Looks once for each of `driven`, and waits until the other thread has read and written."""
         self._runner.run(self._looked(serial_number, driven, learned))
 
     async def _looked(self, serial_number: int, driven: tuple[bool, ...], learned: Learned | None) -> None:

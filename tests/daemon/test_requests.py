@@ -40,7 +40,6 @@ def test_all_together_are_bounded() -> None:
 
 @pytest.mark.parametrize("command", FIRST)
 def test_no_packing_of_a_first_command_is_overlooked(command: str) -> None:
-    """msgpack has four ways to write a string; a client of another language may choose any."""
     for header in (bytes([0xA0 | len(command)]), b"\xd9", b"\xda", b"\xdb"):
         size = {0xD9: 1, 0xDA: 2, 0xDB: 4}.get(header[0])
         text = header + (b"" if size is None else len(command).to_bytes(size, "big")) + command.encode()

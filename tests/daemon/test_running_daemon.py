@@ -88,7 +88,7 @@ class Heartbeat:
 
 
 class Port:
-    """The line of a simulated device. Unplugged, it cannot be opened and fails."""
+    """The line of a simulated device."""
 
     def __init__(self) -> None:
         self.line = VirtualPort(VirtualDevice(NEAR_HOME, ReversingHand(2.0), seed=1))
@@ -170,7 +170,7 @@ class Running:
             await asyncio.sleep(0)
 
     def answer(self, pending: Pending) -> dict[str, Any]:
-        """The result of what was asked. Raises RefusedError."""
+        """The result of what was asked."""
         for _ in range(PATIENCE_TICKS):
             if (result := self.client.answer(pending, 1e-3)) is not None:
                 return result
@@ -178,7 +178,7 @@ class Running:
         pytest.fail(f"no answer to {pending}")
 
     def command(self, name: str, **args: Any) -> dict[str, Any]:
-        """The result of a command. Raises RefusedError."""
+        """The result of a command."""
         return self.answer(self.client.ask(name, **args))
 
     def refused(self, name: str, **args: Any) -> str:
@@ -383,7 +383,6 @@ def test_sighup_takes_over_what_it_can_and_names_the_rest(
 
 
 def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.LogCaptureFixture) -> None:
-    """The loops are graded from their first period on."""
     said = logging.getLogger(daemon_module.__name__)
     said.addFilter(running.clock.slow)
     begun_ns = running.clock.now_ns
@@ -402,7 +401,6 @@ def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.L
 def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
     alone: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Length and culprit are those of the stall that did it, whatever stalls come after."""
     control, causes = alone.daemon._control, alone.daemon._causes
 
     def stall(now_s: float, took_s: float, culprit: str) -> None:
@@ -707,7 +705,6 @@ def test_a_mark_stands_in_every_snapshot_that_follows(alone: Running) -> None:
 
 
 def test_the_measurement_that_a_step_was_given_is_kept_though_driving_loses_the_device(armed: Running) -> None:
-    """What explains a fault is what the step saw."""
     control, connection = armed.daemon._control, armed.daemon._connection
     armed.port.is_mute = True
     armed.tick()

@@ -128,7 +128,6 @@ def test_what_the_messages_of_a_stream_are_taken_for(start: Start, parts: list[P
 def test_two_publishers_of_one_name_do_not_alternate(
     sessions: tuple[int | None, int | None], rates: tuple[int, int]
 ) -> None:
-    """One of the two is followed, and that there are two is said."""
     sequence = Sequence(sessions[0], 0)
     numbers, taken, doubled = [0, 50_000], [], 0
     for round_ in range(200):
@@ -240,7 +239,6 @@ def test_a_step_is_counted_with_its_size() -> None:
 
 
 def test_a_way_that_becomes_longer_is_no_clock() -> None:
-    """A queue of 0.4 s that fills and stays: what is on the way is old, and no patience makes it young."""
     clock, heard = listen(lambda t: t - 1.0, lambda t: 0.001 + (0.4 if 4.0 < t < 40.0 else 0.0), 44.0)
     assert clock.steps == 0
     assert worst_error_s(heard, 1.0) <= 0.001 + DRIFT * 37.0
@@ -248,14 +246,12 @@ def test_a_way_that_becomes_longer_is_no_clock() -> None:
 
 
 def test_a_backlog_is_as_old_as_it_is() -> None:
-    """The link stood still for a second; then everything comes at once."""
     _, heard = listen(lambda t: t, lambda t: 0.001 + (5.0 - t if 4.0 < t < 5.0 else 0.0))
     assert worst_error_s(heard, 0.0) < 1.1 * DRIFT
 
 
 @pytest.mark.parametrize("behind_s", [0.0, 1.0])
 def test_a_backlog_at_first_contact_is_not_taken_for_a_clock(behind_s: float) -> None:
-    """What is heard first was sent 0.8 s ago."""
     clock, heard = listen(lambda t: t - behind_s, lambda t: max(0.8 - t, 0.0) + 0.001)
     assert clock.offset_s == pytest.approx(behind_s, abs=0.002)
     assert worst_error_s(heard, 0.81 + SETTLED_S) < 0.0011
@@ -275,7 +271,6 @@ def test_until_it_is_settled_a_message_is_as_old_as_it_says() -> None:
 
 
 def test_a_reader_that_is_held_up_blames_no_clock() -> None:
-    """What has waited for 30 ms is read at once; the messages are late, and no stamp has run back."""
     clock = SourceClock()
     for number in range(100):
         clock.hear(number * 0.002, 0.001)
@@ -307,8 +302,6 @@ def test_after_a_long_silence_a_clock_may_have_been_set() -> None:
 def test_any_clock_any_jitter_any_losses(
     seed: int, behind_s: float, drift: float, jitter_s: float, losses: float, steps: list[tuple[float, float]]
 ) -> None:
-    """No delay is negative once the clock is settled, none is over what it was by more than the way shows, and the
-    error is no more than the way's constant part and its jitter, for each time that the clock was set."""
     noise = random.Random(seed)
     lost = {number for number in range(1_000) if noise.random() < losses}
 

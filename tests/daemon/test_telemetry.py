@@ -105,7 +105,6 @@ def test_what_is_known_is_published_and_the_rest_is_null(published: Telemetry, k
 
 
 def test_a_tick_is_recorded_whole() -> None:
-    """Every value differs from every other, so that none can stand in another's place."""
     measurement = MEASUREMENT.replaced(
         number=11,
         received_s=1.25,

@@ -138,7 +138,6 @@ def test_every_table_of_a_configuration_that_is_shown_is_taken(page):
 
 
 def test_the_pages_of_reference_are_those_of_the_types():
-    """`python tools/reference_pages.py` writes them."""
     assert (ROOT / "docs/reference/configuration.md").read_text(encoding="utf-8") == configuration_page()
     assert (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8") == commands_page()
 

@@ -131,7 +131,6 @@ def test_send_says_whether_a_real_daemon_renders_it(rig, capsys):
 
 
 def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
-    """By another process, of a run in real time: whatever was late in it, the core gives the same again."""
     rig.arm()
     for force_N in (1.0, 1.5):
         rig.render(force_N)

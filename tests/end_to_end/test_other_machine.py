@@ -30,8 +30,7 @@ CTL = [sys.executable, "-m", "tormagd.ctl.main"]
 
 @contextlib.contextmanager
 def two_machines() -> Iterator[list[tuple[str, ...]]]:
-    """Network namespaces with a cable between them: what a command begins with to run at HERE, and at THERE. What runs
-    there has to have ended before they are taken away."""
+    """Network namespaces with a cable between them: what a command begins with to run at HERE, and at THERE."""
     number = f"{os.getpid() % 10_000}{next(_NUMBERS)}"
     here, there = (f"tormag{number}{end}" for end in "ab")
     with contextlib.ExitStack() as stack:
@@ -158,7 +157,6 @@ def test_a_publisher_on_another_machine_drives_the_brake(machines: Machines) -> 
 
 
 def test_nobody_else_is_let_in_from_there_and_each_is_counted(machines: Machines) -> None:
-    """What strangers try is in tests/daemon/test_admission.py; here they are counted by the address they come from."""
     # the publisher's key neither commands nor looks, the screen's only looks
     for asked in [machines.asked("robot", command) for command in ("stop", "enable", "status")]:
         assert machines.answer(asked)["error"]["code"] == "unreachable"

@@ -176,7 +176,6 @@ def leaves(node: str | dict[str, Any]) -> Iterator[str]:
     [("plotjuggler_recording.xml", SCHEMAS), ("plotjuggler_live.xml", {"": plain_schema(Telemetry)})],
 )
 def test_plotjuggler_finds_its_curves(name: str, topics: dict[str, dict[str, Any]]) -> None:
-    """It names a series by topic, slash and field, and shows numbers; a message of one frame has no topic."""
     known = {path: kind for topic, schema in topics.items() for path, kind in fields(schema, topic, "/")}
     root = ElementTree.parse(EXAMPLES / name).getroot()
     curves = [curve.attrib["name"] for curve in root.iter("curve")]
@@ -192,7 +191,6 @@ def test_plotjuggler_finds_its_curves(name: str, topics: dict[str, dict[str, Any
 
 
 def test_foxglove_finds_its_paths() -> None:
-    """A path is the topic and, behind a dot, the field."""
     layout = json.loads((EXAMPLES / "foxglove.json").read_text(encoding="utf-8"))
     known = {path: kind for topic, schema in SCHEMAS.items() for path, kind in fields(schema, topic, ".")}
     assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])

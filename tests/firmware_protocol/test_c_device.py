@@ -90,10 +90,7 @@ class Carriages:
 
 
 class Twins(CompiledFirmware):
-    """Both firmwares as one device's: whatever happens to it they do the same, and can be seen to.
-
-    `requests` and `expected` retell it to the exchange program.
-    """
+    """Both firmwares as one device's: whatever happens to it they do the same, and can be seen to."""
 
     def __init__(self, plant: PlantParameters = PLANT) -> None:
         super().__init__(plant)
@@ -419,7 +416,6 @@ def duty(tick: int, position_mm: float) -> float:
 def test_the_twins_agree_in_the_simulated_device(
     plant: str, faults: list[str], ticks: int, latched: DeviceFault
 ) -> None:
-    """From homing, over a run where it comes to that, to a latch."""
     device = MessageDevice(load_plant(plant), SteadyHand(), [parse_fault(fault) for fault in faults], 5, boot=Twins)
     position_mm, senses = 0.0, 0
     for tick in range(ticks):

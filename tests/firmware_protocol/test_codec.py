@@ -204,14 +204,12 @@ def test_out_of_range_is_refused_with_name_value_and_range(message: Message, tex
     ],
 )
 def test_what_is_no_number_or_no_message_is_refused(message: Any, changes: dict[str, object], text: str) -> None:
-    """Compiled, a message takes nothing of another type in the first place."""
     with pytest.raises(TypeError if IS_COMPILED else EncodeError, match="object expected" if IS_COMPILED else text):
         encode(message.replaced(**changes) if changes else message)
 
 
 @given(st.sampled_from(LAYOUTS), st.data(), st.floats() | st.floats(-40.0, 40.0))
 def test_a_step_is_python_s_round_of_the_quotient(layout: Layout, data: st.DataObject, value: float) -> None:
-    """To the even one where two are as near: also far outside the range of a signal that wraps."""
     quantities = [s for s in layout.signals if s.type is float]
     assume(quantities)
     signal = data.draw(st.sampled_from(quantities))
@@ -250,7 +248,6 @@ def test_periods() -> None:
 
 
 def test_numbers_of_numpy_s_are_numbers() -> None:
-    """Compiled, a message takes whole numbers of Python's only."""
     assert encode(Drive(np.float64(0.5), np.float32(-0.25), DriveMode.RUN, 7)) == encode(DRIVE)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="int object expected") if IS_COMPILED else contextlib.nullcontext():
         assert encode(DRIVE.replaced(counter=np.uint8(7))) == encode(DRIVE)
@@ -336,7 +333,6 @@ def test_the_readme_says_which_way_round_the_schema_hash_is() -> None:
 
 
 def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
-    """At 1 Mbaud a byte takes 10 us, at 1 Mbit/s a bit takes 1."""
     for message in (Drive(0.0, 0.0, DriveMode.OFF, 1), State(0, 0, 0, 1)):
         payload = encode(message)
         serial_ms = 0.01 * len(encode_frame(FUNCTION[type(message)], 0, payload))
@@ -529,7 +525,6 @@ def test_under_sanitizers_any_payload_is_framed_as_by_python(exchange) -> None:
 
 
 def test_under_sanitizers_golden_streams_are_read_as_written_down(exchange) -> None:
-    """Any bytes: `make fuzz`."""
     requests, expected = [], []
     for vector in FRAMES["streams"]:
         requests += ["restart", f"stream {vector['bytes']}"]

@@ -80,7 +80,7 @@ def nothing(_device: object, *_what: object) -> None:
 
 
 class Wire:
-    """A serial port of a simulated device, in virtual time: a `BytePort`. Wrong ones spoil what passes."""
+    """A serial port of a simulated device, in virtual time: a `BytePort`."""
 
     def __init__(self, device: Any) -> None:
         self.device = device
@@ -165,7 +165,7 @@ def test_the_c_sources_pass(library: object) -> None:
 
 
 class Rogue(CompiledFirmware):
-    """The Python firmware behind the interface that a device boots. A wrong one puts a function in a hook's place."""
+    """The Python firmware behind the interface that a device boots."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self.plant = plant
@@ -229,17 +229,11 @@ class Rogue(CompiledFirmware):
     # the hooks
 
     up_s = 0.0
-    """What its clock begins with."""
     boots = nothing
-    """What it is like after a reset."""
     before = after = nothing
-    """What a message does to it before it is obeyed, and besides."""
     hears = answers = as_it_is
-    """What it takes a message for, None: for nothing; what it makes of the right answer."""
     ticks = ticked = nothing
-    """What it does before and after each tick."""
     senses = shows = measures = drives = as_it_is
-    """What it makes of its sensors, of a right Status, of a right measurement; its bridges of the right output."""
 
 
 def is_running(device: Rogue) -> bool:
@@ -595,7 +589,6 @@ class Lenient(Wire):
     """Mends what the device would refuse: so it obeys what it must not."""
 
     mended: Callable[..., bytes]
-    """What it makes of the bytes before a delimiter."""
     count = 0
     is_deaf = False
 
@@ -694,7 +687,6 @@ class Planted(NamedTuple):
     finds: str
     line: Callable[[], Line]
     first: tuple[str, ...] = ()
-    "Checks whose traffic the one that finds it judges."
     uptime_s: float | None = None
 
 
@@ -1263,7 +1255,6 @@ def test_every_check_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_every_check_cites_the_page() -> None:
-    """By its heading, and the number of the rule below it."""
     text = PAGE.read_text(encoding="utf-8")
     for one in CHECKS:
         heading, _, number = one.page.partition(", ")
@@ -1277,7 +1268,6 @@ def test_every_check_cites_the_page() -> None:
 @pytest.mark.live
 @pytest.mark.parametrize(("door", "prefix"), [("--pty", ""), ("--slcan", "slcan:")])
 def test_real_ports_carry_it(door: str, prefix: str) -> None:
-    """What virtual time cannot show: that ports open, and that the command finds the device behind them."""
     names = ("schema_hash", "drive_crc_8", "no_answer_without_drive")
     only = [argument for name in names for argument in ("--only", name)]
     simulator = subprocess.Popen([sys.executable, "-m", "tormagd.simulation", door], stdout=subprocess.PIPE, text=True)

@@ -108,7 +108,6 @@ def test_a_cut_frame_is_not_a_frame(frame: Frame, data: st.DataObject) -> None:
 
 @given(frames, st.data())
 def test_a_flipped_bit_in_a_frame_is_found(frame: Frame, data: st.DataObject) -> None:
-    """CRC-16 finds every flip inside; flips of COBS distances move bytes about and are found by place or CRC."""
     encoded = bytearray(wire(frame))
     position = data.draw(st.integers(0, len(encoded) - 2))
     encoded[position] ^= 1 << data.draw(st.integers(0, 7))
@@ -143,7 +142,6 @@ def test_a_right_crc_does_not_make_a_frame_of_less_than_its_header(body: bytes) 
 
 @pytest.mark.parametrize("excess", [0, 1, 2, 100])
 def test_the_longest_frame_passes_and_a_longer_stretch_does_not(excess: int) -> None:
-    """However it is cut: the byte that makes it too long must count also when it was not kept."""
     body = bytes((1, 2)) + bytes(8 + excess)
     encoded = cobs.encode(body + bitwise_crc16(body).to_bytes(2, "big")) + b"\0"
     for size in (1, 5, 200):
@@ -181,7 +179,6 @@ def test_a_second_gap_does_not_forget_the_first_and_a_late_repetition_fills_none
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 10_000), lossy=st.booleans())
 def test_a_line_that_reorders_loses_what_it_lost(seed: int, lossy: bool) -> None:
-    """Neighbours change places now and then, and some frames go missing: counted is what never came."""
     rng = random.Random(seed)
     sent = numbered(2_000, rng.randrange(256))
     kept = [

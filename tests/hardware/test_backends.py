@@ -86,7 +86,6 @@ class Line(NamedTuple):
 
     @property
     def adapter(self) -> Device:
-        """What is there where it is a slcan adapter's."""
         return Device(backend="can", options={"interface": "slcan"}, port=self.device.port)
 
 
@@ -475,7 +474,6 @@ def test_one_that_will_not_is_a_plain_warning(
 def test_a_pty_refuses_and_is_not_asked_unless_it_is_said_to_have_a_timer(
     line: Line, tmp_path: Path, caplog: pytest.LogCaptureFixture, has_timer: bool
 ) -> None:
-    """The driver's real refusal, as pyserial hands it on."""
     if has_timer:
         timer_of(line.device.port, tmp_path)
     with serial.Serial(line.device.port) as port:

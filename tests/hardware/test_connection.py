@@ -124,7 +124,6 @@ class Bench:
         self.is_held = self.is_mute = self.is_bus_off = self.is_babbling = False
         self.request, self.number = DeviceRequest.NONE, 0
         self.asked_of: int | None = None
-        "The device that was asked, by the losses before it; None if there was none to ask."
         self.accepted_before = 0
         self.seen = [LinkState.CLOSED]
         self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose)
@@ -365,7 +364,7 @@ CHANGES = st.one_of(
 
 
 class Cables(RuleBasedStateMachine):
-    """Anything that can happen to a connection, in any order. It asserts its own transitions, `Port` what is sent."""
+    """Anything that can happen to a connection, in any order."""
 
     def __init__(self) -> None:
         super().__init__()

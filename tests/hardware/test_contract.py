@@ -103,21 +103,14 @@ class Case(NamedTuple):
 
     way: MakeTransfer = whole
     tolerance_N: float = math.inf
-    "The force is rendered so well, in the end, where no fault appears."
     faults: frozenset[Fault] = frozenset()
-    "A fault, if there is one, is one of these."
     named: frozenset[Fault | Limit] = frozenset()
-    "One of these holds at the end."
     link: LinkState = LinkState.RUNNING
     losses: int = 0
-    "Where the link ends."
     bad_s: float = 0.5
-    "How long the line is like that."
     is_bytewise: bool = False
     counted: tuple[str, ...] = ()
-    "Which of the link's counters show it."
     uncounted: tuple[str, ...] = ()
-    "Which of them do not."
 
 
 TOO_LATE = frozenset({Fault.MEASUREMENT_STALE, Fault.DEVICE_COMMAND_TIMEOUT, Fault.LINK_LOST})
@@ -143,10 +136,9 @@ CASES = {
 
 
 class PtyEnd(Pty):
-    """A far end at a pseudo-terminal. It is the simulator's door, which hears and says here what the line carries."""
+    """A far end at a pseudo-terminal."""
 
     end: bytes
-    "The last byte of a unit."
     carried = said = arrived = b""
 
     def read(self) -> bytes:
@@ -308,7 +300,6 @@ EVERY_TRANSPORT = [pytest.param(name, marks=MARKS.get(name, ())) for name in TRA
 
 
 def _waiting(fd: int) -> int:
-    """Bytes that can be read from a terminal: a kernel thread brings them across, and takes its time."""
     return int(struct.unpack("i", fcntl.ioctl(fd, termios.FIONREAD, bytes(4)))[0])
 
 
@@ -327,7 +318,6 @@ class Line:
 
     @property
     def truth(self) -> Truth:
-        """What really is."""
         return self._device.truth
 
     def exchange(self, now_s: float) -> list[Message]:

@@ -126,7 +126,6 @@ def test_a_device_that_turns_up_late_is_no_loss_and_asked_at_its_first_word(unme
 
 
 def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
-    """Its Status shows the nonce 0, which no host ever sends."""
     link = running(nonce=FIRST_NONCE)
     link.receive(0.02, status(0, switches=Switches(0)))
     assert link.state is LinkState.RUNNING, "the core sees first what the reset did"
@@ -204,7 +203,6 @@ def test_a_command_is_repeated_until_its_own_number_comes_back(
 
 
 def test_no_hello_comes_between_a_command_and_its_acknowledgement(link: DeviceLink) -> None:
-    """The device takes a Hello's number for the last accepted one: that must not look like an acknowledgement."""
     link.request(0.5, DeviceRequest.HOME)
     waiting = due(link, 0.5, 0.5 + GIVE_UP_S)
     assert all(isinstance(message, Home) for _, message in waiting)
@@ -225,7 +223,6 @@ def test_a_command_that_the_device_does_not_take_is_given_up(request_: DeviceReq
 
 
 def test_opening_is_asked_for_until_the_device_opens_or_has_latched(link: DeviceLink) -> None:
-    """A latched device has its drives off and refuses: it has opened before, or cannot."""
     link.request(0.0, DeviceRequest.RETRACT)
     assert {type(message) for _, message in due(link, 0.0, 5.0)} == {Retract}
     link.receive(5.0, status(mode=DeviceMode.RETRACTING))
@@ -235,7 +232,6 @@ def test_opening_is_asked_for_until_the_device_opens_or_has_latched(link: Device
 
 
 def test_every_request_has_a_new_number_and_none_is_zero_or_a_hellos(link: DeviceLink) -> None:
-    """A device takes no number twice: one that Hello has told it would be a command that it has carried out already."""
     last = 0
     for turn in range(600):
         link.request(turn * 0.1, DeviceRequest.HOME)
@@ -274,7 +270,6 @@ def test_a_number_that_another_host_used_last_is_no_acknowledgement(
 
 
 def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_origin(unmet: DeviceLink) -> None:
-    """The Status that says so comes between two States; with the last one's position a carriage were out of stroke."""
     homing = status(mode=DeviceMode.HOMING, switches=Switches(0))
     told(unmet, 0.0, US, homing, Sense(0.0, 0.0, 0.0, 0.0), State(7.5, 8.5, 0.0, 0))
     unmet.receive(0.001, status(switches=Switches.LEFT_OPEN | Switches.RIGHT_OPEN | Switches.HOMED))
@@ -330,7 +325,6 @@ def with_numbers(measurement: Measurement, numbers: dict[str, float]) -> Measure
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_each_number_has_to_be_one_that_can_be_computed_with(name: str, link: DeviceLink) -> None:
-    """The root of the squares' sum counts: a negative number as a positive one, and none makes up for another."""
     zero, sound = (with_numbers(link.measurement, dict.fromkeys(NUMBERS, number)) for number in (0.0, -2e9))
     assert (sound.is_finite, with_numbers(zero, {name: 1e10}).is_finite) == (True, True)
     assert not any(with_numbers(sound, {name: odd}).is_finite for odd in (1.1e10, -1.1e10, math.inf, math.nan))
@@ -381,7 +375,6 @@ def through_the_wire(message: Message) -> Message:
 def test_wraps_are_taken_out(
     start: tuple[float, float, float, float], moves: list[tuple[float, float, float, float]]
 ) -> None:
-    """Any motion of less than half a wrap per message comes out as it was, but for the wire's steps."""
     left, right, time_s, handle = start
     link = DeviceLink(0.0)
     told(link, 0.0, status(), *map(through_the_wire, (Sense(0.0, 0.0, 0.0, handle), State(left, right, time_s, 0))))

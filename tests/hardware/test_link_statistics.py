@@ -27,7 +27,7 @@ def exchange(
     trip: RoundTrip, ticks: Iterable[int], way_ticks: int, lost: frozenset[int] = frozenset(), paused: range = range(0)
 ) -> None:
     """Drives every millisecond; each that is not lost is answered `way_ticks` later, and where that is while the device
-    is `paused`, right after. A Hello goes every second."""
+    is `paused`, right after."""
     states = 0
     answers: dict[int, list[str]] = {}
     for tick in ticks:
@@ -77,7 +77,6 @@ def test_a_round_trip_of_any_length_is_known_after_one_hello_or_a_status_that_co
 
 
 def test_percentiles_are_of_all_round_trips(trip: RoundTrip) -> None:
-    """Some Drives at once, each of which is answered a millisecond after the one before."""
     for counter in range(1, 102):
         trip.drive(counter, 0.0)
     for counter in range(1, 102):
@@ -138,7 +137,6 @@ def heard(device_s: Callable[[float], float], ticks: int) -> DeviceClock:
 def test_offset_and_drift_are_found_behind_jitter_and_outliers(
     drift_ppm: float, offset_s: float, seed: int, outlier_share: float
 ) -> None:
-    """0.2 to 0.4 ms of way; a share of the windows is late by tens of milliseconds altogether."""
     noise = random.Random(seed)
     clock = DeviceClock()
     late_until_s = late_s = 0.0
@@ -179,7 +177,6 @@ def test_nothing_is_claimed_before_there_is_enough(windows: int, is_known: bool)
 
 @pytest.mark.parametrize(("late_s", "outliers"), [(4e-4, 0), (8e-4, 1)])
 def test_a_window_further_off_than_the_jitter_explains_does_not_count(late_s: float, outliers: int) -> None:
-    """A deviation of 0.1 ms in the median, of which 5.9 are borne."""
     clock = DeviceClock()
     for window in range(31):
         clock.add(window * WINDOW_S, window * WINDOW_S - 1e-4 * (window % 3) - late_s * (window == 15))

@@ -74,7 +74,6 @@ def test_noise_never_raises_and_does_not_outlive_a_delimiter(noise: bytes) -> No
 
 
 def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:
-    """The last one's CRC is right, that of the Drive in it is not: the damage happened before the frame was made."""
     stream = FrameStream()
     for corrupt, frame in enumerate(
         ((99, 0, b"\x01"), (6, 1, b"\x01\x02"), (2, 2, b"\x00\x00\x00\x00\x01\x05\x00")), 1

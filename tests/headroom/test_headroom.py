@@ -19,7 +19,6 @@ pytestmark = pytest.mark.usefixtures("usual_slices")
 
 
 def test_the_reference_loop_is_what_it_was() -> None:
-    """Changed, it would make every figure that stands beside it incomparable."""
     left_mm, right_mm, crc = machine_loop.work()
     assert (left_mm.hex(), right_mm.hex(), crc) == ("0x1.cc52cff28ee7bp-1", "0x1.c5ef2fa2304bdp-1", 770)
     assert machine_loop.machine_us(3) > 0.0

@@ -208,7 +208,6 @@ def test_above_the_peak_of_a_bump_is_above(name: str) -> None:
 
 @pytest.mark.parametrize("name", ANY_SHAPE)
 def test_a_tie_is_resolved_by_continuity(name: str) -> None:
-    """Hundreds of fields give the same force to the last bit: the last field among them stays."""
     top = PLATEAU.predict_one(0.5, 10, 740.0, CIP)
     for last in (600.0, 633.3):
         solution = solver(name, PLATEAU).solve(PLATEAU.curve(0.5, 10, CIP), top, last)
@@ -234,7 +233,6 @@ HUNDREDFOLD = {"displacement": 100.0, "rate": 6000.0, "force": 600.0, "cip": 400
 
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> None:
-    """100 times the training range, zeros, denormals, the largest admissible: in range, finite, the same again."""
     searcher = solver(name, rising)
     usual = {"displacement": 0.5, "rate": 10.0, "force": 2.0, "cip": CIP, "last": 400.0}
     points = [usual | {key: value} for key in usual for value in (*EXTREMES, LARGEST, -LARGEST)]
@@ -299,7 +297,6 @@ def test_parameters_that_cannot_work_are_refused(
 
 @pytest.mark.parametrize(("neighbours", "keeps"), [(1, False), (2, False), (16, True)])
 def test_neighbours_decide_where_the_force_falls(neighbours: int, keeps: bool) -> None:
-    """Steep up, gently down: of the points nearest in force the first few are all on the gentle side."""
     solver, curve = nearest(neighbours=neighbours, step_mT=5.0), LOPSIDED.curve(0.5, 10, CIP)
     last, strayed = 440.0, False
     for force in np.linspace(curve.force_N(440.0), curve.force_N(420.0), 80).tolist():
@@ -311,8 +308,6 @@ def test_neighbours_decide_where_the_force_falls(neighbours: int, keeps: bool) -
 
 
 def test_on_a_plateau_the_field_moves_as_little_as_possible() -> None:
-    """Where hundreds of fields give the same force, the answer is one of the nearest in force, not a far one; a rise by
-    a few units of rounding up to 800 mT is no reason to travel there."""
     solver = nearest(neighbours=701)
     creep = CREEPING.curve(0.5, 10, CIP)
     assert 0 < creep.force_N(800.0) - creep.force_N(500.0) < 1e-14
@@ -418,7 +413,6 @@ def test_from_the_answer_it_does_not_move(rising: ForceModel) -> None:
 
 
 def test_a_force_that_moves_is_followed_with_few_evaluations(rising: ForceModel) -> None:
-    """20 pulses of 100 mT in 4 s, planned 200 times a second: most answers take three evaluations or fewer."""
     counts, last = [], 450.0
     for field in (450.0 + 50.0 * np.sin(np.arange(800) * 2 * np.pi * 5 / 200)).tolist():
         curve = rising.curve(0.5, 10.0, CIP)
@@ -431,7 +425,6 @@ def test_a_force_that_moves_is_followed_with_few_evaluations(rising: ForceModel)
 
 @pytest.mark.parametrize("rate", [1.0, 5.0, 25.0])
 def test_flat_stretches_do_not_stop_it(rate: float) -> None:
-    """A stair whose steps are 1/rate mT wide, and flat to the last bit between: Newton has no direction there."""
     curve = curve_of([(rate, 150.0 + 100.0 * place, 1.0) for place in range(7)], 0.0)
     for stair in range(7):
         for last in (None, *RANGE_MT, 199.9, 450.0, 650.1):
@@ -507,7 +500,6 @@ def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name
 
 
 def test_no_other_search_without_torch_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
-    """Why nothing picks among them: on the device, by what `tools/benchmark.py scenes` measured."""
     file = measured()
     for scene in file.scenes:
         way = scene.chosen
@@ -527,7 +519,6 @@ def test_a_scene_may_name_its_search() -> None:
 
 
 def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
-    """torch takes seconds to load, and the searches that the daemon may run know nothing but a curve."""
     loaded = "import sys, tormagd.control.core, tormagd.inverse.choice; print(*sys.modules)"
     found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
     assert "tormagd.inverse.newton" in found

@@ -89,16 +89,12 @@ def test_what_is_slower_than_the_carriages_is_followed_exactly() -> None:
 
 
 def test_a_step_is_begun_half_its_way_before_it_comes() -> None:
-    """The way D takes D/V: without delay the error falls from D, D^3/3V in all; begun D/2V before, D^3/12V."""
     way_mm, lasts_s = 6.0, 1.0
     expected_N = [N_MM * math.sqrt(way_mm**3 / (share * SPEED_MM_S) / lasts_s) for share in (3.0, 12.0)]
     assert errors_N(np.where(time_s(lasts_s) < 0.5, 50.0, 50.0 + way_mm)) == pytest.approx(tuple(expected_N), rel=0.01)
 
 
 def test_a_square_wave_that_is_too_fast_is_met_by_a_zigzag_in_phase() -> None:
-    """Amplitude A, period P: the gap turns in the middle of every half, and is off by A - Vt for P/4 on either side.
-    Without delay it turns at the edges, a quarter of a period late, and misses more than a gap that never moved.
-    """
     amplitude_mm, period_s = 5.0, 0.2
     along_s = time_s(8 * period_s)
     wave_mm = 50.0 + np.where(along_s % period_s < period_s / 2.0, amplitude_mm, -amplitude_mm)
@@ -110,7 +106,6 @@ def test_a_square_wave_that_is_too_fast_is_met_by_a_zigzag_in_phase() -> None:
 
 
 def test_without_delay_a_step_takes_the_least_time_that_acceleration_allows() -> None:
-    """Half the way speeding up, half of it braking, sqrt(D/a) each: 23/30 D^2 sqrt(D/a) of squared error."""
     way_mm, acceleration_mm_s2, lasts_s = 2.0, 1600.0, 0.5
     drive = Drive(stall_mm_s2=1e6, per_s=1.0, most_mm_s2=acceleration_mm_s2)
     no_delay_N, _ = errors_N(np.where(time_s(lasts_s) < 0.1, 50.0, 50.0 + way_mm), drive)
@@ -134,7 +129,6 @@ SAMPLES = [load_plant(name) for name in ("sample_1", "sample_2", "sample_3")]
 @pytest.mark.parametrize("plant", SAMPLES)
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_no_carriage_of_the_plant_is_faster_and_none_much_slower(plant: PlantParameters, direction: float) -> None:
-    """Full voltage from rest for 0.15 s, then against: what windings and backlash take is less than 0.12 mm."""
     start_mm = 70.0
     at_rest = msgspec.structs.replace(plant.assumed, start_left_mm=start_mm / 2, start_right_mm=start_mm / 2)
     device = Plant(msgspec.structs.replace(plant, assumed=at_rest), SteadyHand(), substep_s=1e-4)
@@ -153,7 +147,6 @@ def test_no_carriage_of_the_plant_is_faster_and_none_much_slower(plant: PlantPar
 
 
 def test_the_force_of_the_gap_is_that_of_the_devices_element() -> None:
-    """Field, its lag, relaxation and the Stribeck level, along the way of a carriage that comes too late."""
     drifting = SAMPLES[2]
     plant = msgspec.structs.replace(drifting, thermal=msgspec.structs.replace(drifting.thermal, drift_K_h=0.0))
     brake, hand_mm_s, along_s = brake_of(plant), 8.0, time_s(4.0)
@@ -175,7 +168,6 @@ def test_the_force_of_the_gap_is_that_of_the_devices_element() -> None:
 
 
 def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag() -> None:
-    """A slow wave that turns twice, first step excepted: the greedy gap goes further after every turn."""
     plant = SAMPLES[1]
     brake = brake_of(plant)
     wanted = asked_of(brake, 1.3 - 0.3 * np.cos(2.0 * time_s(3.5)), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
@@ -185,7 +177,6 @@ def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag() 
 
 
 def test_the_fields_lag_takes_some_of_what_foresight_gains() -> None:
-    """And no wave of the gap beside the optimum is better than the optimum, lag included."""
     plant = SAMPLES[2]
     brake, drive, along_s = brake_of(plant), drive_of(plant), time_s(1.2)
     wanted = asked_of(brake, 1.55 + 0.15 * zigzag(along_s / 0.25), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
@@ -204,7 +195,6 @@ def test_the_fields_lag_takes_some_of_what_foresight_gains() -> None:
 
 
 def test_finer_steps_find_the_same() -> None:
-    """On sample 2 another round of the finer would take the solver more than its usual 200 iterations."""
     pulse = pulse_profile(0.4, 1.4, 1.8, 500)
     coarse, fine = [best(SAMPLES[1], *pulse, step_s=step_s).figures() for step_s in (1e-3, 5e-4)]
     assert (coarse["foresight_rms_N"], coarse["no_delay_rms_N"]) == pytest.approx(
@@ -214,7 +204,6 @@ def test_finer_steps_find_the_same() -> None:
 
 
 def test_forces_out_of_range_are_clipped_before_they_count() -> None:
-    """Below what the open gap brakes and above the scene's greatest nothing is missed: the rest is a slow ramp."""
     times_s, forces_N = np.array([0.0, 0.1, 3.1, 3.2]), np.array([0.1, 0.1, 2.6, 2.6])
     found = best(SAMPLES[0], times_s, forces_N, step_s=4e-3)
     assert 0.4 <= found.asked_N.min() <= 0.7

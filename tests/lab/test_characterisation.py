@@ -109,7 +109,6 @@ def test_the_printed_law_is_found_again(exponent: float) -> None:
     ("file", "published_kPa"), [("Ecoflex_00-10", 7.4), ("Ecoflex_00-30", 15.1), ("Ecoflex_00-50", 20.8)]
 )
 def test_measured_silicones(recordings: Path, file: str, published_kPa: float) -> None:
-    """Neo-Hookean over 5..50 % strain, where the grips' slack is out; Ogden to four times the length."""
     columns = ("Engineering Strain", "Engineering Stress (MPa)")
     strain, stress_MPa = read_columns(recordings / "srmd_silicone" / f"{file}.csv", columns, delimiter=";").values()
     chosen = (strain >= 0.05) & (strain <= 0.5)
@@ -339,9 +338,6 @@ def test_stress_is_the_derivative_of_the_energy(
 
 
 def test_the_force_law_is_the_radial_stress_per_undeformed_shaft_with_the_sign_of_the_field_turned() -> None:
-    """What Eq. 33 makes of Eq. 27: T_rr / lambda_1^2 at lambda_2 = 1 with free ends. Its field is the one in the
-    deformed elastomer, and its Maxwell term presses the elastomer on the shaft.
-    """
     elastomer = Elastomer(277.3e3, 4.0, 0.2)
     material = MooneyRivlin(100e3, 38.65e3, 4.0)
     for moment_Tm in (1e-4, 1e-3, 2.5e-3):

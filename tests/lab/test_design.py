@@ -205,7 +205,6 @@ def test_an_elastomer_too_soft_for_any_design_is_refused(solver: str) -> None:
 
 
 def test_what_a_design_covers_as_it_is_made_is_the_least_of_its_neighbours() -> None:
-    """The thesis's printed optimum of use case 1: what rounding to its printed digits does, and a percent of each."""
     problem, printed = Problem(USE_CASE_1, "trapezoid", THESIS_SPEED_MM_S), Design(7.3, 12.5, 197.0)
     assert coverage_as_made(problem, printed, 0.0) == coverage(problem, printed)
     least = coverage_as_made(problem, printed, 0.01)
@@ -234,7 +233,6 @@ def thread() -> Iterator[Executor]:
 
 
 def test_other_processes_give_the_same_answer(thread: Executor) -> None:
-    """As Dask's workers do: a run goes there and its outcome comes back, the same but for the processor time."""
     with ProcessPoolExecutor(1) as pool:
         found = [sweep(RUNS, executor) for executor in (thread, pool)]
     here, there = ([(run, each.design, each.coverage) for run, each in outcomes.items()] for outcomes in found)
@@ -328,7 +326,6 @@ def test_no_other_friction_has_a_smaller_mean_error() -> None:
 
 
 def test_the_registrys_friction_is_the_least_squares_of_the_relative_errors() -> None:
-    """With the thesis's field; it is given there to three digits."""
     for matrix in (ALL[:4], ALL[4:8], ALL[8:]):
         ratios = np.array([frictionless_range_N(item, LAWS[0]) / item.force_range.measured_N for item in matrix])
         least = ratios.sum() / (ratios**2).sum()
@@ -368,5 +365,4 @@ def test_of_what_the_thesis_names_one_is_not_wide_enough() -> None:
 
 
 def test_the_page_has_it() -> None:
-    """`tormag-lab reproduce-thesis --out docs` writes it."""
     assert page.table_2_5(FOUND) in Path(__file__).parents[2].joinpath("docs/reproduction.md").read_text("utf-8")

@@ -90,7 +90,7 @@ def test_emps_is_within_the_published_values_and_drawn(recordings, capsys, tmp_p
 
 
 def compare(log: Log) -> dict:
-    """Identified and true, by parameter, of sample 3. Without a current in the log the true gain is given."""
+    """Identified and true, by parameter, of sample 3."""
     true = truth(load_plant("sample_3"), "left", 2e3 * log.position_m[fit.motion(log).sign != 0.0])
     result = identification.identify(log, None if log.current_A is not None else true["gain_N_V"])
     identified = {**(result["motor"] or {}), **result["parameters"], "time_constant_s": result["time_constant_s"]}
@@ -136,11 +136,7 @@ def calibrated() -> Columns:
 
 
 def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, float]:
-    """What the plant file says, in the identified quantities; friction and offset as means over the gaps of the log.
-
-    The delay runs from a row's positions to the middle of the millisecond in which its voltage acts: the Drive that
-    carries it arrives when the next positions are taken, but for the device's reply jitter, half of it in the mean.
-    """
+    """What the plant file says, in the identified quantities; friction and offset as means over the gaps of the log."""
     motor, gear, screw = plant.motor, plant.gear, plant.screw
     lead_m_rad = screw.lead_mm * 1e-3 / math.tau
     k = gear.ratio * motor.back_emf_V_s_rad / lead_m_rad
@@ -182,7 +178,6 @@ def sample_log():
 
 
 def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log):
-    """The plant is richer than the models: backlash, a springy screw, losses in the gears, friction under load."""
     found, without_current = compare(sample_log), compare(sample_log._replace(current_A=None))
     for rows in (found, without_current):
         assert {name for name, row in rows.items() if not row["inside"]} == set()
@@ -213,7 +208,6 @@ def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
 
 
 def test_intervals_cover_what_hangs_together():
-    """Residuals that stay for half a second: the naive interval of a mean is far too short, the block one is not."""
     rng = np.random.default_rng(0)
     blocks = np.repeat(np.arange(100), 40)
     inside = 0

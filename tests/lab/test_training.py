@@ -356,7 +356,6 @@ def test_a_stroke_mobilises_before_it_creeps() -> None:
 
 
 def test_what_inserts_of_one_matrix_remember_is_found_in_all_their_records() -> None:
-    """Both relax alike; at one gap the weaker has half the field, and some rows are not yet mobilised."""
     fraction, random, time_s = 0.06, np.random.default_rng(0), np.arange(0.0, 160.0)
     records = []
     for iron, greatest_mT in ((20.0, 400.0), (40.0, 800.0), (20.0, 400.0), (40.0, 800.0)):

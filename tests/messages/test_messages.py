@@ -112,7 +112,6 @@ def test_messages_come_back_as_they_went(setpoint: Setpoint, request_: Request) 
 
 
 def test_a_message_is_a_plain_msgpack_map() -> None:
-    """What a publisher in any language writes is what we write."""
     assert msgpack.unpackb(encode(decode(changed(SETPOINT), Setpoint))) == SETPOINT
 
 
@@ -253,7 +252,6 @@ def test_broken_msgpack_is_a_message_error(data: bytes, kind: type[Any]) -> None
 @pytest.mark.parametrize("depth", [100, 300, 400, 511, 600, 900, 1000, 1023, 1100])
 @pytest.mark.parametrize("one", [b"\x91", b"\x81\xa1a"])
 def test_deep_nesting_is_decoded_or_refused(depth: int, one: bytes) -> None:
-    """Where free values are allowed, their depth is not the recursion limit's business."""
     nested = b"\x84\xa1v\x01\xa2id\x01\xa7command\xa1x\xa4args\x81\xa1k" + one * depth + b"\xc0"
     try:
         request = decode(nested, Request)

@@ -100,7 +100,6 @@ WORDS = {int: "int", float: "float", str: "str", bool: "bool", Any: "any"}
 
 @pytest.mark.parametrize("kind", V1, ids=lambda kind: kind.__name__)
 def test_no_key_of_this_version_goes(kind: type[msgspec.Struct]) -> None:
-    """A key that goes, or is renamed, takes a higher `v`. A new one stands in the page, and here from a release on."""
     assert messages.VERSION == 1
     assert set(V1[kind].split()) <= set(kind.__struct_encode_fields__)
 

@@ -294,7 +294,6 @@ def test_the_slope_is_that_of_finite_differences(model: ForceModel) -> None:
 
 
 def test_a_saturated_unit_that_rises_still_rises(model: ForceModel) -> None:
-    """Honest data level off: a slope that rounding makes 0 would be refused as one that does not rise."""
     steep = replace(model, hidden_weight=60.0 * np.abs(model.hidden_weight), output_weight=np.abs(model.output_weight))
     rows = [(*POINT[:2], field_mT, POINT[3]) for field_mT in np.linspace(*model.field_range_mT, 9)]
     assert steep.field_slope_N_per_mT(rows).min() > 0.0
@@ -481,7 +480,6 @@ def test_a_grid_of_fields_has_the_forces_of_its_fields(
 @pytest.mark.parametrize("exponent", [LARGEST_EXPONENT, 709.7, 710.0, 1e4, 1e18])
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_unit_far_from_its_step_is_shut_or_open(exponent: float, side: int) -> None:
-    """exp() of more than 709.78 has no float."""
     known = Known(((0.0, 1.0), (0.0, 60.0), (100.0, 800.0), (40.0, 40.0)), 6.0)
     weight = np.array([[0.0, 0.0, side * exponent / 400.0, 0.0]])
     curve = Network(weight, np.zeros(1), np.array([3.0]), 0.25, known).curve(0.5, 10.0, 40.0)
@@ -527,7 +525,6 @@ def test_no_state_and_no_field_has_no_force(
 def test_confidence_follows_its_formula(
     model: ForceModel, place: tuple[float, float, float, float], error_N: float, expected: float
 ) -> None:
-    """The model's force span is 5.6 N; its share of iron never varied."""
     displacement, rate, field, cip = place
     curve = model.curve(displacement, rate, cip)
     assert (curve.confidence(field, error_N), curve.confidence(field, -error_N)) == (

@@ -75,7 +75,6 @@ def test_the_dry_force_never_exceeds_the_level(
 
 @given(frictions, st.lists(st.tuples(speeds, levels, st.floats(1e-4, 0.5)), min_size=1, max_size=40))
 def test_passive_under_any_motion_and_any_field(friction: Friction, steps: list[tuple[float, float, float]]) -> None:
-    """The hand never gets back more than it put in: work done stays above the energy stored in the bristles."""
     deflection_mm, work_mJ = 0.0, 0.0
     for speed_mm_s, kinetic_N, dt_s in steps:
         force_N, deflection_mm = friction.advance(deflection_mm, speed_mm_s, kinetic_N, dt_s)
@@ -118,7 +117,6 @@ def test_a_step_relaxes_as_the_closed_form(time_s: float) -> None:
 
 @pytest.mark.parametrize("dt_s", [1e-6, 1e-4, 1.0, 10.0])
 def test_a_ramp_follows_the_closed_form(dt_s: float) -> None:
-    """F0 = t: F = (1 - sum g) t + sum g tau (1 - exp(-t / tau)), whatever the step."""
     update, state, force = SERIES.discretise(dt_s), SERIES.relaxed(0.0), 0.0
     for index in range(1, 101):
         force, state = update.advance(state, index * dt_s)

@@ -130,7 +130,6 @@ def test_float64_force_and_slope_agree_with_50_digits(cases: Callable[[int], Ite
 
 
 def test_float32_force_agrees_with_float64() -> None:
-    """Whose own error is a ten-millionth of what is allowed here."""
     strained = 0
     for case in islice(over_loads(2), 500):
         moment = np.array([0.999 * case.moment], dtype=np.float32)
@@ -257,7 +256,7 @@ def modelled_range_N(item: Insert) -> float:
 
 
 THESIS = [f"MRE-{shore}-{cip}" for shore in (10, 30, 50) for cip in (10, 20, 30, 40)]
-"Three matrices by four fillings. A laboratory adds its own inserts to the registry."
+"Three matrices by four fillings."
 
 
 def test_the_twelve_inserts_of_the_thesis_are_there() -> None:

@@ -36,7 +36,7 @@ class Back(NamedTuple):
 
 
 def back(path: Path) -> Back:
-    """Reads it all. Raises RecordingError."""
+    """Reads it all."""
     seen: list[Seen] = []
     found = read_recording(path, dict[str, Any], seen.append)
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))

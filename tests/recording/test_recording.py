@@ -157,7 +157,6 @@ def test_before_a_disk_is_full_all_that_came_is_closed_in_order(tmp_path, monkey
 
 
 def test_a_disk_that_fails_without_a_warning_leaves_what_is_whole(tmp_path):
-    """Such as one with a quota: the chunk that it did not take whole is lost, and the index."""
     path = tmp_path / "full.mcap"
     writer = RecordingWriter(path)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -174,7 +173,6 @@ def test_a_disk_that_fails_without_a_warning_leaves_what_is_whole(tmp_path):
 
 
 def test_half_a_second_is_written_at_once(tmp_path):
-    """Whatever has not been written when the recorder is killed is lost."""
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
     for ms in range(0, 3_000, 20):  # as slow as control may be, and far less than a chunk holds
@@ -370,7 +368,6 @@ def test_an_overview_that_nothing_vouches_for_is_not_shown(path: Path, tmp_path:
 
 
 def test_neither_approach_nor_decay_is_in_how_well_a_force_was_followed(path: Path) -> None:
-    """A sine of 0.3 N that is 20 ms late is 2 sin(pi * 0.02) * 0.3 / sqrt(2) off."""
     overview = RecordingFile(path).overview
     known = overview.following
     assert known.rms_N == pytest.approx(0.6 * math.sin(0.02 * math.pi) / math.sqrt(2.0), rel=0.01)
@@ -421,7 +418,6 @@ def test_an_overview_that_no_tormagd_writes_is_refused(path: Path, change: dict[
 
 
 def test_any_length_is_held_in_bounds() -> None:
-    """A year of snapshots, with a limit in every other."""
     builder = OverviewBuilder()
     for k in range(20_000):
         builder.add(k * 1_600_000_000_000, False, {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k)})

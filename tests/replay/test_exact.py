@@ -59,7 +59,6 @@ def test_floats_keep_their_bits() -> None:
 
 
 def test_sentinels_come_back_equal() -> None:
-    """Nothing in the core asks which of two equal ones it is; replays from snapshots show it."""
     assert [through_msgpack(each) for each in (NOTHING_LEARNED, UNSEEN)] == [NOTHING_LEARNED, UNSEEN]
 
 
@@ -99,7 +98,6 @@ def test_what_has_no_plain_form_is_refused() -> None:
 
 
 def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core: Core) -> None:
-    """What was written down of them is all that they are, and neither has anything in common with the other."""
     flight = fly(until_s=6.0)
     loop, planner = flight.loop, flight.planner
     stepper_again, planner_again = core.stepper(), core.planner()
@@ -120,7 +118,6 @@ def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core
 
 
 def test_what_changes_in_a_stage_is_annotated_in_its_class_or_made_at_its_beginning() -> None:
-    """So it is written down, before it has changed too; whatever else there is, is final."""
     of_bases = {"Actuator": {"self.reference", "self.acceleration_scale", "self.acted"}}
     for path in (ROOT / "tormagd" / "control").rglob("*.py"):
         for kind in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -71,7 +71,6 @@ def number_of(entries: list[Any], place: int) -> int:
 
 
 def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -> None:
-    """The bytes are the device's and ours, decoded by the protocol alone."""
     serial, can = frames(path), frames(can_path)
     assert serial[0].keys() == {"monotonic_s", "direction", "data"}
     line = b"".join(bytes.fromhex(frame["data"]) for frame in serial if frame["direction"] == "read")
@@ -88,7 +87,6 @@ def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -
 
 
 def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFile) -> None:
-    """From the middle of the run too: a snapshot has what the link and the decoder remembered."""
     done = again(core, box.entries, 1.6)
     assert (done.difference, done.from_s) == (None, pytest.approx(1.5, abs=1e-9))
     assert done.frames > 2 * done.ticks
@@ -130,7 +128,6 @@ def test_a_memory_that_differs_is_found_where_no_tick_shows_it(core: Core, box: 
 
 
 def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, tmp_path: Path) -> None:
-    """The firmware hangs, the port is given back and opened again; a new conversation begins."""
     flight = fly("frozen@2.9", until_s=3.4)
     assert (flight.loop.connection.losses, flight.loop.measurement is None) == (1, False)
     entries = read_black_box(flight.write(tmp_path / "frozen.mcap")).entries
@@ -160,7 +157,6 @@ def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(
 
 
 def test_a_limit_that_was_too_narrow(fly: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Recorded: carriages that were 0.02 mm apart; with 2 mm that would have been no fault."""
     narrow = Config(limits=Limits(skew_warning_mm=0.02, skew_fault_mm=0.02))
     path = fly("drag_left=+300%@2.5", until_s=3.6, config=narrow).write(tmp_path / "narrow.mcap")
     assert run([str(path), "--set", "limits.skew_fault_mm=2", "--fault", "drag_left=+300%@2.5"]) == 0

@@ -109,7 +109,6 @@ def test_it_is_from_the_middle_of_the_run(core: Core, box: BlackBoxFile, from_s:
     ],
 )
 def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Path, fault, silent_s, told) -> None:
-    """The device falls silent, and the daemon stands still."""
     flight = fly(*([fault] if fault else []), until_s=2.8, silent_s=silent_s)
     assert str(flight.loop.stepper.safety.faults[0]) == told
     box = read_black_box(flight.write(tmp_path / "planted.mcap"))
@@ -121,7 +120,6 @@ def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Pa
 
 
 def test_the_other_build_replays_them_to_the_bit(fly: Any, path: Path, tmp_path: Path) -> None:
-    """This process wrote them. The other names the same fields of every stage, or it would refuse the snapshots."""
     switch = "0" if settle().is_compiled else "1"
     stalled = fly(until_s=2.8, silent_s=0.083).write(tmp_path / "stalled.mcap")
     for box, from_s, ticks in ((path, 3.0, TICKS - 3_000), (stalled, 0.0, 3_000)):
@@ -140,7 +138,6 @@ def test_a_black_box_is_drawn_like_a_recording(path: Path) -> None:
 
 
 def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, core: Core, tmp_path: Path) -> None:
-    """It may have failed half way: that it was tried comes first, and then that planning began afresh."""
     flight = fly(until_s=3.1)
     number = flight.planner.planned.number
     flight.tick(asked(flight.loop.now_s).replaced(force_N=math.nan))
@@ -166,7 +163,6 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
 
 
 def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
-    """A part was lost: 20 ticks are missing, and the rest up to the next snapshot says nothing."""
     places = list(ticks_of(COLUMNS, box.entries))
     done = again(core, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
     assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
@@ -230,7 +226,6 @@ def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: B
     ],
 )
 def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path, monkeypatch: Any, edit, said) -> None:
-    """A file that was written anew, with seals that fit, and another tick in the place of what the core gave."""
     box = read_black_box(path)
     assert box.odd == ""
     head = box.entries[: list(ticks_of(COLUMNS, box.entries))[600]]
@@ -333,7 +328,6 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
 
 
 def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
-    """Anything at all in the place of an entry, or of a value in one, is found, passed over or refused."""
     rng = random.Random(5)
     rubbish: list[Any] = [None, -1, 2**63, "x", float("nan"), b"\0", {}, [], [[]], [1], ["plan"], ["unheard"]]
     rubbish += [["state", 1, 2], ["command", "stop", 1.0, False], ["latch", "SKEWED"], ["afresh", "now"]]

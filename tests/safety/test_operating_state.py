@@ -181,7 +181,6 @@ def test_clearing_while_driven_hides_no_fault_of_the_device(present: OperatingSt
 
 @pytest.mark.parametrize("fault", [Fault.NO_MOTION, Fault.FOLLOWING_ERROR, Fault.SKEW])
 def test_an_encoder_fault_takes_homing_away_until_the_device_has_homed_again(fault: Fault) -> None:
-    """The device knows nothing of it, and calls itself homed all the time; a fault that comes later changes nothing."""
     latched = latch(latch(SafetyState(), (Fault.LINK_LOST, fault)), (Fault.STOPPED,))
     cleared = command(latched, "clear-fault", 2.0, READY)
     refused = refusal(homed_again(cleared, is_homed=True), "enable")
@@ -208,7 +207,6 @@ def test_faults_are_kept_in_the_order_they_came() -> None:
 
 @given(found=st.lists(st.sampled_from(Fault), unique=True, max_size=len(Fault)))
 def test_faults_that_show_at_once_are_named_in_the_order_of_their_table(found: list[Fault]) -> None:
-    """Causes before what follows of them, whatever order a step looked in."""
     assert latch(SafetyState(), tuple(found)).faults == tuple(fault for fault in Fault if fault in found)
 
 
@@ -217,7 +215,6 @@ def test_the_table_has_a_row_for_every_event_in_every_state() -> None:
 
 
 def test_what_the_table_promises() -> None:
-    """The rules of arming, as the rows have them."""
     taken = [row for row in ROWS if isinstance(row, Transition)]
     assert [(row.event, row.source) for row in taken if row.target is ENABLED and row.source is not ENABLED] == [
         (Event.ENABLE, DISABLED),
@@ -241,8 +238,7 @@ def test_a_row_says_why_it_is_and_what_its_guards_want(row: Transition | Refusal
 
 
 class Operating(RuleBasedStateMachine):
-    """Operators, faults and a device in any condition: what enabling wants and what is asked of the device. That every
-    way is a row of the table, tests/core/test_rules.py holds."""
+    """Operators, faults and a device in any condition: what enabling wants and what is asked of the device."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -324,7 +320,6 @@ def test_the_next_commands_lead_to_a_force_that_is_followed(
 
 @pytest.mark.parametrize("fault", Fault)
 def test_the_next_commands_of_each_fault_are_taken_and_arm_it(fault: Fault) -> None:
-    """On a device that has been put right: what it had latched it has given up, and its place with it."""
     state = latch(SafetyState(OperatingState.ENABLED), (fault,))
     is_homed = FAULTS[fault].position is not Position.LOST_THERE
     commands = next_commands(state, is_homed)
@@ -349,7 +344,6 @@ def test_every_device_fault_is_a_fault_of_its_own_and_a_stalled_hosts_timeout_th
 
 
 def test_codes_are_their_names_and_each_is_explained_in_the_order_of_its_table() -> None:
-    """Clients compare text; the tables are what people read, and the order of `Fault` is the order of naming."""
     assert all(code.value == code.name for kind in (Fault, Limit) for code in kind)
     assert (tuple(FAULTS), tuple(LIMITS)) == (tuple(Fault), tuple(Limit))
     rows = [*FAULTS.values(), *LIMITS.values()]

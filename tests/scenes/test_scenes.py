@@ -181,7 +181,6 @@ def test_a_scene_that_does_not_fit_model_device_or_rates_gives_no_core(
 
 @pytest.mark.parametrize("name", INSERTS)
 def test_every_insert_of_the_registry_has_a_model_that_stays_in_its_box(write, name: str) -> None:
-    """Whatever the handle does, and whatever a setpoint says that it is meant for."""
     core = build_core(Config(scene=write(insert__name=f'"{name}"', insert__model='"auto"', force__most_N="0.8")))
     nominal, box = (
         core.element.nominal,
@@ -213,7 +212,6 @@ def test_a_force_that_is_too_fast_for_the_gap_is_refused_with_the_failing_points
 
 
 def test_the_scenes_own_gap_speed_counts_where_it_is_the_lower_one(write) -> None:
-    """The thesis's 8.33 mm/s."""
     slow = {"insert__gap_speed_mm_s": "8.33"}
     refused(write(signal__bandwidth_hz="0.2", **slow), "gaps of 8.33 mm/s", load=of_path)
     of_path(write(signal__bandwidth_hz="0.02", **slow))
@@ -221,7 +219,6 @@ def test_the_scenes_own_gap_speed_counts_where_it_is_the_lower_one(write) -> Non
 
 
 def test_a_thousand_scenes_are_a_thousand_fingerprints(write) -> None:
-    """Which is what a measured decision is found by."""
     base = load_scene(write())
     steps = [{"most_N": 1.0 + number / 1000} for number in range(1000)]
     steps += [{"tolerance_rms_N": 0.01 + 1e-5 * number} for number in range(1000)]

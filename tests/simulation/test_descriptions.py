@@ -94,7 +94,6 @@ def test_assumptions_can_be_overridden_one_by_one(tmp_path) -> None:
 def test_a_bad_plant_is_refused_with_key_value_and_what_is_allowed(
     tmp_path: Path, old: str, new: str, said: list[str]
 ) -> None:
-    """Of the samples' keys, and of those that only the second plant has."""
     (text,) = (text for text in (SAMPLE_1_TEXT, SECOND_TEXT) if old in text)
     refused(tmp_path, text.replace(old, new, 1), "bench.toml", *said)
 
@@ -129,7 +128,6 @@ def test_a_missing_plant_names_the_known_ones(tmp_path) -> None:
 
 
 def test_another_insert_keeps_what_the_sample_is_off_its_kind() -> None:
-    """Sample 1 has the registry's own MRE-50-40; sample 2 is softer by 8 %, and stays so."""
     soft = insert("MRE-10-10").elastomer
     first = with_insert(load_plant("sample_1"), "MRE-10-10")
     assert (

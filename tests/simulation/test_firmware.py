@@ -129,7 +129,6 @@ def test_homing_zeroes_the_encoders_at_the_open_switches_repeatably(name: str) -
 
 @pytest.mark.parametrize("fault", ["encoder_stuck_left", "motor_reversed_left", "encoder_reversed_left"])
 def test_homing_that_fails_opens_where_it_can_and_does_not_press_shut(fault: str) -> None:
-    """Without an encoder it opens blind; what goes the wrong way cannot, and ends where it is at once."""
     host = Bench([fault])
     before = host.device.truth
     host.command(Home)
@@ -169,15 +168,11 @@ class Ending(NamedTuple):
 
     faults: tuple[str, ...]
     duties: tuple[float, float] | None
-    "None: it falls silent."
     gap_mm: float
     at_once: DeviceFault
-    "What is latched when it is out of RUN."
     latched: DeviceFault
-    "And once the drives are off."
     left_mm: float
     right_mm: float
-    "Where the carriages are then."
     within_mm: float = 0.3
 
 
@@ -273,7 +268,6 @@ def test_how_a_run_ends(ending: Ending) -> None:
 
 @pytest.mark.parametrize(("percent", "within_s"), [(-100, 0.4), (-75, 3.5), (-200, 3.5)])
 def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int, within_s: float) -> None:
-    """No current, too few volts, the wrong way: it was 8 s, whatever the stroke takes."""
     host = running([f"opening={percent}%@3.5"], gap_mm=52.0)
     host.run_until(3.5)
     started_s = host.now_s
@@ -310,7 +304,6 @@ def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open(
 
 
 def test_a_device_that_is_mended_homes_as_a_healthy_one() -> None:
-    """After all faults that last have struck it at rest; what they made it latch, it clears."""
     passing = ("frozen", "reset", "encoder_jump", "encoder_jump_left")
     lasting = [f"{name}=+20%" if name in SIZED else name for name in KNOWN if name not in passing]
     mended, healthy = Bench(f"{fault}@0.1" for fault in lasting), Bench()

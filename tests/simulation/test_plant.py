@@ -174,7 +174,6 @@ HARD_MOTIONS: dict[str, Callable[[float], Volts]] = {
 @pytest.mark.parametrize("motion", HARD_MOTIONS)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_substep_is_fine_enough_for_hard_motion(name: str, motion: str, drag_left_N: float) -> None:
-    """Against substeps of 0.01 ms; voltages change between substeps, and screws are read there too."""
     parameters = at_gap(changed(load_plant(name), "screw", drag_left_N=drag_left_N), 60.0)
 
     def path(substep_s: float) -> np.ndarray:
@@ -206,7 +205,6 @@ def test_the_substep_is_fine_enough_for_hard_motion(name: str, motion: str, drag
     wear=st.sampled_from([1.0, 4.0]),
 )
 def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) -> None:
-    """What the supply and the magnets put in is never less than what is stored and lost in the winding."""
     axis = an_axis(drag_N=6.0)
     axis.gear_friction_Nm /= wear
     axis.screw_friction_m /= wear
@@ -316,7 +314,6 @@ def test_warming_weakens_the_force_and_levels_off() -> None:
 def test_the_brake_gives_the_hand_no_energy_over_its_reversals(
     name: str, volts: float | None, stiffness_N_mm: float, least_J: float
 ) -> None:
-    """At rest or while the gap opens and closes, the work is never less than what the bristles hold."""
     plant, work_J, directions = Plant(load_plant(name), ReversingHand(4.0)), 0.0, set()
     for step in range(8000):
         if volts is not None:

@@ -51,7 +51,7 @@ def missing() -> str:
 
 
 class Machine:
-    """A booted machine, which has `shared` as /opt/shared. Nothing of it is left when it is closed."""
+    """A booted machine, which has `shared` as /opt/shared."""
 
     def __init__(self, folder: Path, shared: Path) -> None:
         self._folder, self._shared = folder, shared

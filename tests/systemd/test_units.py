@@ -97,7 +97,6 @@ def test_every_installed_unit_is_understood(root, tmp_path):
 @needs_analyze
 @pytest.mark.parametrize(("drop_ins", "most"), [((), 5), (("can", "tcp"), 15)])
 def test_the_unit_is_closed_to_what_it_does_not_need(unit, drop_ins, most):
-    """A serial line and ipc: at most 0.5. A CAN bus and tcp: at most 1.5."""
     opened = unit.parent / "tormagd.service.d"
     opened.mkdir()
     for name in drop_ins:

@@ -94,7 +94,6 @@ def test_the_roots_that_judge_are_roots():
 
 
 def test_the_plant_of_the_workload_is_the_plant():
-    """Against the simulator's own element, turned steadily after a reversal, its memory switched off."""
     plant = load_plant("sample_1")
     still = msgspec.structs.replace(
         plant,
@@ -170,7 +169,6 @@ def test_a_millimetre_is_nearly_time_optimal_and_the_figures_are_those_promised(
 
 
 def test_a_wrong_motor_is_noticed_in_the_comparison():
-    """With twice the inertia the same comparison fails: it can."""
     heavy = msgspec.structs.replace(Config().motor, inertia_kg_m2=1.6e-6)
     assert step.nrmse(*step.model_step(heavy, load_plant("sample_1"), step.MODEL_DUTY)) > 0.1
 

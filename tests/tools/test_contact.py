@@ -41,7 +41,6 @@ def test_a_hand_that_draws_back_is_let_go(rows) -> None:
 
 
 def test_a_handle_that_only_sticks_at_the_waiting_level_is_not_held() -> None:
-    """Static friction is more than kinetic; a brake that is still closed holds."""
     time_s, nothing = np.arange(4.0), np.zeros(4)
     touch = Touch(time_s, nothing, nothing, np.array([0.6, 0.6, 0.9, 0.6]), np.full(4, -0.75), nothing, (), ())
     assert held_ms(touch, 0.6) == 1.0

@@ -120,7 +120,6 @@ def test_an_attack_that_got_somewhere_is_named(name: str, times: int, took_ms: f
 
 
 def test_no_hostile_message_is_valid() -> None:
-    """Otherwise one that is taken would be no failure of the daemon's."""
     draw, inbox = random.Random(1), SetpointInbox()
     for _ in range(3_000):
         parts = siege.hostile(draw, siege.SETPOINT, siege.NO_SETPOINT)

@@ -180,7 +180,6 @@ def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
 
 
 def test_an_error_in_the_physics_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One part in 1e11 on the force, far below what any plot would show."""
     original = BrakeCurve.force
     monkeypatch.setattr(BrakeCurve, "force", lambda self, eps, load: original(self, eps, load) * (1.0 + 1e-11))
     tally = numerics.check_chunk(seed=3, devices=8, references=20)
@@ -189,7 +188,6 @@ def test_an_error_in_the_physics_is_seen(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_naive_formula_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """lambda1 from the printed difference, as Eq. 29 has it, cancels while the field is weak."""
     monkeypatch.setattr(
         BrakeCurve,
         "compression",

@@ -57,7 +57,7 @@ ON_A_BUS_TOO = (
 )
 """What is done to frames, and silence; behind the line both buses are one."""
 SAMPLED_S = 2.5
-"""How long a fault is watched here: the slowest gap is open after 2.2 s. `tools/faults.py` watches all for longer."""
+"""How long a fault is watched here: the slowest gap is open after 2.2 s."""
 JUDGED_S = 1.5
 """How long where the judge is judged: one gap is open by then, the other has not moved."""
 
@@ -126,7 +126,6 @@ def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection) -> None:
 
 
 def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None:
-    """The judge has to be able to say no."""
     stuck = NAMED["left encoder stuck"]._replace(names=("SENSOR",), within_ms=10.0)
     _, unnamed = faults.inject(stuck, "sample_1", watched_s=JUDGED_S)
     assert (unnamed.named, unnamed.safe, unnamed.in_time) == (False, True, False)
@@ -152,7 +151,6 @@ def test_what_leads_out_of_a_fault_does_so_when_its_cause_has_gone(
 
 
 def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The judge has to be able to say no here, too."""
     hot = NAMED["device too hot"]
     rig, cell = faults.inject(hot, "sample_1", watched_s=JUDGED_S)
     monkeypatch.setattr(rig, "mend", lambda: None)

@@ -89,7 +89,6 @@ def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Followed) -
 
 
 def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:
-    """Sample 2 starts and turns too late for what it is not told before: with the slope alone it misses by 28 mN."""
     found = track(load_plant("sample_2"), pulse_signal(6.5), "pulse", 0.0)
     assert found.since(4.5).rms_N <= 0.02
     assert found.shown.lag_s > 0.005
@@ -231,7 +230,6 @@ def test_a_corner_keeps_the_bounds(case) -> None:
 
 
 def test_the_shipped_model_is_good_where_it_is_asked() -> None:
-    """By the scene's insert, on sample 1, where its handles go."""
     model = load_model(model_path("torque_mre_50_40", Path()), element="torque", insert="MRE-50-40")
     found = models.errors(model, insert("MRE-50-40"), load_plant("sample_1"), np.linspace(5.0, 300.0, 119))
     assert found["mean_N"] <= 0.03

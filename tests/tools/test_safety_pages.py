@@ -52,7 +52,6 @@ def test_the_page_of_states_has_every_code_and_every_event() -> None:
 
 
 def test_the_evidence_is_of_the_matrix_that_there_is() -> None:
-    """A row that came, went or changed what is stated of it takes `python tools/evidence.py faults`."""
     expected = {(item.name, bus): item for item in MATRIX for bus in item.buses}
     known = {(cell["fault"], cell["bus"]): cell for cell in CELLS}
     assert set(known) == set(expected)
@@ -71,7 +70,6 @@ def test_no_cell_loses_a_force_faster_than_the_scene_allows() -> None:
 
 
 def test_what_is_seen_at_once_is_stated_so() -> None:
-    """50 ms and one tick for wire and host, 100 ms for what is visible at once; the others say what they take."""
     at_once = (Fault.LINK_LOST, Fault.HOST_STALL, Fault.DEVICE_COMMAND_TIMEOUT)
     assert {FAULTS[fault].safe_ms for fault in at_once} == {51.0}
     late = [code for code, row in FAULTS.items() if row.safe_ms > 100.0 and row.shows.startswith("at once")]
@@ -82,7 +80,6 @@ def test_what_is_seen_at_once_is_stated_so() -> None:
 
 
 def test_no_row_is_red_but_those_that_are_known() -> None:
-    """Another one lost its control, its code, its tests or its evidence; or one is mended."""
     kinds = (line.split(": ") for line in RED.split("\n") if line)
     known = {f"{kind}.{name}" for kind, names in kinds for name in names.split()}
     red = red_rows(RISKS)

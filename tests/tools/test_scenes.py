@@ -40,7 +40,6 @@ def test_every_shipped_scene_is_measured() -> None:
 
 
 def test_a_case_gives_what_was_stored() -> None:
-    """The whole device again, for one scene as it was chosen: the file belongs to this model and this plant."""
     brain = next(scene for scene in STORED.scenes if scene.name == "brain")
     case = case_of("brain", brain.chosen, "sample_1", "signal", is_learning=True)
     assert run(case) == pytest.approx(brain.of(brain.chosen).rms_N[0], rel=0.05)
@@ -83,7 +82,6 @@ def test_an_error_is_allowed_within_the_tolerance_or_beside_the_usual_way() -> N
 def test_the_lowest_rates_are_taken_that_do_what_the_usual_do(
     situation: str, device: str, chosen_hz: tuple[int, int]
 ) -> None:
-    """Slow plans fail one device in one situation: it decides, unless it only judges."""
 
     def outcomes(cases: Collection[Case]) -> dict[Case, float]:
         return {

@@ -139,7 +139,7 @@ class Bench:
         self.roots = {size: network_roots_mT(model, self.course) for size, model in self.models.items()}
 
     def sweep(self) -> tuple[list[dict[str, Any]], list[str]]:
-        """The rows of the table, and the searches that refused a network. In rounds: a disturbance meets all alike."""
+        """The rows of the table, and the searches that refused a network."""
         wanted = list(dict.fromkeys(cases(self.effort.hidden)))
         refused = [case for case in wanted if case.solver == NEWTON and self._falls(case.hidden)]
         runs = [Run(self, case) for case in wanted if case not in refused]
@@ -151,7 +151,6 @@ class Bench:
         return [run.row() for run in runs], [f"{case.name}, {case.hidden} units" for case in refused]
 
     def _falls(self, hidden: int) -> bool:
-        """Whether the daemon would refuse the network."""
         model = self.models[hidden]
         return falling_at(model, FIELDS_MT, model.feature_ranges[0][1]) is not None
 
@@ -208,10 +207,7 @@ class Run:
 
 
 def follow(solver: FieldSolver, model: ForceModel, along: Course, solves: int) -> tuple[Array, Array]:
-    """Fields and times (us) of that many solves along the course, round and round; each is told the last field.
-
-    The curve belongs to the solve: it is another one for every state of the handle.
-    """
+    """Fields and times (us) of that many solves along the course, round and round; each is told the last field."""
     rows = along.rows()
     fields, times_ns = np.empty(solves), np.empty(solves)
     last: float | None = None

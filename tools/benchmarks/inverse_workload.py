@@ -107,10 +107,7 @@ def trained(data: Dataset, hidden: int, epochs: int, seed: int = 0) -> ForceMode
 
 
 def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
-    """For each solve every field in range at which the network gives the force: a fine grid, then bisection.
-
-    Shares no code with the searches. Where the network does not reach the force, the array is empty.
-    """
+    """For each solve every field in range at which the network gives the force: a fine grid, then bisection."""
     grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
     found: list[Array] = []
     for displacement, rate, force in along.rows():

@@ -72,7 +72,7 @@ def summary(found_us: Stages, count: int, realtime: RealTime) -> dict[str, Any]:
 
 
 def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[str, Any]]]:
-    """Publishes and records: when each force was sent, ns, and the ticks of that time. Raises RuntimeError."""
+    """Publishes and records: when each force was sent, ns, and the ticks of that time."""
     with context(priority_of_threads()) as ours, listening(ours, config.endpoints.recording, None) as recording:
         sent = publish(config.endpoints.setpoint, count)
         # only now: reading would set the pace
@@ -80,7 +80,7 @@ def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[st
 
 
 def publish(address: str, count: int) -> dict[float, int]:
-    """So many setpoints, each of its own force, to who binds there: when each was sent, ns. Raises RuntimeError."""
+    """So many setpoints, each of its own force, to who binds there: when each was sent, ns."""
     with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher:
         publisher.setsockopt(zmq.LINGER, 1_000)
         publisher.connect(address)
@@ -101,7 +101,7 @@ def publish(address: str, count: int) -> dict[float, int]:
 
 
 def rows_until(recording: "zmq.Socket[bytes]", until_ns: int) -> list[dict[str, Any]]:
-    """What the daemon has recorded, up to that time. Raises RuntimeError where it records no more."""
+    """What the daemon has recorded, up to that time."""
     rows: list[dict[str, Any]] = []
     while not rows or rows[-1]["t_ns"] < until_ns:
         if not recording.poll(5_000):
@@ -119,7 +119,7 @@ def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tupl
 
 
 def bare_hop(count: int) -> Array:
-    """The same message from PUB to SUB between two processes, us. Raises zmq.Again where messages are lost."""
+    """The same message from PUB to SUB between two processes, us."""
     scheduling = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, ProcessPoolExecutor(1) as pool:
         address = f"ipc://{folder}/hop"
@@ -129,7 +129,7 @@ def bare_hop(count: int) -> Array:
 
 
 def receive(address: str, count: int, scheduling: tuple[int, int]) -> Array:
-    """The far end of the bare hop, scheduled like the near one. Raises zmq.Again where messages are lost."""
+    """The far end of the bare hop, scheduled like the near one."""
     os.sched_setscheduler(0, scheduling[0], os.sched_param(scheduling[1]))
     with context(priority_of_threads()) as ours, ours.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.RCVTIMEO, round(LOST_S * 1e3))

@@ -164,7 +164,6 @@ def _told(blocks: list[Block]) -> dict[str, Any]:
 
 
 def _middle(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """The median of each figure; yes where it was yes each time."""
     return {
         key: _middle([each[key] for each in found])
         if isinstance(first, dict)
@@ -230,14 +229,14 @@ def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
 
 
 def built_host(folder: Path) -> Path:
-    """The host in C, built in that folder. Raises BuildError where there is no compiler."""
+    """The host in C, built in that folder."""
     host, sources = folder / "reference_host", [TOOLS / "reference_host.c", *(ROOM / f"{name}.c" for name in FIRMWARE)]
     subprocess.run([compiler(), *STRICT, "-O2", f"-I{ROOM}", *map(str, sources), "-lm", "-o", str(host)], check=True)
     return host
 
 
 def collect(socket: "zmq.Socket[bytes]", seconds: float, config: Config) -> Block:
-    """Reads tick rows for a while. Raises RuntimeError where there are none."""
+    """Reads tick rows for a while."""
     until_s = time.monotonic() + seconds
     rows: list[list[Any]] = []
     while time.monotonic() < until_s:
@@ -331,10 +330,7 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
 
 @contextlib.contextmanager
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
-    """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0).
-
-    Raises RuntimeError where it does not reach its device.
-    """
+    """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
     with contextlib.ExitStack() as stack:
         theirs = environment(stand.root, folder)
         start = partial(begun, stack, folder / LOG, environment=theirs)
@@ -353,7 +349,7 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
 
 
 def checkout(text: str) -> Path:
-    """The root of a checkout. Raises ArgumentTypeError for any other folder."""
+    """The root of a checkout."""
     root = Path(text).resolve()
     if not (root / "tormagd" / "closed_loop.py").is_file() or not (root / "tools" / "benchmark.py").is_file():
         raise argparse.ArgumentTypeError(f"{text}: allowed is the root of a checkout, with tormagd/ and tools/ in it")
@@ -361,11 +357,7 @@ def checkout(text: str) -> Path:
 
 
 def environment(root: Path | None, folder: Path) -> dict[str, str]:
-    """For a process that runs package and tools of that checkout; None for what runs here, which may be installed.
-
-    A checkout's backends are found by what its package says of itself, which is written into the folder. Raises
-    CalledProcessError.
-    """
+    """For a process that runs package and tools of that checkout; None for what runs here, which may be installed."""
     if root is None:
         folders = [str(TOOLS), *filter(None, [os.environ.get("PYTHONPATH")])]
     else:

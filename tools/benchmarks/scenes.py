@@ -95,7 +95,7 @@ def store(file: Measurements, is_wanted: bool) -> None:
 
 
 def figures(scene: MeasuredScene, file: Measurements) -> Json:
-    """One scene's choice as numbers. `full` is the usual way."""
+    """One scene's choice as numbers."""
     chosen, usual = file.share(scene.chosen), file.share(scene.usual.way)
     return {
         "name": scene.name,
@@ -117,7 +117,7 @@ def figures(scene: MeasuredScene, file: Measurements) -> Json:
 
 
 def measured_scene(name: str, runs: Runs) -> MeasuredScene:
-    """Measure one scene, whole; `runs` gives the outcomes of cases. Raises ConfigError for a scene without a signal."""
+    """Measure one scene, whole; `runs` gives the outcomes of cases."""
     scene = load_scene(name)
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")

@@ -88,7 +88,7 @@ def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
 
 
 def step(loop: ClosedLoop, target_mm: float) -> Step:
-    """One step to a gap, from rest. Raises RuntimeError where nothing was measured yet."""
+    """One step to a gap, from rest."""
     before = loop.stepper.measured
     if before is None:
         raise RuntimeError("the loop has no measurement")
@@ -129,9 +129,7 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
 
 def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[Array, Array]:
     """Both carriages' mean position every tick from the start of a duty step, mm: as the encoders count it, and by
-    H(z). There it is the step less the Coulomb duty. The motor's inertia is taken over the gears' efficiency, because
-    they take their share of the torque that speeds it up.
-    """
+    H(z)."""
     plant = Plant(_at_rest(parameters, MODEL_GAP_MM), SteadyHand())
     volts = duty * parameters.electronics.supply_V
     counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
@@ -156,8 +154,7 @@ def nrmse(measured: Array, modelled: Array) -> float:
 
 
 def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: float) -> tuple[float, float]:
-    """The fastest the plant can do, s: the rise from 10 to 90 %, and from rest to rest. Bang-bang: the latest switch
-    that still comes to rest at the target, by bisection."""
+    """The fastest the plant can do, s: the rise from 10 to 90 %, and from rest to rest."""
     low, high = 0.0, 4.0
     for _ in range(16):  # to less than a tick of the plant
         middle = (low + high) / 2.0

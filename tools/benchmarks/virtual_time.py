@@ -83,10 +83,7 @@ Stretches = dict[str, dict[str, list[float]]]
 
 
 def compared(ticks: int) -> Stretches:
-    """Every build there is, `interpreted` always, `compiled` where there is one, taking turns.
-
-    Raises BrokenProcessPool where the loops of one cannot be made.
-    """
+    """Every build there is, `interpreted` always, `compiled` where there is one, taking turns."""
     builds: dict[str, Executor] = {}
     with contextlib.ExitStack() as stack:
         for switch in ("0", "1"):

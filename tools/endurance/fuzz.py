@@ -45,7 +45,7 @@ RESTED = MEND + 8 * WAIT + CLEAR
 
 
 def run(seconds: int, seed: int) -> dict[str, Any]:
-    """So many seconds in total; the figures, and `failures`. Nothing, with `skipped`, where there is no clang."""
+    """So many seconds in total; the figures, and `failures`."""
     try:
         program = build(Target.FUZZ)
     except BuildError as error:
@@ -119,8 +119,7 @@ def streams() -> Iterator[bytes]:
 
 
 def lives() -> Iterator[bytes]:
-    """Frames on a device's line. Then lives that home and run. There comes each message twice, each sensor goes wrong
-    or leaps to and fro, or the host falls silent."""
+    """Frames on a device's line."""
     vectors = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
     for vector in vectors["valid"]:
         yield in_pieces(bytes.fromhex(vector["frame"]), 31, lambda size: size << 3 | 4)
@@ -151,7 +150,7 @@ SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {"codec": payloads, "framing":
 
 def covered(program: Path, folder: Path) -> tuple[float | None, list[str]]:
     """Which share of the firmware's lines that bytes can reach the targets ran, by the profiles in `folder`, and those
-    that they did not. None without LLVM's two tools."""
+    that they did not."""
     merged = folder / "all.profdata"
     merge = ["llvm-profdata", "merge", "-o", str(merged), *map(str, folder.glob("*.profraw"))]
     sources = [str(ROOM / f"{name}.c") for name in FIRMWARE]

@@ -134,7 +134,7 @@ def flood(name: str, endpoints: Endpoints, _keys: Path, stop: Event, times: Any)
 
 
 def messages(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
-    """Hostile setpoints, and hostile requests one after the other. Raises RuntimeError at one that is carried out."""
+    """Hostile setpoints, and hostile requests one after the other."""
     draw = random.Random(1)
     with zmq.Context() as context:
         publisher = _peer(context, zmq.XPUB, endpoints.setpoint)
@@ -220,8 +220,7 @@ def judged(name: str, times: int, took_ms: Sequence[float], status: dict[str, An
 
 
 def _stop(stand: Stand, draw: random.Random) -> float:
-    """Holds force for a while and stops. From when the stop is handed to ZeroMQ until the tick that writes RETRACT has
-    ended, ms; inf where none did."""
+    """Holds force for a while and stops."""
     stand.arm()
     since_s = time.monotonic()
     stand.ask(FORCE_N)

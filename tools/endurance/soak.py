@@ -25,7 +25,7 @@ ALLOWED_KB = {"daemon": 2_048, "recorder": 16_384}
 
 
 def run(stand: Stand, count: int, seed: int) -> Figures:
-    """`count` samples, two a second; the figures, and `failures`. Nothing is drawn."""
+    """`count` samples, two a second; the figures, and `failures`."""
     path = stand.folder / "soak.mcap"
     ctl = ("-m", "tormagd.ctl.main", "--config", str(stand.folder / "tormagd.toml"))
     processes = {"daemon": stand.daemon, "recorder": stand.begin(*ctl, "record", str(path))}

@@ -48,7 +48,7 @@ class Stop(NamedTuple):
 
 
 def run(stand: Stand, count: int, seed: int) -> Figures:
-    """`count` stops of either process by turns; the figures, and `failures`. Ends the device."""
+    """`count` stops of either process by turns; the figures, and `failures`."""
     draw = random.Random(seed)
     stops: list[Stop] = []
     for number in tqdm(range(count), desc="stalls", unit="stop", disable=None):
@@ -69,7 +69,7 @@ def run(stand: Stand, count: int, seed: int) -> Figures:
 
 
 def _hold(stand: Stand) -> None:
-    """Holds force, settled. What latches meanwhile no stop has brought about."""
+    """Holds force, settled."""
     while True:
         stand.arm()
         since_s = time.monotonic()

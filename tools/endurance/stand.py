@@ -40,7 +40,7 @@ class Stand:
     """Daemon, device and an operator's client. All of it ends with `stack`."""
 
     def __init__(self, stack: ExitStack, transport: str = "serial") -> None:
-        """Raises TimeoutError. Telemetry demands keys, which lie in `keys`; the other endpoints are open."""
+        """Raises TimeoutError."""
         self._stack = stack
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
         self.latched: list[tuple[str, float, float]] = []
@@ -82,11 +82,11 @@ class Stand:
         port.symlink_to(line)
 
     def status(self) -> dict[str, Any]:
-        """The daemon's status. Raises ClientError."""
+        """The daemon's status."""
         return self.client.request("status")
 
     def until(self, reached: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
-        """The status in which that is so. Raises TimeoutError saying what was waited for, and the last words."""
+        """The status in which that is so."""
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s and self.daemon.poll() is None:
             with contextlib.suppress(ClientError):
@@ -100,7 +100,7 @@ class Stand:
         self.client.publish(force_N, LASTS_MS)
 
     def arm(self) -> None:
-        """Clears, homes and enables, whatever was before, at a low force. Raises TimeoutError."""
+        """Clears, homes and enables, whatever was before, at a low force."""
 
         def is_armed(status: dict[str, Any]) -> bool:
             if status["operating_state"] != "ENABLED":

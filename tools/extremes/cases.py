@@ -63,7 +63,7 @@ def draw_batch(rng: np.random.Generator, size: int) -> Batch:
 
 
 def reference(batch: Batch, x: float) -> Reference:
-    """The thesis's formulas as printed (Eq. 7, 29, 33, 34; Gammas of the appendix), derivatives by differences."""
+    """The thesis's formulas as printed (Eq."""
     with mp.workdps(DIGITS):
         # Eq. 7 bends at 95 mm, so that a step is measured from there
         scale = min(mp.mpf(x), 95 - mp.mpf(x)) if isinstance(batch.field, ThesisFieldLaw) else mp.mpf(x)
@@ -120,7 +120,6 @@ def _force(batch: Batch, x: Any) -> tuple[Any, Any] | None:
 
 
 def _differences(values: Any, step: Any) -> tuple[Any, Any]:
-    """First and second derivative from three equidistant values."""
     below, centre, above = values
     return (above - below) / (2 * step), (above - 2 * centre + below) / step**2
 

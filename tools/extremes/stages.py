@@ -59,7 +59,6 @@ class Draw:
         return self.now_s
 
     def __call__(self, usual: float) -> float:
-        """A number."""
         value = self._drawn(usual, self._strange)
         self.has_nan |= math.isnan(value)
         return value
@@ -78,8 +77,7 @@ class Draw:
 
 class Stage(NamedTuple):
     """One row of the table. `make` gives a fresh stage, or whatever `feed` is given; `feed` takes one step of it and
-    gives what came out. `border` names the check that stands before it; empty: its own. Time goes on by `period_s`
-    before each step; it stands where the stage asks for no time, or `feed` lets it go on."""
+    gives what came out."""
 
     name: str
     make: Callable[[], Any]
@@ -90,8 +88,7 @@ class Stage(NamedTuple):
 
 class Row(NamedTuple):
     """What became of a stage. It counts steps with hostile inputs, those that it refused by name, and those after which
-    a limit or a fault was told. Then come numbers that came out and were not finite, steps with NaN after which nothing
-    was said, and errors that name nothing. The last is the first of these three."""
+    a limit or a fault was told."""
 
     stage: str
     border: str

@@ -174,7 +174,7 @@ def stepper() -> Stepper:
 
 
 def step(stage: Stepper, draw: Draw) -> object:
-    """One tick. Raises DomainError where it latches NOT_FINITE."""
+    """One tick."""
     duty = stage.step(draw(draw.now_s), measurement(draw), plan(draw))
     faults = stage.safety.faults
     if Fault.NOT_FINITE in faults:
@@ -188,7 +188,7 @@ def planner() -> Planner:
 
 
 def planning(stage: Planner, draw: Draw) -> object:
-    """One plan. Where it is refused its owner begins afresh, and the next is made."""
+    """One plan."""
     now_s, told_s = draw.now_s, draw(draw.now_s)
     try:
         made = stage.plan(now_s if math.isfinite(told_s) else told_s, setpoint(draw), measured(draw))

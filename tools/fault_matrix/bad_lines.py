@@ -97,7 +97,6 @@ class _Spoilt(Generic[DeviceT]):
         return self._device.truth
 
     def spoil(self, way: MakeTransfer) -> None:
-        """From now on."""
         self._up, self._down = way(), way()
 
 

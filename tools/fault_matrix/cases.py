@@ -21,11 +21,7 @@ SERIAL, CAN = "serial", "can"
 
 
 class Injection(NamedTuple):
-    """A fault: of the simulated device (a `--fault` word), of the host, of the publisher, or of the line.
-
-    `names` are the codes of which one has to be told, `safe` is how it has to end. One that is not driven is there from
-    the beginning, and the device is homed and enabled with it, as far as that goes.
-    """
+    """A fault: of the simulated device (a `--fault` word), of the host, of the publisher, or of the line."""
 
     name: str
     names: tuple[str, ...]
@@ -44,7 +40,6 @@ class Injection(NamedTuple):
 
     @property
     def passes(self) -> bool:
-        """Whether its cause is gone again before anybody can do anything about it."""
         return bool(self.stall_ms) or self.host in ("stop", "disable") or self.device in PASSING
 
 

@@ -64,21 +64,18 @@ class Rig:
 
     @property
     def safety(self) -> SafetyState:
-        """Operating state and faults."""
         return self.loop.stepper.safety
 
     @property
     def is_homed(self) -> bool:
-        """As telemetry says it."""
         return is_homed(self.loop.measurement, self.loop.stepper.measured)
 
     @property
     def off_N(self) -> float:
-        """By how much the rendered force is more than what is asked for."""
         return self.loop.simulated.truth.force_N - asked_N(self.loop.now_s)
 
     def tick(self) -> Sample | None:
-        """One control period; None where the daemon does nothing in it. Periods are 1 ms."""
+        """One control period; None where the daemon does nothing in it."""
         is_away = self.is_dead or self._stalled_ms > 0
         self._stalled_ms -= 1
         if self._hogged_ms is not None:
@@ -124,7 +121,6 @@ class Rig:
 
 @cache
 def _coronary() -> Core:
-    """A core keeps nothing of what it is stepped through: one does for every rig."""
     return build_core(Config(scene="coronary"))
 
 
@@ -146,7 +142,6 @@ class LyingSensor:
 
     @property
     def reading_N(self) -> float:
-        """What is shown now, as far as a sensor reaches."""
         return min(max(self._lie(self._first_N, self.mended.reading_N), -20.0), 20.0)
 
     def advance(self, time_s: float, force_N: float) -> None:
@@ -172,7 +167,6 @@ class Publisher:
         self._newest: TimedSetpoint | None = None
 
     def __call__(self, now_s: float) -> TimedSetpoint | None:
-        """The newest one at that time; None before the first."""
         if not self.is_silent:
             stamp_s = now_s - now_s % 0.002
             force_N = OTHER_N if self.is_other else asked_N(stamp_s)
@@ -195,7 +189,6 @@ class DaemonsBorder:
         self._kept: bytes | None = None
 
     def __call__(self, now_s: float) -> TimedSetpoint | None:
-        """The newest one at that time that was taken."""
         self._ticks += 1
         if self._ticks % 2 and not self.is_silent:
             realtime_ns = round((REALTIME_S + now_s) * 1e9)

@@ -24,17 +24,7 @@ REFUSED_MS = 100.0
 
 
 class Cell(NamedTuple):
-    """One row of the matrix. A time is null where it did not come to that within 6 s.
-
-    `named`: one of the codes that it should have was told, and no other fault before. `safe`: it ended as stated, and
-    `seconds` is when that began; for a force that is held, when it was named. `reacted_ms` is when the reaction was on
-    its way. The device began to open or let go, the limit was told, or the command was refused. `in_time`: that was by
-    `stated_ms`, which is null where nothing is to be told.
-
-    The last three are of `recover`. `tried`: what the recovery came to before the cause had gone, empty where
-    there was nothing to try. `recovery`: the commands that led back once it had. `recovered`: they did, not before, and
-    the force was followed again.
-    """
+    """One row of the matrix. A time is null where it did not come to that within 6 s."""
 
     bus: str
     fault: str
@@ -63,7 +53,7 @@ class Watch:
     """What the injection brought about, tick by tick."""
 
     def __init__(self, rig: Rig, usual: dict[str, None], *, is_driven: bool) -> None:
-        """Watches `rig` from now on. `usual` are the limits that were held before, too: they notice nothing."""
+        """Watches `rig` from now on."""
         loop = rig.loop
         self._rig, self._loop = rig, loop
         self._has_run = is_driven
@@ -105,13 +95,11 @@ class Watch:
         self._off_N.append(self._rig.off_N)
 
     def _note(self, what: str, is_so: bool) -> None:
-        """Keeps when it first was so."""
         if is_so:
             self._since_s.setdefault(what, self._loop.now_s)
 
     @property
     def is_open(self) -> bool:
-        """Whether the gap is open, and no force left that could be lost."""
         return "open" in self._since_s
 
     def refuse(self, error: RefusedError) -> None:
@@ -199,7 +187,6 @@ class Watch:
         return safe in (HELD, HELD_OR_OPENS) and is_held and not self._host, noticed_ms
 
     def _loss_N_s(self) -> float:
-        """The fastest that force was lost over LOSS_MS."""
         over = zip(self._forces_N, self._forces_N[LOSS_MS:], strict=False)
         return max((before - after) / (LOSS_MS * 1e-3) for before, after in over)
 

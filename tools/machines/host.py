@@ -33,16 +33,11 @@ HOST_SHARE = 0.5
 MIN_KEPT = 0.99
 "Share of its beats below which a bare timer says that the host does not leave enough."
 MAX_WAITED = 0.1
-"""Share of the time above which a process that waits for a processor has not been left enough. With FIFO the daemon
-waits for 3 to 8% of it, 30 to 80 us a wake-up; without, beside four busy loops, for a third."""
+"""Share of the time above which a process that waits for a processor has not been left enough."""
 MAX_WAIT_MS = 25.0
-"""Over what MAX_WAITED allows between two looks. Who once waited for so much longer has lost half of the time after
-which a device opens by itself. Beside four busy loops, without FIFO, a device stood still for 110 ms while every bare
-timer, which sleeps more, kept its beats."""
+"""Over what MAX_WAITED allows between two looks."""
 MAX_BLOCKED = 0.02
-"""Share of the time above which waiting for disk or memory is taken for a hold-up. Once a device that writes its truth
-to a disk stood still for 38 ms while every bare timer kept its beats. The disk was why, or what carries a pty's bytes
-(`wire.py`), which was not known then. Neither is shown."""
+"""Share of the time above which waiting for disk or memory is taken for a hold-up."""
 
 
 class Stall(NamedTuple):
@@ -76,7 +71,6 @@ class Host(NamedTuple):
 
     @property
     def took_much(self) -> bool:
-        """Whether a real-time program could not have kept its time."""
         return (
             self.bare_worst_ms >= STALL_MS
             or self.bare_kept < MIN_KEPT
@@ -86,7 +80,6 @@ class Host(NamedTuple):
         )
 
     def __str__(self) -> str:
-        """One clause for a sentence."""
         name, share = max(self.waited.items(), key=lambda item: item[1], default=("", 0.0))
         waited = ""
         if share > MAX_WAITED:
@@ -100,10 +93,7 @@ class Host(NamedTuple):
 
 
 class HostWatch:
-    """Bare timers on the processors, and a thread that reads the kernel's counters. A context manager.
-
-    `fifo_priority` is the timers' own; it is refused where the daemon's is refused. `log` takes what they complain of.
-    """
+    """Bare timers on the processors, and a thread that reads the kernel's counters. A context manager."""
 
     def __init__(self, fifo_priority: int, log: IO[str]) -> None:
         command = [sys.executable, str(Path(__file__).parents[1] / "bare_timer.py"), "--fifo", str(fifo_priority)]
@@ -146,7 +136,7 @@ class HostWatch:
                 self._stalls.append([Stall(*pair) for pair in json.loads(printed)])
 
     def between(self, start_s: float, end_s: float) -> Host:
-        """What was taken between two times of CLOCK_MONOTONIC. Only after `end`."""
+        """What was taken between two times of CLOCK_MONOTONIC."""
         # the kernel counts a wait when it is over: what led to the end is seen by a look after it
         looks = [look for look in self._looks if start_s - LOOK_S <= look.time_s <= end_s + LOOK_S]
         if len(looks) < 2:
@@ -190,7 +180,7 @@ def kept(stalls: list[Stall], start_s: float, end_s: float) -> float:
 
 def processor_s(pid: int) -> float:
     """Processor time that a process and all that it has begun have had, s; what has ended counts where it was waited
-    for. Raises OSError where there is no such process."""
+    for."""
     ticks = 0
     waiting = [pid]
     while waiting:

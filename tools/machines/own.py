@@ -15,8 +15,7 @@ from tormagd.daemon.realtime import prepare
 
 
 def own_machine(priority: int, module: str, *arguments: str, waits: bool = False) -> list[str]:
-    """What the interpreter is given to run `module` so. One that `waits` is loaded, prints a line, and its
-    `main` begins when SIGUSR1 comes."""
+    """What the interpreter is given to run `module` so."""
     return ["-P", __file__, str(priority), *["--waits"][: int(waits)], module, *arguments]
 
 

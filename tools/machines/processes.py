@@ -23,8 +23,7 @@ def begun(
     is_read: bool = True,
     environment: dict[str, str] | None = None,
 ) -> "subprocess.Popen[str]":
-    """A Python that ends with the stack. What it says on stderr is added to the log, and what it prints, unless that
-    `is_read`. A pipe that nobody reads is full some time."""
+    """A Python that ends with the stack."""
     with log.open("a") as said:
         stdout = subprocess.PIPE if is_read else said
         child = subprocess.Popen([sys.executable, *arguments], stdout=stdout, stderr=said, text=True, env=environment)

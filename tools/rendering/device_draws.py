@@ -26,7 +26,7 @@ def judging(draws: int) -> list[str]:
 
 
 def drawn_device(number: int) -> PlantParameters:
-    """Draw `number` of the plant card. Every third has the thesis's field law (Eq. 7), which has no exponent."""
+    """Draw `number` of the plant card."""
     random = np.random.default_rng((SEED, number))
     nominal = load_plant("sample_1")
 

@@ -61,9 +61,7 @@ def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
 
 class Followed(NamedTuple):
     """What a run showed, a row for each control tick. `time_s` is since its beginning, s. Forces are those asked and
-    truly rendered, signed as the handle moves, N. Then comes where the handle is, mm and mm/s. And the share of time
-    that each limit was held, the faults that ended it, what the device had shown by then.
-    """
+    truly rendered, signed as the handle moves, N."""
 
     time_s: Array
     asked_N: Array
@@ -76,12 +74,10 @@ class Followed(NamedTuple):
 
     @property
     def along_N(self) -> Array:
-        """The force against the motion: what is felt of a brake."""
         return np.where(self.handle_mm_s >= 0.0, self.rendered_N, -self.rendered_N)
 
     @property
     def error_N(self) -> Array:
-        """What is felt less what was asked."""
         return self.along_N - self.asked_N
 
     def since(self, start_s: float) -> Tracking:
@@ -107,8 +103,7 @@ def armed(
     is_ideal: bool = False,
     boot: FirmwareKind = Firmware,
 ) -> ClosedLoop:
-    """A device that was homed and enabled, and counts as having `shown` so much of itself. `is_ideal`: carriages that
-    lose no time move its gap. Raises RuntimeError where the device does not get that far."""
+    """A device that was homed and enabled, and counts as having `shown` so much of itself."""
     device = VirtualDevice(plant, hand, seed=1, boot=boot)
     stepper = ideal_stepper(core, device.messages.plant) if is_ideal else core.stepper()
     loop = ClosedLoop(core.config, stepper, core.planner(), device)
@@ -200,7 +195,7 @@ Rehearsals = dict[Case, Followed]
 
 
 def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array, boot: FirmwareKind = Firmware) -> Followed:
-    """Homes, enables, plays the profile. Raises RuntimeError where the device does not get that far or faults."""
+    """Homes, enables, plays the profile."""
     if case.gap_speed_mm_s is not None:
         slow = msgspec.structs.replace(config.position, gap_speed_mm_s=case.gap_speed_mm_s)
         config = msgspec.structs.replace(config, position=slow)

@@ -50,7 +50,7 @@ WALLS = (Wall("soft", 0.1, 4.0), Wall("stiff", 0.5, 15.5))
 
 
 def felt(watched: HostWatch) -> dict[Wall, Touch]:
-    """The show from the first process to the last, and what each push was. Raises ShowError."""
+    """The show from the first process to the last, and what each push was."""
     with contextlib.ExitStack() as stack:
         rig = enabled(stack, watched, str(SCENE), "--hand", HAND)
         # both are loaded before the first push: there is less than a second between two
@@ -63,7 +63,7 @@ def felt(watched: HostWatch) -> dict[Wall, Touch]:
 
 
 def pushed(rig: Rig, wall: Wall, patient: "subprocess.Popen[str]") -> int:
-    """Lets the patient begin, until the hand has been at its wall; which push that was. Raises ShowError."""
+    """Lets the patient begin, until the hand has been at its wall; which push that was."""
     first_line(patient)
     now_s = time.monotonic() - rig.power_on_s
     push = next_push(now_s)

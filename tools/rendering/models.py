@@ -25,8 +25,7 @@ GAPS_MM, RATES_MM_S = np.linspace(45.0, 95.0, 101), np.geomspace(1.0, 300.0, 61)
 
 
 def models() -> Json:
-    """The errors of each shipped model of the brake, for each insert that it knows. They are those on sample 1, which
-    it learned from, and on the devices that judge."""
+    """The errors of each shipped model of the brake, for each insert that it knows."""
     return {"rows": [row for path in FILES for row in of_file(path)]}
 
 

@@ -182,7 +182,7 @@ def signal_of(
 
 
 def run_all(cases: Collection[Case], executor: Executor, known: dict[Case, float]) -> dict[Case, float]:
-    """The outcome of every case, in their order. Those that are `known` are not run again; new ones are added there."""
+    """The outcome of every case, in their order."""
     for case, future in finished(executor, run, [case for case in dict.fromkeys(cases) if case not in known], "run"):
         known[case] = future.result()
     return {case: known[case] for case in cases}

@@ -88,15 +88,11 @@ else."""
 
 
 OUT_OF_TIME = frozenset({"not_fresh", "timeout", "not_begun", "not_homed"})
-"""Why a device could not be homed and enabled where somebody came too late. A homing, too, ends with an open gap when
-the device hears nothing for its 50 ms."""
+"""Why a device could not be homed and enabled where somebody came too late."""
 
 
 class ShowError(Exception):
-    """A show that did not get to its end: one sentence with cause and remedy.
-
-    `is_of_time` says whether a host that took the processor would explain it; `time_s` is when it was seen.
-    """
+    """A show that did not get to its end: one sentence with cause and remedy."""
 
     def __init__(self, cause: str, remedy: str, is_of_time: bool = False) -> None:
         super().__init__(f"{cause}; {remedy}")
@@ -106,11 +102,7 @@ class ShowError(Exception):
 
 
 class Shown(NamedTuple):
-    """What was asked and rendered, and how daemon and host kept time meanwhile.
-
-    `kept` is the share of control periods that began a tick of their own. `spacing_s` the time between ticks that the
-    fastest tenth of them keeps: what the software takes where nobody is in its way.
-    """
+    """What was asked and rendered, and how daemon and host kept time meanwhile."""
 
     time_s: Array
     asked_N: Array
@@ -195,7 +187,7 @@ def start(stack: contextlib.ExitStack, name: str, *arguments: str, is_read: bool
 
 
 def enabled(stack: contextlib.ExitStack, watched: HostWatch, scene: str, *device: str) -> Rig:
-    """Starts device, daemon and recorder, homes and enables. `device`: more of its options. Raises ShowError."""
+    """Starts device, daemon and recorder, homes and enables."""
     options = ("--pty", "--seed", "1", "--truth", str(RUN_DIR / "truth.csv"), *device)
     simulator = start(stack, "simulator", *own_machine(DEVICE_FIFO, "tormagd.simulation", *options), is_read=True)
     port, power_on_s = first_line(simulator), time.monotonic()
@@ -220,7 +212,7 @@ def enabled(stack: contextlib.ExitStack, watched: HostWatch, scene: str, *device
 
 def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant: str) -> Shown:
     """One show from the first process to the last, and its figures, from the device's own truth and the daemon's
-    recording. Raises ShowError."""
+    recording."""
     rows, formats = np.column_stack([times_s, forces_N]), ("%.4f", "%.5f")
     np.savetxt(RUN_DIR / "pulse.csv", rows, formats, delimiter=",", header="t_s,force_N", comments="")
     with contextlib.ExitStack() as stack:
@@ -268,7 +260,7 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
 
 
 def told_truth() -> Any:
-    """What the device wrote of itself: a row for each millisecond of its time. Raises ShowError."""
+    """What the device wrote of itself: a row for each millisecond of its time."""
     try:
         return np.genfromtxt(RUN_DIR / "truth.csv", delimiter=",", names=True)
     except (OSError, ValueError) as error:
@@ -288,7 +280,7 @@ class Tick(TypedDict, total=False):
 
 
 def ticks() -> list[Tick]:
-    """Those of the recording. Raises RecordingError."""
+    """Those of the recording."""
     seen: list[Seen] = []
     read_recording(RECORDING, Tick, seen.append)
     return [each.message for each in seen if each.is_tick and "monotonic_s" in each.message]
@@ -302,7 +294,7 @@ def between(known: list[Tick], start_s: float, end_s: float) -> Array:
 
 def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
     """When the first fault of a show that ended early was latched, by its recording; whoever saw it at `seen_s` may
-    have been late. Also the time between ticks that the fastest tenth of them keeps; 0 where none were recorded."""
+    have been late."""
     try:
         known = ticks()
     except RecordingError:
@@ -321,7 +313,7 @@ def ended(name: str) -> ShowError:
 
 
 def arm(client: Client) -> None:
-    """Homes and enables. Raises ShowError."""
+    """Homes and enables."""
     try:
         client.arm(PATIENCE_S, lambda step: print(f"arm: {step}"))
     except ClientError as error:
@@ -331,7 +323,7 @@ def arm(client: Client) -> None:
 
 
 def status(client: Client) -> dict[str, Any]:
-    """The daemon's status. Raises ShowError."""
+    """The daemon's status."""
     try:
         return client.request("status")
     except ClientError as error:
@@ -351,8 +343,7 @@ def raise_fault(state: dict[str, Any]) -> None:
 def watch(
     is_done: Callable[[], bool], daemon: "subprocess.Popen[str]", client: Client, duration_s: float
 ) -> dict[str, float]:
-    """The live view until the publisher is done; the share of telemetry messages in which each limit was held. Raises
-    ShowError."""
+    """The live view until the publisher is done; the share of telemetry messages in which each limit was held."""
     is_terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     held: Counter[str] = Counter()
     seen = 0

@@ -56,8 +56,7 @@ MASS_KG = 0.15
 
 class Case(NamedTuple):
     """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without; jitter
-    and loss are the network's. `is_known`: a law tells the wall before it was met. Hand and wall come to rest at
-    `most_N`."""
+    and loss are the network's. `is_known`: a law tells the wall before it was met."""
 
     device: str
     hand_N_mm: float
@@ -73,7 +72,7 @@ class Case(NamedTuple):
 
 class Touch(NamedTuple):
     """A row for each tick from when the hand begins to push. It has time, s, the handle's place behind the wall's, mm,
-    and speed, mm/s. Then come the kinetic force, the one on the handle and the hand's, N."""
+    and speed, mm/s."""
 
     time_s: Array
     depth_mm: Array
@@ -196,7 +195,7 @@ class Scenario:
 
 
 def rendered(case: Case, core: Core) -> Touch:
-    """Play one case by this controller. Raises RuntimeError where the device is not enabled."""
+    """Play one case by this controller."""
     scenario = Scenario(case, core)
     loop = armed(core, with_insert(device_of(case.device), core.scene.insert.name), scenario.felt)
     truth = loop.simulated.truth
@@ -211,8 +210,7 @@ def rendered(case: Case, core: Core) -> Touch:
 
 
 def opened(case: Case, core: Core) -> Touch:
-    """Play one case by this controller until the hand pulls. From there the motors open at their rated voltage, or at
-    what the device has."""
+    """Play one case by this controller until the hand pulls."""
     scenario, parameters = Scenario(case, core), with_insert(device_of(case.device), core.scene.insert.name)
     loop = armed(core, parameters, scenario.felt)
     plant, has_pulled = loop.simulated.plant, False

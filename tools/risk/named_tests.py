@@ -21,7 +21,7 @@ Named = Mapping[str, Counter[str]]
 
 
 def named_tests(folder: Path) -> Named:
-    """Return what the tests of `folder` name. Raises SyntaxError where a test is no Python."""
+    """Return what the tests of `folder` name."""
     named: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for path in sorted({path for place in BEHAVIOUR for path in folder.glob(place)}):
         file, said = path.relative_to(folder).as_posix(), _said_by_part(ast.parse(path.read_text(encoding="utf-8")))

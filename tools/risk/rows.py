@@ -44,15 +44,11 @@ class Row(NamedTuple):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """The columns that the row lacks; empty where it is no red row."""
         return tuple(name for name in ("hazard", "control", "code", "tests", "evidence") if not getattr(self, name))
 
 
 def rows(named: Named, cells: Sequence[Mapping[str, Any]], judged: Mapping[str, Judged]) -> list[Row]:
-    """Return all rows, of what the tests name, the cells of a run of the matrix, and a person's judgement.
-
-    Raises ValueError where that judges what is no row.
-    """
+    """Return all rows, of what the tests name, the cells of a run of the matrix, and a person's judgement."""
     told = _told(cells)
     made = [*_of_codes("fault", FAULTS_OF, FAULTS, named, told), *_of_codes("limit", LIMITS_OF, LIMITS, named, told)]
     made += [*_of_causes(named, told), *_of_kit(named)]
@@ -62,7 +58,7 @@ def rows(named: Named, cells: Sequence[Mapping[str, Any]], judged: Mapping[str, 
 
 
 def judgement(path: Path) -> dict[str, Judged]:
-    """Return what a person judges, by the name of the row. Raises ConfigError naming file, key and what is allowed."""
+    """Return what a person judges, by the name of the row."""
     tables = convert(path, dict[str, dict[str, Judged]])
     return {f"{kind}.{name}": judged for kind, table in tables.items() for name, judged in table.items()}
 

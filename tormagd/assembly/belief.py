@@ -7,14 +7,7 @@ from tormagd_client.messages import BeliefReport
 
 
 def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> dict[str, BeliefReport]:
-    """Return what is believed of the device at `now_s`, by name: value, standard deviation, unit, and whether it acts.
-
-    Of its force: `scale`, `offset`, `low_speed_factor`, `relaxed` and `field_lag`. Of sensor and carriages:
-    `sensor_zero`, `carriage_lag` and `acceleration_scale`. Of the setpoints: `forecast_trust`. The device's force is
-    `scale` times the model's plus `offset`, at a creep times `low_speed_factor`. `terms` are the scene's: a belief
-    about a term that is left out does not act. `sd` is None but for scale, offset and zero. `now_s` is on the core's
-    clock; nothing changes. docs/messages.md says more.
-    """
+    """Return what is believed of the device at `now_s`, by name: value, standard deviation, unit, and whether it acts."""
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
     is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust

@@ -80,38 +80,23 @@ class Core(NamedTuple):
 
     @property
     def gap_speed_mm_s(self) -> float:
-        """The fastest that the gap is moved, mm/s: the scene's gap speed where that is below the configured one."""
         return self.config.position.gap_speed_mm_s
 
     @property
     def portrait(self) -> Portrait:
-        """The force over the gap of the nominal device, without memory."""
         return self.element.portrait
 
     def planner(self, now_s: float = 0.0) -> Planner:
-        """Return a new planner that begins at `now_s`, with the gap open and nothing known of the device.
-
-        Planners of one core share nothing that changes.
-        """
+        """Return a new planner that begins at `now_s`, with the gap open and nothing known of the device."""
         return Planner(self.config, self.scene, self.element, now_s)
 
     def stepper(self, now_s: float = 0.0) -> Stepper:
-        """Return a new stepper that begins at `now_s`, DISABLED, without a measurement.
-
-        Steppers of one core share nothing that changes.
-        """
+        """Return a new stepper that begins at `now_s`, DISABLED, without a measurement."""
         return Stepper(self.config, self.scene, now_s)
 
 
 def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
-    """Build the core for `config.scene` from the scene's file and the file of the scene's model.
-
-    `scene` replaces the scene in the file; None reads the file. `models` is the folder of the scene's model. None takes
-    the folder of the scene's file, and also checks the scene's signal against the gap's speed, for `missed`. The gap's
-    speed is the scene's where that is lower; rates are `config`'s, see `at_rates_of`. Raises ConfigError where scene,
-    model and configuration do not fit each other, or a file is refused. All that the model and the gap's speed refuse
-    is told in one error; of other refusals the first.
-    """
+    """Build the core for `config.scene` from the scene's file and the file of the scene's model."""
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
     config = _slowed(config, scene)
@@ -142,12 +127,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
-    """Return the scene's element as the model describes it, and the choice of the search for its field.
-
-    The choice of the thesis's search also tells epsilon in its reason. A pad has no force law, and without the term
-    `memory` nothing is remembered. A search in torch loads torch, as `inverse.choice.build`. Raises DomainError where
-    the model does not fit the scene's insert and gaps, or the search does not fit the model.
-    """
+    """Return the scene's element as the model describes it, and the choice of the search for its field."""
     terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
     require("insert.name, cip_percent", cip_percent, *model.feature_ranges[FEATURES.index("cip_percent")])
@@ -164,11 +144,7 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
 
 
 def sources_hash() -> str:
-    """Return the SHA-256, hexadecimal, of all sources that `plan` and `step` run; the compiled build gives the same.
-
-    Reads the files of the rooms in SOURCES anew at every call. A room that is missing counts as empty. Raises OSError
-    for a file that cannot be read.
-    """
+    """Return the SHA-256, hexadecimal, of all sources that `plan` and `step` run; the compiled build gives the same."""
     root, digest = Path(__file__).parents[2], hashlib.sha256()
     for room in SOURCES:
         for path in sorted((root / room).glob("**/*.py")):
@@ -183,31 +159,19 @@ def platform_name() -> str:
 
 
 def _brake(scene: Scene) -> tuple[ElementContact, FieldOfGap, float]:
-    """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent by volume.
-
-    Raises DomainError for an unknown insert, and as `Insert.elastomer` and `FieldOfGap`.
-    """
+    """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent by volume."""
     fitted = insert(scene.insert.name)
     permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
     return Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction
 
 
 def _pad(finger: Finger, model: ForceModel) -> tuple[ElementContact, FieldOfGap, float]:
-    """Return a tactile pad's contact, the mean field in the pad over the gap, and its share of iron, percent by volume.
-
-    The share of iron is the least that the model was trained on; the scene's insert is not looked at.
-    """
     *_, (cip_percent, _) = model.feature_ranges
     return Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
 
 
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
-    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`, its force over the gap.
-
-    `Aim` holds the fields that the search finds near this law. Raises DomainError where the law does not hold for the
-    gaps, and for an unknown insert. Do not call it for a pad: the thesis prints no law for one, and nothing is refused
-    here.
-    """
+    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`, its force over the gap."""
     fitted, metres = scene.insert, 1e-3
     geometry = Geometry(
         fitted.inner_radius_mm * metres,
@@ -222,11 +186,7 @@ def _known_fields_mT(
     scene: Scene, model: ForceModel, contact: ElementContact, field: FieldOfGap
 ) -> tuple[tuple[float, float], bool]:
     """Return the fields, least and greatest, mT, that the scene's gaps give and the model knows, and whether its force
-    rises.
-
-    False: it may fall somewhere when a pad is pressed to another depth than the portrait's. Raises DomainError where no
-    such range is left, and where the force falls at the portrait's depth or displacement.
-    """
+    rises."""
     low_mT, high_mT = model.field_range_mT
     low_mT = max(low_mT, field.field_mT(scene.insert.gap_open_mm))
     high_mT = min(high_mT, field.field_mT(scene.insert.gap_closed_mm))
@@ -247,11 +207,7 @@ def _known_fields_mT(
 
 
 def _stable_margins(config: Config) -> Margins:
-    """Return the stability margins of the position loop at the configured control rate.
-
-    Raises ConfigError where the phase margin is under MIN_PHASE_MARGIN_DEG, or the gain margin under
-    MIN_GAIN_MARGIN_DB.
-    """
+    """Return the stability margins of the position loop at the configured control rate."""
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
     if stability.phase_margin_deg < MIN_PHASE_MARGIN_DEG or stability.gain_margin_dB < MIN_GAIN_MARGIN_DB:
         raise ConfigError(
@@ -263,10 +219,7 @@ def _stable_margins(config: Config) -> Margins:
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
-    """Raise ConfigError where the voltage cannot open the scene's closed gap against friction and the magnets.
-
-    Only half of the supply's voltage at the duty limit counts.
-    """
+    """Raise ConfigError where the voltage cannot open the scene's closed gap against friction and the magnets."""
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
     needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
     max_V = config.position.duty_limit * motor.supply_V / 2.0
@@ -278,11 +231,7 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
 
 
 def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
-    """Return what the gaps do not reach of the scene's greatest and standby forces, a line each with what is allowed.
-
-    Empty where they reach both. Standby has to be above the open gap's force, by STANDBY_N at most, and not above the
-    scene's greatest force. A scene may leave it out. The scene's least force may be any.
-    """
+    """Return what the gaps do not reach of the scene's greatest and standby forces, a line each with what is allowed."""
     # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
     unmet = []
     if not reach.min_N < scene.force.most_N <= reach.max_N:
@@ -300,11 +249,7 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:
-    """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`.
-
-    The control rate is MIN_CONTROL_HZ at least, the other rates stay. Whether control is stable at these rates is
-    `build_core`'s to tell. Raises ConfigError for rates that a configuration may not have.
-    """
+    """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`."""
     if not config.rates.of_scene:
         return config
     needed = scene.bandwidth
@@ -326,12 +271,7 @@ def _slowed(config: Config, scene: Scene) -> Config:
 
 
 def approaches_s(core: Core) -> list[tuple[float, float]]:
-    """Return forces at which a brake may wait, N, each with the time of its gap to the middle of the scene's forces, s.
-
-    The first is the force at which the scene lets the brake wait. The others are a third, two thirds and all of
-    STANDBY_N above the open gap's force. The middle is that of the first and the scene's greatest; from above it the
-    time is negative. The gap moves at its greatest speed all the way. Empty for a pad.
-    """
+    """Return forces at which a brake may wait, N, each with the time of its gap to the middle of the scene's forces, s."""
     if core.scene.element == "tactile":
         return []
     reach, force = core.portrait, core.scene.force
@@ -341,19 +281,12 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
-    """Return the smallest difference of force, N, that the device makes and measures at forces up to `most_N`.
-
-    It is the greater of the sensor's step and of what SETTLES_MM changes at `most_N`, or at the nearer end of `reach`.
-    Raises DomainError for NaN.
-    """
+    """Return the smallest difference of force, N, that the device makes and measures at forces up to `most_N`."""
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
 def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
-    """Return that the scene's resolution is finer than the device makes and measures, and what is allowed, as one line.
-
-    Empty where it is not. Raises DomainError as `least_resolution_N`.
-    """
+    """Return that the scene's resolution is finer than the device makes and measures, and what is allowed, as one line."""
     least_N = least_resolution_N(reach, scene.force.most_N)
     if scene.force.resolution_N >= least_N:
         return []
@@ -364,10 +297,7 @@ def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
-    """Return which of the handle's rates, or of a finger's depth and rate, the model was not trained on; empty if none.
-
-    A line each, with key, value and what is allowed.
-    """
+    """Return which of the handle's rates, or of a finger's depth and rate, the model was not trained on; empty if none."""
     depths_mm, rates_mm_s, *_ = model.feature_ranges
     handle, finger = scene.handle, scene.finger
     stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
@@ -381,11 +311,7 @@ def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
 
 
 def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
-    """Return what ideal carriages at the gap's speed miss of the scene's signal; None where the scene states no signal.
-
-    The first LOOKED_AT_S of the signal count, within what scene and device give. Its file is read from the folder
-    `beside`. Raises ConfigError for a file that is refused or cannot be read.
-    """
+    """Return what ideal carriages at the gap's speed miss of the scene's signal; None where the scene states no signal."""
     if scene.signal is None:
         return None
     # a scene whose greatest force is out of reach is asked for what is in reach
@@ -398,10 +324,7 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
 
 def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
     """Return that ideal carriages miss the scene's signal by more than its tolerance, with the tolerance that they
-    keep.
-
-    One line; empty where they do not, and for a scene without a signal (`miss` None).
-    """
+    keep."""
     if miss is None or miss.rms_N <= scene.force.tolerance_rms_N:
         return []
     worst = ", ".join(
@@ -416,12 +339,7 @@ def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
 
 
 def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
-    """Return that an opening gap could release the force faster than the scene allows, with what it has to allow.
-
-    One line; empty where it could not. Three things are taken at their worst: the weakest believable device, the
-    greatest force that the ceiling lets it make, and the speed. The speed is that of the device's own opening or the
-    gap's, whichever is greater.
-    """
+    """Return that an opening gap could release the force faster than the scene allows, with what it has to allow."""
     # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
     # ceiling lets no gap make more than CEILING times the scene's greatest
     opening_mm_s, key = max(
@@ -440,14 +358,7 @@ def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    """Return the search that `scene` names, with its settings; a setting that the scene leaves out is the usual one.
-
-    Raises DomainError for an unknown name, and for settings that the search does not have. Whether the search fits the
-    model is `inverse.choice.build`'s to tell.
-
-    Where the scene leaves the choice ("auto"), it is the portrait if the handle's rate is no term. With the rate it is
-    Newton's method where the force `rises` with the field, else the k-nearest search.
-    """
+    """Return the search that `scene` names, with its settings; a setting that the scene leaves out is the usual one."""
     wanted = scene.solver
     if wanted.name == AUTO:
         if not scene.terms.rate:

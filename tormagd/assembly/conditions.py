@@ -10,20 +10,12 @@ from tormagd.safety.operating_state import Conditions, DeviceRequest
 
 
 def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool:
-    """Tell whether the carriages' positions are known: the device says that it is homed, and a step has taken them.
-
-    False without a `measurement` of the device (None), and before the first step `measured` one (None).
-    """
+    """Tell whether the carriages' positions are known: the device says that it is homed, and a step has taken them."""
     return measurement is not None and measured is not None and measured.is_homed
 
 
 def is_busy(measurement: Measurement | None, pending: DeviceRequest, stepper: Stepper, output: Duty | None) -> bool:
-    """Tell whether the device homes or opens, or has not acknowledged a request yet: home, retract or clear.
-
-    `pending` is the unacknowledged request. One of the stepper's that `output`, the newest step's, does not carry yet
-    counts too; before the first step (None) it does not. A device that has homed is busy until a step has taken its
-    positions, unless it has to home again. Without a `measurement` (None) it is not busy.
-    """
+    """Tell whether the device homes or opens, or has not acknowledged a request yet: home, retract or clear."""
     if measurement is None:
         return False
     is_asked = output is not None and output.request_number != stepper.safety.request_number
@@ -42,13 +34,7 @@ def conditions(
     *,
     sensor_doubted: bool,
 ) -> Conditions:
-    """Return the conditions at `now_s`, on the host's clock, on which operators' commands are taken.
-
-    `output` is the newest step's, None before the first. `sensor_doubted` tells whether the plans doubt the force
-    sensor. `cause` is a stream that stopped, else the connection's own. Without a measurement `connected` and all that
-    needs one are False, round trip and drift 0. Skew and the greatest values that a command may find are not among
-    them: `Watch.command_conditions` adds these. Nothing changes, and nothing is waited for.
-    """
+    """Return the conditions at `now_s`, on the host's clock, on which operators' commands are taken."""
     measurement = connection.measurement
     old = "" if measurement is None else _late_stream(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
     return Conditions(
@@ -66,11 +52,7 @@ def conditions(
 
 
 def _late_stream(now_s: float, measurement: Measurement, timeout_s: float) -> str:
-    """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has.
-
-    Of several it is the first of State, Sense and Status. A State is late after `timeout_s`, a Sense and a Status after
-    the times of their faults, all on the host's clock. A time of NaN counts as late.
-    """
+    """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has."""
     for name, came_s, longest_s in (
         ("State", measurement.received_s, timeout_s),
         ("Sense", measurement.sensed_s, SENSE_FAULT_S),

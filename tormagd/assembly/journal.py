@@ -56,12 +56,7 @@ Entry = str | TickRecord | tuple[Any, ...]
 
 
 class Journal:
-    """The core's inputs since the last `take`, in their order. Every method but `take` adds an entry.
-
-    An entry is STEP, a tick's record, or a tuple: its name, then what the method was given. An entry costs a reference
-    in a list: records do not change, and states are written out at once. With `is_kept` False nothing is added.
-    MAX_ENTRIES that nobody took are dropped, and MISSING stands for them.
-    """
+    """The core's inputs since the last `take`, in their order. Every method but `take` adds an entry."""
 
     def __init__(self, *, is_kept: bool = True) -> None:
         self.is_kept = is_kept
@@ -72,17 +67,11 @@ class Journal:
         self._add(STEP)
 
     def ticked(self, record: TickRecord) -> None:
-        """Note the record of a control period that is over; it has the inputs and results of the last step.
-
-        Call it after `stepped`, once for each; the record must not change any more.
-        """
+        """Note the record of a control period that is over; it has the inputs and results of the last step."""
         self._add(record)
 
     def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """Note that a plan begins at `now_s` for `setpoint`, None without a publisher; it uses the newest measurement.
-
-        The entry is (PLAN, now_s, setpoint). Whether the plan then failed, `began_afresh` says.
-        """
+        """Note that a plan begins at `now_s` for `setpoint`, None without a publisher; it uses the newest measurement."""
         self._add((PLAN, now_s, setpoint))
 
     def foresaw(self) -> None:
@@ -98,8 +87,7 @@ class Journal:
         self._add((TEACH, learned))
 
     def confirmed(self, what: str) -> None:
-        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong. Other words are
-        not refused."""
+        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong."""
         self._add((CONFIRM, what))
 
     def answered(self, answer: Answer) -> None:
@@ -107,10 +95,7 @@ class Journal:
         self._add((ANSWER, answer))
 
     def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
-        """Note an operator's command, the conditions it was decided on, and whether it was refused.
-
-        The entry is (COMMAND, name, now_s, is_refused, conditions): not in the order of the arguments.
-        """
+        """Note an operator's command, the conditions it was decided on, and whether it was refused."""
         self._add((COMMAND, name, now_s, is_refused, conditions))
 
     def latched(self, fault: Fault) -> None:
@@ -130,16 +115,11 @@ class Journal:
         self._add((WROTE, now_s, raw, unsent))
 
     def connected(self, memory: Any) -> None:
-        """Note that a conversation begins from the state `memory`; None: that it is over. As `connection.Traffic`."""
+        """Note that a conversation begins from the state `memory`; None: that it is over."""
         self._add((CONNECTED, memory))
 
     def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
-        """Note the whole state of the core and of the conversation (None without one): a replay may begin here.
-
-        The states of `stepper` and `planner` are copied as plain data. `connection` is taken as it is, as
-        `Connection.memory` gives it. Where the journal is not kept nothing is done. Raises TypeError for a state that
-        `exact.plain` refuses.
-        """
+        """Note the whole state of the core and of the conversation (None without one): a replay may begin here."""
         if self.is_kept:
             self._add((STATE, plain(stepper), plain(planner), connection))
 
@@ -149,10 +129,7 @@ class Journal:
 
     def take(self) -> list[Entry]:
         """Return the entries since the last `take`, the oldest first, and remove them from the journal; empty where
-        none came.
-
-        MISSING among them says that entries before it were lost. What follows can be rerun only from the next snapshot.
-        """
+        none came."""
         entries, self._entries = self._entries, []
         return entries
 
@@ -166,26 +143,19 @@ class Journal:
 
 
 class Packer:
-    """Writer of entries as one growing msgpack array.
-
-    Values are written as `exact.plain` gives them; a setpoint is a list of its fields, in its constructor's order.
-    """
+    """Writer of entries as one growing msgpack array."""
 
     def __init__(self) -> None:
         self._bytes, self._count = bytearray(_NONE), 0
 
     def add(self, entries: Sequence[Entry]) -> None:
-        """Append entries; none changes nothing.
-
-        Raises TypeError, ValueError or OverflowError for one that cannot be written. Those before it stay. Part of it
-        may stay too, and spoil what follows: drop the packer then, or all that `take` gives next.
-        """
+        """Append entries; none changes nothing."""
         for entry in entries:
             _ENCODER.encode_into(entry, self._bytes, -1)
             self._count += 1
 
     def take(self) -> bytes:
-        """Return the array's bytes, and begin an empty array. Without entries they are those of an empty array."""
+        """Return the array's bytes, and begin an empty array."""
         _LENGTH.pack_into(self._bytes, 1, self._count)
         packed = bytes(self._bytes)
         self._bytes, self._count = bytearray(_NONE), 0
@@ -193,7 +163,7 @@ class Packer:
 
 
 def _of_value(thing: Any) -> Any:
-    """Return a value as msgpack can write it. Raises TypeError for one that `exact.plain` refuses."""
+    """Return a value as msgpack can write it."""
     if type(thing) is TimedSetpoint:
         return [getattr(thing, name) for name in thing.__match_args__]
     return plain(thing)

@@ -33,13 +33,7 @@ class ProfileError(ValueError):
 
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is known of a device, by its serial number, with an insert and a model, by its fingerprint.
-
-    `saved_ns` is CLOCK_REALTIME. The other fields are those of `Learned`, with a standard deviation for the variance.
-    Old profiles have no `lag_s`: it is 0, nothing known of the carriages' lag. `gains` is the fingerprint of the
-    configuration's [motor] and [position] with which that was learned; empty in old ones. Bounds are checked where a
-    file is read, not where one is made.
-    """
+    """What is known of a device, by its serial number, with an insert and a model, by its fingerprint."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
@@ -57,12 +51,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     def learned(self, now_ns: int, gains: str = "") -> Learned:
         """Return what is still known of the device at CLOCK_REALTIME `now_ns`, driven with these `gains`, as of
-        `gains_of`.
-
-        Scale and offset become as uncertain as a day makes them, even a second after; without covariance. A sensor's
-        zero saved ZERO_LASTS_S or more from `now_ns`, before or after, is 0. The factor at a creep stays, and with the
-        same `gains` the carriages' lag; else it is 0. The profile stays.
-        """
+        `gains_of`."""
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
         is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
@@ -79,12 +68,7 @@ def gains_of(config: Config) -> str:
 def profile_of(
     learned: Learned, *, serial_number: int, insert: str, model: str, saved_ns: int, gains: str = ""
 ) -> Profile:
-    """Return the profile that keeps `learned` of the device `serial_number` with the insert `insert`.
-
-    `model` and `gains` are fingerprints, SHA-256 in hexadecimal; empty `gains` stand for none. `saved_ns` is the time
-    of saving, CLOCK_REALTIME. A scale less certain than an unseen device's is kept as certain as that. Nothing is
-    checked, and no file is written.
-    """
+    """Return the profile that keeps `learned` of the device `serial_number` with the insert `insert`."""
     return Profile(
         v=VERSION,
         serial_number=serial_number,
@@ -103,13 +87,7 @@ def profile_of(
 
 
 def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: DeviceBounds) -> Profile:
-    """Return the profile in `data`, the bytes of a profile's file; no file is read here.
-
-    `serial_number`, `insert` and `model` are those in use; `model` is the model's fingerprint, SHA-256 in hexadecimal.
-    Raises ProfileError for data that are no profile, and for a profile of another device,
-    insert or model. Values beyond the `bounds` of a device raise ProfileError, too. Its age and `gains` are not looked
-    at.
-    """
+    """Return the profile in `data`, the bytes of a profile's file; no file is read here."""
     try:
         profile = msgspec.json.decode(data, type=Profile)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -17,11 +17,7 @@ class Point(NamedTuple):
 
 
 class Missed(NamedTuple):
-    """What ideal carriages miss of a signal.
-
-    `rms_N` is the RMS error, `share` the share of the steps in which the signal is faster than the device. `worst` are
-    the SHOWN points where it is too fast by the largest factor, one a tenth of the signal's range, worst first.
-    """
+    """What ideal carriages miss of a signal."""
 
     rms_N: float
     share: float
@@ -29,13 +25,7 @@ class Missed(NamedTuple):
 
 
 def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_speed_mm_s: float) -> Missed:
-    """Return what ideal carriages miss of forces (n >= 2, N) at rising times (n, s), which they follow without preview.
-
-    They begin at the first force, and change it by at most what their top speed `gap_speed_mm_s` gives at the force
-    where they are. `shown` gives the force over the gap; hold the forces within its own, as none out of reach is
-    noticed. The mean is over the n - 1 steps. Raises DomainError for NaN. One force, or equal times, raise
-    ZeroDivisionError, no force ValueError; fewer times raise IndexError.
-    """
+    """Return what ideal carriages miss of forces (n >= 2, N) at rising times (n, s), which they follow without preview."""
     tenth_N = max(max(forces_N) - min(forces_N), 1e-9) / 10.0
     furthest: dict[int, Point] = {}
     at_N, squares, outside = forces_N[0], 0.0, 0

@@ -21,11 +21,7 @@ SWITCH = "look at the switch, its cable and the coupling between motor and screw
 
 
 def link(known: Known) -> Course[list[Finding]]:
-    """Watch a device for REST_S without a setpoint, in any state but FAULT, and judge what carries every other step.
-
-    Six findings: round trip, ms; periods with the device's answer, messages lost, and periods that the host kept, % of
-    all; supply, V; temperature, °C. What no tick says is not measured. Raises StoppedError for a fault.
-    """
+    """Watch a device for REST_S without a setpoint, in any state but FAULT, and judge what carries every other step."""
     ticks = yield from watch(REST_S, states=ANY_STATE)
     steps_s = np.diff(ticks["monotonic_s"])
     lost = ticks["link_unanswered"] + ticks["link_damaged"]
@@ -63,12 +59,7 @@ def link(known: Known) -> Course[list[Finding]]:
 
 
 def homing(_known: Known) -> Course[list[Finding]]:
-    """Disable the device, wait until its gap is open, home it, and return three findings.
-
-    They are how long homing takes, s, and where the left and the right switch then are, mm by the device's encoders.
-    The device is left homed and DISABLED. Raises StoppedError for a fault, and where it takes longer than BEGINS_S,
-    OPENING_S or HOMING_S allow.
-    """
+    """Disable the device, wait until its gap is open, home it, and return three findings."""
     yield from given("disable", lambda row: bool(row[_STATE] == "DISABLED"), BEGINS_S)
     yield from watch(TOLD_S, states=ANY_STATE)
     yield from given("", _is_idle, OPENING_S)
@@ -82,12 +73,7 @@ def homing(_known: Known) -> Course[list[Finding]]:
 
 
 def weight(known: Known) -> Course[list[Finding]]:
-    """Read the force sensor without and with a weight on it, and return one finding: its gain, read over hung.
-
-    `known.weight_N` may not be None. The weight shows once the reading has changed by 0.4 of it, either way; it then
-    swings out for SWINGS_S. Raises StoppedError where none shows within HUNG_S, and for a fault. Without a reading
-    before, none ever shows.
-    """
+    """Read the force sensor without and with a weight on it, and return one finding: its gain, read over hung."""
     assert known.weight_N is not None, "the step is left out without one"
     before = yield from watch(REST_S, states=ANY_STATE)
     begins_N = float(np.nanmean(before["device_force_N"]))
@@ -104,12 +90,7 @@ def weight(known: Known) -> Course[list[Finding]]:
 
 
 def way_back(_known: Known) -> Course[list[Finding]]:
-    """Disable the device, which opens the gap, and look whether the carriages meet their switches where they left them.
-
-    Four findings: how long opening takes, s; where the left and the right switch first closed, mm; how fast the
-    device's clock runs, ppm. A switch that did not close is not measured. The device is left DISABLED. Raises
-    StoppedError for a fault, and after OPENING_S.
-    """
+    """Disable the device, which opens the gap, and look whether the carriages meet their switches where they left them."""
     ticks = yield from given("disable", _is_idle, OPENING_S)
     at = []
     for side in SIDES:

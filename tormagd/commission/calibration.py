@@ -19,13 +19,7 @@ DIGITS = "{:.4g}"
 
 
 def calibration(report: Report, config: Config) -> str:
-    """Return the TOML that `load_calibration` reads: serial_number, [motor], [position] and [trim].
-
-    `config` was in force, and what the report has as shares is of its motor. [motor] is the mean of both sides; it is
-    left out where one of its eight findings is not known. [position] is left out then, too, and where no gain is
-    robust; [trim] where the device's force over the model's is not known. Rows that failed are not left out: the first
-    line, a comment, counts them.
-    """
+    """Return the TOML that `load_calibration` reads: serial_number, [motor], [position] and [trim]."""
     motor, values = config.motor, report.values
     found = {
         name: nominal * (values.get(f"left {name}", math.nan) + values.get(f"right {name}", math.nan)) / 2.0
@@ -53,11 +47,7 @@ def calibration(report: Report, config: Config) -> str:
 
 
 def _position(config: Config) -> list[str]:
-    """Return the lines of the table [position], with the stiffest gains that are robust around the motor of `config`.
-
-    Before them goes a comment with the margins. Robust is at the control rate, with resistance and inertia off by
-    SURELY. An empty list where no gains are.
-    """
+    """Return the lines of the table [position], with the stiffest gains that are robust around the motor of `config`."""
     position = config.position
     grid = itertools.product(DERIVATIVE_TIMES_S, (position.derivative_filter_s,), (position.integral_time_s,))
     period_s = 1.0 / config.rates.control_hz

@@ -60,10 +60,7 @@ CLEAR_N = 0.1
 
 
 class Known(NamedTuple):
-    """The daemon's configuration, its control period, s, and the least and most force that it gives, N.
-
-    `weight_N` is the weight that a person hangs up; None: none is at hand. No value is checked.
-    """
+    """The daemon's configuration, its control period, s, and the least and most force that it gives, N."""
 
     config: Config
     period_s: float
@@ -78,10 +75,7 @@ class Known(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """What a course asks for: a force, N (None: no setpoint), and a command, given once ("": none).
-
-    `preview_N` are the forces that follow, PREVIEW_STEP_S apart; empty where none are told.
-    """
+    """What a course asks for: a force, N (None: no setpoint), and a command, given once ("": none)."""
 
     force_N: float | None = None
     command: str = ""
@@ -99,10 +93,7 @@ Course: TypeAlias = Generator[Asked, Heard, Found]
 
 
 class StoppedError(Exception):
-    """A course that cannot go on: a code, the cause in a sentence, what to do.
-
-    `rows` are the ticks that `watch` had until then, `found` the findings that they still give; both may be empty.
-    """
+    """A course that cannot go on: a code, the cause in a sentence, what to do."""
 
     def __init__(self, code: str, cause: str, remedy: str, rows: Sequence[Row] = ()) -> None:
         super().__init__(cause)
@@ -121,12 +112,7 @@ class Device(Protocol):
 
 
 def drive(course: Course[Found], device: Device) -> Found:
-    """Run `course` on `device` to its end, and return what it found.
-
-    A command goes out before the force that is asked with it. Raises what the course (StoppedError) and the device
-    raise. Whatever is raised, KeyboardInterrupt too, the device is first given `disable`, which opens the gap. At a
-    regular end nothing is commanded: the gap stays where it is.
-    """
+    """Run `course` on `device` to its end, and return what it found."""
     try:
         asked = next(course)
         while True:
@@ -142,11 +128,7 @@ def drive(course: Course[Found], device: Device) -> Found:
 
 
 def columns_of(rows: Iterable[Row]) -> Columns:
-    """Return the ticks as one array for each of COLUMNS, by name; without ticks all are empty.
-
-    NUMBERS are floats, NaN where a value is None. WORDS are objects as they came: text, None, or a sequence of texts.
-    Raises ValueError for rows of different lengths; that they are as long as COLUMNS is not checked.
-    """
+    """Return the ticks as one array for each of COLUMNS, by name; without ticks all are empty."""
     by_name = zip(*rows, strict=True)
     table = dict(zip(COLUMNS, by_name, strict=False)) or dict.fromkeys(COLUMNS, ())
     return {
@@ -164,12 +146,7 @@ def watch(
     *,
     is_told_ahead: bool = False,
 ) -> Course[Columns]:
-    """Ask for a force, N, over the time, s, for `lasts_s`, and return all ticks as `columns_of`.
-
-    Time counts from the first answer, with ticks or without; the columns are empty where none comes. None for `force_N`
-    publishes no setpoint. `is_told_ahead` also tells the PREVIEW_STEPS forces that follow. Raises StoppedError for a
-    tick in another operating state than `states`; its `rows` are the ticks before.
-    """
+    """Ask for a force, N, over the time, s, for `lasts_s`, and return all ticks as `columns_of`."""
     rows: list[Row] = []
     ahead_s = [PREVIEW_STEP_S * number for number in range(1, 1 + PREVIEW_STEPS)] if is_told_ahead else []
     begun_s, t_s = math.nan, 0.0
@@ -184,12 +161,7 @@ def watch(
 
 
 def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: float | None = None) -> Course[Columns]:
-    """Give `command` once, and wait until the newest tick `is_done`; return all ticks heard as `columns_of`.
-
-    An empty `command` gives none, and only waits. `force_N` is asked for meanwhile; None: no setpoint is published.
-    Raises StoppedError where it takes over `most_s`, and for a tick in FAULT. A fault in the first ticks heard, which
-    may be from before the command, is not looked at.
-    """
+    """Give `command` once, and wait until the newest tick `is_done`; return all ticks heard as `columns_of`."""
     begun_s, fresh = yield Asked(force_N, command)
     rows = list(fresh)
     while not (rows and is_done(rows[-1])):
@@ -203,11 +175,7 @@ def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: 
 
 
 def handle_moved(force_N: float) -> Course[None]:
-    """Ask for `force_N` until a tick shows the handle moving at MOVING_MM_S or more, either way; return nothing.
-
-    Raises StoppedError after HANDLE_PATIENCE_S, and for a tick in another operating state than ENABLED; the first ticks
-    heard are not looked at for that.
-    """
+    """Ask for `force_N` until a tick shows the handle moving at MOVING_MM_S or more, either way; return nothing."""
     begun_s, fresh = yield Asked(force_N)
     while not any(abs(row[PLACES["handle_rate_mm_s"]] or 0.0) >= MOVING_MM_S for row in fresh):
         now_s, fresh = yield Asked(force_N)
@@ -221,11 +189,7 @@ def handle_moved(force_N: float) -> Course[None]:
 
 
 def _require_state(fresh: Sequence[Row], states: Sequence[str], before: Sequence[Row] = ()) -> None:
-    """Raise StoppedError, with `before` as its `rows`, for a tick in another operating state than `states`.
-
-    Its code is the tick's first fault by name, STOPPED last, with that fault's cause and remedy. Without a fault it is
-    `not_enabled`. Raises ValueError for a fault that `Fault` does not know.
-    """
+    """Raise StoppedError, with `before` as its `rows`, for a tick in another operating state than `states`."""
     for row in fresh:
         state = row[PLACES["operating_state"]]
         if state not in states:

@@ -14,11 +14,7 @@ SURE = 2.0
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One row of a commissioning: a value in `unit`, which passes from `least` to `most`, these included.
-
-    The truth lies within `half_width` of the value, 95 times of 100; 0 where no interval is known. `value` None: it
-    could not be measured, and counts as failed. `remedy` says what to do where it fails.
-    """
+    """One row of a commissioning: a value in `unit`, which passes from `least` to `most`, these included."""
 
     name: str
     value: float | None
@@ -30,7 +26,6 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def is_fine(self) -> bool:
-        """Whether the value is known and allowed."""
         return self.value is not None and self.least <= self.value <= self.most
 
     @property
@@ -43,7 +38,6 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def allowed(self) -> str:
-        """What is allowed, for a person."""
         return f"{self.least:.4g} to {self.most:.4g}"
 
 
@@ -56,12 +50,7 @@ def finding(
     scale: float = 1.0,
     half_width: float = 0.0,
 ) -> Finding:
-    """Return the finding of the mean of `values`, or of one number, times `scale`, which turns it into `unit`.
-
-    Values that are not finite are left out; where none is left it is not measured. `allowed` are least and most, in
-    `unit`. The interval is of the means of BLOCKS parts of `values`, in their order. Fewer than 2 * BLOCKS finite ones
-    have `half_width`, which is in `unit`, too.
-    """
+    """Return the finding of the mean of `values`, or of one number, times `scale`, which turns it into `unit`."""
     known = np.atleast_1d(np.asarray(values, dtype=np.float64)) * scale
     known = known[np.isfinite(known)]
     if not known.size:

@@ -23,10 +23,7 @@ TICK_S = 1e-3
 
 
 class Corners(NamedTuple):
-    """How far the motor's parameters may be off, as a share, and the loop's periods, s, at which margins have to hold.
-
-    `parameters` are those of the motor that vary.
-    """
+    """How far the motor's parameters may be off, as a share, and the loop's periods, s, at which margins have to hold."""
 
     share: float = 0.3
     periods_s: Sequence[float] = (0.8 * TICK_S, TICK_S, 1.2 * TICK_S)
@@ -45,11 +42,7 @@ class Tuning(NamedTuple):
 
 
 def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, float]:  # noqa: B008  # immutable
-    """Return the least margins of the position loop over every corner: `gain_margin_dB`, `phase_margin_deg`, `corners`.
-
-    `corners` is their number. Motor and gains are those of `config`; the loop's periods are those of `corners`,
-    whatever rate `config` has. Both margins may come from different corners.
-    """
+    """Return the least margins of the position loop over every corner: `gain_margin_dB`, `phase_margin_deg`, `corners`."""
     gain, phase = [], []
     factors = (1.0 - corners.share, 1.0 + corners.share)
     for chosen in itertools.product(factors, repeat=len(corners.parameters)):
@@ -69,13 +62,7 @@ def tunings(
     grid: Iterable[tuple[float, float, float]],
     corners: Corners = Corners(),  # noqa: B008  # immutable
 ) -> Iterator[Tuning]:
-    """Yield the largest robust proportional gain for every point of the grid that has one, with its margins.
-
-    A point is derivative time, derivative filter and integral time, s. Robust is with MIN_GAIN_MARGIN_DB and
-    MIN_PHASE_MARGIN_DEG or more at every corner. The gain, duty per mm, is rounded down to a tenth and at most
-    LARGEST_GAIN_PER_MM. A point that has none under that is left out. The motor is that of `config`, which stays as it
-    is. A point is searched when it is asked for.
-    """
+    """Yield the largest robust proportional gain for every point of the grid that has one, with its margins."""
     for derivative_s, filter_s, integral_s in grid:
         position = msgspec.structs.replace(
             config.position,

@@ -47,16 +47,12 @@ BACK_EMF = "voltage for speed over the configured"
 INERTIA = "inertia over motor.inertia_kg_m2"
 FRICTION = "friction over the configured"
 ALLOWED = {RESISTANCE: (0.75, 1.25), BACK_EMF: (0.88, 1.12), INERTIA: (0.6, 2.2), FRICTION: (0.75, 1.25)}
-"""By the name of a finding. Most friction is the gearbox's: a screw that runs dry adds a fifth. One that is dry by half
-adds 3 to 6 %: it is not told from other gains, which add up to 10, and other gearboxes."""
+"""By the name of a finding. Most friction is the gearbox's: a screw that runs dry adds a fifth."""
 REMEDIES = {RESISTANCE: PLUG, BACK_EMF: SCALE, INERTIA: COUPLED, FRICTION: GREASE}
 
 
 class Driven(NamedTuple):
-    """What one carriage's motor shows: ohm, V s and kg m2 as in `[motor]`, each with the half width of its interval.
-
-    Both numbers of a pair are NaN where it does not show.
-    """
+    """What one carriage's motor shows: ohm, V s and kg m2 as in `[motor]`, each with the half width of its interval."""
 
     resistance_ohm: tuple[float, float]
     back_emf_V_s: tuple[float, float]
@@ -64,10 +60,7 @@ class Driven(NamedTuple):
 
 
 def nominals(motor: Motor) -> dict[str, float]:
-    """Return what the findings on a motor are shares of, by their names, which a side goes before: `left NAME`.
-
-    These are resistance, ohm, back EMF, V s, inertia, kg m2, and the torque of the dry friction, N m; NaN for none.
-    """
+    """Return what the findings on a motor are shares of, by their names, which a side goes before: `left NAME`."""
     return {
         RESISTANCE: motor.resistance_ohm,
         BACK_EMF: motor.back_emf_V_s,
@@ -77,13 +70,7 @@ def nominals(motor: Motor) -> dict[str, float]:
 
 
 def carriages(known: Known) -> Course[list[Finding]]:
-    """Go slowly, jump and swing over the range, with the device enabled and its handle moved, and return 15 findings.
-
-    Enables the device first, and waits for the handle, as `ready`. For each side the findings are gain, lag, ms, and
-    bandwidth, Hz, of the answer to sines. Then come, for each side, resistance, back EMF, inertia and friction, as
-    shares of those in [motor]. Last is the loop's gain margin, dB, with the motor that was found. The device stays
-    ENABLED. Raises StoppedError as `ready`, and where a fault or a command ends ENABLED.
-    """
+    """Go slowly, jump and swing over the range, with the device enabled and its handle moved, and return 15 findings."""
     levels_N = [known.force_N(share) for share in JUMP_SHARES]
     yield from ready(levels_N[0])
     times_s, forces_N = (0.0, SLOW_S, 2.0 * SLOW_S), (levels_N[0], known.most_N, levels_N[0])
@@ -108,12 +95,7 @@ def _sine(middle_N: float, swing_N: float, at_Hz: float) -> Callable[[float], fl
 
 
 def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
-    """Return how one carriage, `left` or `right`, answers the sines: gain and lag at AT_HZ, and its bandwidth.
-
-    `swings` are the ticks of each sine by its frequency, Hz, AT_HZ among them, else KeyError. The gain is the
-    carriage's swing over half of the gap reference's, the lag behind that in ms. Both are not measured where the
-    reference stands. The bandwidth, Hz, is as `_bandwidth_Hz`: what a carriage follows in swing and lag.
-    """
+    """Return how one carriage, `left` or `right`, answers the sines: gain and lag at AT_HZ, and its bandwidth."""
     ratios = {at_Hz: _ratio(sine, side, at_Hz) for at_Hz, sine in swings.items()}
     lag_s = -cmath.phase(ratios[AT_HZ]) / (math.tau * AT_HZ)
     most_Hz = max(SINES_HZ)
@@ -131,12 +113,7 @@ def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
 
 
 def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
-    """Return up to which frequency, Hz, a carriage follows, by its ratio at each; the highest where it follows all.
-
-    `ratios` are those of `_ratio` by frequency, Hz. A carriage follows with at least MIN_RATIO of the swing, at most
-    MAX_BEHIND late. Between two frequencies what it lacks counts as linear over the logarithm of the frequency. 0 where
-    it does not follow the lowest, or the ratio there is NaN. NaN where all under a ratio of NaN are followed.
-    """
+    """Return up to which frequency, Hz, a carriage follows, by its ratio at each; the highest where it follows all."""
     lacks = [
         (at_Hz, max(MIN_RATIO / max(abs(it), 1e-9), abs(cmath.phase(it)) / MAX_BEHIND))
         for at_Hz, it in sorted(ratios.items())
@@ -150,10 +127,7 @@ def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
 
 
 def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
-    """Return a carriage's swing at `at_Hz` over half of the gap reference's: its size and, as its angle, its lead, rad.
-
-    Counted are whole turns after the first. A carriage that lags has a negative angle. NaN where the reference stands.
-    """
+    """Return a carriage's swing at `at_Hz` over half of the gap reference's: its size and, as its angle, its lead, rad."""
     times_s = ticks["monotonic_s"] - ticks["monotonic_s"][0]
     whole = (times_s >= 1.0 / at_Hz) & (times_s < math.floor(SINE_S * at_Hz) / at_Hz)
     turning = np.exp(-2j * math.pi * at_Hz * times_s[whole])
@@ -165,11 +139,7 @@ def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
 
 
 def _driven(known: Known, ticks: Columns, side: str) -> Driven:
-    """Return what a side's motor shows of itself while its carriage moves; NaN where that is too little.
-
-    Two regressions in the units of the carriage give it. Windings: V = R i + L di/dt + K v + V0. Gearbox: i = m a +
-    sign(v) c + p(x) + d v, where p is as the magnets' pull over the gap.
-    """
+    """Return what a side's motor shows of itself while its carriage moves; NaN where that is too little."""
     motor, period_s = known.config.motor, known.period_s
     volts, current_A, slope_A_s, speed_m_s, acceleration, moves, window = smoothed(period_s, ticks, side)
     pull = smooth((ticks["left_mm"] + ticks["right_mm"] + PULL_DEPTH_MM) ** -4.0, window)
@@ -190,11 +160,7 @@ def _driven(known: Known, ticks: Columns, side: str) -> Driven:
 
 
 class Smoothed(NamedTuple):
-    """One carriage's columns, a row for each of n ticks, without the encoder's steps; all are smoothed alike.
-
-    `moves` is True where the carriage has gone one way for the whole window. Opening is positive. The first and the
-    last `window` rows are blurred by the ends.
-    """
+    """One carriage's columns, a row for each of n ticks, without the encoder's steps; all are smoothed alike."""
 
     volts: Array
     current_A: Array
@@ -206,11 +172,7 @@ class Smoothed(NamedTuple):
 
 
 def smoothed(period_s: float, ticks: Columns, side: str) -> Smoothed:
-    """Return how the carriage `side`, `left` or `right`, moved, and by which voltage and current.
-
-    `ticks` are columns (n) that are `period_s` apart, which is not checked: SIDE_duty, SIDE_current_A, SIDE_mm and
-    supply_V. NaN in one of them makes the rows around it NaN, and not moving.
-    """
+    """Return how the carriage `side`, `left` or `right`, moved, and by which voltage and current."""
     window = max(round(WINDOW_S / period_s), 1) | 1
     # a tick's duty acts until the next tick's measurement
     volts = smooth(np.roll(ticks[f"{side}_duty"], 1) * ticks["supply_V"], window)
@@ -223,20 +185,13 @@ def smoothed(period_s: float, ticks: Columns, side: str) -> Smoothed:
 
 
 def smooth(values: Array, window: int) -> Array:
-    """Return values (n) after two running means over `window` of them; towards both ends they fall to 0.
-
-    Where n is under 2 * window - 1, that many come back.
-    """
+    """Return values (n) after two running means over `window` of them; towards both ends they fall to 0."""
     kernel = np.convolve(np.full(window, 1.0 / window), np.full(window, 1.0 / window))
     return np.convolve(values, kernel, "same")
 
 
 def _motor_findings(known: Known, slow: Columns, side: str, driven: Driven) -> list[Finding]:
-    """Return a motor's resistance, back EMF, inertia and dry friction as shares of those in [motor], four findings.
-
-    `driven` has what `_driven` found of the first three, `slow` the ticks of the slow way, which shows the friction.
-    What is NaN is not measured.
-    """
+    """Return a motor's resistance, back EMF, inertia and dry friction as shares of those in [motor], four findings."""
     torque_Nm = _friction_A(known.period_s, slow, side) * driven.back_emf_V_s[0]
     seen = zip(nominals(known.config.motor).items(), (*driven, (torque_Nm, 0.0)), strict=True)
     return [
@@ -246,12 +201,7 @@ def _motor_findings(known: Known, slow: Columns, side: str, driven: Driven) -> l
 
 
 def _friction_A(period_s: float, ticks: Columns, side: str) -> float:
-    """Return the current, A, that a carriage's dry friction takes: half of what opening takes more than closing.
-
-    It is of the closer half of a slow way to and fro, where the magnets press most on the screw. `ticks` are `period_s`
-    apart. NaN where the carriage did not go both ways there. A handle that turns back makes the carriages hurry now and
-    then, which moves no median.
-    """
+    """Return the current, A, that a carriage's dry friction takes: half of what opening takes more than closing."""
     window = max(round(SMOOTH_S / period_s), 1)
     flat = np.full(window, 1.0 / window)
     current_A, place_mm = (np.convolve(ticks[f"{side}_{name}"], flat, "same") for name in ("current_A", "mm"))

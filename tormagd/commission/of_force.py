@@ -50,10 +50,7 @@ ELEMENT = (
 
 
 def enabled(force_N: float) -> Course[None]:
-    """Enable a device that is not, with `force_N` as the setpoint until then; return nothing.
-
-    It waits for the first tick, however long that takes. Raises StoppedError as `given`, after ENABLE_S.
-    """
+    """Enable a device that is not, with `force_N` as the setpoint until then; return nothing."""
     rows: Sequence[Row] = ()
     while not rows:
         _, rows = yield Asked(force_N)
@@ -62,20 +59,13 @@ def enabled(force_N: float) -> Course[None]:
 
 
 def ready(force_N: float) -> Course[None]:
-    """Enable a device that is not, at `force_N`, and wait until its handle moves. Raises as `enabled`,
-    `handle_moved`."""
+    """Enable a device that is not, at `force_N`, and wait until its handle moves."""
     yield from enabled(force_N)
     yield from handle_moved(force_N)
 
 
 def sensor(known: Known) -> Course[list[Finding]]:
-    """Hold one force for HOLD_S on a handle that is moved both ways, and return four findings on the sensor.
-
-    They are its zero, noise and resolution, mN, and the force when slow over that at speed, as a share of the model's.
-    The first fifth of the time does not count. A finding that the handle's motion does not show is not measured.
-    Enables the device first, as `ready`; it stays ENABLED. Raises StoppedError as `ready`, where a fault or a command
-    ends ENABLED, and for a handle that hardly moves.
-    """
+    """Hold one force for HOLD_S on a handle that is moved both ways, and return four findings on the sensor."""
     held_N = known.force_N(0.4)
     yield from ready(held_N)
     ticks = yield from watch(HOLD_S, lambda t_s: held_N)
@@ -109,12 +99,7 @@ def sensor(known: Known) -> Course[list[Finding]]:
 
 
 def force_over_gap(known: Known) -> Course[list[Finding]]:
-    """Go slowly over the whole range and back as RAMPS_S says, while the handle is moved, and return two findings.
-
-    They are the device's force over the model's, and by how much, mN RMS, it is off the learned curve. Enables the
-    device first, as `ready`; it stays ENABLED. Raises StoppedError where a fault or a command ends ENABLED on the way,
-    with the first finding in `found`. Raises it without any as `ready`, and for a handle that hardly moves.
-    """
+    """Go slowly over the whole range and back as RAMPS_S says, while the handle is moved, and return two findings."""
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
     times_s = np.cumsum([0.0, *(lasts_s for lasts_s in RAMPS_S for _ in range(2))])
@@ -137,23 +122,14 @@ def force_over_gap(known: Known) -> Course[list[Finding]]:
 
 
 def _strength(ticks: Columns) -> Finding:
-    """Return the device's force over the model's: what magnets, insert and the sensor's gain share.
-
-    It is the mean of the ticks at over SLIDING_MM_S; without any it is not measured.
-    """
+    """Return the device's force over the model's: what magnets, insert and the sensor's gain share."""
     slides = (np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S) & (ticks["predicted_cf"] > 0.0)
     over_model = (ticks["trim"] * ticks["measured_cf"] / ticks["predicted_cf"])[slides]
     return finding("force over the model's: magnets, insert, or sensor's gain", over_model, "", STRENGTH, ELEMENT)
 
 
 def steps(known: Known) -> Course[list[Finding]]:
-    """Step over the range as STEP_SHARES says, while the handle is moved, and return four findings.
-
-    They are the mean error and the greatest, measured less asked, mN. Then come the carriages' greatest overshoot, % of
-    a step, and how far apart they stand 99 % of the time, mm. Errors count from ARRIVED_S after each step on. Where the
-    handle stood after one step, both errors are not measured. Enables the device first, as `ready`; it stays ENABLED.
-    Raises StoppedError as `ready`, where a fault or a command ends ENABLED, and for a handle that hardly moves.
-    """
+    """Step over the range as STEP_SHARES says, while the handle is moved, and return four findings."""
     levels_N = [known.force_N(share) for share in STEP_SHARES]
     yield from ready(levels_N[1])
     yield from watch(ARRIVED_S, lambda t_s: levels_N[1])
@@ -182,12 +158,7 @@ def steps(known: Known) -> Course[list[Finding]]:
 
 
 def memory(known: Known) -> Course[list[Finding]]:
-    """Step up, hold that gap, and return one finding: the force that dies away from 0.5 to 5 s after the step, %.
-
-    It is a share of the force at 0.5 s; not measured where the handle is not moved both ways at over FAST_MM_S. Enables
-    the device first, as `ready`. It is paused for HELD_S, then ENABLED again. Raises StoppedError as `ready`, as
-    `given`, and where a fault or another command changes the operating state.
-    """
+    """Step up, hold that gap, and return one finding: the force that dies away from 0.5 to 5 s after the step, %."""
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
     yield from watch(RESTED_S, lambda t_s: low_N)
@@ -206,10 +177,7 @@ def memory(known: Known) -> Course[list[Finding]]:
 
 
 def require_sliding(ticks: Columns) -> None:
-    """Raise StoppedError where the handle moved, either way, for less than MIN_SLIDING of the ticks, or there are none.
-
-    Moving is at MOVING_MM_S or more; a rate of NaN is none.
-    """
+    """Raise StoppedError where the handle moved, either way, for less than MIN_SLIDING of the ticks, or there are none."""
     rates = ticks["handle_rate_mm_s"]
     share = float(np.mean(np.abs(rates) >= MOVING_MM_S)) if rates.size else 0.0
     if share < MIN_SLIDING:
@@ -221,7 +189,6 @@ def require_sliding(ticks: Columns) -> None:
 
 
 def _way(known: Known, ticks: Columns) -> Array:
-    """Return which way the handle goes on its encoder in each tick, 1, -1, or 0 where it stands."""
     return np.sign(np.gradient(_smooth(ticks["device_handle_mm"], round(0.02 / known.period_s))))
 
 

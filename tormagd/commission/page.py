@@ -13,10 +13,7 @@ KIT = "python -m firmware_protocol.conformance PORT --json > FILE, then --confor
 
 
 def page_of(report: Report) -> str:
-    """Return the HTML page of `report`: how it ended, the kit's checks that did not pass, and a row for each finding.
-
-    A step without findings has one row, which says that it was not done. What the report says is escaped.
-    """
+    """Return the HTML page of `report`: how it ended, the kit's checks that did not pass, and a row for each finding."""
     title = f"Commissioning of device {report.serial_number}"
     before = f"; the last one began {_date(report.last_ns)}" if report.last_ns else ""
     parts = [
@@ -34,10 +31,7 @@ def page_of(report: Report) -> str:
 
 
 def _verdict(report: Report) -> str:
-    """Return how it ended, and what failed, as HTML paragraphs.
-
-    Of a report that is not whole they also say what to do next. Checks of the kit do not count.
-    """
+    """Return how it ended, and what failed, as HTML paragraphs."""
     said = []
     if report.stopped is not None:
         stopped = report.stopped
@@ -55,11 +49,7 @@ def _verdict(report: Report) -> str:
 
 
 def _conformance(report: Report) -> str:
-    """Return `report.conformance`, the kit's checks that did not pass, as an HTML table: check, seen, expected.
-
-    It is one paragraph instead where the list is empty, as all passed, or None, as no report of the kit was given. What
-    the report says is escaped.
-    """
+    """Return `report.conformance`, the kit's checks that did not pass, as an HTML table: check, seen, expected."""
     if report.conformance is None:
         return f"<p>No report was given. The kit owns the device, so it runs without the daemon: {escape(KIT)}</p>"
     if not report.conformance:

@@ -6,12 +6,7 @@ from tormagd.commission.finding import SURE, Array
 
 
 def sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
-    """Return the covariance (p x p) of least-squares coefficients by the sandwich over blocks (Liang and Zeger 1986).
-
-    `jacobian` (n x p) are the rows of the fit, `residual` (n) is what it leaves of the target. `blocks` (n) numbers
-    each row's block: rows of one block may be correlated, blocks may not. Few blocks widen the result. Raises
-    LinAlgError where the columns depend on each other exactly. That values are finite is not checked.
-    """
+    """Return the covariance (p x p) of least-squares coefficients by the sandwich over blocks (Liang and Zeger 1986)."""
     labels, index = np.unique(blocks, return_inverse=True)
     scores = np.zeros((len(labels), jacobian.shape[1]))
     np.add.at(scores, index, jacobian * residual[:, None])
@@ -21,11 +16,7 @@ def sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
 
 
 def solved(rows: Array, target: Array, blocks: Array) -> tuple[Array, Array]:
-    """Fit `target` (n) by `rows` (n x p) in least squares; return the coefficients (p) and their covariance (p x p).
-
-    Rows of one number in `blocks` (n) may be correlated. Both results are NaN where the columns depend on each other,
-    as where there are fewer rows than columns, or one column is all 0. That `target` is finite is not checked.
-    """
+    """Fit `target` (n) by `rows` (n x p) in least squares; return the coefficients (p) and their covariance (p x p)."""
     scale, count = np.linalg.norm(rows, axis=0), rows.shape[1]
     if not (scale > 0.0).all() or np.linalg.matrix_rank(rows / scale) < count:
         return np.full(count, np.nan), np.full((count, count), np.nan)
@@ -35,9 +26,6 @@ def solved(rows: Array, target: Array, blocks: Array) -> tuple[Array, Array]:
 
 
 def fitted(rows: Array, target: Array, blocks: Array) -> tuple[Array, Array]:
-    """Fit `target` (n) by `rows` (n x p) as `solved`; return the coefficients and the half widths of their intervals.
-
-    Both have p values; an interval is SURE standard deviations to either side. NaN as in `solved`.
-    """
+    """Fit `target` (n) by `rows` (n x p) as `solved`; return the coefficients and the half widths of their intervals."""
     values, covariance = solved(rows, target, blocks)
     return values, SURE * np.sqrt(np.diag(covariance))

@@ -25,10 +25,7 @@ HANDLE = "turn the handle to and fro, about 20 turns a minute"
 
 
 class Step(NamedTuple):
-    """One step: its name, about how long it takes, s, what a person does meanwhile, and its course.
-
-    One that is `always` run prepares the device for the others, and is not left out where it was done before.
-    """
+    """One step: its name, about how long it takes, s, what a person does meanwhile, and its course."""
 
     name: str
     lasts_s: float
@@ -60,10 +57,7 @@ class Stopped(msgspec.Struct, frozen=True):
 
 
 def due(steps: Sequence[Step], known: Known, done: Mapping[str, Findings]) -> list[Step]:
-    """Return which of `steps` are to be run, in order: those not `done`, or `always` run, and `weight` only with one.
-
-    `done` are findings by step; of them only the names count.
-    """
+    """Return which of `steps` are to be run, in order: those not `done`, or `always` run, and `weight` only with one."""
     without = {"weight"} if known.weight_N is None else set()
     return [step for step in steps if step.always or step.name not in done.keys() | without]
 
@@ -74,11 +68,7 @@ def sequence(
     begins: Callable[[Step], object],
     ends: Callable[[Step, Findings], object],
 ) -> Course[Stopped | None]:
-    """Run the `steps`, in order, and return why it stopped early; None where all were done.
-
-    `begins` is called before each step, `ends` behind it with its findings. A StoppedError ends the sequence: `ends`
-    gets the findings that it still has, if any, and the gap is told to open. What a device raises is raised.
-    """
+    """Run the `steps`, in order, and return why it stopped early; None where all were done."""
     for step in steps:
         begins(step)
         try:
@@ -92,13 +82,7 @@ def sequence(
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A commissioning of one device: when it began, CLOCK_REALTIME, the findings by step, and how it ended.
-
-    `last` has the values of the one before, by name, and `last_ns` when that began; 0: there was none. `conformance`
-    are name, what was seen and what was expected of the kit's checks that did not pass; None: no report was given.
-    `weight_N` is the weight that was hung up, None without. `motor` was in force: shares of a motor, also in `last`,
-    are of that.
-    """
+    """A commissioning of one device: when it began, CLOCK_REALTIME, the findings by step, and how it ended."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)] = VERSION
     serial_number: int
@@ -113,22 +97,16 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     @property
     def is_whole(self) -> bool:
-        """Whether all steps were done."""
         return self.stopped is None and all(
             step.name in self.findings for step in STEPS if step.name != "weight" or self.weight_N is not None
         )
 
     @property
     def is_sound(self) -> bool:
-        """Whether all steps were done, every value is allowed, and no check of the kit failed."""
         return self.is_whole and not self.failed and not self.conformance
 
     def resumed(self, weight_N: float | None) -> "Report":
-        """Return the report to go on with, whose steps without findings are still to be done.
-
-        That is also the step in which it stopped, and each with a row that could not be measured. `weight_N` is the
-        weight at hand now, None without; where the step `weight` stays done, that step's stays. This one is unchanged.
-        """
+        """Return the report to go on with, whose steps without findings are still to be done."""
         stopped_in = "" if self.stopped is None else self.stopped.step
         findings = {
             step: found
@@ -140,22 +118,15 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     @property
     def failed(self) -> list[Finding]:
-        """The findings that are not allowed."""
         return [each for found in self.findings.values() for each in found if not each.is_fine]
 
     @property
     def values(self) -> dict[str, float]:
-        """The known values by name."""
         return {each.name: each.value for found in self.findings.values() for each in found if each.value is not None}
 
 
 def begun(before: Report | None, serial_number: int, now_ns: int, weight_N: float | None, motor: Motor) -> Report:
-    """Return a report without findings that begins at `now_ns`, ns of CLOCK_REALTIME, with `motor` in force.
-
-    `before` is the device's last report, None without. Its values become `last`, or its own `last` where it found
-    nothing; shares of its motor become shares of `motor`, so that both times compare. `weight_N` is the weight that is
-    to be hung up, N; None: there is none. That `before` is of the same device is not checked.
-    """
+    """Return a report without findings that begins at `now_ns`, ns of CLOCK_REALTIME, with `motor` in force."""
     report = Report(serial_number=serial_number, began_ns=now_ns, weight_N=weight_N, motor=motor)
     if before is None:
         return report

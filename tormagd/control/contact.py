@@ -22,10 +22,7 @@ PRESSED: Final = 0.9
 
 @final
 class Sliding:
-    """The sliding handle of a brake, which plans take as moving and with its friction mobilised.
-
-    There the field decides the force. Before break-away the hand chooses the force, and the inverse is ill-posed.
-    """
+    """The sliding handle of a brake, which plans take as moving and with its friction mobilised."""
 
     def __init__(self) -> None:
         self.displacement_mm: Final = MOBILISED_MM
@@ -33,14 +30,7 @@ class Sliding:
         self.slides: Final = True
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, that the force is planned for.
-
-        `setpoint` is None without a publisher, `measured` before a measurement. The displacement is the setpoint's, or
-        MOBILISED_MM where it states none. Until friction is measured to be mobilised (`is_known`), the rate is the one
-        that the setpoint states, without its sign. Otherwise the rate is the measured `sliding_mm_s`, or MOVING_MM_S
-        before a measurement. A rate below CREEP_MM_S becomes CREEP_MM_S. Nothing else is checked: what the setpoint
-        states may be far from what the model knows.
-        """
+        """Return the displacement, mm, and the rate, mm/s, that the force is planned for."""
         displacement_mm = MOBILISED_MM
         rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
         if setpoint is not None:
@@ -52,19 +42,11 @@ class Sliding:
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the motion to ask the model with for the present force: MOBILISED_MM, and the rate, mm/s, unsigned.
-
-        Ask `is_known` first: before that the hand chooses the force. A rate below CREEP_MM_S stays as it is, unlike in
-        `planned`.
-        """
+        """Return the motion to ask the model with for the present force: MOBILISED_MM, and the rate, mm/s, unsigned."""
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether friction is mobilised: whether the model can give the present force.
-
-        The handle then has gone MOBILISED_MM one way since it last turned round, and is at most GONE_BACK_MM from its
-        furthest place. Whether it moves now does not matter. NaN gives False.
-        """
+        """Tell whether friction is mobilised: whether the model can give the present force."""
         handle = measured.handle
         gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
         return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
@@ -72,10 +54,7 @@ class Sliding:
 
 @final
 class Pressing:
-    """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest.
-
-    `depth_mm` > 0 is the scene's; it is not checked.
-    """
+    """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest."""
 
     def __init__(self, depth_mm: float) -> None:
         self.displacement_mm: Final = depth_mm
@@ -83,12 +62,7 @@ class Pressing:
         self.slides: Final = False
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the depth, mm, and the rate, mm/s, that the force is planned for.
-
-        `setpoint` is None without a publisher, `measured` before a measurement. A depth or rate that the setpoint
-        states is taken, with its sign and unchecked. The others are measured once the finger `is_known`. Before, they
-        are the scene's depth and 0.
-        """
+        """Return the depth, mm, and the rate, mm/s, that the force is planned for."""
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
             depth_mm, rate_mm_s = self.motion_now(measured)
@@ -100,10 +74,7 @@ class Pressing:
         return depth_mm, rate_mm_s
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the measured depth, mm, 0 or more, and its rate, mm/s, positive inwards.
-
-        Ask `is_known` first: the model knows no finger that is less deep.
-        """
+        """Return the measured depth, mm, 0 or more, and its rate, mm/s, positive inwards."""
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
     def is_known(self, measured: Measured) -> bool:

@@ -41,10 +41,7 @@ _PAUSED: Final = OperatingState.PAUSED
 
 @final
 class Planner:
-    """Planning half of the core, for one device: turns the newest setpoint and measurement into a plan of the gap.
-
-    It holds the planning stages, whose fields are all of its state, and the newest plan, `planned`.
-    """
+    """Planning half of the core, for one device: turns the newest setpoint and measurement into a plan of the gap."""
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begin at `now_s` with the gap open and nothing known of the device."""
@@ -63,14 +60,7 @@ class Planner:
     def plan(
         self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None, is_followed: bool = True
     ) -> Plan:
-        """Make the next plan, keep it in `planned`, and return it. All planning stages take one update.
-
-        `setpoint` is None without a publisher. `measured` is None while the device is silent: nothing is learned of it.
-        `is_followed` says whether the gap follows the plans, as `Stepper` does; where it does not, they begin at the
-        measured gap. From the plan's gap the carriages' lag is learned, for the next plan. A forecast is not made here:
-        `foresee` does. Raises DomainError for a number that is not finite, a field that no gap gives, or a search's
-        answer that is too old. The stages are then half updated, and `planned` is still the last plan: call `afresh`.
-        """
+        """Make the next plan, keep it in `planned`, and return it."""
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
@@ -87,12 +77,7 @@ class Planner:
         return plan
 
     def _held_N(self, measured: Measured | None, device: DeviceFit) -> float:
-        """Return the force of `device`, N, at the gap where it is: `measured`, or open where that is None or not homed.
-
-        By as much as the newest plan's gap differs from the portrait's for its force, the measured gap is corrected
-        first. A plan that the ceiling held corrects nothing. A gap outside the portrait counts as its nearer end.
-        Changes nothing. Raises DomainError for NaN.
-        """
+        """Return the force of `device`, N, at the gap where it is: `measured`, or open where that is None or not homed."""
         portrait, planned = self._portrait, self.planned
         if measured is None or not measured.is_homed:
             return device.force_N(portrait.min_N)
@@ -103,23 +88,19 @@ class Planner:
         return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
 
     def foresee(self) -> bool:
-        """Forecast the force for the next plans, and return whether a forecast was due.
-
-        Call it after each plan, when nothing waits: a forecast takes longer than a plan.
-        """
+        """Forecast the force for the next plans, and return whether a forecast was due."""
         return self.governor.foresee()
 
     @property
     def question(self) -> Question | None:
-        """The newest plan's question to a search that runs beside the plans; None where plans search themselves."""
         return self.aim.question
 
     def answered(self, answer: Answer) -> None:
-        """Take the `answer` of the search that runs beside the plans. All plans use it until the next answer."""
+        """Take the `answer` of the search that runs beside the plans."""
         self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
-        """Replace what is known of the device by `learned`. The element's memory stays."""
+        """Replace what is known of the device by `learned`."""
         self.believe.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
@@ -128,11 +109,7 @@ class Planner:
         self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
-        """Begin anew at `now_s` after a plan that failed, with nothing known of the device or of setpoints.
-
-        The newest plan is then one that opens the gap, with the limit NO_SETPOINT. Plan numbers go on. The element's
-        memory and the handle's travel stay, and so does a `question` to a search beside the plans.
-        """
+        """Begin anew at `now_s` after a plan that failed, with nothing known of the device or of setpoints."""
         self.believe.forget()
         self.governor.begin(now_s)
         self.planned = self.aim.begin(now_s, self.planned.number + 1, self.believe.memory.lag_mT)
@@ -140,13 +117,10 @@ class Planner:
 
 @final
 class Stepper:
-    """Driving half of the core, for one device: turns measurements and plans into duties, and latches faults.
-
-    It holds the operating state with the latched faults (`safety`), the measuring stage, the watches, and the actuator.
-    """
+    """Driving half of the core, for one device: turns measurements and plans into duties, and latches faults."""
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
-        """Begin disabled at `now_s`. `move` is the actuator of the gap; None: the carriages."""
+        """Begin disabled at `now_s`."""
         position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s = now_s
         "When the newest step was."
@@ -163,26 +137,14 @@ class Stepper:
 
     @property
     def measured(self) -> Measured | None:
-        """What was measured at the newest step; None while the device has said nothing."""
         return self.measure.measured
 
     @property
     def is_followed(self) -> bool:
-        """Whether the gap follows the plans."""
         return self.safety.operating_state is _ENABLED
 
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
-        """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties.
-
-        `now_s`, s, is of the host's clock. Where it is not later than the last step's, or by 10 periods or more, the
-        drive counts one period. A device that is not driven gets duties of 0 in mode OFF. A paused one is driven to
-        hold its gap, and opens it for a force over the ceiling. While the loop is blind, or after a leap of the
-        encoders, a driven one gets 0 in mode RUN: friction holds the gap. `measurement` is None when the link is lost:
-        mode OFF, and a driven device gives the fault LINK_LOST. A number in a measurement or a duty that is not finite
-        gives the fault NOT_FINITE and mode OFF; measuring and driving begin anew. The result also has the newest
-        request to the device, as a fault makes one to open. Raises DomainError where `now_s` is not finite; nothing has
-        changed then.
-        """
+        """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties."""
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
@@ -210,13 +172,7 @@ class Stepper:
         return self._drive(now_s, dt_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
-        """Take an operator's command `name`, one of `operating_state.COMMANDS`, and change `safety` by it.
-
-        `conditions` are what the caller knows of the device; the skew and the greatest values are added here. Enabling
-        a disabled device also begins the motion at the measured gap, at rest, and the watch's counts. Nothing is sent:
-        the next `step` says what is. Raises RefusedError where the conditions or the state do not allow it, and nothing
-        has changed then.
-        """
+        """Take an operator's command `name`, one of `operating_state.COMMANDS`, and change `safety` by it."""
         measured, before = self.measured, self.safety
         self.safety = command(before, name, now_s, self.watch.command_conditions(conditions, measured))
         if self.is_followed and before.operating_state is OperatingState.DISABLED:
@@ -229,11 +185,7 @@ class Stepper:
         self.safety = latch(self.safety, (fault,))
 
     def lose_link(self) -> None:
-        """Forget the device after its link broke: its newest measurement, and how fast its motors gain speed.
-
-        A device that was driven gives the fault LINK_LOST. The gap's opening is no longer watched. Calling it again
-        changes nothing more. `step` without a measurement does the same.
-        """
+        """Forget the device after its link broke: its newest measurement, and how fast its motors gain speed."""
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
         self.opening.rest(self.safety.request_number)
@@ -241,12 +193,7 @@ class Stepper:
         self.move.lose_device()
 
     def _judge(self, now_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Measured:
-        """Latch in `safety` the faults that show, and return `measured`.
-
-        `plan` counts only for how long the sensor has been doubted. While the device is not driven, its homing and
-        opening are watched too. A device that has lost its position counts as not homed in the record returned and
-        kept, until it begins to home or is reset.
-        """
+        """Latch in `safety` the faults that show, and return `measured`."""
         measure = self.measure
         shown = self.watch.faults(
             now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
@@ -266,11 +213,7 @@ class Stepper:
         return measure.without_position(measured)
 
     def _hold(self, now_s: float) -> Duty:
-        """Return duties of 0 in mode RUN: the device answers, and friction holds the gap. The watch counts nothing.
-
-        Call it for a driven device while the loop is blind or in a leap. The limit is ENCODER in a leap, else
-        HOST_STALL within SHOWN_S of a stall of this host, else DEVICE_SILENT. The reference waits.
-        """
+        """Return duties of 0 in mode RUN: the device answers, and friction holds the gap."""
         limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
         if self.measure.leap is not None:
             limit = Limit.ENCODER
@@ -278,12 +221,7 @@ class Stepper:
         return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
 
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
-        """Return the duties that follow `plan`, or hold the gap while PAUSED, and count what the watch sees.
-
-        The mode is RUN. `dt_s` > 0 is the time since the last step. A force over the ceiling opens the gap in either
-        case. The limits are those of the actuator, then those of the watch. A duty that is not finite gives the fault
-        NOT_FINITE, and duties of 0 in mode OFF, as in `_begin_anew`.
-        """
+        """Return the duties that follow `plan`, or hold the gap while PAUSED, and count what the watch sees."""
         followed = None if self.safety.operating_state is _PAUSED else plan
         try:
             drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
@@ -294,11 +232,7 @@ class Stepper:
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
     def _begin_anew(self) -> Duty:
-        """Latch the fault NOT_FINITE, and return duties of 0 in mode OFF.
-
-        The device is asked to open, as after any fault. What the number may have entered is forgotten: the newest
-        measurement, the watches on homing and motion, the actuator. The watch on the opening stays.
-        """
+        """Latch the fault NOT_FINITE, and return duties of 0 in mode OFF."""
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()
         self.homing = Homing(self._ceiling_N)
@@ -308,5 +242,4 @@ class Stepper:
         return self._duty(DriveMode.OFF, 0.0, 0.0, ())
 
     def _duty(self, mode: DriveMode, left: float, right: float, limits: tuple[Limit, ...]) -> Duty:
-        """Return the record of these duties, with the newest request of `safety`."""
         return Duty(mode, left, right, self.safety.request, self.safety.request_number, limits)

@@ -9,11 +9,7 @@ from tormagd.physics.field import PowerFieldLaw, flux_density_T
 
 @final
 class FieldOfGap:
-    """Flux density at the shaft's surface, mT, over the gap, mm, in one insert: Eq. 6 with a power law of the gap.
-
-    It gives what `PowerFieldLaw` and `flux_density_T` give, computed on floats alone. Raises DomainError for a
-    permeability outside 1..1000, and a radius outside 10 um to 1 m.
-    """
+    """Flux density at the shaft's surface, mT, over the gap, mm, in one insert: Eq. 6 with a power law of the gap."""
 
     def __init__(self, law: PowerFieldLaw, relative_permeability: float, inner_radius_m: float) -> None:
         self._coefficient: Final = law.coefficient
@@ -26,20 +22,13 @@ class FieldOfGap:
         self._weakest_mT: Final = self.field_mT(farthest_mm)
 
     def field_mT(self, gap_mm: float) -> float:
-        """Return the flux density, mT, at the shaft's surface for `gap_mm`; a closer gap gives more.
-
-        Raises DomainError outside the law's range of gaps, and for NaN.
-        """
+        """Return the flux density, mT, at the shaft's surface for `gap_mm`; a closer gap gives more."""
         if not self._range_mm[0] <= gap_mm <= self._range_mm[1]:
             raise DomainError("gap_mm", gap_mm, f"a number from {self._range_mm[0]:g} to {self._range_mm[1]:g}")
         return 1e3 * (self._coefficient * math.pow(gap_mm, self._exponent) * self._per_moment_T)
 
     def gap_mm(self, field_mT: float) -> float:
-        """Return the gap, mm, that gives `field_mT`; it may be no gap of the scene's.
-
-        It is the inverse of `field_mT`, up to rounding. Raises DomainError where no gap in the law's range gives the
-        field, and for NaN.
-        """
+        """Return the gap, mm, that gives `field_mT`; it may be no gap of the scene's."""
         if not self._weakest_mT <= field_mT <= self._strongest_mT:
             raise DomainError(
                 "field_mT", field_mT, f"a number from {self._weakest_mT:g} to {self._strongest_mT:g}, which gaps give"

@@ -16,11 +16,7 @@ MIN_STEP: Final = 1e-200
 
 @final
 class Rising:
-    """A list (n >= 1) of finite numbers that rises, with a fast search for a value's place. The order is not checked.
-
-    The list is kept, not copied: do not change it. Raises DomainError for a number that is not finite or too large, and
-    for neighbours that differ by less than MIN_STEP. Equal neighbours are allowed. An empty list raises IndexError.
-    """
+    """A list (n >= 1) of finite numbers that rises, with a fast search for a value's place. The order is not checked."""
 
     def __init__(self, values: list[float]) -> None:
         for place, value in enumerate(values):
@@ -36,10 +32,7 @@ class Rising:
         self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     def after(self, value: float) -> int:
-        """Return how many numbers are at most `value`, 0..n, as `bisect_right` does: the index of the next greater one.
-
-        Infinity gives one of the ends, 0 or n. Raises DomainError for NaN.
-        """
+        """Return how many numbers are at most `value`, 0..n, as `bisect_right` does: the index of the next greater one."""
         values = self.values
         stretch = (value - values[0]) * self._per_unit
         if not stretch >= 0.0:
@@ -53,20 +46,12 @@ class Rising:
 
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x`, linear between the points of `xs` and `ys` (n each; the lengths are not checked).
-
-    Beyond the points, also for infinity, the first or last of `ys` holds. Of points with an equal x the last counts
-    there. Raises DomainError for NaN.
-    """
+    """Return y at `x`, linear between the points of `xs` and `ys` (n each; the lengths are not checked)."""
     return interpolated_before(xs.after(x), x, xs, ys)
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x` as `interpolated`, with the place `after` = `xs.after(x)` already known.
-
-    `after` is 0 for the first of `ys` and n for the last, whatever `x` is. Nothing is checked: NaN or another `after`
-    gives a wrong number. It spares the search where two lists are read at one `x`.
-    """
+    """Return y at `x` as `interpolated`, with the place `after` = `xs.after(x)` already known."""
     if after == 0:
         return ys[0]
     if after == len(ys):
@@ -77,11 +62,7 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n >= 1), linear between them.
-
-    Beyond the last, also for infinity, the last holds. Below 0 nothing is refused, and the result means nothing. Raises
-    DomainError for NaN; empty `ys` raise IndexError.
-    """
+    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n >= 1), linear between them."""
     if not steps < len(ys) - 1:
         if steps != steps:
             raise DomainError("steps", steps, "a number")

@@ -22,11 +22,7 @@ MIN_DT_S: Final = 5e-6
 
 @final
 class Measure:
-    """The stage that turns one device's messages into positions, filtered speeds and the handle's motion.
-
-    It keeps the newest record, `measured`. `sight` tells whether the device is silent, `leap` whether an encoder has
-    stepped as no carriage moves.
-    """
+    """The stage that turns one device's messages into positions, filtered speeds and the handle's motion."""
 
     measured: Measured | None = None
     "The newest record; None while the device has said nothing."
@@ -36,13 +32,7 @@ class Measure:
     def __init__(
         self, home_mm: float, derivative_filter_s: float, turns: bool, full_speed_mm_s: float, period_s: float
     ) -> None:
-        """Take the constants of one device.
-
-        `home_mm` is a carriage's distance from the centre plane on its home switch. `derivative_filter_s` is the time
-        constant of carriage speeds, `full_speed_mm_s` one carriage's greatest speed, `period_s` the control period.
-        With `turns` the element is a handle that turns round. Without it a finger presses, whose force always has the
-        same sign.
-        """
+        """Take the constants of one device."""
         self.sight = Sight(period_s)
         self._home_mm: Final = home_mm
         self._derivative_filter_s: Final = derivative_filter_s
@@ -50,14 +40,7 @@ class Measure:
         self._full_speed_mm_s: Final = full_speed_mm_s
 
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
-        """Measure at `now_s`, one tick after `last_s`: return the new record, and keep it in `measured`.
-
-        Times are the host's, s. A `measurement` of the last number, or whose device time is less than MIN_DT_S after
-        the last or before it, gives the last record again. Updates `sight`, and begins or ends a `leap`. A leap begins
-        only between two measurements of a homed device. It ends when the counts come back, when the device says that it
-        is not homed, or with `needs_homing`. Nothing is refused: call it with a measurement that `is_finite` only, as
-        NaN would stay in the filters.
-        """
+        """Measure at `now_s`, one tick after `last_s`: return the new record, and keep it in `measured`."""
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
         self.sight.update(last_s, now_s, is_new)
@@ -72,17 +55,12 @@ class Measure:
         return measured
 
     def without_position(self, measured: Measured) -> Measured:
-        """Return `measured`, the newest record, marked as not homed, and keep it as the newest.
-
-        A record that is not homed is returned as it is; one that is not the newest would become it. The places stay in
-        the record. The next new measurement brings the device's own word again.
-        """
+        """Return `measured`, the newest record, marked as not homed, and keep it as the newest."""
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
 
     def lose_device(self) -> None:
-        """Drop the newest measurement: `measured` is None, and the next one is taken at rest. `sight` and `leap`
-        stay."""
+        """Drop the newest measurement: `measured` is None, and the next one is taken at rest."""
         self.measured = None
 
     def forget(self) -> None:
@@ -91,18 +69,10 @@ class Measure:
         self.sight.forget()
 
     def begin(self, measurement: Measurement) -> None:
-        """Replace the newest record by one of `measurement` at rest: speeds are 0, and the handle has not travelled.
-
-        `sight` and `leap` stay. It serves while the origin of the places moves.
-        """
+        """Replace the newest record by one of `measurement` at rest: speeds are 0, and the handle has not travelled."""
         self.measured = self._first(measurement)
 
     def _first(self, measurement: Measurement) -> Measured:
-        """Return a record of `measurement` at rest: speeds and the handle's rates are 0, it has not travelled.
-
-        The handle's way, which the sign of the force is by, counts as positive; `sliding_mm_s` begins at MOVING_MM_S.
-        The caller keeps the record. Nothing is checked.
-        """
         return Measured(
             number=measurement.number,
             is_homed=measurement.is_homed,
@@ -119,13 +89,7 @@ class Measure:
         )
 
     def _measured(self, last: Measured | None, measurement: Measurement) -> Measured:
-        """Return the record of `measurement`, or `last` again where the device has said nothing new.
-
-        Nothing new is the same number, or a device time less than MIN_DT_S after that of `last`. `last` is None before
-        the first: the record is one at rest. The force is positive against the handle's way. Without a new Sense the
-        handle's motion stays that of `last`. Speeds are filtered derivatives over the *device's* clock, so that late
-        delivery is not mistaken for slow motion. The caller keeps the record.
-        """
+        """Return the record of `measurement`, or `last` again where the device has said nothing new."""
         if last is None:
             return self._first(measurement)
         dt_s = measurement.device_time_s - last.device_time_s
@@ -153,13 +117,7 @@ class Measure:
         )
 
     def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
-        """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` > 0 after `last`.
-
-        `dt_s` is from the last Sense, on the device's clock. Rates are filtered over RATE_FILTER_S and QUICK_FILTER_S,
-        with their sign along the way of the handle, or inwards for a finger. `sliding_mm_s` follows the rate over
-        SLIDING_MM of travel: a handle that stops keeps it, FAST_MM_S at most. A finger's depth is its position, and at
-        least 0 mm; its `turn` stays. Nothing is kept here, and nothing checked.
-        """
+        """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` > 0 after `last`."""
         before = last.handle
         travel_mm = position_mm - last.handle_mm
         rate_mm_s = low_pass(before.turn.direction * before.rate_mm_s, travel_mm / dt_s, dt_s, RATE_FILTER_S)

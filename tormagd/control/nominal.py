@@ -11,12 +11,7 @@ from tormagd.model.model_file import ForceModel
 
 @final
 class Nominal:
-    """The nominal element: the force that one model gives over the field. It has no state.
-
-    The model is asked only within the range that it was trained on. Without `has_rate`, `now` and `planned` always give
-    `only`, the curve for the portrait's motion. The share of iron, `cip_percent`, is the caller's to hold within the
-    model's range. Raises DomainError for one that is not finite.
-    """
+    """The nominal element: the force that one model gives over the field. It has no state."""
 
     def __init__(self, model: ForceModel, contact: ElementContact, cip_percent: float, has_rate: bool) -> None:
         self._network: Final = model.network
@@ -32,10 +27,7 @@ class Nominal:
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        """Return the model's force over the field for the handle's present motion, held within the model's range.
-
-        Without `has_rate` that is `only`, and `measured` is not looked at. Raises DomainError for a motion of NaN.
-        """
+        """Return the model's force over the field for the handle's present motion, held within the model's range."""
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.motion_now(measured)
@@ -44,13 +36,7 @@ class Nominal:
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
     ) -> tuple[ForceCurve, tuple[Outside, ...]]:
-        """Return the model's force over the field for the motion to plan for, and what of it is out of range.
-
-        `setpoint` is None without a publisher, or where its motion is not to count; `measured` is None before a
-        measurement. The motion is the contact's `planned`. Each `Outside` names a quantity of it that the model does
-        not know, the value asked for and the value used. Of two the displacement comes first; none gives an empty
-        tuple, and so does a scene without `has_rate`. Raises DomainError for a motion of NaN.
-        """
+        """Return the model's force over the field for the motion to plan for, and what of it is out of range."""
         if not self._has_rate:
             return self.only, ()
         displacement_mm, rate_mm_s = self.contact.planned(setpoint, measured)
@@ -63,11 +49,6 @@ class Nominal:
         return curve, outside
 
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
-        """Return the model's force over the field at this displacement, mm, and rate, mm/s.
-
-        Each is held within the model's range, infinity too. A handle's rate is given without its sign, a finger's is
-        positive inwards. Where a handle slides, any displacement but NaN is replaced by the mobilised one. The curve
-        tells the values used, and is a new one for each call. Raises DomainError for NaN.
-        """
+        """Return the model's force over the field at this displacement, mm, and rate, mm/s."""
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

@@ -30,10 +30,7 @@ _RIGHT_CLOSED: Final = int(Switches.RIGHT_CLOSED)
 
 @final
 class Leap(Value):
-    """A step of the encoders that no carriage makes, found at `seen_s`: by `left_mm` and `right_mm` within `within_s`.
-
-    `left_from_mm` and `right_from_mm` are the places before the step.
-    """
+    """A step of the encoders that no carriage makes, found at `seen_s`: by `left_mm` and `right_mm` within `within_s`."""
 
     def __init__(
         self,
@@ -52,12 +49,7 @@ class Leap(Value):
         self.right_from_mm: Final = right_from_mm
 
     def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
-        """Tell whether both carriages read places that they can have reached by `now_s` from before the step.
-
-        The leap was noise on a line then. In all the time since before the step they can have gone as far as
-        LEAP_SPEEDS times `full_speed_mm_s`, one carriage's, brings them, and LEAP_MM. `now_s` is on the clock of
-        `seen_s`. NaN has not come back.
-        """
+        """Tell whether both carriages read places that they can have reached by `now_s` from before the step."""
         max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
             abs(measured.left_mm - self.left_from_mm) <= max_mm
@@ -71,13 +63,7 @@ class Leap(Value):
 def leap_between(
     last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
 ) -> Leap | None:
-    """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None.
-
-    `last` was found at `seen_s`, `measured` at `now_s`, both on the host's clock. The step took the longer of two
-    times, by the device's clock and by the host's. In that time a carriage can go as far as LEAP_SPEEDS times
-    `full_speed_mm_s`, one carriage's, brings it, and LEAP_MM. One that went further is enough. NaN counts as a leap.
-    That both records are of a homed device is the caller's to know: homing moves the places.
-    """
+    """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None."""
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
     max_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
@@ -87,23 +73,13 @@ def leap_between(
 
 
 def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
-    """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`.
-
-    A place more than OVERRUN_MM outside the stroke is impossible, and NaN. One carriage is enough. A `closed_mm` over
-    CLOSED_END_MM counts as that. Whether it is homed is the caller's to know.
-    """
+    """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`."""
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     return not (min_mm <= measured.left_mm <= max_mm and min_mm <= measured.right_mm <= max_mm)
 
 
 def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm: float) -> bool:
-    """Tell whether an end switch contradicts its carriage's place, for gaps from `closed_mm` to `open_mm`.
-
-    `switches` are bits of `Switches`, 1 for a closed contact, of about the time of `measured`. The contact of an open
-    end is to be closed at that end, and only there. The one of a closed end may be closed only near it; there it need
-    not be, as no scene goes on to it. One of the four is enough. Allowed besides is what a carriage goes in TOLD_S. NaN
-    contradicts nothing: `is_outside` finds it. Whether the device is homed is the caller's to know.
-    """
+    """Tell whether an end switch contradicts its carriage's place, for gaps from `closed_mm` to `open_mm`."""
     inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
     left_open, left_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0
     right_open, right_closed = switches & _RIGHT_OPEN != 0, switches & _RIGHT_CLOSED != 0
@@ -115,13 +91,7 @@ def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm
 def _is_contradicted(
     at_mm: float, speed_mm_s: float, is_open: bool, is_closed: bool, inner_mm: float, home_mm: float
 ) -> bool:
-    """Tell whether a carriage's place `at_mm`, half of an even gap, contradicts the contacts at its two ends.
-
-    `is_open` and `is_closed` say whether the contact of the open and of the closed end is closed. With `is_open` the
-    carriage may be OPEN_SWITCH_MM short of the open end, `home_mm`, or beyond it; without, as far beyond it at most.
-    With `is_closed` it may be no further out than `inner_mm`; without, that contact contradicts nothing. Allowed
-    besides is what the carriage goes in TOLD_S at `speed_mm_s`, either way. NaN contradicts nothing.
-    """
+    """Tell whether a carriage's place `at_mm`, half of an even gap, contradicts the contacts at its two ends."""
     moved_mm = TOLD_S * abs(speed_mm_s)
     if is_closed and at_mm > inner_mm + moved_mm:
         return True

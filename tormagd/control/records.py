@@ -24,28 +24,13 @@ class Wall(Value):
         self.friction_N: Final = friction_N
 
     def force_N(self, handle_mm: float) -> float:
-        """Return the force, N, on a handle that pushes on and is at `handle_mm`.
-
-        In front of the wall that is the friction alone. Nothing is checked: NaN gives NaN.
-        """
+        """Return the force, N, on a handle that pushes on and is at `handle_mm`."""
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
 
 
 @final
 class TimedSetpoint(Value):
-    """A publisher's newest valid setpoint. It states the force over the handle's place and way: `asked_N`.
-
-    force_N                      for a handle that pushes on, where there is no `wall`
-    stamp_s                      when the publisher meant it, on the clock of `now_s`
-    valid_for_s                  how long after the stamp it is followed
-    displacement_mm, rate_mm_s   the handle's motion that is planned for; None where the publisher states none
-    preview_N                    the forces that follow `force_N`, `preview_dt_s` apart; empty without a preview
-    holder                       number of the publisher that holds the brake; each new holder has a greater one
-    limits                       what is wrong with how it came, or with who else sends setpoints
-    withdraw_N                   for a handle that withdraws; None: the wall's friction, `force_N` without a wall
-    playout_s                    by how much later than its stamp it is meant to be followed, to take out jitter
-    wall                         what the handle pushes against; None: nothing
-    """
+    """A publisher's newest valid setpoint. It states the force over the handle's place and way: `asked_N`."""
 
     def __init__(
         self,
@@ -76,13 +61,7 @@ class TimedSetpoint(Value):
         self.wall: Final = wall
 
     def asked_N(self, travel: "Travel") -> float:
-        """Return the force, N, that is asked for a handle with this `travel`: its `is_pushing` decides, not its rate.
-
-        One that pushes on is asked for the wall's force at its place, or for `force_N` without a wall. One that
-        withdraws is asked for `withdraw_N`. Where that is None, it is asked for the wall's friction, or for `force_N`
-        without a wall: a brake cannot push the handle back. Neither the preview nor the stamp's age counts here.
-        Nothing is checked, or held within what the device gives.
-        """
+        """Return the force, N, that is asked for a handle with this `travel`: its `is_pushing` decides, not its rate."""
         if not travel.is_pushing and self.withdraw_N is not None:
             return self.withdraw_N
         if self.wall is None:
@@ -91,24 +70,16 @@ class TimedSetpoint(Value):
 
     @property
     def preview_s(self) -> float:
-        """How long after its stamp the preview ends, s; 0 without a preview."""
         return self.preview_dt_s * len(self.preview_N)
 
     @property
     def preview_slope_N_s(self) -> float:
-        """The mean slope of the preview, N/s, from `force_N` to its last force.
-
-        Ask only where there is a preview: without one it raises IndexError.
-        """
         return (self.preview_N[-1] - self.force_N) / self.preview_s
 
 
 @final
 class Travel(Value):
-    """The handle's place, mm, and its rate, mm/s, both positive pushing on.
-
-    A handle that was turned back, or is held while it is pulled back, withdraws: `is_pushing` is False.
-    """
+    """The handle's place, mm, and its rate, mm/s, both positive pushing on."""
 
     def __init__(self, place_mm: float, rate_mm_s: float, is_pushing: bool = True) -> None:
         self.place_mm: Final = place_mm
@@ -122,14 +93,7 @@ AT_REST: Final = Travel(0.0, 0.0)
 
 @final
 class Handle(Value):
-    """The motion of a handle or a finger.
-
-    displacement_mm   travel since `turn`, or how deep a finger is in a pad
-    rate_mm_s         positive the way the handle went last, or inwards
-    turn              where a handle last turned round, and which way it has gone since
-    sliding_mm_s      >= 0, the rate that friction has the level of: a mean over travel, which a stopped handle keeps
-    quick_mm_s        the rate filtered over less time, which shows a stop sooner; None: `rate_mm_s`
-    """
+    """The motion of a handle or a finger."""
 
     def __init__(
         self,
@@ -148,15 +112,7 @@ class Handle(Value):
 
 @final
 class Measured(Value):
-    """What is measured of the carriages and the handle.
-
-    number                 the measurement's
-    left_mm, right_mm      carriage places from the centre plane, meaningless unless `is_homed`; with speeds
-    force_N                the sensor's, against the handle's motion
-    handle_mm              the handle's place on its encoder
-    device_time_s          when the carriages were measured, on the device's clock
-    sensed_s               when force and handle came, on the host's clock; `handle_time_s` on the device's
-    """
+    """What is measured of the carriages and the handle."""
 
     def __init__(
         self,
@@ -188,32 +144,20 @@ class Measured(Value):
 
     @property
     def gap_mm(self) -> float:
-        """Distance between the magnets, mm; meaningless unless `is_homed`."""
         return self.left_mm + self.right_mm
 
     @property
     def gap_speed_mm_s(self) -> float:
-        """How fast the gap opens, mm/s, filtered; negative while it closes."""
         return self.left_mm_s + self.right_mm_s
 
     @property
     def skew_mm(self) -> float:
-        """Place of the left carriage minus that of the right, mm; meaningless unless `is_homed`."""
         return self.left_mm - self.right_mm
 
 
 @final
 class Belief(Value):
-    """What is believed of the device at a plan.
-
-    device            its force over the model's without memory, at the rate at which the handle slides
-    at_speed          its force over the model's without memory, for a handle at speed
-    unseen            a device of which nothing is known, while `device` is known only from another day; else None
-    lag_s             how late its carriages come
-    predicted_N       the force that it is expected to show now; None where nothing is known, as before break-away
-    limits            what is wrong with its sensor, its encoder or the fit of its force
-    sensor_doubted_s  for how long of sliding its force sensor has not been believed
-    """
+    """What is believed of the device at a plan."""
 
     def __init__(
         self,
@@ -236,16 +180,7 @@ class Belief(Value):
 
 @final
 class Ask(Value):
-    """The force to render.
-
-    asked_N     what the setpoint asks for now; None without a setpoint
-    force_N     what of `asked_N` to render now
-    path_N      the forces (7) at `path.PATH_S` after the moment that is planned for
-    age_s       the setpoint's age; None without a setpoint
-    limits      what holds the force back
-    foresight   0..1, how well what comes is known: 1 from a preview, less where the force repeats, 0 where extrapolated
-    is_meant    True while a valid setpoint is followed, False while the force decays
-    """
+    """The force to render."""
 
     def __init__(
         self,
@@ -278,24 +213,7 @@ class Outside(Value):
 
 @final
 class Plan(Value):
-    """Where the gap should go, and why.
-
-    number            counts plans: a recording says with it which plan a tick used
-    time_s            when the plan was made
-    setpoint_N        the force that the publisher asks for, and its age `setpoint_age_s`; None without a setpoint
-    stamp_s           of the setpoint that the force follows; -inf where it follows none
-    governed_N        the force to render now
-    predicted_N       the force that the device is expected to show now; None where the model does not know
-    field_mT          the gap's field for the force
-    gap_mm            with its speed and acceleration, opening positive; never closer than `min_gap_mm`
-    confidence        0..1, of the model in `field_mT`
-    limits            what holds the force back
-    foresight         as in `Ask`
-    trim              the device's force over the model's at `governed_N`
-    outside           what the limit MODEL_RANGE is about
-    sensor_doubted_s  as in `Belief`
-    search_age_s      how long ago the search for `field_mT` began; 0 where it is part of the plan
-    """
+    """Where the gap should go, and why."""
 
     def __init__(
         self,
@@ -342,10 +260,7 @@ class Plan(Value):
 
 @final
 class Duty(Value):
-    """What goes to the device: the drive mode, and a duty for each motor, within +-position.duty_limit.
-
-    `request` is the newest request to the device, numbered `request_number`. `limits` are what holds the force back.
-    """
+    """What goes to the device: the drive mode, and a duty for each motor, within +-position.duty_limit."""
 
     def __init__(
         self,

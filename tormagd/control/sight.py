@@ -10,7 +10,7 @@ from typing import Final, final
 BLIND_S: Final = 0.005
 BLIND_PERIODS: Final = 5.0
 """The loop is blind after both of these times without a new State: the carriages' places are not known well enough to
-drive them. The answer to the first Drive after a stall may take twice as long."""
+drive them."""
 UNSENSED_S: Final = 0.02
 "Without a new Sense for longer than this and BLIND_PERIODS, force and handle are not measured."
 SHOWN_S: Final = 0.1
@@ -19,11 +19,7 @@ SHOWN_S: Final = 0.1
 
 @final
 class Sight:
-    """Whether the loop is blind, told from the times of steps and of new States; at first it is not.
-
-    It keeps when a State was last new, and when the last stall of the loop ended and how long it was. `period_s` is the
-    control period, > 0; times are the host's, s.
-    """
+    """Whether the loop is blind, told from the times of steps and of new States; at first it is not."""
 
     seen_s: float = math.inf
     "When a new State was last found; inf before the first."
@@ -49,21 +45,11 @@ class Sight:
         return now_s - self.stalled_s < SHOWN_S
 
     def is_waiting(self, now_s: float) -> bool:
-        """Tell whether the answer to the first Drive after a stall may still be on its way.
-
-        This is so while the loop is blind, within twice its time to blindness after the stall's end.
-        """
+        """Tell whether the answer to the first Drive after a stall may still be on its way."""
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 
     def update(self, last_s: float, now_s: float, is_new: bool) -> None:
-        """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind` and `was_blind`.
-
-        `is_new` says that a State has come since the last step. The loop is blind after no new State for longer than
-        BLIND_S and BLIND_PERIODS periods, whichever is more. Waiting for the very first does not make it blind. A step
-        that comes later than that after the last one ends a stall, which is noted, before the first State too. The loop
-        is then blind until a later step finds a new State, even where this one did. Times are not checked: a clock that
-        goes back ends no stall.
-        """
+        """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind` and `was_blind`."""
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:
             before_s = self.stall_s if self.has_stalled(now_s) else 0.0
@@ -75,6 +61,5 @@ class Sight:
 
 
 def unsensed_s(period_s: float) -> float:
-    """Return the greatest age of a Sense, s, at this control period. With an older one, force and handle count as not
-    measured."""
+    """Return the greatest age of a Sense, s, at this control period."""
     return max(UNSENSED_S, BLIND_PERIODS * period_s)

@@ -12,13 +12,7 @@ LONGEST_S = 30.0
 
 
 def black_box(client: Client, copy: Path | None) -> Outcome:
-    """Have the daemon write its black box, wait until the file is on the disk, and copy it to the new file `copy`.
-
-    The result's `file` is the copy and `original` the daemon's file. With `copy` None nothing is copied, and `file` is
-    the daemon's. Raises CommandError (USAGE) where `copy` exists, before anything is asked, or cannot be made; half a
-    copy stays. Raises it (REFUSED) where the daemon could not write the file, or has not within LONGEST_S. Raises as
-    `Client.request` where the daemon keeps no black box.
-    """
+    """Have the daemon write its black box, wait until the file is on the disk, and copy it to the new file `copy`."""
     if copy is not None and copy.exists():
         raise usage_error(f"{copy} exists", "give another name; nothing is overwritten")
     written = Path(client.request("blackbox")["file"])

@@ -50,14 +50,7 @@ def calibrate_insert(
     by_law: bool,
     wait_s: float,
 ) -> Outcome:
-    """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`.
-
-    The model is a network; `by_law` fits the law of the brake instead, which takes no torch. `training_csv` also gets
-    the training data, unless it is None. A person has to turn the handle; stderr says how. `scene` gives the greatest
-    force and the insert's inner radius. The gap opens after the sweeps. The result is a fit's, as of `_ask_fitter`.
-    Raises as `known_of`, `armed` and `Run.follow`. Raises CommandError (REFUSED) for an unknown insert, a still handle,
-    another publisher, or a sweep or fit that is not good enough. Then there is neither file.
-    """
+    """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`."""
     law = ("--law",) if by_law else ()
     _ask_fitter("--insert", insert, *law)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
@@ -78,12 +71,7 @@ def calibrate_insert(
 
 
 def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
-    """Tell the person on stderr how to turn the handle, wait until it moves, play one sweep, and return its ticks.
-
-    They are an array for each of the ticks' columns; a value that is not known is NaN. `number` counts from 0, and
-    picks the rate and the pace that is asked for. Shows a progress bar. Raises as `Run.follow`, also where the handle
-    stays still.
-    """
+    """Tell the person on stderr how to turn the handle, wait until it moves, play one sweep, and return its ticks."""
     waveform = up_and_down(forces, rates_N_s[number])
     label = f"sweep {number + 1} of {len(rates_N_s)}"
     print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
@@ -99,13 +87,7 @@ def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
-    """Write the sweeps as the CSV file `path` that `FITTING` reads; a file there is replaced.
-
-    Each sweep has an array for each of COLUMNS, all of one length; others are not used. The header is FILE_COLUMNS:
-    `time_s`, `sweep`, `gap_mm`, `handle_mm`, `rate_mm_s`, `force_N`. Ticks with a value that is not finite are left
-    out, and of the rest every fourth is kept. Time counts from the first tick of the earliest sweep, `sweep` from 0,
-    and `gap_mm` is left plus right. Raises OSError.
-    """
+    """Write the sweeps as the CSV file `path` that `FITTING` reads; a file there is replaced."""
     start_s = min((float(sweep["monotonic_s"][0]) for sweep in sweeps if sweep["monotonic_s"].size), default=0.0)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -125,12 +107,7 @@ def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
 
 
 def _ask_fitter(*arguments: str) -> dict[str, Any]:
-    """Run the fitting process on `arguments`, and return the `result` that it prints; SIGINT and SIGTERM end it.
-
-    A fit has `model`, `csv`, `insert`, `created`, `rows`, `ranges` and `metrics`. Arguments without a sweep give
-    `insert` alone, where it is known. What the process says on stderr is shown. Raises CommandError (REFUSED) where it
-    refuses, with its own code and hint; where it ends without an answer; or where it was interrupted.
-    """
+    """Run the fitting process on `arguments`, and return the `result` that it prints; SIGINT and SIGTERM end it."""
     command = [sys.executable, "-m", FITTING, *arguments]
     with (
         interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted,
@@ -161,11 +138,6 @@ def _ask_fitter(*arguments: str) -> dict[str, Any]:
 
 
 def _text(result: dict[str, Any]) -> str:
-    """Say how well an insert's fitted model did on sweeps kept from the fit, and what to do next.
-
-    `result` is a fit's, as of `_ask_fitter`; a key that is missing raises KeyError. Errors are told in mN, beside what
-    is allowed and the sensor's noise.
-    """
     metrics = result["metrics"]
     return (
         f"{result['model']}: {result['insert']}, {result['created']}, {result['rows']} rows. On sweeps kept from the "
@@ -189,14 +161,7 @@ def calibrate(
     side: Literal["left", "right"],
     is_agreed: bool,
 ) -> Outcome:
-    """Calibrate one of: the device, an `insert`, or the `motors`; asks for agreement first unless `is_agreed`.
-
-    `out` is the new file of the model or motor log, and None for `device`. `csv` gets an insert's training data; None
-    writes none. `rates_N_s` are an insert's sweeps, `by_law` is the kind of its model, `side` the motor that is logged.
-    Raises CommandError (USAGE) for options that do not fit each other, a file that exists or has no folder, or a faulty
-    scene. USAGE is also agreement that is needed where stdin is no terminal. Then nothing has moved. Returns and raises
-    as `calibrate_device`, `calibrate_insert` and `calibrate_motors` do.
-    """
+    """Calibrate one of: the device, an `insert`, or the `motors`; asks for agreement first unless `is_agreed`."""
     if [insert is not None, motors, device].count(True) != 1:
         raise usage_error("calibrate takes one of three things", "give one of --insert NAME, --motors and --device")
     if insert is None and csv is not None:
@@ -231,11 +196,7 @@ def calibrate(
 
 
 def agree() -> None:
-    """Say on stderr that the carriages will move, and wait until a person presses Enter.
-
-    Whatever else is typed in that line counts as agreement, too. Raises CommandError (USAGE) where stdin is no
-    terminal, and where it ends (Ctrl-D). Ctrl-C raises KeyboardInterrupt.
-    """
+    """Say on stderr that the carriages will move, and wait until a person presses Enter."""
     if not is_terminal(sys.stdin):
         raise usage_error("stdin is no terminal: nobody can agree to the carriages moving", "a script says --yes")
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)

@@ -23,15 +23,7 @@ DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
 
 
 def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
-    """Let the daemon learn the device, judge it by steps, and wait until its profile is kept. The gap opens before
-    that.
-
-    A person has to turn the handle, as stderr says. `scene_most_N` is the greatest force to ask for. The result holds
-    `serial_number`, the fields of a DeviceReport, and the number of `steps`. It also holds their `mean_error_N`, with
-    its sign, their `worst_error_N`, both 0 where not known, and `profile`, the folder. Raises as `known_of`, `armed`
-    and `Run.follow`. Raises CommandError (REFUSED) where no profile is kept, the handle hardly moves, or the daemon
-    doubts the force sensor.
-    """
+    """Let the daemon learn the device, judge it by steps, and wait until its profile is kept."""
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
         if not status.profile.folder:
@@ -51,16 +43,12 @@ def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, 
 
 
 def _in_N(value_mN: float | None) -> float:
-    """Return mN as N, to 0.1 mN; 0 for None, a value that is not known."""
     return round((value_mN or 0.0) * 1e-3, 4)
 
 
 def require_believed(status: Status) -> None:
     """Raise CommandError (REFUSED) where `status` has a limit of DOUBTS: the daemon doubts the force sensor, and
-    learned nothing.
-
-    The message has that limit's cause, the hint its remedy. Otherwise return.
-    """
+    learned nothing."""
     doubt = next((limit for limit in status.limit_details if limit.code in DOUBTS), None)
     if doubt is not None:
         raise CommandError(
@@ -69,11 +57,7 @@ def require_believed(status: Status) -> None:
 
 
 def _kept(client: Client) -> ProfileReport:
-    """Wait until the daemon has written the profile, and return its report.
-
-    One that was written up to a second before the call counts, an older one does not. Raises CommandError (REFUSED)
-    where the daemon says that it cannot write it, or has not within KEPT_WITHIN_S. Raises as `Client.status`.
-    """
+    """Wait until the daemon has written the profile, and return its report."""
     began_s = time.monotonic()
     while True:
         profile = client.status().profile
@@ -85,10 +69,6 @@ def _kept(client: Client) -> ProfileReport:
 
 
 def _not_kept(profile: ProfileReport) -> CommandError:
-    """Return the error (REFUSED) for a daemon that keeps no profile, to be raised by the caller.
-
-    Its message has the reason that `profile` gives, or that none was written where it gives none.
-    """
     return CommandError(
         Exit.REFUSED,
         "not_kept",
@@ -98,10 +78,6 @@ def _not_kept(profile: ProfileReport) -> CommandError:
 
 
 def _text(result: dict[str, Any]) -> str:
-    """Say what the device showed of itself, how well the steps were followed, and where the profile is.
-
-    `result` is that of `calibrate_device`; a key that is missing raises KeyError. Forces are told in mN.
-    """
     return (
         f"device {result['serial_number']}: {result['scale']:.3f} +- {result['scale_sd']:.3f} times the model's force, "
         f"{result['offset_N'] * 1e3:+.0f} +- {result['offset_sd_N'] * 1e3:.0f} mN; its sensor reads "

@@ -49,12 +49,7 @@ LONGEST_HOLE_S = 0.02
 
 
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
-    """Return the waveform to ask for, N over s from 0: ramps, then jumps, `rounds` times, between two forces.
-
-    These are CLEAR_N above the least of `forces`, and their most. Each ramp takes one of RAMPS_S up, and as long down.
-    A jump takes 1 ms, to one of JUMP_SHARES of the range, and is held for JUMP_S. `rounds` is 1 or more, which is not
-    checked. A range narrower than CLEAR_N is not refused: the waveform is then upside down.
-    """
+    """Return the waveform to ask for, N over s from 0: ramps, then jumps, `rounds` times, between two forces."""
     low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]
     # each there in a millisecond, and held
@@ -63,13 +58,7 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
 
 
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
-    """Drive both carriages through `excitation`, and write the log of one to the new CSV file `path`.
-
-    Its columns are LOG_COLUMNS, as of `motor_log`, with six digits. The result has `file`, `side`, and the log's `rows`
-    and `seconds`. The gap opens before the file is written. Raises as `reach`, `armed` and `Run.follow`. Raises
-    CommandError (REFUSED) for a control rate under MIN_HZ, before anything moves, and as `motor_log`. Raises OSError
-    where the file exists or cannot be made: this shows only after the drive.
-    """
+    """Drive both carriages through `excitation`, and write the log of one to the new CSV file `path`."""
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
         waveform = excitation(reach(status, scene_most_N))
@@ -97,14 +86,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
 def motor_log(ticks: Columns, side: Side) -> Columns:
     """Return the motor log of one side: an array for each of LOG_COLUMNS, evenly spaced on the device's clock, from 0
-    s.
-
-    `ticks` have an array of one length for each of COLUMNS. A row's voltage, V, is the one sent in answer to the row's
-    position: duty times supply. Positions are from the centre plane, positive as the gap opens; `reference_mm` is half
-    the gap's reference. `force_N` is at the roller. Ticks with an unknown value, or without news from the device, are
-    left out. The step is the median one: voltages are held, other values interpolated. Raises CommandError (REFUSED)
-    where the device was silent for more than LONGEST_HOLE_S, or throughout.
-    """
+    s."""
     known = np.isfinite(np.column_stack([ticks[name] for name in COLUMNS])).all(axis=1)
     time_s = ticks["device_time_s"][known]
     # of ticks with the same measurement the last one's duty is what the device goes on with

@@ -49,10 +49,7 @@ HOMING_S = 30.0
 
 
 def interrupted_run() -> CommandError:
-    """Return the error (REFUSED, code `interrupted`) for a run that the person ended; the caller raises it.
-
-    It says that a device that was armed opens its gap, and that nothing is saved. The daemon may keep what it learned.
-    """
+    """Return the error (REFUSED, code `interrupted`) for a run that the person ended; the caller raises it."""
     return CommandError(
         Exit.REFUSED,
         "interrupted",
@@ -70,10 +67,7 @@ class Range(NamedTuple):
 
 
 class Progress:
-    """One line of progress on stderr: what is done, for how long, and how long it takes.
-
-    Where stderr is no terminal, it shows nothing.
-    """
+    """One line of progress on stderr: what is done, for how long, and how long it takes."""
 
     def __init__(self) -> None:
         self._label, self._lasts_s, self._begun_s, self._is_shown = "", 0.0, 0.0, is_terminal(sys.stderr)
@@ -99,10 +93,7 @@ class Progress:
 
 
 class Run(Device):
-    """The daemon's device for courses: commands and forces go out, control ticks come in. Made by `connected`.
-
-    Holds the sockets, and when the daemon was last heard.
-    """
+    """The daemon's device for courses: commands and forces go out, control ticks come in. Made by `connected`."""
 
     def __init__(
         self,
@@ -117,12 +108,7 @@ class Run(Device):
         self.progress = Progress()
 
     def follow(self, course: Course[Found]) -> Found:
-        """Run `course` in real time, and return what it found; the line of progress ends with it.
-
-        Where it raises, the device is told to disable. Raises CommandError: FAULT or REFUSED where the course stops, by
-        its code; REFUSED where the person interrupts. UNREACHABLE is a daemon without ticks for SILENT_S, or with those
-        of another version. Raises as `Client.request` for a command, and as `Client.publish`.
-        """
+        """Run `course` in real time, and return what it found; the line of progress ends with it."""
         try:
             return drive(course, self)
         except StoppedError as error:
@@ -132,18 +118,11 @@ class Run(Device):
             self.progress.end()
 
     def play(self, waveform: Waveform) -> Columns:
-        """Publish `waveform` in real time, and return its ticks as an array for each of COLUMNS.
-
-        A number that is not known is NaN. Raises as `follow`, also where the device is not ENABLED throughout.
-        """
+        """Publish `waveform` in real time, and return its ticks as an array for each of COLUMNS."""
         return self.follow(watch(waveform.duration_s, lambda t_s: waveform.at(t_s).force_N))
 
     def command(self, name: str) -> None:
-        """Give the daemon a command by its name, and wait for the answer, which is not returned.
-
-        Raises as `Client.request` where it is refused; `disable` alone raises nothing, whatever happens. `enable` is
-        tried again for SILENT_S while measurements are not fresh. `name` is not checked here.
-        """
+        """Give the daemon a command by its name, and wait for the answer, which is not returned."""
         until_s = time.monotonic() + SILENT_S
         while True:
             try:
@@ -159,12 +138,7 @@ class Run(Device):
 
     def exchange(self, asked: Asked) -> Heard:
         """Publish the force, N, valid for VALID_FOR_MS, and return the time and the ticks until the next is due,
-        1/RATE_HZ later.
-
-        A tick is a row by the course's COLUMNS. A force of None publishes nothing. There may be no tick: they come
-        every 20 ms. The command in `asked` is not given. Draws the progress anew. Raises as `follow`, also for an
-        interrupt.
-        """
+        1/RATE_HZ later."""
         if self._is_interrupted():
             raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
@@ -182,11 +156,7 @@ class Run(Device):
         return Heard(time.monotonic(), rows)
 
     def _rows(self, data: bytes) -> list[Row]:
-        """Return a batch's ticks, each a row by the course's COLUMNS, and note that the daemon was heard.
-
-        `data` is one message of the recording endpoint. Raises CommandError (UNREACHABLE) where it is no batch, or
-        lacks a column.
-        """
+        """Return a batch's ticks, each a row by the course's COLUMNS, and note that the daemon was heard."""
         try:
             batch = decode_ticks(data)
             places = [batch.columns.index(name) for name in COLUMNS]
@@ -203,11 +173,7 @@ class Run(Device):
 
 def reach(status: Status, scene_most_N: float) -> Range:
     """Return the forces that can be asked for, N: from the daemon's least to its most, or to `scene_most_N` where that
-    is less.
-
-    A least force above the most is not refused here; `known_of` does that. Raises CommandError (REFUSED) where another
-    source holds the brake, or anybody published within RECENT_SETPOINT_MS.
-    """
+    is less."""
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
     is_held = holder is not None and holder.state == "holds"  # an old setpoint may be valid for long
@@ -223,11 +189,7 @@ def reach(status: Status, scene_most_N: float) -> Range:
 
 def known_of(config: Config, status: Status, scene_most_N: float, weight_N: float | None = None) -> Known:
     """Return what a course may use: configuration, the daemon's control period, s, the forces of `reach`, and the
-    weight.
-
-    `weight_N` is what a person will hang up, N; None: nothing. The daemon must have run for a moment: a control rate of
-    0 Hz raises ZeroDivisionError. Raises as `reach`, and CommandError (REFUSED) where the forces leave no range.
-    """
+    weight."""
     forces = reach(status, scene_most_N)
     known = Known(config, 1.0 / status.rates["control"].hz, forces.least_N, forces.most_N, weight_N)
     if not known.force_N(0.0) < forces.most_N:
@@ -242,12 +204,7 @@ def known_of(config: Config, status: Status, scene_most_N: float, weight_N: floa
 
 @contextmanager
 def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
-    """Give a `Run`, as a context; however it ends, the device is told to disable, so that the gap opens.
-
-    A `disable` that fails is passed over. Within the context SIGINT and SIGTERM are only noted: the `Run` raises for
-    them. `client` stays open. Raises UnreachableError where nobody takes setpoints, and SettingError for keys or
-    addresses that cannot be used.
-    """
+    """Give a `Run`, as a context; however it ends, the device is told to disable, so that the gap opens."""
     context = zmq.Context()
     try:
         ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
@@ -264,11 +221,7 @@ def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
 
 @contextmanager
 def armed(endpoints: Endpoints, client: Client, force_N: float) -> Iterator[Run]:
-    """Home where needed, enable with the setpoint `force_N`, N, and give a `Run`, as a context.
-
-    At its end and after an error the gap opens, and signals are only noted, as in `connected`. Homing takes HOMING_S at
-    most. Raises as `connected`, `home` and `Run.follow`.
-    """
+    """Home where needed, enable with the setpoint `force_N`, N, and give a `Run`, as a context."""
     with connected(endpoints, client) as run:
         if not client.status().is_homed:
             home(client, HOMING_S, is_waiting=True)

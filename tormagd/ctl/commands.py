@@ -17,12 +17,7 @@ Option = tuple[tuple[str, ...], dict[str, Any]]
 
 
 class Command(NamedTuple):
-    """One command. `function` names a module of `tormagd.ctl` and a function in it, as in `status.status`.
-
-    The function takes the command's options by name, and each of `needs`: `client`, `command`, `config`, `config_file`,
-    `endpoints`, `parser`, `wait_s`. With `has_daemon` the configuration and endpoints must be valid even where not
-    needed.
-    """
+    """One command. `function` names a module of `tormagd.ctl` and a function in it, as in `status.status`."""
 
     help: str
     function: str
@@ -37,7 +32,7 @@ def option(*names: str, **settings: Any) -> Option:
 
 
 def number(text: str) -> float:
-    """Parse a finite number, also in a form such as `1e3`. Raises ArgumentTypeError, which says what is allowed."""
+    """Parse a finite number, also in a form such as `1e3`."""
     try:
         value = float(text)
     except ValueError:
@@ -62,7 +57,7 @@ class Within(NamedTuple):
 
 
 def port(text: str) -> int:
-    """Return the TCP port in `text`, 0..65535; 0 takes one that is free. Raises ArgumentTypeError for anything else."""
+    """Return the TCP port in `text`, 0..65535; 0 takes one that is free."""
     value = Within(0, 65_535)(text)
     if not value.is_integer():
         raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number, 0..65535")
@@ -70,10 +65,7 @@ def port(text: str) -> int:
 
 
 def rates(text: str) -> tuple[float, ...]:
-    """Return 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas, in their order; equal ones are allowed.
-
-    Raises ArgumentTypeError for anything else.
-    """
+    """Return 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas, in their order; equal ones are allowed."""
     found = tuple(Within(0.02, 10.0, " N/s")(part) for part in text.split(","))
     if not 3 <= len(found) <= 60:
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 3..60 rates")
@@ -81,7 +73,7 @@ def rates(text: str) -> tuple[float, ...]:
 
 
 def source(text: str) -> str:
-    """Return a publisher's name as it is. Raises ArgumentTypeError unless it is 1..64 printable characters."""
+    """Return a publisher's name as it is."""
     if not 0 < len(text) <= 64 or not text.isprintable():
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
     return text
@@ -106,11 +98,6 @@ def _operate(help_text: str) -> Command:
 
 
 def _waiting(usual_s: float) -> tuple[Option, ...]:
-    """Return two options of a command that can wait until the carriages have arrived.
-
-    They are `--timeout`, s, as `timeout_s`, with `usual_s` for its default, and `--no-wait`, which makes `is_waiting`
-    False.
-    """
     return (
         option(
             "--timeout",

@@ -57,18 +57,7 @@ def commission(
     conformance: Path | None,
     is_agreed: bool,
 ) -> Outcome:
-    """Run all steps on the device, and keep findings and page in `folder`, named by its serial number.
-
-    The configuration that the daemon has in force judges, an earlier calibration included. Findings (.json) and page
-    (.html) are written after each step; after the last one also the calibration (.toml). `is_resumed` goes on with
-    those that are there; else a new report replaces them. `weight_N` is the weight to hang up, N; None: there is none.
-    `conformance` is the kit's report, None without one. A person agrees first, unless `is_agreed`.
-
-    The result has the `page` and the fields of a Report. The outcome is REFUSED where a row or a check of the kit
-    failed, or a step stopped. Raises CommandError (USAGE) for files that cannot be read or written. It also does where
-    nothing is there to resume, or `[motor]` has changed since. Raises it (REFUSED) without a device. Raises as
-    `Client.request`, `known_of`, `Run.follow` and `calibrate.agree`; the gap opens then, too.
-    """
+    """Run all steps on the device, and keep findings and page in `folder`, named by its serial number."""
     checks = None if conformance is None else _failed_checks(conformance)
     with Client(endpoints, wait_s, SOURCE) as client:
         status, running = client.status(), client.describe()
@@ -108,22 +97,14 @@ def commission(
 
 
 class Kept:
-    """A report that is written to its file, with the page beside it, after each step.
-
-    `report` is the report so far.
-    """
+    """A report that is written to its file, with the page beside it, after each step."""
 
     def __init__(self, path: Path, report: Report) -> None:
-        """Begin with `report`, and write it. Raises CommandError (USAGE) where it cannot be written."""
         self._path, self.report, self._step = path, report, ""
         self._write()
 
     def follow(self, run: Run, known: Known) -> None:
-        """Run the steps that are `due`, in order, and write the report after each; say each on stderr, with its number.
-
-        That a step stopped, and why, is written; a stop that the steps themselves find is not raised. Raises as
-        `Run.follow`, after writing why. Raises CommandError (USAGE) where the report cannot be written.
-        """
+        """Run the steps that are `due`, in order, and write the report after each; say each on stderr, with its number."""
         steps = due(STEPS, known, self.report.findings)
 
         def begins(step: Step) -> None:
@@ -150,7 +131,7 @@ class Kept:
         self.write(".html", page_of(self.report))
 
     def write(self, suffix: str, text: str) -> None:
-        """Write the report's file with this suffix, whole or not at all. Raises CommandError (USAGE)."""
+        """Write the report's file with this suffix, whole or not at all."""
         with as_usage_error(OSError, hint="give a folder that you may write to"):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with in_place_of(self._path.with_suffix(suffix)) as beside:
@@ -158,20 +139,12 @@ class Kept:
 
 
 def _failed_checks(path: Path) -> list[tuple[str, str, str]]:
-    """Return name, what was seen and what was expected, of each check of the kit's report that did not pass.
-
-    Empty where all passed. Raises CommandError (USAGE) where `path` cannot be read, or is no such report.
-    """
     report = _decoded(path, _Conformance, "give what the kit prints with --json")
     return [(each.name, each.seen, each.expected) for each in report.checks if not each.passed]
 
 
 def _decoded(path: Path, kind: type[Read], hint: str) -> Read:
-    """Read the JSON file `path`, of at most MAX_BYTES, as a `kind`; the caller says what helps, as `hint`.
-
-    Raises CommandError (USAGE) with that hint. The OSError or ValueError of a file that is missing, too large, or no
-    JSON of this kind becomes one.
-    """
+    """Read the JSON file `path`, of at most MAX_BYTES, as a `kind`; the caller says what helps, as `hint`."""
     with as_usage_error(OSError, ValueError, hint=hint):
         try:
             return msgspec.json.decode(read_bounded(path, MAX_BYTES), type=kind)

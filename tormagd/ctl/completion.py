@@ -15,20 +15,13 @@ def completion(parser: ArgumentParser, shell: str) -> Outcome:
 
 
 def script(parser: ArgumentParser, shell: str) -> str:
-    """Return the script by which `shell`, bash or zsh, completes the program of `parser`; paths complete to files.
-
-    Marks the parser's path arguments for shtab, which lasts. Raises NotImplementedError for a shell that shtab does not
-    know.
-    """
+    """Return the script by which `shell`, bash or zsh, completes the program of `parser`; paths complete to files."""
     _complete_paths(parser)
     return str(shtab.complete(parser, shell=shell))
 
 
 def _complete_paths(parser: ArgumentParser) -> None:
-    """Mark arguments of type Path or with metavar FILE, also of subcommands, so that shtab completes them by files.
-
-    Changes the parser's actions, and returns nothing.
-    """
+    """Mark arguments of type Path or with metavar FILE, also of subcommands, so that shtab completes them by files."""
     for action in parser._actions:
         if action.type is Path or action.metavar == "FILE":
             action.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab looks for it here

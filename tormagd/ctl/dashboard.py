@@ -18,12 +18,7 @@ from tormagd_client.endpoints import Endpoints
 
 
 def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
-    """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording.
-
-    It is served at 127.0.0.1 alone; port 0 takes one that is free, and stderr says the address. The result has the
-    `seconds` that it was served. Raises CommandError (USAGE) where the port is taken, or the recording cannot be read
-    or is empty. Raises as `AsyncClient.status` where no daemon answers at the start; one that goes later is waited for.
-    """
+    """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording."""
     start_s = time.monotonic()
     try:
         asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(config, path, port))
@@ -36,11 +31,7 @@ def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int
 
 
 async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
-    """Serve the page of the daemon until a signal, listening to it meanwhile.
-
-    Raises as `AsyncClient.status` where it does not answer within `wait_s` at the start. Raises OSError where the port
-    is taken.
-    """
+    """Serve the page of the daemon until a signal, listening to it meanwhile."""
     async with AsyncClient(endpoints, wait_s) as client:
         shown = Live(client, await client.status(), await client.describe())
         listening = asyncio.create_task(shown.run())
@@ -51,7 +42,7 @@ async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
 
 
 async def _recorded(config: Config, path: Path, port: int) -> None:
-    """Serve the page of a recording. Raises CommandError (USAGE) where it cannot be read or is empty."""
+    """Serve the page of a recording."""
     (file,) = opened(config, [path])
     with as_usage_error(ValueError, hint="give a recording with data"):
         shown = Recorded(file)

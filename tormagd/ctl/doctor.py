@@ -90,12 +90,7 @@ class Running(NamedTuple):
 
 
 def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_s: float, measure: bool) -> Outcome:
-    """Check this machine, and with `measure` also which rates it holds; return the report as text and result.
-
-    Judges the configuration of the daemon that answers within `wait_s`, else `config`, read from `config_file`; None
-    means the defaults. A daemon that cannot be asked is a warning. The result is as of `judged`. The outcome is REFUSED
-    where a check failed. Measuring takes some six seconds. Raises CommandError (REFUSED) where it fails.
-    """
+    """Check this machine, and with `measure` also which rates it holds; return the report as text and result."""
     machine = Machine(Path("/"))
     known: Running | ClientError = running(endpoints, wait_s)
     if isinstance(known, Running):
@@ -104,11 +99,7 @@ def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_
 
 
 def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
-    """Ask the daemon at the control endpoint for its status and configuration, and return both with the file's path.
-
-    Returns the error, and raises nothing, where that fails: nobody answers within `wait_s`, or it is not understood. An
-    endpoint on another machine is not asked: that is an error, too.
-    """
+    """Ask the daemon at the control endpoint for its status and configuration, and return both with the file's path."""
     if not re.match(HERE, endpoints.control):
         return ClientError("elsewhere", f"{endpoints.control} is another machine's", "run tormagctl doctor there")
     try:
@@ -125,13 +116,7 @@ def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
 def judged(
     config: Config, machine: Machine, found: Headroom | None = None, known: Running | ClientError | None = None
 ) -> Outcome:
-    """Return the report on a machine, on the daemon `known` there, and on the headroom `found`.
-
-    A daemon says itself what it was granted; where `known` is an error or None, the caller's rights are judged by
-    `config`. None for `known` or `found` leaves that part out. The result holds `checks`, each a Finding's fields, and
-    the counts `ok`, `warn` and `fail`. With `found` it holds `measured`: that, and `rates`, each a Rate's fields. The
-    outcome is REFUSED where a check failed.
-    """
+    """Return the report on a machine, on the daemon `known` there, and on the headroom `found`."""
     if isinstance(known, Running):
         findings = (*of_daemon(known), *(check(_in_force(known), machine) for check in OF_MACHINE))
     else:
@@ -155,17 +140,11 @@ def judged(
 
 
 def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Severity = Severity.WARN) -> Finding:
-    """Return an OK finding without a remedy, or one with `remedy` and the verdict `otherwise`."""
     return Finding(name, Severity.OK, found) if is_good else Finding(name, otherwise, found, remedy)
 
 
 def of_daemon(known: Running) -> tuple[Finding, ...]:
-    """Return findings on what a daemon says of itself: that it runs, its build, its link, and its device's calibration.
-
-    What it asked of the kernel is among them: FAIL for a setting that was refused, WARN for `fifo_priority` or
-    `lock_memory` that is not set. Other settings that are not set have no finding. FAIL is also a link that is not
-    RUNNING. WARN is an interpreted build, and a calibration that is refused.
-    """
+    """Return findings on what a daemon says of itself: that it runs, its build, its link, and its device's calibration."""
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
     findings = [
@@ -202,10 +181,7 @@ def _in_force(known: Running) -> Config:
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
     """Return five findings on a measurement: bare timer, what others took, the core's cost, control rate, inference
-    rate.
-
-    The rates are those of `config`.
-    """
+    rate."""
     held = {row.loop: row for row in rates(config, found) if row.configured}
     return (
         bare_timer(found),
@@ -216,10 +192,7 @@ def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
 
 
 def bare_timer(found: Headroom) -> Finding:
-    """Judge how late a thread wakes that does nothing else, at the control rate, us.
-
-    WARN where its p99 is over LATE_SHARE of a period, or it missed more than MISSED_SHARE of its beats; else OK.
-    """
+    """Judge how late a thread wakes that does nothing else, at the control rate, us."""
     late_us, rate_hz = found.bare.lateness_us, found.bare.rate_hz
     return _finding(
         "bare timer",
@@ -231,10 +204,7 @@ def bare_timer(found: Headroom) -> Finding:
 
 
 def others(found: Headroom) -> Finding:
-    """Judge what a hypervisor and other programs took during the measurement, as shares of its time.
-
-    WARN where `steal` is over MAX_STOLEN, or `waited` over MAX_WAITED; a wait that is not known passes.
-    """
+    """Judge what a hypervisor and other programs took during the measurement, as shares of its time."""
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
     is_stolen = found.steal > MAX_STOLEN
     return _finding(
@@ -246,10 +216,7 @@ def others(found: Headroom) -> Finding:
 
 
 def core(found: Headroom) -> Finding:
-    """Report the core's build, what its step and plan take, us, and how long the reference loop took here.
-
-    Always OK: the findings on the rates judge it. The reference loop tells how fast machines are beside each other.
-    """
+    """Report the core's build, what its step and plan take, us, and how long the reference loop took here."""
     step, plan = found.step_us, found.plan_us
     return Finding(
         "core",
@@ -266,10 +233,7 @@ def configured_rate(row: Rate) -> Finding:
 
 
 def preemption(config: Config, machine: Machine) -> Finding:
-    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT, else WARN, naming the model in force.
-
-    The model that was asked for at boot is named where the one in force cannot be read, as that takes root.
-    """
+    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT, else WARN, naming the model in force."""
     version = machine.text("/proc/version") or ""
     is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
     # the model in force stands in brackets or parentheses; reading it takes root
@@ -292,10 +256,7 @@ def preemption(config: Config, machine: Machine) -> Finding:
 
 
 def governor(config: Config, machine: Machine) -> Finding:
-    """Judge whether processors slow down between ticks: WARN unless every scaling governor is `performance`.
-
-    OK also where the kernel tells of no governor.
-    """
+    """Judge whether processors slow down between ticks: WARN unless every scaling governor is `performance`."""
     files = machine.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governors = {text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))}
     return _finding(
@@ -308,10 +269,7 @@ def governor(config: Config, machine: Machine) -> Finding:
 
 def scheduling(config: Config, machine: Machine) -> Finding:
     """Judge whether the caller may use SCHED_FIFO at the configured priority: FAIL where not; WARN for priority 0,
-    which asks for none.
-
-    The capability CAP_SYS_NICE allows all priorities; without it the process's own limit counts.
-    """
+    which asks for none."""
     wanted = config.realtime.fifo_priority
     allowed = 99 if machine.has_capability(CAP_SYS_NICE) else int(machine.limit("Max realtime priority"))
     return _finding(
@@ -327,10 +285,7 @@ def scheduling(config: Config, machine: Machine) -> Finding:
 
 def memory_lock(config: Config, machine: Machine) -> Finding:
     """Judge whether the caller may lock MEMORY_TO_LOCK_BYTES; where not, FAIL if `lock_memory` is configured, else
-    WARN.
-
-    The capability CAP_IPC_LOCK allows it; without it the process's own limit counts.
-    """
+    WARN."""
     limit = float("inf") if machine.has_capability(CAP_IPC_LOCK) else machine.limit("Max locked memory")
     return _finding(
         "memlock",
@@ -342,10 +297,7 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
-    """Judge the processors online: FAIL where `realtime.cpus` names one that is not, WARN for under two, else OK.
-
-    Processors are taken to be numbered from 0 without a gap.
-    """
+    """Judge the processors online: FAIL where `realtime.cpus` names one that is not, WARN for under two, else OK."""
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:
@@ -382,10 +334,7 @@ def clock_source(config: Config, machine: Machine) -> Finding:
 
 def swap(config: Config, machine: Machine) -> Finding:
     """Judge whether the daemon's memory can be paged out: WARN where swap is on, and `realtime.lock_memory` is not
-    configured.
-
-    OK otherwise, also where /proc/swaps cannot be read. Only the first swap area is named.
-    """
+    configured."""
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
         return Finding("swap", Severity.OK, "off")
@@ -395,10 +344,7 @@ def swap(config: Config, machine: Machine) -> Finding:
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
-    """Judge whether the kernel stops processes to make huge pages: WARN where transparent huge pages are `always`.
-
-    OK for another setting, and for a kernel without them.
-    """
+    """Judge whether the kernel stops processes to make huge pages: WARN where transparent huge pages are `always`."""
     active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
     found = active[1] if active else "not in this kernel"
     return _finding(
@@ -411,11 +357,7 @@ def huge_pages(config: Config, machine: Machine) -> Finding:
 
 def autogroup(config: Config, machine: Machine) -> Finding:
     """Judge whether the kernel shares processors between sessions first: WARN where it does, without
-    `realtime.fifo_priority`.
-
-    Beside busy programs a kernel worker that carries a serial port's bytes then waits for up to 100 ms, and the device
-    counts as silent. OK also for a kernel without autogroups (sched(7)).
-    """
+    `realtime.fifo_priority`."""
     is_on = machine.text("/proc/sys/kernel/sched_autogroup_enabled") == "1"
     return _finding(
         "autogroup",
@@ -427,10 +369,7 @@ def autogroup(config: Config, machine: Machine) -> Finding:
 
 def run_directory(config: Config, machine: Machine) -> Finding:
     """Judge whether the caller can write where the configured control socket lies: FAIL where not, or where there is no
-    folder.
-
-    OK for an address that is no absolute ipc:// path. The other endpoints are not looked at.
-    """
+    folder."""
     address = config.endpoints.control
     if not address.startswith("ipc:///"):
         return Finding("run directory", Severity.OK, f"none needed for {address}")
@@ -454,10 +393,7 @@ def run_directory(config: Config, machine: Machine) -> Finding:
 
 
 def port(config: Config, machine: Machine) -> Finding:
-    """Judge whether the configured device's port is there, and readable and writable for the caller: FAIL where not.
-
-    A name that is no path is a CAN interface: WARN where it is not there. It is not opened.
-    """
+    """Judge whether the configured device's port is there, and readable and writable for the caller: FAIL where not."""
     name = config.device.port
     if not name.startswith("/"):
         is_there = machine.path(f"/sys/class/net/{name}").exists()
@@ -484,10 +420,7 @@ def port(config: Config, machine: Machine) -> Finding:
 
 
 def port_holder(config: Config, machine: Machine) -> Finding:
-    """Judge whether a process other than tormagd has the port open: FAIL, naming each, else OK.
-
-    Only processes that the caller may look into are seen. Of a pseudo-terminal only those count that have locked it.
-    """
+    """Judge whether a process other than tormagd has the port open: FAIL, naming each, else OK."""
     name = config.device.port
     target = machine.resolved(name)
     others = machine.holders([target])[0][target] if name.startswith("/") else []
@@ -502,10 +435,7 @@ def port_holder(config: Config, machine: Machine) -> Finding:
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:
-    """Judge how long a USB serial chip keeps received bytes back: WARN over FAST_LATENCY_MS.
-
-    OK for less, and where the port has no such timer.
-    """
+    """Judge how long a USB serial chip keeps received bytes back: WARN over FAST_LATENCY_MS."""
     adapter = os.path.basename(machine.resolved(config.device.port))  # noqa: PTH119
     file = f"/sys/bus/usb-serial/devices/{adapter}/latency_timer"
     latency_ms = machine.number(file) if adapter else None
@@ -543,12 +473,6 @@ CHECKS = (*OF_CALLER, *OF_MACHINE)
 
 
 def _table(table: tuple[Rate, ...]) -> str:
-    """Return the table of all rates, a row each: loop, Hz, share used, whether held with margin, and what would hold
-    it.
-
-    The share is of a period or of a processor, the larger of both. An asterisk marks the configured rates. The first
-    line is empty; then come a title and the columns' names.
-    """
     lines = [
         f"\nrates (at most {MAX_USED:.0%} used is held with margin; * is configured):",
         "  loop          Hz    used  held  to hold it",
@@ -562,10 +486,7 @@ def _table(table: tuple[Rate, ...]) -> str:
 
 
 def _text(findings: tuple[Finding, ...]) -> str:
-    """Return a line for each finding, in their order: verdict, name and what was found; a remedy has the line below.
-
-    Verdicts are coloured where stdout is a terminal.
-    """
+    """Return a line for each finding, in their order: verdict, name and what was found; a remedy has the line below."""
     colour = Colour(sys.stdout)
     paint = {Severity.OK: colour.green, Severity.WARN: colour.yellow, Severity.FAIL: colour.red}
     return "\n".join(

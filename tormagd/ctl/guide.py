@@ -10,10 +10,7 @@ FOLDERS = ("guides", "reference", ".")
 
 
 def guide(name: str | None) -> Outcome:
-    """Return a page of the documentation, as text and as `name` and `text`; with None, the list of all pages.
-
-    That result is `guides`: titles by name, in the order of FOLDERS. Raises CommandError (USAGE) for an unknown name.
-    """
+    """Return a page of the documentation, as text and as `name` and `text`; with None, the list of all pages."""
     folders = [files("tormagd") / "docs" / folder for folder in FOLDERS]
     pages = {
         page: (folder / f"{page}.md").read_text(encoding="utf-8")

@@ -47,11 +47,7 @@ class Bare(msgspec.Struct, frozen=True):
 
 
 class Headroom(msgspec.Struct, frozen=True):
-    """What `python -m tormagd.headroom` prints, and the shares of its time that others took.
-
-    `steal` a hypervisor gave to others. For `waited` of the time something waited for a processor; None where the
-    kernel does not say.
-    """
+    """What `python -m tormagd.headroom` prints, and the shares of its time that others took."""
 
     machine_us: float
     build: str
@@ -63,11 +59,7 @@ class Headroom(msgspec.Struct, frozen=True):
 
 
 class Rate(msgspec.Struct, frozen=True):
-    """One rate of one loop, beside the other loop's configured rate.
-
-    `used` is the share taken of a period or of a processor, the larger of both. `change` says what to change where the
-    rate is not held; empty where it is.
-    """
+    """One rate of one loop, beside the other loop's configured rate."""
 
     loop: str
     hz: int
@@ -78,11 +70,7 @@ class Rate(msgspec.Struct, frozen=True):
 
 
 def measured(path: Path | None, machine: Machine) -> Headroom:
-    """Measure this machine in a process of its own, for the configuration in `path`; None takes the defaults.
-
-    `machine` is this one, whose kernel tells before and after what others took, as `steal` and `waited`. Waits for the
-    process. Raises CommandError (REFUSED) where it fails, as for a faulty configuration, or takes over LONGEST_S.
-    """
+    """Measure this machine in a process of its own, for the configuration in `path`; None takes the defaults."""
     before, started_s = machine.taken(), time.monotonic()
     try:
         printed = answer_of("tormagd.headroom", [f"--config={path}"] if path else [], LONGEST_S)
@@ -96,11 +84,7 @@ def measured(path: Path | None, machine: Machine) -> Headroom:
 
 
 def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | None]:
-    """Return the share of time stolen between two readings, and the share in which something waited for a processor.
-
-    Both are 0..1. `took_s` lies between the readings, s, and must be above 0. The second is None where the kernel does
-    not say.
-    """
+    """Return the share of time stolen between two readings, and the share in which something waited for a processor."""
     steal = (after.stolen - before.stolen) / max(after.ticks - before.ticks, 1)
     if before.waited_us is None or after.waited_us is None:
         return steal, None
@@ -108,11 +92,7 @@ def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | N
 
 
 def rates(config: Config, found: Headroom) -> Iterator[Rate]:
-    """Yield a verdict on each of RATES_HZ and the configured rate, for control, then for inference, each rising.
-
-    A control rate is judged beside the configured inference rate, or its own where that is less. An inference rate is
-    judged beside the configured control rate; one above that is left out, unless it is configured.
-    """
+    """Yield a verdict on each of RATES_HZ and the configured rate, for control, then for inference, each rising."""
     control_hz, inference_hz = config.rates.control_hz, config.rates.inference_hz
     for hz in sorted({*RATES_HZ, control_hz}):
         yield _judged("control", hz, hz == control_hz, found, hz, min(inference_hz, hz))
@@ -121,12 +101,7 @@ def rates(config: Config, found: Headroom) -> Iterator[Rate]:
 
 
 def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: int, inference_hz: int) -> Rate:
-    """Judge the rate `hz` of `loop`, "control" or "inference", where the loops run at `control_hz` and `inference_hz`.
-
-    `used` is the larger of two shares: of a period, by which the work has to be done, and of one processor, which all
-    share. A control tick counts with the p99 of its lateness and its step, a plan with medians. It holds up to
-    MAX_USED; above that `change` says what helps first.
-    """
+    """Judge the rate `hz` of `loop`, "control" or "inference", where the loops run at `control_hz` and `inference_hz`."""
     late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us
     period = 1e-6 * control_hz
     if loop == "control":

@@ -12,22 +12,12 @@ HINT = "tormagctl keys generate --help; the guide has the whole exchange"
 
 
 def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) -> Outcome:
-    """Show fingerprints at `path` for `action` "show", else generate keys in the folder `path`.
-
-    `clients` are names by role. Raises CommandError (USAGE) as `generate_keys` and `show_keys`.
-    """
+    """Show fingerprints at `path` for `action` "show", else generate keys in the folder `path`."""
     return show_keys(path) if action == "show" else generate_keys(path, clients, client)
 
 
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
-    """Make the daemon's key pair where there is none, and one for each of `clients`, by role; or only one for `client`.
-
-    `clients` has the names by role, which names a folder. The folder, made where it is missing, gets
-    `server.key_secret`, `server.key`, each `NAME.key_secret`, and a folder for each role with every `NAME.key` that is
-    let in. The result's `made` has a dict for each pair, as `_made`. Raises CommandError (USAGE) where both `client`
-    and `clients` are given, or a file exists or cannot be made. It also does without names where the daemon has its
-    pair already. Pairs made before that stay.
-    """
+    """Make the daemon's key pair where there is none, and one for each of `clients`, by role; or only one for `client`."""
     names = [name for listed in clients.values() for name in listed]
     if client is not None and names:
         raise usage_error("--client stands alone: it makes a pair that no list of this machine has", HINT)
@@ -44,12 +34,7 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
 
 
 def show_keys(path: Path) -> Outcome:
-    """Return the fingerprint of the key in a file, or of every `NAME.key` in a folder; nothing is written.
-
-    A file may be a `.key` or a `.key_secret`. The result's `keys` have `name` and `fingerprint` each, sorted by name,
-    and are empty for a folder without any. Raises CommandError (USAGE) for a missing path, a file that holds no key,
-    and a folder as `load_folder` refuses it.
-    """
+    """Return the fingerprint of the key in a file, or of every `NAME.key` in a folder; nothing is written."""
     with as_usage_error(ConfigError, hint="give a .key or .key_secret file, or a folder of them"):
         found = load_folder(path) if path.is_dir() else [(path.stem, load_public(path).decode())]
         keys = [{"name": name, "fingerprint": fingerprint(public)} for name, public in found]
@@ -57,12 +42,6 @@ def show_keys(path: Path) -> Outcome:
 
 
 def _made(name: str, role: str, secret_in: Path, public_in: Path) -> dict[str, str]:
-    """Make a key pair `name`, its secret part in one folder and its public part in the other, and describe it.
-
-    Files have mode 0600; missing folders are made, with 0700. Returns `name`, `role`, which is not checked, the paths
-    `secret` and `public`, and the `fingerprint`. Raises ConfigError where a file exists or cannot be made, or the name
-    is not allowed: then neither file was made, and none is overwritten.
-    """
     secret, public = generate(name, secret_in, public_in)
     return {
         "name": name,

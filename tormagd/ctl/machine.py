@@ -10,11 +10,7 @@ from tormagd_client.printable import printable
 
 
 class Taken(NamedTuple):
-    """The kernel's counters of what others took; the difference of two readings tells of the time between them.
-
-    `stolen` of `ticks` the hypervisor gave to others. For `waited_us` something was ready to run and had no processor;
-    None where the kernel does not say.
-    """
+    """The kernel's counters of what others took; the difference of two readings tells of the time between them."""
 
     stolen: int
     ticks: int
@@ -60,12 +56,7 @@ class Machine:
         return sum(int(last or first) - int(first) + 1 for first, last in ranges) or 1
 
     def taken(self) -> Taken:
-        """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi).
-
-        `stolen` and `ticks` are of all processors since boot, in the kernel's clock ticks. Both are 0 without
-        /proc/stat; the time waited, us, is None without /proc/pressure/cpu. Raises ValueError for a first line of
-        /proc/stat that is not the kernel's.
-        """
+        """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi)."""
         first = (self.text("/proc/stat") or "").split("\n", 1)[0]
         fields = [int(field) for field in first.split()[1:9]]  # beyond: guests, who are counted as users already
         some = re.search(r"^some .*total=(\d+)$", self.text("/proc/pressure/cpu") or "", re.MULTILINE)
@@ -78,11 +69,7 @@ class Machine:
 
     def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
         """Return, for each of `paths`, id and name of each process that has it open; and how many processes could not
-        be looked into.
-
-        This process is left out. `paths` are to be absolute and without symbolic links; links are not followed. Each
-        has a list, which is empty where nobody has it open.
-        """
+        be looked into."""
         holding: dict[str, list[tuple[int, str]]] = {path: [] for path in paths}
         hidden = 0
         for process in sorted(self.path("/proc").glob("[0-9]*")):
@@ -105,10 +92,7 @@ class Machine:
         return printable(self.text(f"/proc/{process_id}/comm") or "?")
 
     def lock_owners(self, absolute: str) -> list[int]:
-        """Return the ids of the processes, of any user, that hold a flock on a file, in rising order.
-
-        Empty where there is none, no such file, or no /proc/locks.
-        """
+        """Return the ids of the processes, of any user, that hold a flock on a file, in rising order."""
         try:
             status = self.path(absolute).stat()
         except OSError:

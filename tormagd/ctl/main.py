@@ -46,11 +46,7 @@ EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command, print its outcome or error, and return the exit code; 130 after Ctrl-C.
-
-    `arguments` None takes those of the process. Wrong arguments and a missing extra, which is named, give 2. `--help`
-    and `--version` raise SystemExit.
-    """
+    """Run one command, print its outcome or error, and return the exit code; 130 after Ctrl-C."""
     write_in_any_encoding()
     given = sys.argv[1:] if arguments is None else arguments
     try:
@@ -81,12 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Outcome:
-    """Import the command's function, call it with its options and what it needs, and return its outcome.
-
-    `options` are those of `parser`. Loads the configuration, and opens a client, which is closed at the end, where they
-    are needed. `doctor` without --config reads SERVICE_CONFIG where that exists. Raises CommandError (USAGE) for a
-    faulty configuration or endpoint, ModuleNotFoundError for a missing extra, and as the function.
-    """
+    """Import the command's function, call it with its options and what it needs, and return its outcome."""
     command = COMMANDS[options.command]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
@@ -112,12 +103,7 @@ def _run(options: argparse.Namespace) -> Outcome:
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
-    """Return the configured endpoints and keys with the changes that options, or else the environment, make.
-
-    An `--endpoint` of `ipc://DIR/control` stands for all endpoints in DIR, under the daemon's own names; any other
-    replaces the control endpoint alone. Key files are not read here. Raises CommandError (USAGE) for an address or keys
-    that cannot be used.
-    """
+    """Return the configured endpoints and keys with the changes that options, or else the environment, make."""
     changed: dict[str, object] = {}
     given = {
         "client_secret": options.key or os.environ.get(KEY),
@@ -141,10 +127,7 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of `tormagctl`'s arguments; completions and man pages are made from it, too.
-
-    Shared options may stand before or after the command. It raises UsageError for arguments that it refuses.
-    """
+    """Return the parser of `tormagctl`'s arguments; completions and man pages are made from it, too."""
     # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
     shared = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     _add(shared, SHARED)

@@ -36,12 +36,7 @@ UP = "Whether the daemon answers"
 
 def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
     """Return the metrics as text where `port` is None; else serve them at that port of 127.0.0.1 until Ctrl-C or
-    SIGTERM.
-
-    The result holds the text as `metrics`, or the `address` that was served. Port 0 takes one that is free; the address
-    is said on stderr. Each scrape asks the daemon anew, as `Scrape.collect`, and waits `wait_s` at most. Raises
-    CommandError (USAGE) where the port is taken, and as `Client.status` where no daemon answers at the start.
-    """
+    SIGTERM."""
     with Client(endpoints, wait_s) as client:
         client.status()
     registry = CollectorRegistry()
@@ -100,11 +95,7 @@ def _family(
     values: Mapping[tuple[str, ...], float | None],
     unit: float = 1.0,
 ) -> Iterator[Metric]:
-    """Yield one metric, `tormag_` and `name`, with a sample for each value, times `unit`; `text` is its help.
-
-    `values` are by the values of `labels`, in that order; `()` without labels. None has no sample. A metric without
-    labels whose value is None is not yielded at all; with labels its head is, even without a sample.
-    """
+    """Yield one metric, `tormag_` and `name`, with a sample for each value, times `unit`; `text` is its help."""
     family = kind(f"tormag_{name}", text, labels=labels)
     for key, value in values.items():
         if value is not None:
@@ -114,10 +105,7 @@ def _family(
 
 
 def _families(status: Status) -> Iterator[Metric]:
-    """Yield the metrics of a status that are numbers, faults or limits, in base units (s, N, m, T).
-
-    One whose value is unknown is left out; of one with labels its head is yielded all the same.
-    """
+    """Yield the metrics of a status that are numbers, faults or limits, in base units (s, N, m, T)."""
     link, setpoints, rates, followed = status.link, status.setpoints, status.rates, status.following
     error_N, aligned_N, delay_ms = (None, None, None) if followed is None else msgspec.structs.astuple(followed)
     sources, trip_us = setpoints.by_source, status.link.round_trip_us

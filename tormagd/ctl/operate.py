@@ -39,12 +39,7 @@ COMES_BACK_S = 0.6
 
 
 def arm(client: Client, timeout_s: float) -> Outcome:
-    """Have the daemon clear faults, home and enable, as far as needed, and say each step on stderr.
-
-    The result has the steps `given`, empty where it was armed already, `operating_state`, and the `seconds` that it
-    took. Raises CommandError (REFUSED) where the device is not ENABLED afterwards. Raises as `Client.arm`: RefusedError
-    after `timeout_s`, UnreachableError without a daemon. Ctrl-C and the timeout disable the device: the gap opens.
-    """
+    """Have the daemon clear faults, home and enable, as far as needed, and say each step on stderr."""
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
     known = client.status()
@@ -58,14 +53,7 @@ def arm(client: Client, timeout_s: float) -> Outcome:
 
 
 def operate(client: Client, command: str) -> Outcome:
-    """Give one command of DONE (enable, disable, pause, resume, stop, clear-fault), and return the daemon's answer.
-
-    The daemon carries it out or refuses it at once. The result has `operating_state` and `is_connected`; the gap may
-    still move. `stop` without a device gives an outcome of REFUSED: the gap does not open. After a fault was cleared,
-    watches for COMES_BACK_S; where none was latched, it does not, and the text says so. Raises CommandError: REFUSED
-    where the answer does not show the state, FAULT where the fault comes back. Raises as `Client.request`, and KeyError
-    for another command, after it was given.
-    """
+    """Give one command of DONE (enable, disable, pause, resume, stop, clear-fault), and return the daemon's answer."""
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
     state = result.get("operating_state")
@@ -83,13 +71,7 @@ def operate(client: Client, command: str) -> Outcome:
 
 
 def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
-    """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open.
-
-    The result is that of `operate`, after waiting with the `seconds`. `stop` without a device gives an outcome of
-    REFUSED at once. Shows progress on a terminal. Raises as `operate`. Raises CommandError: FAULT where the gap cannot
-    open, or `disable` meets any fault; REFUSED where the gap is not known to be open within `timeout_s`. The daemon
-    goes on opening it.
-    """
+    """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open."""
     begun = operate(client, command)
     if begun.exit_code is not Exit.DONE or not is_waiting:
         return begun
@@ -110,11 +92,7 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
 
 
 def take(client: Client, source: str) -> Outcome:
-    """Give the brake to `source`, whoever holds it, so that its setpoints are rendered.
-
-    The result has `source`, and as `instead_of` the holder before, which may be `source` itself. Raises as
-    `Client.request`, and CommandError (REFUSED) where the answer names another holder.
-    """
+    """Give the brake to `source`, whoever holds it, so that its setpoints are rendered."""
     result = client.request("take", source=source)
     if result.get("source") != source:
         raise _not_done(f"the daemon answers that {result.get('source')!r} holds the brake, not {source!r}")
@@ -124,12 +102,7 @@ def take(client: Client, source: str) -> Outcome:
 
 
 def confirm(client: Client, what: str) -> Outcome:
-    """Settle a dispute between force sensor and believed device, by saying what is to be doubted.
-
-    `what` is "device": it has changed, and is learned anew; or "sensor": it is not believed. The result has it as
-    `confirmed`. Raises as `Client.request`: RefusedError where nothing is disputed. Raises CommandError (REFUSED) where
-    the daemon confirms something else.
-    """
+    """Settle a dispute between force sensor and believed device, by saying what is to be doubted."""
     result = client.request("confirm", what=what)
     if result.get("confirmed") != what:
         raise _not_done(f"the daemon answers that {result.get('confirmed')!r} is confirmed, not {what!r}")
@@ -142,12 +115,7 @@ def _not_done(what: str) -> CommandError:
 
 
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
-    """Home both carriages, and with `is_waiting` wait until they are homed, showing progress on a terminal.
-
-    The result has `operating_state` and `is_connected`, and after waiting the `seconds`. Raises CommandError (FAULT)
-    where the device is in FAULT meanwhile. REFUSED is a homing that does not begin within BEGIN_S, or leaves the device
-    not homed. REFUSED is also one that takes over `timeout_s`; it goes on. Raises as `Client.request`.
-    """
+    """Home both carriages, and with `is_waiting` wait until they are homed, showing progress on a terminal."""
     was_homed = client.status().is_homed
     result = client.request("home")
     if not is_waiting:
@@ -176,11 +144,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
 
 
 def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tuple[float, Status]]:
-    """Yield seconds since the start and status, every POLL_S; end after `timeout_s` without raising anything.
-
-    With a `timeout_s` above 0 there is at least one. On a terminal a line of progress on stderr says what the device is
-    `doing`, and is removed at the end. An empty `doing` draws none. Raises as `Client.status`.
-    """
+    """Yield seconds since the start and status, every POLL_S; end after `timeout_s` without raising anything."""
     started_s = time.monotonic()
     shows_progress = bool(doing) and is_terminal(sys.stderr)
     try:
@@ -197,10 +161,7 @@ def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tupl
 
 
 def require_no_fault(state: Status, what: str) -> None:
-    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to do; else return.
-
-    The message begins with `what`. Cause and remedy are of the first fault other than STOPPED, where there is one.
-    """
+    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to do; else return."""
     if state.operating_state != "FAULT":
         return
     # what the device met says more than that somebody stopped it

@@ -55,10 +55,7 @@ def usage_error(message: str, hint: str) -> CommandError:
 
 @contextmanager
 def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
-    """Turn an exception of these kinds raised within this context into a CommandError (USAGE) with `hint`.
-
-    The text stays; of an OSError it is the file's name and the reason. Other exceptions pass.
-    """
+    """Turn an exception of these kinds raised within this context into a CommandError (USAGE) with `hint`."""
     try:
         yield
     except kinds as error:
@@ -76,12 +73,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
-    """Print the outcome to stdout, as text or as one JSON object `{command, ok, result, error}`; return the exit code.
-
-    `ok` is true for the exit code DONE alone, and `error` is null. REFUSED is returned where all was done, but the
-    answer could not be written, as on a full disk; stderr says why then. A stdout that is closed, or whose reader has
-    gone, is no failure.
-    """
+    """Print the outcome to stdout, as text or as one JSON object `{command, ok, result, error}`; return the exit code."""
     is_done = outcome.exit_code is Exit.DONE
     text = _object(command, is_done, outcome.result, None) if as_json else outcome.text
     is_written = write_answer(text, f"tormagctl {command}")
@@ -89,11 +81,7 @@ def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
 
 
 def print_error(command: str, error: ClientError, as_json: bool) -> None:
-    """Print the error and its remedy to stderr, made printable, and with `as_json` an object to stdout as well.
-
-    It is `{command, ok, result, error}`, with `error` as `{code, message, hint}` and a result of null. `command` may be
-    empty.
-    """
+    """Print the error and its remedy to stderr, made printable, and with `as_json` an object to stdout as well."""
     colour = Colour(sys.stderr)
     said, hint = colour.red(printable(error.message)), printable(error.hint)
     write_line(f"{f'tormagctl {command}'.rstrip()}: {said}\n  next: {hint}", sys.stderr)
@@ -108,11 +96,7 @@ def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[s
 
 def folded(text: str) -> str:
     """Wrap `text` to the terminal's width, with a line's rest indented under its words; unchanged where stdout is no
-    terminal.
-
-    A line's words begin behind its label, of up to 24 characters, and at most a third of the width in. Widths under
-    NARROWEST count as that.
-    """
+    terminal."""
     if not is_terminal(sys.stdout):
         return text
     width = max(shutil.get_terminal_size().columns, NARROWEST)

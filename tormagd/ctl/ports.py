@@ -46,10 +46,7 @@ class ListedPort(msgspec.Struct, frozen=True):
 
 
 class CanChannel(msgspec.Struct, frozen=True):
-    """A CAN channel that python-can could connect to now, or the configured one.
-
-    Several processes may use one together. `is_up` is None where it cannot be told.
-    """
+    """A CAN channel that python-can could connect to now, or the configured one."""
 
     interface: str
     channel: str
@@ -67,11 +64,7 @@ class Ports(msgspec.Struct, frozen=True):
 
 
 def ports(config: Config, root: Path = Path("/")) -> Outcome:
-    """Look for serial ports and CAN channels now, for at most about DETECTION_S, and report them.
-
-    The result has the fields of a `Ports`. No port is opened. Silences python-can's log below CRITICAL, which lasts.
-    `root` is where the machine's file system begins.
-    """
+    """Look for serial ports and CAN channels now, for at most about DETECTION_S, and report them."""
     # it says at every start which makers' libraries are not installed
     logging.getLogger("can").setLevel(logging.CRITICAL)
     import can
@@ -84,11 +77,7 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
 
 
 def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:
-    """Describe serial ports, CAN channels, and the processes that hold ports; serial ports are sorted by path.
-
-    `listed` are pyserial's ListPortInfo, `detected` python-can's configurations, with `interface` and `channel`. A
-    configured serial port is added where it exists, a configured CAN channel always, as the last.
-    """
+    """Describe serial ports, CAN channels, and the processes that hold ports; serial ports are sorted by path."""
     known = {machine.resolved(info.device): info for info in listed}
     configured = machine.resolved(config.device.port) if _is_line(config) else ""
     if configured and machine.path(configured).exists():
@@ -108,10 +97,7 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
 def _serial_port(
     machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
 ) -> ListedPort:
-    """Describe the serial port at `path`, which has no symbolic links; `info` is pyserial's, None where it lists none.
-
-    `opened` are id and name of the processes that have it open; those that have locked it are added as holders.
-    """
+    """Describe the serial port at `path`, which has no symbolic links; `info` is pyserial's, None where it lists none."""
     locking = machine.lock_owners(path)
     names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
     has_usb_id = info is not None and info.vid is not None
@@ -128,7 +114,6 @@ def _serial_port(
 
 
 def _is_line(config: Config) -> bool:
-    """Return whether the configured port is a serial port, as it is for an slcan adapter, too."""
     is_adapter = config.device.options.get("interface") == "slcan"
     return config.device.port.startswith("/") and (config.device.backend != "can" or is_adapter)
 
@@ -142,11 +127,7 @@ def _is_up(machine: Machine, channel: str) -> bool | None:
 
 
 def _text(found: Ports, config: Config, colour: Colour) -> str:
-    """Return a line for each serial port, its holders below it, then one for each CAN channel.
-
-    A configured serial port that is not there has a line, too. A last one counts the processes that cannot be looked
-    into. Without any line the text says that there is no port.
-    """
+    """Return a line for each serial port, its holders below it, then one for each CAN channel."""
     lines = []
     for entry in found.serial:
         marks = [

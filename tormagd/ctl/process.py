@@ -6,12 +6,7 @@ from collections.abc import Iterable
 
 
 def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
-    """Run `python -m MODULE` with `arguments` and return what it prints to stdout, as text. What it says on stderr is
-    not shown.
-
-    Raises TimeoutError after `longest_s`, which ends it. Raises ChildProcessError, with stderr's last line, where its
-    exit code is not 0.
-    """
+    """Run `python -m MODULE` with `arguments` and return what it prints to stdout, as text."""
     command = [sys.executable, "-P", "-m", module, *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=longest_s, check=False)

@@ -45,23 +45,13 @@ def budget_of(settings: Recordings) -> Budget:
 
 
 def key_of(config: Config) -> bytes:
-    """Read the configured sealing key; empty where none is configured. Raises CommandError (USAGE) where it cannot be
-    read."""
+    """Read the configured sealing key; empty where none is configured."""
     with as_usage_error(OSError, ValueError, hint="[recordings] key names a file of 16 to 64 bytes"):
         return read_key(config.recordings.key)
 
 
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
-    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder.
-
-    `path` is a new file that ends in .mcap, or a folder that is there. What the daemon runs is asked and written first,
-    and again at the end: its device may have been connected meanwhile. The result is as of `_record`. The outcome is
-    REFUSED where ticks were lost, UNREACHABLE where the daemon was gone at the end.
-
-    Raises CommandError (USAGE) where the folder is missing, where the file exists or cannot be made, and as `key_of`.
-    UNREACHABLE is a daemon that publishes nothing within `wait_s`, or does not answer: then there is no file. REFUSED
-    is a disk that takes no more: what was written stays.
-    """
+    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder."""
     if path.suffix != ".mcap" and not path.is_dir():
         raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
     key, keys = key_of(config), keys_of(endpoints.curve)
@@ -99,11 +89,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
-    """Ask the daemon what it runs, within `wait_s`, and return it as a recording's metadata.
-
-    Keys are the fields of a Description. Values are texts as they are, and others as JSON; unknown ones are left out.
-    Raises as `Client.describe`.
-    """
+    """Ask the daemon what it runs, within `wait_s`, and return it as a recording's metadata."""
     with Client(endpoints, wait_s) as client:
         known = msgspec.to_builtins(client.describe())
     return {
@@ -114,10 +100,7 @@ def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
 
 
 def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
-    """Wait until a socket has a message, and return True; False after `wait_s`, or once interrupted, within POLL_MS.
-
-    Nothing is received here. Looks once even for a `wait_s` of 0.
-    """
+    """Wait until a socket has a message, and return True; False after `wait_s`, or once interrupted, within POLL_MS."""
     end_s = time.monotonic() + wait_s
     while True:
         ready, _, _ = zmq.select(list(sockets), [], [], POLL_MS / 1e3)
@@ -132,15 +115,7 @@ def _record(
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
-    """Write what arrives until the time or an interrupt ends it, then what still waits, for LONGEST_END_S at most.
-
-    `duration_s` may be infinity: then only an interrupt ends it. The result has the last `file`, `seconds`, and how
-    many came and were lost: `telemetry`, `telemetry_lost`, `ticks`, `ticks_lost`. `silent_ms` is the time since the
-    last readable ticks, or since the beginning where none came; telemetry does not count. `unreadable` counts messages
-    that were left out; stderr tells why of the first. Silence does not end it, and `writer` stays open. The outcome is
-    UNREACHABLE for a silence of over SILENT_S at the end, else REFUSED where ticks were lost, else DONE. Raises OSError
-    where the disk takes no more.
-    """
+    """Write what arrives until the time or an interrupt ends it, then what still waits, for LONGEST_END_S at most."""
     unreadable = 0
     start_s = heard_s = time.monotonic()
     is_over = False

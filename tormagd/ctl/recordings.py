@@ -15,26 +15,13 @@ from tormagd_client.blocking import Client
 
 
 def mark(client: Client, text: str) -> Outcome:
-    """Put an event into telemetry, and so into every recording; a folder's present segment is then kept from pruning.
-
-    The result has `t_ns`, since 1970, and `text`. The daemon checks the text. Raises as `Client.request`.
-    """
+    """Put an event into telemetry, and so into every recording; a folder's present segment is then kept from pruning."""
     result = client.request("mark", text=text)
     return Outcome(result, f"marked: {text}")
 
 
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
-    """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy to `target`.
-
-    `action` is "list", "prune" or "mark"; any other exports. To list or prune, `path` is a folder; None takes the
-    configured one. To mark or export it is a recording, which marking renames; the result has the new `file`. `target`,
-    for export alone, is a new file, or a folder for a copy of the same name. Other results are as of `_list`, `_prune`
-    and `_export`.
-
-    The outcome is REFUSED where pruning was not enough. An export is REFUSED where the file was altered, or could not
-    be checked with the configured key. Raises CommandError (USAGE) where a path that is needed is None or cannot be
-    used, and where the copy exists.
-    """
+    """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy to `target`."""
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):
             folder = RecordingFolder(path or Path(config.recordings.folder), budget_of(config.recordings))
@@ -50,12 +37,7 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
 
 
 def _list(folder: RecordingFolder, key: str) -> Outcome:
-    """Describe each segment of the folder, the oldest first, and say their total size.
-
-    The result has `folder`, `recordings`, each as `_row`, and their size, `MB`, of 1e6 bytes. Damaged ones are listed
-    with the reason. Seals are not checked: that takes reading all. Where no `key` is configured, those that have one
-    say so. Raises OSError.
-    """
+    """Describe each segment of the folder, the oldest first, and say their total size."""
     rows = [_row(segment, bool(key)) for segment in folder.segments()]
     size_MB = sum(row["MB"] for row in rows)
     lines = [
@@ -68,12 +50,7 @@ def _list(folder: RecordingFolder, key: str) -> Outcome:
 
 
 def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
-    """Describe one segment by its overview; without one, `said` tells why.
-
-    Returns `name`, `began_s` since 1970 (None where the name does not say), `MB`, `is_marked`, and `seconds` (None
-    without an overview). `faults` and `marks` are codes and texts, empty without an overview. `said` has all that is to
-    be noted, in words.
-    """
+    """Describe one segment by its overview; without one, `said` tells why."""
     seconds, faults, marks = None, [], []
     try:
         known = summary_of(segment.path)
@@ -100,11 +77,7 @@ def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
 
 
 def _prune(folder: RecordingFolder) -> Outcome:
-    """Delete what is over the budget, and say what was deleted and whether that is enough.
-
-    The result has the names `removed`, the oldest first, and `over`, why it is not enough, empty where it is. The
-    outcome is REFUSED where it is not. Raises OSError.
-    """
+    """Delete what is over the budget, and say what was deleted and whether that is enough."""
     gone = folder.prune()
     over = folder.make_room(0)
     names = [each.path.name for each in gone]
@@ -113,13 +86,7 @@ def _prune(folder: RecordingFolder) -> Outcome:
 
 
 def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
-    """Copy a recording to a new file, check the copy's seals under `key`, and say their verdict; REFUSED where unsound.
-
-    `target` is the file, or a folder in which the copy has the same name. The result has `file`, the state as `seal`,
-    and `why`. Sound is also a recording without seals where `key` is empty. Half a copy is deleted; an unsound one
-    stays. Raises OSError where the copy exists or cannot be made, or the recording cannot be read. Raises CommandError
-    (USAGE) for a `target` of None.
-    """
+    """Copy a recording to a new file, check the copy's seals under `key`, and say their verdict; REFUSED where unsound."""
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target

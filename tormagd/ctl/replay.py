@@ -24,14 +24,7 @@ def replay(
     faults: Sequence[str],
     config_file: Path | None,
 ) -> Outcome:
-    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulated `plant`.
-
-    `from_s` counts from the file's first tick, s. Settings are KEY=VALUE, as in limits.skew_fault_mm=2, and faults
-    NAME@SECONDS. With either, `from_s` plays no part; without both, `plant` plays none. `config_file` None means the
-    defaults. The result is that process's report. The outcome is REFUSED where the replay is not bit-exact, or the file
-    was altered, or sealed without the configured key. Raises CommandError (USAGE) where file or options cannot be used,
-    or it takes over LONGEST_S.
-    """
+    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulated `plant`."""
     arguments = [
         f"--from={from_s!r}",
         f"--plant={plant}",
@@ -60,11 +53,7 @@ def replay(
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
-    """Return the text on `done`, the report's `rerun`, and whether it was bit-exact: no first difference.
-
-    The text also tells how many ticks agree and how many gaps there are. Of a difference it tells tick, time, frame,
-    field and both values.
-    """
+    """Return the text on `done`, the report's `rerun`, and whether it was bit-exact: no first difference."""
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     difference = done["difference"]
     span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
@@ -79,11 +68,7 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
 
 
 def _instead(result: dict[str, Any]) -> str:
-    """Compare in words what was recorded with what the simulator met, as configured then and with the settings.
-
-    `result` is the report of `python -m tormagd.replay`; without settings the third is left out. A recorded fault that
-    did not come as configured then is named.
-    """
+    """Compare in words what was recorded with what the simulator met, as configured then and with the settings."""
     told = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
     if result["instead"] is not None:
         told[f"simulated with {', '.join(result['settings'])}"] = result["instead"]
@@ -105,11 +90,7 @@ def _instead(result: dict[str, Any]) -> str:
 
 
 def _happened(what: dict[str, Any]) -> str:
-    """Say in words what was met in a run, of `what`, a part of the replay's report.
-
-    It has `faults` with their times, s from the file's first tick, `limits` with how long they held, s, and `refused`
-    commands. What is empty is told as none, or left out.
-    """
+    """Say in words what was met in a run, of `what`, a part of the replay's report."""
     faults = ", ".join(f"{name} at {at_s:.3f} s" for name, at_s in what["faults"].items()) or "no fault"
     limits = ", ".join(f"{name} {held_s:.3f} s" for name, held_s in what["limits"].items()) or "none"
     refused = f"; refused: {', '.join(what['refused'])}" if what["refused"] else ""

@@ -15,21 +15,14 @@ WRITABLE = "give a file in a directory you may write to"
 
 
 def opened(config: Config, sources: list[Path]) -> list[RecordingFile]:
-    """Open recordings, checked with the configured key, in the order of `sources`; an altered one is not refused.
-
-    Raises CommandError (USAGE) where the key or a recording cannot be read.
-    """
+    """Open recordings, checked with the configured key, in the order of `sources`; an altered one is not refused."""
     key = key_of(config)
     with as_usage_error(ValueError, hint="give files that tormagctl record has made"):
         return [RecordingFile(source, key) for source in sources]
 
 
 def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> Outcome:
-    """Say what was written, and before that what the seals say: REFUSED where one is not sound. Nothing is written
-    here.
-
-    The result has `file`, the `seals`' states by path, and what `result` has.
-    """
+    """Say what was written, and before that what the seals say: REFUSED where one is not sound."""
     seals = {str(each.path): each.seal.state for each in of}
     said = (f"{each.path}: {'. '.join(dict.fromkeys([each.seal.text(), *each.notes]))}" for each in of)
     text = "\n".join([*said, str(target)])
@@ -38,13 +31,7 @@ def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> O
 
 
 def report(config: Config, sources: list[Path], target: Path) -> Outcome:
-    """Write an HTML page on one or two recordings to `target`; a page there is replaced, whole or not at all.
-
-    The result has `file`, and the `seals`' states by path. The outcome is REFUSED where one was altered, or could not
-    be checked with the configured key; the page is written all the same. Raises CommandError (USAGE) for more than two,
-    and one that cannot be read or is empty. It also does where the key cannot be read, or the page cannot be written,
-    as without its folder.
-    """
+    """Write an HTML page on one or two recordings to `target`; a page there is replaced, whole or not at all."""
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"
         raise usage_error(said, "tormagctl report A.mcap B.mcap -o AB.html")
@@ -57,15 +44,7 @@ def report(config: Config, sources: list[Path], target: Path) -> Outcome:
 
 
 def plot(config: Config, source: Path, target: Path) -> Outcome:
-    """Draw the recording `source` into the picture file `target`; a picture there is replaced, whole or not at all.
-
-    The suffix of `target` says its format: .png, .svg or .pdf. The result has `file`, `seals`, the counts `ticks` and
-    `telemetry`, `is_complete`, and the codes of `limits` and `faults`. `tracking_rms_N` and `aligned_rms_N` are None
-    where the force was not followed for long enough. The outcome is REFUSED where the recording was altered, or could
-    not be checked with the configured key; the picture is drawn all the same. Raises CommandError (USAGE) for another
-    suffix, and a recording that is empty. It also does where key or recording cannot be read, or the picture cannot be
-    written.
-    """
+    """Draw the recording `source` into the picture file `target`; a picture there is replaced, whole or not at all."""
     (recording,) = of = opened(config, [source])
     overview, following = recording.overview, recording.overview.following
     with as_usage_error(ValueError, hint="give -o a picture's name, such as pulse.png, and a recording with data"):

@@ -32,13 +32,7 @@ def scene(
     plant: str | None = None,
     **recorded: Any,
 ) -> Outcome:
-    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new.
-
-    Any other `action` is taken for use. `plant`, for check and new, also has to give the scene. `share`, `tolerance_N`
-    or `out` choose how the scene is served, for check only. `new` writes the file `name`, from `recorded`, which with
-    `tolerance_N` is a `Recorded`, or from answers. Raises CommandError (USAGE) for `new` without a name, and for an
-    option that the action does not take. Returns and raises as the function of the action.
-    """
+    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new."""
     named = name or config.scene
     if action == "new":
         if name is None:
@@ -72,13 +66,7 @@ def scene(
 
 
 def use_scene(client: "Client", name: str) -> Outcome:
-    """Have a disabled daemon change its scene, and wait until it has.
-
-    A shipped scene goes before a file of the same name. The daemon reads the file, on its machine. The result has the
-    `scene` that runs, its `fingerprint`, and `is_homed`. The change is undone when the daemon starts anew. Raises as
-    `Client.request`, such as RefusedError where the device is in use. Raises CommandError (REFUSED) where the change
-    was begun and failed, or is not over within LONGEST_S.
-    """
+    """Have a disabled daemon change its scene, and wait until it has."""
     from tormagd.ctl.operate import statuses
 
     scene = str(Path(name).absolute()) if name not in shipped_scenes() and Path(name).exists() else name
@@ -104,19 +92,14 @@ def list_scenes() -> Outcome:
 
 
 def show_scene(name: str) -> Outcome:
-    """Return everything a scene states, defaults included, as TOML. Raises CommandError (USAGE) for an unknown or
-    faulty one."""
+    """Return everything a scene states, defaults included, as TOML."""
     stated = msgspec.to_builtins(loaded(name))
     tables = {key: value for key, value in stated.items() if value is not None}
     return Outcome(tables, as_toml(tables))
 
 
 def as_toml(tables: dict[str, Any]) -> str:
-    """Return the text of a scene file with these keys and tables, without a line's end after the last.
-
-    Keys come first, then tables, each in the order given. Values are numbers, texts, booleans and lists of them. None,
-    and a table within a table, are not refused, and give no TOML.
-    """
+    """Return the text of a scene file with these keys and tables, without a line's end after the last."""
     lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
     for title, table in tables.items():
         if isinstance(table, dict):
@@ -125,10 +108,7 @@ def as_toml(tables: dict[str, Any]) -> str:
 
 
 def torque_range(scene: Scene) -> str:
-    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft, mNm, in words.
-
-    Begins with a comma, to end a line. Empty for a pad, which has no shaft.
-    """
+    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft, mNm, in words."""
     radius_mm, force = scene.roller_radius_mm, scene.force
     if radius_mm is None:
         return ""
@@ -143,14 +123,7 @@ def _line(key: str, value: object) -> str:
 
 
 def check_scene(name: str, config: Path | None, plant: str | None = None) -> Outcome:
-    """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost.
-
-    `config` None means the defaults. With `plant`, a simulated device also has to give it. The result has `scene`,
-    `core_share_allowed`, `on_plant` (None without a plant), what `_derived` gives, and the cost as `core_share`. The
-    cost is None unless that way of serving was measured; only then it is held against `budget.core_share`. Raises
-    CommandError: REFUSED where the daemon refuses the scene, the plant does not give it, or it costs more than its
-    budget. USAGE is for a faulty scene or plant.
-    """
+    """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost."""
     scene = loaded(name)
     derived = _derived(name, config)
     file = measured()
@@ -212,11 +185,7 @@ def check_scene(name: str, config: Path | None, plant: str | None = None) -> Out
 
 
 def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
-    """Return a line on how soon a force comes from where the brake waits, and from higher standby forces.
-
-    `approaches_s` are standby forces, N, with times, s, the present one first; none of them gives no line. The force is
-    halfway from that to the most.
-    """
+    """Return a line on how soon a force comes from where the brake waits, and from higher standby forces."""
     if not approaches_s:
         return []
     (wait_N, now_s), *nearer = approaches_s
@@ -228,12 +197,7 @@ def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]
 
 
 def explain_scene(name: str, config: Path | None) -> Outcome:
-    """Show every way to serve a scene that was measured, the chosen one, and how well that served other signals.
-
-    `config` is the configuration's file, None the defaults: the way that runs with it is marked. The result has the
-    fields of a `MeasuredScene`, the `shares` of all ways, and `derived`, as `_derived`. Raises CommandError: REFUSED
-    where nothing was measured or the daemon refuses the scene; USAGE for a faulty one.
-    """
+    """Show every way to serve a scene that was measured, the chosen one, and how well that served other signals."""
     file = measured()
     found = measured_as(loaded(name), file)
     derived = _derived(name, config)
@@ -273,10 +237,7 @@ def way_of(derived: dict[str, Any]) -> OperatingPoint:
 
 
 def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
-    """Return what was measured of the scene that asks for exactly what `scene` does, under whatever name.
-
-    Raises CommandError (REFUSED, `not_measured`) where `file` has none.
-    """
+    """Return what was measured of the scene that asks for exactly what `scene` does, under whatever name."""
     found = file.scene(scene.fingerprint)
     if found is None:
         raise CommandError(
@@ -289,18 +250,13 @@ def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
 
 
 def loaded(name: str) -> Scene:
-    """Load a scene. Raises CommandError (USAGE) for an unknown or faulty one."""
+    """Load a scene."""
     with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
         return load_scene(name)
 
 
 def _derived(name: str, config: Path | None) -> dict[str, Any]:
-    """Run the daemon's own check of the scene in a process of its own, and return what it derives.
-
-    The keys are those of `derived` in what `tormagd --check` prints, such as `least_N`, `most_N`, `control_hz`. `name`
-    is a shipped scene or a file; `config` None means the defaults. Raises CommandError (REFUSED) where the check
-    refuses the scene or the configuration, or takes over LONGEST_S.
-    """
+    """Run the daemon's own check of the scene in a process of its own, and return what it derives."""
     arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
     try:
         derived: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.daemon.main", arguments, LONGEST_S))["derived"]

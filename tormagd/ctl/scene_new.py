@@ -22,11 +22,9 @@ INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
 TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
 "Proposed tolerance: this share of the range, and at least this share of the greatest force."
 RESERVED = 0.7
-"""Share of the greatest force that the model gives. A device may be weaker than its model by friction, modulus, field
-and relaxation: sample 2 gives 0.72. A soft insert is asked for more only where no stiffer one follows fast enough."""
+"""Share of the greatest force that the model gives."""
 OVER_MISSED = 4.0
-"""A tolerance under this many times what the gap's speed alone misses may be missed: carriages have mass and delay. Of
-recorded pulses, live, sample 2 misses up to 4.0 times as much, samples 1 and 3 up to 2.0."""
+"""A tolerance under this many times what the gap's speed alone misses may be missed: carriages have mass and delay."""
 
 UNMET, UNMET_IF_WEAK = "# NOT MET: ", "# NOT MET BY A WEAK DEVICE: "
 "Begin a line of a scene file that says what the device does not give."
@@ -51,18 +49,7 @@ class Recorded(NamedTuple):
 
 
 def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | None = None) -> Outcome:
-    """Write the new scene file `out` from a recorded force, or without one from a person's answers.
-
-    `config` is the configuration to check it by; None means the defaults. `plant` also has to give it; None: no plant
-    is asked. Where column, scale or offset are stated, the forces are written beside `out`, as CSV. The result is that
-    of `check_scene` with `file`, `insert`, `unmet` and `unmet_if_weak`. What only a weak device does not give stands in
-    the file's first lines, and as `unmet_if_weak`.
-
-    A scene that no insert renders is written all the same. Its first lines say what is not met, and so does `unmet`;
-    the outcome is REFUSED, and has no check. Raises CommandError (USAGE) for files and answers that cannot be used, or
-    nobody to ask. Raises it for an unknown insert or plant, and where the check does not come to an end. Then there is
-    no file.
-    """
+    """Write the new scene file `out` from a recorded force, or without one from a person's answers."""
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
     force_file = _forces_of(out, recorded)
@@ -77,11 +64,7 @@ def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | N
 def _proposed(
     out: Path, force_file: Path | None, recorded: Recorded, config: Path | None, plant: str | None
 ) -> Outcome:
-    """Write the scene file `out` for the forces in `force_file`, and for None from a person's answers.
-
-    Returns and raises as `new_scene`, but the forces' file stays. `recorded` tells insert and tolerance where they are
-    stated.
-    """
+    """Write the scene file `out` for the forces in `force_file`, and for None from a person's answers."""
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
     if recorded.tolerance_N is not None:
         tables["force"] |= {"tolerance_rms_N": recorded.tolerance_N, "resolution_N": 2.0 * recorded.tolerance_N}
@@ -106,10 +89,7 @@ def _proposed(
 
 
 def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
-    """Return what a weak device does not give of a scene that is taken, a text for each, with what it does give.
-
-    Looked at are the greatest force and the tolerance. Empty where it gives both.
-    """
+    """Return what a weak device does not give of a scene that is taken, a text for each, with what it does give."""
     force, missed_N = tables["force"], checked.result["missed_rms_N"] or 0.0
     weak = []
     if not _has_reserve(tables, checked):
@@ -120,11 +100,7 @@ def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
 
 
 def _forces_of(out: Path, recorded: Recorded) -> Path | None:
-    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new CSV beside `out`.
-
-    That has the columns `t_s` and `force_N`, and the name of `out`. None where nothing was recorded. Raises
-    CommandError (USAGE) for a file or options that cannot be used, and where the new file exists.
-    """
+    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new CSV beside `out`."""
     is_converted = (recorded.column, recorded.scale, recorded.offset_N) != (None, None, None)
     if recorded.force is None:
         if is_converted:
@@ -149,13 +125,7 @@ def _forces_of(out: Path, recorded: Recorded) -> Path | None:
 def _softest(
     out: Path, tables: Tables, inserts: Sequence[str], config: Path | None, plant: str | None
 ) -> tuple[str, Outcome | None, list[str]]:
-    """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all.
-
-    `inserts` are from the softest on. Returns the insert, what the check says, and an empty list. Where no insert gives
-    the scene, the nearest to it is written, and what it lacks as comments. Then the check is None, and the list has
-    these reasons. Raises CommandError, and deletes the file, for an unknown insert and where a check does not come to
-    an end.
-    """
+    """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all."""
     taken: dict[str, Outcome] = {}
     lacks: dict[str, list[str]] = {}
     for insert in inserts:
@@ -193,18 +163,12 @@ def _write(out: Path, tables: Tables, insert: str, unmet: Sequence[str] = (), be
 
 
 def _has_reserve(tables: Tables, checked: Outcome) -> bool:
-    """Return whether the scene's greatest force is at most RESERVED of the device's."""
     return bool(tables["force"]["most_N"] <= RESERVED * checked.result["most_N"])
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
     """Propose a scene's tables for a recorded force: its range, rounded outwards, a tolerance, a steady handle of 42
-    mm/s.
-
-    The resolution is twice the tolerance. `out` is the scene file to be: it gives the scene's name, and the recorded
-    file is named relative to its folder. Nothing is written, and there is no insert yet. Raises CommandError (USAGE)
-    for a bad file, or a force that does not change.
-    """
+    mm/s."""
     hint = "a CSV with the columns t_s,force_N, no force below 0; else --column, --scale, --offset"
     with as_usage_error(ConfigError, hint=hint):
         time_s, force_N = recorded(force_file)
@@ -222,11 +186,7 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
 
 def _from_answers(name: str) -> Tables:
     """Ask a person on stderr for each value of the scene `name`, each with a proposal, and return its tables, without
-    an insert.
-
-    A number is asked for until it is one; that it is allowed is not checked here. Raises CommandError (USAGE) where
-    stdin is no terminal, or ends.
-    """
+    an insert."""
     if not is_terminal(sys.stdin):
         raise usage_error(
             "stdin is no terminal: there is nobody to ask",
@@ -248,10 +208,7 @@ def _from_answers(name: str) -> Tables:
 
 
 def _answer(question: str, usual: str) -> str:
-    """Ask one question on stderr, and return the line from stdin without spaces around it; an empty one takes `usual`.
-
-    Raises CommandError (USAGE) where stdin ends.
-    """
+    """Ask one question on stderr, and return the line from stdin without spaces around it; an empty one takes `usual`."""
     print(f"{question} [{usual}]: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:
@@ -260,10 +217,7 @@ def _answer(question: str, usual: str) -> str:
 
 
 def _number(question: str, usual: float) -> float:
-    """Ask until the answer is a number, `nan` and `inf` included, and return it; an empty line takes `usual`.
-
-    That is shown, and taken, with six digits. Raises as `_answer`.
-    """
+    """Ask until the answer is a number, `nan` and `inf` included, and return it; an empty line takes `usual`."""
     while True:
         answer = _answer(question, f"{usual:g}")
         try:
@@ -282,12 +236,6 @@ def _tables(
     signal: Tables,
     handle_mm_s: tuple[float, float],
 ) -> Tables:
-    """Return a scene's tables as they are written to its file, but for the insert, at the least control and inference
-    rates.
-
-    Forces are rounded to three digits. `signal` is its table. `handle_mm_s` is the slowest and the fastest. Nothing is
-    checked.
-    """
     force = {"least_N": least_N, "most_N": most_N, "resolution_N": resolution_N, "tolerance_rms_N": tolerance_N}
     return {
         "name": name,
@@ -300,6 +248,5 @@ def _tables(
 
 
 def _rounded(value: float, direction: Callable[[float], int]) -> float:
-    """Return `value` >= 0, rounded to two significant digits: down by `math.floor`, or up by `math.ceil`."""
     unit = 10.0 ** (math.floor(math.log10(value or 1.0)) - 1)
     return float(f"{direction(round(value / unit, 6)) * unit:.3g}")

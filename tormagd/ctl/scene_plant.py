@@ -17,17 +17,7 @@ LONGEST_S, SIGNAL_S, SIGNAL_HZ = 120.0, 5.0, 200
 
 
 def on_plant(scene: Scene, name: str, plant: str) -> dict[str, Any]:
-    """Return what ideal carriages of `plant` give of a scene, N: range, RMS errors, and the asked force's deviation.
-
-    `plant` is a plant file or a packaged plant's name; `name` is the scene's, or its file. The result has `plant` as
-    given, `least_N`, `most_N`, `sd_N`, `no_delay_rms_N`, and `foresight_rms_N`, which is judged. The carriages follow
-    the first SIGNAL_S of the scene's signal, without one the scene's range, up and down. This waits for the
-    laboratory, a process of its own, LONGEST_S at most.
-
-    Raises CommandError (REFUSED) where the plant does not reach the greatest force or follow within the tolerance.
-    Raises it (USAGE) for a plant that is refused, without the laboratory, and where it takes too long. Raises
-    ConfigError for a signal's file that is not as allowed.
-    """
+    """Return what ideal carriages of `plant` give of a scene, N: range, RMS errors, and the asked force's deviation."""
     force = scene.force
     times_s, forces_N = (
         np.array([0.0, SIGNAL_S / 2.0, SIGNAL_S]),

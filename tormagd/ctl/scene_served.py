@@ -20,13 +20,7 @@ class Served(NamedTuple):
 
 
 def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
-    """Choose the most exact measured way that takes at most `share` of a processor, or the cheapest within an error.
-
-    The error is `tolerance_N`, RMS; one of both is None. With `out` writes the scene, served that way, to this new
-    file. The result has `scene`, `way`, its worst `rms_N`, its `daemon_share`, and `file`, None without one. Raises
-    CommandError: USAGE for another action than check, for both or neither limit, and for files that cannot be used.
-    REFUSED where nothing was measured, or no way is good enough.
-    """
+    """Choose the most exact measured way that takes at most `share` of a processor, or the cheapest within an error."""
     if action != "check" or (share is None) == (tolerance_N is None):
         raise usage_error(
             "--share, --tolerance and --out choose how a scene is served",
@@ -52,11 +46,7 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
 
 def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
     """Return the most exact of `ways` whose share is at most `share`, or for None the cheapest whose error is at most
-    `tolerance_N`.
-
-    Raises CommandError (REFUSED), with the least that is allowed, where no way does; ValueError where there is none at
-    all.
-    """
+    `tolerance_N`."""
     bounds = ("--tolerance", 1, tolerance_N, "N") if share is None else ("--share", 0, share, "of a processor")
     asked, bounded, most, unit = bounds
     fits = [way for way in ways if way.figures[bounded] <= most]
@@ -72,11 +62,7 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
 
 
 def _write(name: str, way: OperatingPoint, out: Path) -> None:
-    """Write the scene `name` with this way's rates and search to the new file `out`; relative paths in it are adapted.
-
-    `[bandwidth]` and `[solver]` are replaced whole: a search's own settings are dropped. Raises CommandError (USAGE)
-    where `out` exists or cannot be made, ConfigError for a scene that cannot be loaded.
-    """
+    """Write the scene `name` with this way's rates and search to the new file `out`; relative paths in it are adapted."""
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
     tables = {key: value for key, value in tables.items() if value is not None}

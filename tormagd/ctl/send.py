@@ -34,17 +34,7 @@ def send(
     preview_ms: float,
     is_blind: bool,
 ) -> Outcome:
-    """Publish `what`, a shape or a CSV file, at `rate_hz`, and report what became of it.
-
-    It ends after `duration_s` or an interrupt; None means the file's length, or ten seconds for a shape. `from_N`,
-    `to_N` and `frequency_hz` are a shape's alone. Each setpoint carries those of the next `preview_ms`. The result has
-    `source`, the counts of `_publish`, and the fields of a `Fate`. With `is_blind` the daemon is not asked, and the
-    fate is left out.
-
-    Raises CommandError (USAGE) for what cannot be sent. UNREACHABLE is a daemon that does not answer or subscribe
-    within `wait_s`, or goes. FAULT comes as soon as the device is in FAULT. REFUSED are forces that the scene does not
-    allow, before any is sent, or that were not rendered.
-    """
+    """Publish `what`, a shape or a CSV file, at `rate_hz`, and report what became of it."""
     with as_usage_error(
         WaveformError,
         ForceFileError,
@@ -93,11 +83,7 @@ def send(
 
 
 def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> StatusWatch:
-    """Check the waveform's forces against the daemon's scene, and return a watch of `source`.
-
-    Raises CommandError: REFUSED where forces are not allowed, UNREACHABLE for another version's scene, FAULT where the
-    device is in FAULT. Raises UnreachableError without an answer; where a key is configured its hint names --blind.
-    """
+    """Check the waveform's forces against the daemon's scene, and return a watch of `source`."""
     try:
         known = client.describe()
     except UnreachableError as error:
@@ -119,14 +105,7 @@ def _publish(
     is_interrupted: Callable[[], bool],
     watch: StatusWatch | None,
 ) -> dict[str, Any]:
-    """Publish setpoints until the time or an interrupt, and return the counts.
-
-    `watch` looks at the daemon in between, unless None. Returns `sent`, `skipped`, `start_ns` since 1970, `seconds`,
-    `worst_late_ms` and `interrupted`. Setpoints are due every 1/`rate_hz` from the start on, the first at once and the
-    last at `duration_s`; lateness does not add up. One whose successor is already due is `skipped`. Each carries the
-    `preview` that follow it; after the end these stay at the last force. Raises CommandError (UNREACHABLE) where the
-    daemon goes, as `StatusWatch.look`, and ValueError for a force that no setpoint may have.
-    """
+    """Publish setpoints until the time or an interrupt, and return the counts."""
     sent = skipped = index = 0
     worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()

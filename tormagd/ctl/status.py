@@ -37,11 +37,7 @@ LINK_COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronis
 
 def status(client: Client) -> Outcome:
     """Ask for the daemon's status, and return it as result and as text; the outcome is FAULT while the device is in
-    FAULT.
-
-    The result has the daemon's own keys, those of a Status and others that it may know. Raises as `Client.request`, and
-    UnreachableError for an answer that is no status.
-    """
+    FAULT."""
     result = client.request("status")
     known = understood(result, Status)
     code = Exit.FAULT if known.operating_state == "FAULT" else Exit.DONE
@@ -49,10 +45,7 @@ def status(client: Client) -> Outcome:
 
 
 def status_text(known: Status, colour: Colour) -> str:
-    """Return a status as labelled lines of text, the most important first; an unknown value shows as `-`.
-
-    Lines on what is not there, as faults or sources, are left out. Lines are not wrapped.
-    """
+    """Return a status as labelled lines of text, the most important first; an unknown value shows as `-`."""
     state = known.operating_state
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
     is_running = known.link.state == "RUNNING"
@@ -97,11 +90,6 @@ def status_text(known: Status, colour: Colour) -> str:
 
 
 def _peers(peers: PeersReport, colour: Colour) -> list[str]:
-    """Return lines on peers that were refused or sent too much: both counts, the newest refusal, the worst sender.
-
-    Of these two a line tells endpoint, address, key, reason and how often. Empty where nobody was refused, and nothing
-    dropped.
-    """
     return [
         *_said("peers     ", peers.refused and f"{peers.refused} refused", colour.yellow),
         *_said("peers     ", peers.dropped and f"{peers.dropped} messages not read", colour.yellow),
@@ -113,11 +101,7 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 
 
 def _device(known: Status, colour: Colour) -> list[str]:
-    """Return lines on what the device has shown of itself: scale, offset, sensor's zero, each with its deviation.
-
-    They also tell the age of the kept profile and why it is not used, other beliefs that act, and the calibration or
-    its refusal. What there is not, is left out.
-    """
+    """Return lines on what the device has shown of itself: scale, offset, sensor's zero, each with its deviation."""
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
     # without a folder nothing was to be kept
@@ -133,7 +117,6 @@ def _device(known: Status, colour: Colour) -> list[str]:
 
 
 def _long_ago(known: Status) -> str:
-    """Say how long ago the setpoint came, where that is over OLD_MS; empty for a recent one, or none."""
     age_ms = known.setpoint_age_ms
     return "" if known.setpoint_cf is None or age_ms is None or age_ms < OLD_MS else f" {age_ms * 1e-3:.0f} s ago"
 
@@ -161,10 +144,7 @@ def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
 
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
-    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and unit of each.
-
-    Empty where none acts. A deviation that is not known is left out.
-    """
+    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and unit of each."""
     return ", ".join(
         f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
         for name, it in belief.items()
@@ -184,18 +164,13 @@ def _number(value: float | None, unit: str, digits: int = 3) -> str:
 
 
 def _counts(report: LinkReport | SetpointReport, names: tuple[str, ...]) -> str:
-    """Return the named counters in one line; unknown ones are left out."""
     numbers = [(getattr(report, name), name) for name in names]
     return ", ".join(f"{number} {name}" for number, name in numbers if number is not None)
 
 
 def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
     """Return lines on the source `name`: state, delay, jitter, losses, clock, restarts, then cause and remedy of what
-    is wrong.
-
-    The clock's drift is shown once it is fitted over SURE_WINDOWS, restarts where there are any. A state without words
-    of its own is shown as it is.
-    """
+    is wrong."""
     paint = {"holds": colour.green, "refused": colour.yellow}.get(source.state, str)
     delay, behind = source.delay_us, source.clock_behind_ms
     words = {"holds": "holds the brake", "refused": "refused", "stale": f"silent for {source.silent_ms * 1e-3:.1f} s"}
@@ -216,10 +191,7 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
 
 
 def _way(way: WayReport | None, colour: Colour) -> list[str]:
-    """Return lines on the delay from a setpoint's stamp to its force, part by part, against its budget.
-
-    Empty for None, and before the first setpoint. Over the budget, a second line names the part that takes most.
-    """
+    """Return lines on the delay from a setpoint's stamp to its force, part by part, against its budget."""
     if way is None or way.to_duty_us.max == 0.0:
         return []
     to_duty, total_ms = way.to_duty_us, way.total_ms
@@ -242,10 +214,6 @@ def _way(way: WayReport | None, colour: Colour) -> list[str]:
 
 
 def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:
-    """Return a line for each of `codes`, with `label` before it, followed by its cause and its remedy from `details`.
-
-    A code without details has its line alone. `paint` colours the codes.
-    """
     why = {each.code: _explained(each.cause, each.remedy, str) for each in details}
     return [line for code in codes for line in (f"{label:<9} {paint(code)}", *why.get(code, ()))]
 
@@ -255,15 +223,11 @@ def _explained(cause: str, remedy: str, paint: Callable[[str], str]) -> list[str
 
 
 def _said(label: str, text: str | int | None, paint: Callable[[str], str]) -> list[str]:
-    """Return one labelled line; empty where there is no text, or 0."""
     return [f"{label}{paint(str(text))}"] if text else []
 
 
 def _rate(name: str, group: RateReport, colour: Colour) -> str:
-    """Return a line on how the loop `name` keeps its rate: its grade, Hz, lateness, us, and counts of late runs.
-
-    A grade of warning or error is coloured.
-    """
+    """Return a line on how the loop `name` keeps its rate: its grade, Hz, lateness, us, and counts of late runs."""
     paint = {"warning": colour.yellow, "error": colour.red}.get(group.grade, str)
     lateness = group.lateness_us
     return (
@@ -273,23 +237,19 @@ def _rate(name: str, group: RateReport, colour: Colour) -> str:
 
 
 def _late_ticks(blamed: Mapping[str, int]) -> list[str]:
-    """Return a line on who made control ticks late, the worst first; empty where none was late."""
     worst_first = sorted(blamed, key=lambda name: (-blamed[name], name))
     return [f"late by   {', '.join(f'{blamed[name]} {name}' for name in worst_first)}"] if blamed else []
 
 
 def firmware(client: Client) -> Outcome:
-    """Report the daemon's link; the keys of `--json` are those of `link` in the status. Raises as `Client.request`."""
+    """Report the daemon's link; the keys of `--json` are those of `link` in the status."""
     result = client.request("status")
     known = understood(result, Status).link
     return Outcome(result["link"], folded(firmware_text(known, Colour(sys.stdout))))
 
 
 def firmware_text(link: LinkReport, colour: Colour) -> str:
-    """Return the link's report as some ten labelled lines; an unknown value shows as `-`, or "not known yet".
-
-    They tell of the link, firmware and device, schema, losses, counts of what was received and refused, and timing.
-    """
+    """Return the link's report as some ten labelled lines; an unknown value shows as `-`, or "not known yet"."""
     paint = colour.green if link.state == "RUNNING" else colour.yellow
     last = f", the last: {link.last_loss}" if link.last_loss else ""
     ours, theirs = link.daemon_schema, link.firmware_schema
@@ -324,10 +284,7 @@ def _round_trip(known: RoundTripReport | None) -> str:
 
 def _quality(link: LinkReport) -> str:
     """Say what share of Drives was unanswered and of frames damaged in the last second, and how many messages found the
-    wire full.
-
-    "not known yet" where either share is None; a count that is None shows as `-`.
-    """
+    wire full."""
     if link.unanswered_share is None or link.damaged_share is None:
         return "not known yet"
     return (
@@ -338,10 +295,7 @@ def _quality(link: LinkReport) -> str:
 
 def _clock(known: ClockReport | None) -> str:
     """Say how the device's clock fits the host's: drift, ppm, offset, s, how far the fit is off, us, and over how many
-    windows.
-
-    For None says that a fit takes some seconds.
-    """
+    windows."""
     if known is None:
         return "not known yet: a fit takes some seconds"
     return (

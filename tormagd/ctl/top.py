@@ -28,11 +28,7 @@ KEPT = 1_000
 
 
 def top(client: Client) -> Outcome:
-    """Draw the daemon's state until `q`, Ctrl-C or SIGTERM; the terminal is restored then.
-
-    The result has the `seconds` that it took. The end of input counts as `q`; other keys do nothing. Raises
-    CommandError (USAGE) without a terminal to draw on, and as `Client.status` and `Watcher.look`.
-    """
+    """Draw the daemon's state until `q`, Ctrl-C or SIGTERM; the terminal is restored then."""
     console = Console(highlight=False)
     if not (is_terminal(sys.stdin) and console.is_terminal) or console.is_dumb_terminal:
         raise usage_error("top needs a terminal that can be drawn on", "tormagctl status, with --json for a script")
@@ -54,10 +50,7 @@ def top(client: Client) -> Outcome:
 
 
 class Watcher:
-    """Gathers telemetry and status for the screen; waits for the daemon only when made, for the first status.
-
-    Holds the last KEPT snapshots, the newest status, every code's explanation so far, and one request under way.
-    """
+    """Gathers telemetry and status for the screen; waits for the daemon only when made, for the first status."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -68,11 +61,7 @@ class Watcher:
         self._ask_s = self._heard_s = time.monotonic()
 
     def look(self) -> Seen:
-        """Take what has arrived and return what is known by now, without waiting; asks for the status now and then.
-
-        The telemetry returned is the one that later calls add to. A silent daemon raises nothing: `silent_s` grows.
-        Raises as `Client.answer`, and UnreachableError for a message that is no telemetry.
-        """
+        """Take what has arrived and return what is known by now, without waiting; asks for the status now and then."""
         now_s = time.monotonic()
         try:
             arrived = self._client.telemetry()
@@ -87,12 +76,7 @@ class Watcher:
 
     def _ask(self, now_s: float, codes: set[str]) -> None:
         """Take the answer to the last request, if it has come, and ask again after ASK_S, or for a code not explained
-        yet.
-
-        `now_s` is by the monotonic clock, `codes` are those in the newest snapshot. A request not answered by then is
-        given up; for a code, none may be under way. Called only while the daemon is heard: requests to a silent one
-        would pile up. Raises as `Client.answer`, and UnreachableError for a result that is no status.
-        """
+        yet."""
         result = None if self._asked is None else self._client.answer(self._asked)
         if result is not None:
             self._status = understood(result, Status)

@@ -65,11 +65,7 @@ CURVES = (
 
 
 def screen(seen: Seen, width: int, height: int) -> RenderableType:
-    """Return the whole screen: state, curves, loops and link, then faults and limits with remedies.
-
-    `width` and `height` are in characters. What is too high is not cut here: then loops and link come last, and the
-    terminal cuts them. `seen` may be without telemetry.
-    """
+    """Return the whole screen: state, curves, loops and link, then faults and limits with remedies."""
     more = max(height - STANDARD_ROWS, 0) // len(CURVES)
     wide = width - 2
     head, curves = _head(seen, wide), _curves(seen, wide, max(more, 1), is_apart=more > 0)
@@ -84,12 +80,7 @@ def _below_each_other(*parts: RenderableType) -> RenderableType:
 
 
 def _head(seen: Seen, width: int) -> Text:
-    """Return the first line: state, whether homed and busy, the force as torque in mNm, scene, uptime and version.
-
-    State, homed, busy and force are of the newest telemetry, or of the status without any. There is no torque where the
-    force is not known, or there is no shaft. Over SILENT_S it says, too, how long nothing was heard. The line ends at
-    `width`, in characters. A longer one comes whole, and is cut where it is drawn.
-    """
+    """Return the first line: state, whether homed and busy, the force as torque in mNm, scene, uptime and version."""
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state, is_silent = printable(newest.operating_state), seen.silent_s > SILENT_S
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
@@ -115,12 +106,7 @@ def _head(seen: Seen, width: int) -> Text:
 
 
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
-    """Return a row for each of CURVES: name, newest value, sparkline of `rows` lines, and the ends of its scale.
-
-    A character stands for COLUMN_NS, the newest at the right; `width` says how many there are. Curves of one scale
-    share its ends, which are left out below NARROW. A value that is not known is a dash, and a blank in the line.
-    `is_apart` puts an empty row between curves.
-    """
+    """Return a row for each of CURVES: name, newest value, sparkline of `rows` lines, and the ends of its scale."""
     ends_wide = ENDS if width >= NARROW else 0
     count = max(width - LABEL - VALUE - ends_wide - 3, 8)
     table = _grid(LABEL, VALUE, count, *([ends_wide] if ends_wide else []))
@@ -159,10 +145,7 @@ def _grid(*widths: int, is_cut: bool = True) -> Table:
 
 
 def _timing(status: Status, width: int) -> Table:
-    """Return rows on how loops keep time, the link, setpoints, playout, what the kernel refused, following and belief.
-
-    Loops that the status does not have, and what there is nothing to say of, have no row.
-    """
+    """Return rows on how loops keep time, the link, setpoints, playout, what the kernel refused, following and belief."""
     table = _grid(LABEL, width - LABEL - 1)
     for name in ("control", "inference", "search"):
         group = status.rates.get(name)
@@ -196,11 +179,7 @@ def _timing(status: Status, width: int) -> Table:
 
 
 def _codes(seen: Seen, width: int) -> Table:
-    """Return rows of the newest faults, then of limits that held in the telemetry kept, the longest first.
-
-    Each has its cause and remedy, where they are known. A limit has its share of the snapshots; one that does not hold
-    now is dim. Without any, one row says so.
-    """
+    """Return rows of the newest faults, then of limits that held in the telemetry kept, the longest first."""
     newest = seen.telemetry[-1] if seen.telemetry else seen.status
     times = Counter(code for each in seen.telemetry for code in each.limits)
     table = _grid(LABEL, width - LABEL - 1, is_cut=False)
@@ -230,12 +209,7 @@ def columns(
     of_column: Callable[[list[float]], float],
 ) -> list[float | None]:
     """Return a value for each of the newest `count` periods, the oldest first: `of_column` of what fell into it, else
-    None.
-
-    `times_ns` rise, and have a value each; the last one is in the last period. None and values not finite are left out.
-    Periods are aligned to the clock, so that a column keeps its value while the picture moves on. All are None without
-    times.
-    """
+    None."""
     if not times_ns:
         return [None] * count
     first = times_ns[-1] // period_ns - count + 1
@@ -249,11 +223,7 @@ def columns(
 
 def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
     """Return the least and the greatest known value, widened to `least` apart so that noise does not look like a
-    signal.
-
-    The middle stays. Only where no value is below 0 and the widened range would be, it is 0..`least`, as it is where no
-    value is known. `values` are None where not known; `least` is in their unit.
-    """
+    signal."""
     known = [value for value in values if value is not None]
     if not known:
         return 0.0, least
@@ -264,10 +234,7 @@ def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
 
 def sparkline(values: Sequence[float | None], low: float, high: float, rows: int) -> list[str]:
     """Return `rows` lines of bars, the top line first, with a character for each value: `low` is one eighth of one,
-    `high` all rows.
-
-    None is blank. Values outside are clipped; `high` must be above `low`, which is not checked.
-    """
+    `high` all rows."""
     steps = len(EIGHTHS) - 1
     full = rows * steps
     eighths = [

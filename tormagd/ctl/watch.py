@@ -26,10 +26,7 @@ SPOILING = ("RANGE", "F_MAX")
 
 
 class Fate(msgspec.Struct, frozen=True):
-    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and what held them.
-
-    `rendered_share` is None where the time was too short for a look.
-    """
+    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and what held them."""
 
     accepted: int
     rendered_share: float | None
@@ -37,10 +34,7 @@ class Fate(msgspec.Struct, frozen=True):
 
 
 def require_range(known: Description, least_N: float, most_N: float) -> None:
-    """Raise CommandError (REFUSED) unless the daemon's scene allows forces from `least_N` to `most_N`; else return.
-
-    The message names both ranges, N. UNREACHABLE is a scene without a range, as of another version.
-    """
+    """Raise CommandError (REFUSED) unless the daemon's scene allows forces from `least_N` to `most_N`; else return."""
     try:
         force = msgspec.convert(known.scene["force"], dict[str, Any])
         allowed = msgspec.convert((force["least_N"], force["most_N"]), tuple[float, float])
@@ -63,12 +57,7 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
     """Return why the setpoints of `source` are not rendered, as an error (REFUSED) that the caller may raise; None
-    while they are.
-
-    Reasons in this order: not ENABLED, nothing taken of the source, another holds the brake, its setpoints are stale, a
-    limit of SPOILING. With `is_over`, after the last setpoint, only the first three count. Raises CommandError (FAULT)
-    where the device is in FAULT: then nothing more is to be sent.
-    """
+    while they are."""
     require_no_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
         return CommandError(
@@ -102,11 +91,7 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
 
 
 class StatusWatch:
-    """Looks at the daemon's status while one source's setpoints are sent; waits only when made, and in `finish`.
-
-    Counts looks, and looks that saw the force rendered, and keeps the limits met and the newest reason that held it
-    back. Making one raises CommandError (FAULT) where the device is in FAULT already.
-    """
+    """Looks at the daemon's status while one source's setpoints are sent; waits only when made, and in `finish`."""
 
     def __init__(self, client: Client, source: str) -> None:
         self._client, self._source = client, source
@@ -121,12 +106,7 @@ class StatusWatch:
         self._limits: dict[str, None] = {}
 
     def look(self) -> None:
-        """Take a status that has arrived, or ask for one after LOOK_S, without waiting; call it between setpoints.
-
-        Says on stderr what newly keeps the force from being rendered. Once a force has been rendered, that spoils the
-        sending, as `finish` says; before, it is waiting. Raises CommandError (FAULT) where the device is in FAULT, and
-        as `Client.answer`. An answer that never comes raises nothing.
-        """
+        """Take a status that has arrived, or ask for one after LOOK_S, without waiting; call it between setpoints."""
         now_s = time.monotonic()
         if self._look_s is None:  # an answer may overtake the first setpoint
             self._look_s = now_s + LOOK_S
@@ -150,13 +130,7 @@ class StatusWatch:
         self._held = held
 
     def finish(self, sent: int) -> Fate:
-        """Wait up to ARRIVAL_S until the daemon has taken all `sent` setpoints, and return what became of them.
-
-        Call it once, after the last setpoint; those of the source before this watch do not count. Raises CommandError
-        (REFUSED) where under MIN_TAKEN of them were taken, the force never came, or was held back later. Where no
-        `look` saw a status, the last one alone decides whether it came. Raises CommandError (FAULT) where the device is
-        in FAULT, and as `Client.status`.
-        """
+        """Wait up to ARRIVAL_S until the daemon has taken all `sent` setpoints, and return what became of them."""
         until_s = time.monotonic() + ARRIVAL_S
         while True:
             status = self._client.status(LAST_ANSWER_S)
@@ -182,6 +156,5 @@ class StatusWatch:
 
 
 def _accepted(status: Status, source: str) -> int:
-    """Return how many setpoints of `source` the daemon has taken; 0 for an unknown source."""
     report = status.setpoints.by_source.get(source)
     return 0 if report is None else report.accepted

@@ -37,22 +37,13 @@ class Waveform(NamedTuple):
 
 
 def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
-    """Return straight lines from `start_N` on: each leg is its duration, s, and the force at its end, N.
-
-    Needs a leg at least, and durations above 0; neither is checked. Before and after, the first and the last force
-    hold.
-    """
+    """Return straight lines from `start_N` on: each leg is its duration, s, and the force at its end, N."""
     times_s = [0.0, *accumulate(lasts_s for lasts_s, _ in legs)]
     return _lines(times_s, [start_N, *(force_N for _, force_N in legs)])
 
 
 def _lines(times_s: Sequence[float], forces_N: Sequence[float], *others: Sequence[float] | None) -> Waveform:
-    """Return straight lines between samples of force at `times_s`, s, which is to begin with 0.
-
-    `others` are displacement, mm, and rate, mm/s, or fewer, each of as many values; None where there is none. Needs two
-    samples or more, at times that rise; nothing of this is checked. Before the first and after the last, their values
-    hold.
-    """
+    """Return straight lines between samples of force at `times_s`, s, which is to begin with 0."""
 
     def at(t_s: float) -> Sample:
         right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
@@ -71,14 +62,7 @@ SHAPES = ("step", "sine", "ramp", "pulse")
 
 
 def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s: float) -> Waveform:
-    """Return one of SHAPES between two forces, N, over `duration_s`.
-
-    step: `to_N` from half of the time on. ramp: a straight line over the whole time. sine: begins at `from_N`, swings
-    to `to_N` and back, once per 1/`frequency_hz`. pulse: a synthetic arterial pulse, one beat per 1/`frequency_hz`.
-    `to_N` may be below `from_N`. Raises WaveformError: an unknown name, a force outside 0..MAX_FORCE_N, or a step or
-    ramp without end. Not refused are a time or frequency of 0 or below: a ramp of 0 s raises ZeroDivisionError once it
-    is asked.
-    """
+    """Return one of SHAPES between two forces, N, over `duration_s`."""
     for label, value in (("from-N", from_N), ("to-N", to_N)):
         if not 0.0 <= value <= MAX_FORCE_N:
             raise WaveformError(f"--{label} = {value:g}: allowed is 0..{MAX_FORCE_N:g} N")
@@ -112,12 +96,7 @@ def beat(phase: float) -> float:
 
 
 def read_csv(path: Path) -> Waveform:
-    """Read a file of forces, N, into a waveform of straight lines between its rows, with time, s, from the first row.
-
-    It has the columns `t_s` and `force_N`, at least two rows, and times that rise from row to row. It may have
-    OPTIONAL_COLUMNS, mm and mm/s: samples carry these then. After the last row its values hold. Raises ForceFileError,
-    naming row, column and value, for any other column or row, and for a file that cannot be read.
-    """
+    """Read a file of forces, N, into a waveform of straight lines between its rows, with time, s, from the first row."""
     table = read_forces(path)
     start_s = table["t_s"][0]
     times_s = array("d", (time_s - start_s for time_s in table["t_s"]))

@@ -73,11 +73,7 @@ log = logging.getLogger(__name__)
 
 
 class _Connections:
-    """The connections of one endpoint, counted from the events of its socket monitor.
-
-    It keeps each connection's address, how often each address was admitted, the peers whose keys were refused, and why
-    the newest handshake failed.
-    """
+    """The connections of one endpoint, counted from the events of its socket monitor."""
 
     def __init__(self, name: str, endpoint: "zmq.Socket[bytes]", is_guarded: bool) -> None:
         self.name, self.endpoint, self.is_guarded = name, endpoint, is_guarded
@@ -87,7 +83,7 @@ class _Connections:
         self.turned_away: deque[str] = deque(maxlen=CONNECTIONS)
         "Addresses whose keys were refused, and whose connections are not closed yet."
         self.untold = 0
-        "Peers of refused keys that libzmq has not rejected yet. One that leaves in the handshake may be one of them."
+        "Peers of refused keys that libzmq has not rejected yet."
         self.taken_for_one: deque[str] = deque(maxlen=CONNECTIONS)
         "Addresses of peers that left in the handshake and were counted as one of these."
         self.failed: str | None = None
@@ -96,12 +92,7 @@ class _Connections:
 
     def told(self) -> str | None:
         """Note that libzmq has rejected a peer for its key, and return whom the caller has to count as refused for
-        that.
-
-        Normally None: the peer was counted when its key was refused. Otherwise another connection, which broke off its
-        handshake, had been counted in its place. Returns the address of that connection, empty where it is not known,
-        and adds it to `turned_away`.
-        """
+        that."""
         if self.untold:
             self.untold -= 1
             return None
@@ -110,12 +101,7 @@ class _Connections:
         return address
 
     def left_untold(self, address: str) -> bool:
-        """Tell whether a peer that broke off its handshake was counted already, when its key was refused.
-
-        True where libzmq has not rejected a refused key yet, and `left` finds such a peer at `address`. That peer is
-        removed from `turned_away` and noted for `told`, so each refused key answers True once. An empty `address` is
-        unknown, and stands for the oldest such peer. False changes nothing.
-        """
+        """Tell whether a peer that broke off its handshake was counted already, when its key was refused."""
         if not self.untold or (taken := self.left(address)) is None:
             return False
         self.untold -= 1
@@ -123,16 +109,11 @@ class _Connections:
         return True
 
     def gone(self) -> str:
-        """Return an address that was admitted more often than it has connections open; empty where there is none."""
         still = Counter(self.addresses.values())
         return next((address for address, count in self.admitted.items() if count > still[address]), "")
 
     def left(self, address: str) -> str | None:
-        """Remove one entry of `address` from `turned_away`, and return it; None where there is none.
-
-        An empty `address`, of a peer that was gone before it was seen, stands for the oldest entry, which is then
-        returned.
-        """
+        """Remove one entry of `address` from `turned_away`, and return it; None where there is none."""
         if not address and self.turned_away:  # the peer had gone before its address was read
             return self.turned_away.popleft()
         if address not in self.turned_away:
@@ -142,12 +123,7 @@ class _Connections:
 
 
 class Admission:
-    """Decides who may connect to the daemon's sockets: by CURVE key, and by the number of connections of an address.
-
-    `keys` is None where no endpoint is guarded. Create it before any guarded socket is bound. It keeps the `allowed`
-    keys and the count of `refusals`. It also counts in `oversize` the publishers that were cut off for too long a
-    message.
-    """
+    """Decides who may connect to the daemon's sockets: by CURVE key, and by the number of connections of an address."""
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
         self._keys, self._arrivals = keys, arrivals
@@ -166,11 +142,7 @@ class Admission:
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
-        """Begin to watch the connections of the endpoint `name`, and set the options of its socket if it is guarded.
-
-        Call before `bind`, once for each endpoint; `name` is one of MAY, which is not checked. A guarded socket asks
-        for CURVE keys. Raises OSError where `is_guarded` and the daemon has no keys.
-        """
+        """Begin to watch the connections of the endpoint `name`, and set the options of its socket if it is guarded."""
         if is_guarded:
             if self._keys is None:
                 raise OSError("CURVE keys are needed: endpoints.curve.server_secret")
@@ -187,10 +159,7 @@ class Admission:
 
     def update(self) -> bool:
         """Handle up to AT_ONCE waiting events of one socket, the next in turn that has any; return False where none
-        has.
-
-        Answers libzmq's questions about keys, counts refusals, and cuts off connections beyond the allowed number.
-        """
+        has."""
         # in turn: who knocks at one endpoint without pause must not keep everybody from the others
         for _ in range(len(self._parts)):
             self._parts.rotate()
@@ -201,17 +170,13 @@ class Admission:
         return False
 
     def close(self) -> None:
-        """Stop watching the connections. The sockets themselves stay open: the context closes them."""
+        """Stop watching the connections."""
         for known in self._endpoints.values():
             # or ZeroMQ's thread would wait for ever for a monitor that has gone
             known.endpoint.disable_monitor()
 
     def has_role(self, public: str, roles: frozenset[str]) -> bool:
-        """Tell whether the key `public`, 40 characters (Z85), is now listed for at least one of `roles`.
-
-        False for one that is not listed, and so for every key where `keys` is None. Ask for each message: a peer may
-        have been taken off the list after it was let in.
-        """
+        """Tell whether the key `public`, 40 characters (Z85), is now listed for at least one of `roles`."""
         return public in self.allowed and not roles.isdisjoint(self.allowed[public].roles)
 
     def name(self, public: str) -> str:
@@ -220,19 +185,11 @@ class Admission:
         return fingerprint(public) if listed is None else f"{fingerprint(public)} ({listed.name})"
 
     def connections(self) -> dict[str, int]:
-        """Return the number of connections by the endpoint's name, as far as `update` has handled their events.
-
-        A peer counts from when it is accepted, also before its key has been asked for.
-        """
+        """Return the number of connections by the endpoint's name, as far as `update` has handled their events."""
         return {name: len(known.addresses) for name, known in self._endpoints.items()}
 
     def let_in(self, allowed: Allowed) -> None:
-        """Replace the list of allowed keys by `allowed`, and log it.
-
-        Keys that have lost a role are logged as a warning. Where one has, all peers of the guarded telemetry and
-        recording endpoints are cut off. Peers that are still allowed reconnect by themselves. Peers of setpoint and
-        control stay: each of their messages is held against `has_role`. Call it after `guard` of all endpoints.
-        """
+        """Replace the list of allowed keys by `allowed`, and log it."""
         before, self.allowed = self.allowed, allowed
         roles = Counter(role for listed in allowed.values() for role in listed.roles)
         log.info("%d keys are let in: %s", len(allowed), ", ".join(f"{role} {roles[role]}" for role in ROLES))
@@ -249,21 +206,13 @@ class Admission:
                     self.cut_off(name)
 
     def cut_off(self, name: str, whose: str = "") -> None:
-        """Shut down the connections from the address `whose` to the endpoint `name`; an empty `whose` ends all.
-
-        Does not wait: they are counted until `update` has handled their ends. A peer that may connect comes back by
-        itself. Raises KeyError for an endpoint that was not given to `guard`.
-        """
+        """Shut down the connections from the address `whose` to the endpoint `name`; an empty `whose` ends all."""
         for descriptor, address in self._endpoints[name].addresses.items():
             if address == whose or not whose:
                 _end(descriptor, address)
 
     def _admit(self) -> None:
-        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most. Never waits.
-
-        The answer's status 200 lets the peer in, 400 does not. A peer that is let in has its key as user id. Each
-        answer is counted, as in `_is_admitted`.
-        """
+        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most."""
         for _ in range(AT_ONCE):
             if not self._arrivals.has(self._zap):
                 return
@@ -277,11 +226,7 @@ class Admission:
             self._arrivals.touch(self._zap)
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
-        """Tell whether the key `public` may use the endpoint `name`, and count the answer.
-
-        A refused key is counted in `refusals` with the reason, and noted: its connection is closed soon. An admission
-        is counted for its address. A publisher that is admitted within RECONNECT_S of leaving counts in `oversize`.
-        """
+        """Tell whether the key `public` may use the endpoint `name`, and count the answer."""
         known = self._endpoints[name]
         if self.has_role(public, MAY[name]):
             self._count_oversize(name, address)
@@ -295,11 +240,7 @@ class Admission:
         return False
 
     def _watch(self, known: _Connections) -> None:
-        """Handle the waiting events of one endpoint's monitor, AT_ONCE at most: connected, closed, handshake failed.
-
-        Cuts off connections beyond the allowed number. A peer counts as refused once its connection is closed, unless
-        that was counted with its key. A publisher that comes back at once to an open endpoint counts in `oversize`.
-        """
+        """Handle the waiting events of one endpoint's monitor, AT_ONCE at most: connected, closed, handshake failed."""
         for _ in range(AT_ONCE):
             if not self._arrivals.has(known.monitor):
                 return
@@ -320,11 +261,7 @@ class Admission:
                 known.failed = PLAIN if known.is_guarded else "left in the handshake"
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
-        """Note a new connection and its address, and end it where its address or its endpoint has too many.
-
-        One whose peer has gone already is only noted. On an open endpoint, a publisher that returns at once counts in
-        `oversize`.
-        """
+        """Note a new connection and its address, and end it where its address or its endpoint has too many."""
         address = known.addresses[descriptor] = _address(descriptor)
         if not address:
             return
@@ -336,12 +273,7 @@ class Admission:
             self._count_oversize(known.name, address)
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
-        """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many.
-
-        Nothing is counted where it was when the key was refused. A publisher that had got in is noted in `left`: it may
-        come back at once. A connection of an unknown address whose handshake did not fail stands for one that was
-        admitted.
-        """
+        """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many."""
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
         was_asked = (
@@ -363,10 +295,7 @@ class Admission:
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
     def _count_oversize(self, name: str, address: str) -> None:
-        """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget that leaving.
-
-        Does nothing for other endpoints than `setpoint`. A program that quickly opens another socket counts, too.
-        """
+        """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget that leaving."""
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
         # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
         # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
@@ -381,10 +310,7 @@ class Admission:
 
 
 def _address(descriptor: int) -> str:
-    """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`.
-
-    Empty where the peer has gone, or `descriptor` is no socket. `descriptor` stays open.
-    """
+    """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`."""
     try:
         with socket.socket(fileno=os.dup(descriptor)) as connection:
             if connection.family == socket.AF_UNIX:

@@ -7,23 +7,14 @@ PEERS = 256
 
 
 class Allowance:
-    """A token bucket for each peer: `per_s` messages a second, and a `burst` at once. No sockets, no clock.
-
-    Neither figure is checked; both are to be positive.
-    """
+    """A token bucket for each peer: `per_s` messages a second, and a `burst` at once. No sockets, no clock."""
 
     def __init__(self, per_s: float, burst: float) -> None:
         self._per_s, self._burst = per_s, burst
         self._buckets: dict[Peer, tuple[float, float]] = {}
-        "When each peer's bucket was last filled, and the messages left in it then."
 
     def grants(self, peer: Peer, now_s: float) -> bool:
-        """Tell whether one more message of `peer` may be read at `now_s`; if so, it is taken from the peer's bucket.
-
-        A new peer begins with a full bucket, and none holds more than `burst`. Of more than PEERS peers, the one heard
-        longest ago is forgotten, and would begin anew. A refused message counts as heard. `now_s` must not fall, which
-        is not checked.
-        """
+        """Tell whether one more message of `peer` may be read at `now_s`; if so, it is taken from the peer's bucket."""
         if peer not in self._buckets and len(self._buckets) >= PEERS:
             del self._buckets[min(self._buckets, key=self._buckets.__getitem__)]
         filled_s, left = self._buckets.get(peer, (now_s, self._burst))

@@ -24,14 +24,10 @@ WAITS = frozenset({"busy", "device_latched", "not_homed", "not_fresh"})
 
 
 class Arming:
-    """Progress of one `arm`: gives each command that leads to ENABLED once, as soon as the state allows it.
-
-    Ends with a refusal at every fault that was not latched when it began: a person clears only faults that they have
-    seen. `given` lists the commands so far, `is_over` tells the end, `refusal` why it failed. No clock.
-    """
+    """Progress of one `arm`: gives each command that leads to ENABLED once, as soon as the state allows it."""
 
     def __init__(self, now_s: float, faults: tuple[Fault, ...]) -> None:
-        """Begin at `now_s`. `faults` are those latched now, which the person has agreed to clear."""
+        """Begin at `now_s`."""
         self.given: tuple[str, ...] = ()
         self.is_over = False
         self.refusal: RefusedError | None = None
@@ -40,18 +36,12 @@ class Arming:
         self._given_s = self._moved_s = now_s
 
     def end(self, refusal: RefusedError | None = None) -> None:
-        """End the arming, with the reason where it failed; None where the force follows now. Later calls do nothing."""
+        """End the arming, with the reason where it failed; None where the force follows now."""
         if not self.is_over:
             self.is_over, self.refusal = True, refusal
 
     def advance(self, now_s: float, safety: SafetyState, present: Conditions, give: Callable[[str], None]) -> None:
-        """Give the next command by calling `give`, once its time has come; end in ENABLED or at a refusal.
-
-        Call it again and again: each call gives one command at most, and no command is given twice. `give` raises
-        RefusedError. Refusals in WAITS are tried again for PATIENCE_S; any other ends the arming. So do a new fault, a
-        device that is not connected, and one still busy MOVES_S after a command. RefusedError is never raised:
-        `refusal` says why it ended. Once over, it does nothing.
-        """
+        """Give the next command by calling `give`, once its time has come; end in ENABLED or at a refusal."""
         if self.is_over:
             return
         try:
@@ -75,12 +65,7 @@ class Arming:
             raise RefusedError("fault", f"a fault came while arming: {', '.join(news)}", "tormagctl status")
 
     def _attempt(self, now_s: float, command: Event, give: Callable[[str], None]) -> None:
-        """Give `command` and note it in `given`. Raises RefusedError where it is refused, or was given and has not led
-        on.
-
-        Refusals in WAITS are passed over, and nothing is noted, until PATIENCE_S after the last command or motion. A
-        command that was given before counts as refused with `busy`, which is one of these.
-        """
+        """Give `command` and note it in `given`."""
         try:
             if command in self.given:
                 raise RefusedError("busy", f"{command} was taken, and has not come to its end", "tormagctl status")
@@ -94,10 +79,7 @@ class Arming:
 
 
 def _next(safety: SafetyState, present: Conditions) -> Event:
-    """Return the next command towards ENABLED; `clear-fault` where only the device has latched a fault.
-
-    Not to be called in ENABLED: there is none, and IndexError is raised.
-    """
+    """Return the next command towards ENABLED; `clear-fault` where only the device has latched a fault."""
     if present.device_latched and safety.operating_state is OperatingState.DISABLED:
         return Event.CLEAR_FAULT
     return next_commands(safety, present.homed)[0]

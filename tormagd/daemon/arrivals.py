@@ -8,11 +8,7 @@ _EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 
 
 class Arrivals:
-    """Knows which ZeroMQ sockets hold messages, by polling their descriptors once a beat.
-
-    A descriptor signals new messages once, and any use of its socket clears the signal (zmq_getsockopt, ZMQ_FD). So a
-    socket that has signalled counts as ready until it is found empty.
-    """
+    """Knows which ZeroMQ sockets hold messages, by polling their descriptors once a beat."""
 
     def __init__(self) -> None:
         self._poll = select.poll()
@@ -20,14 +16,14 @@ class Arrivals:
         self._ready: set[zmq.Socket[bytes]] = set()
 
     def watch(self, socket: "zmq.Socket[bytes]") -> None:
-        """Watch `socket`, too. It counts as ready at once: its first message may come without a signal."""
+        """Watch `socket`, too."""
         self._ready.add(socket)
         descriptor = int(socket.fileno())
         self._sockets[descriptor] = socket
         self._poll.register(descriptor, select.POLLIN)
 
     def look(self) -> None:
-        """Poll all watched sockets without waiting, and note which have signalled. Call once a beat."""
+        """Poll all watched sockets without waiting, and note which have signalled."""
         for descriptor, _ in self._poll.poll(0):
             self._ready.add(self._sockets[descriptor])
 
@@ -36,16 +32,12 @@ class Arrivals:
         self._ready.add(socket)
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
-        """Tell whether a message waits in a watched socket; False for one that is not watched.
-
-        A message that came after the last `look` is seen only where the socket counts as ready. A socket that is found
-        empty counts as ready no longer.
-        """
+        """Tell whether a message waits in a watched socket; False for one that is not watched."""
         if socket in self._ready and not is_readable(socket):
             self._ready.discard(socket)
         return socket in self._ready
 
 
 def is_readable(socket: "zmq.Socket[bytes]") -> bool:
-    """Tell whether a message waits in `socket`, watched or not. Costs a third of an exception of `recv`."""
+    """Tell whether a message waits in `socket`, watched or not."""
     return bool(int(socket.get(_EVENTS)) & _POLLIN)

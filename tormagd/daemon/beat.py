@@ -35,10 +35,7 @@ Part = tuple[str, Callable[[Beat], object]]
 
 
 class Delay(NamedTuple):
-    """Delay of a late beat: from when it was due until it drove the device, ns.
-
-    `culprit` is the part that took most of it, or KERNEL; `share_ns` is what it took.
-    """
+    """Delay of a late beat: from when it was due until it drove the device, ns."""
 
     took_ns: int
     culprit: str
@@ -46,11 +43,7 @@ class Delay(NamedTuple):
 
 
 class Phases:
-    """Runs the parts of every beat: all phases in order, then one of the slices, which take turns.
-
-    An exception ends only its own part of that beat; it is logged, unless its message is that part's last one. `spent`
-    has the parts' times, `blamed` how often each made a beat late.
-    """
+    """Runs the parts of every beat: all phases in order, then one of the slices, which take turns."""
 
     def __init__(
         self,
@@ -58,10 +51,7 @@ class Phases:
         clock_ns: Callable[[], int] = monotonic_ns,
         cpu_ns: Callable[[], int] = thread_time_ns,
     ) -> None:
-        """Begin with no parts. A beat that drives the device later than `stall_ns` is logged as an error.
-
-        `clock_ns` gives the time, `cpu_ns` the processor time of this thread.
-        """
+        """Begin with no parts."""
         self._stall_ns, self._clock_ns, self._cpu_ns = stall_ns, clock_ns, cpu_ns
         self._phases: list[Part] = []
         self._slices: list[Part] = []
@@ -79,19 +69,12 @@ class Phases:
         self._tell_ns = clock_ns()
 
     def begin(self, phases: list[Part], slices: list[Part]) -> None:
-        """Set the phases and slices of every beat from now on, each name with its function, and empty `spent`.
-
-        Needs at least one slice, and names that differ, which is not checked. Call it before the first `run`.
-        """
+        """Set the phases and slices of every beat from now on, each name with its function, and empty `spent`."""
         self._phases, self._slices = phases, slices
         self.spent = {name: Histogram() for name, _ in (*phases, *slices)}
 
     def run(self, due_ns: int, merged: int) -> None:
-        """Run one beat that was due at `due_ns` of the monotonic clock, and stands for `merged` missed ones, too.
-
-        Runs all phases, then one slice, the next in turn. Where the last beat's slice had work, slices run in turn
-        until one has work again. No exception of a part leaves it. The times of every COUNTED-th beat go into `spent`.
-        """
+        """Run one beat that was due at `due_ns` of the monotonic clock, and stands for `merged` missed ones, too."""
         beat = Beat(due_ns, self._clock_ns(), merged)
         self._last_ran, self._ran = self._ran, []
         for name, phase in self._phases:
@@ -112,13 +95,7 @@ class Phases:
         self._cpu_before_ns = self._cpu_ns()
 
     def blame(self, due_ns: int) -> Delay:
-        """Return the delay of the device since `due_ns`, and the part that took most of it. Call in the phase that
-        drives.
-
-        Counts that part in `blamed`, and keeps the worst delay for `tell`. Where the thread did not run for more than
-        half of the delay, by `cpu_ns`, KERNEL is to blame. A shorter pause counts for the part in which it fell. The
-        last beat's parts count as far as they ran after `due_ns`. Processor time for the next call counts from now.
-        """
+        """Return the delay of the device since `due_ns`, and the part that took most of it."""
         done_ns = self._clock_ns()
         took_ns = done_ns - due_ns
         shares: Counter[str] = Counter()
@@ -139,11 +116,7 @@ class Phases:
         return delay
 
     def tell(self) -> None:
-        """Log the number of late beats and the worst of them since the last line, at most once in NEWS_NS.
-
-        Late beats are those of `blame`. The line is an error where the worst delay was over `stall_ns`, else a warning.
-        Without late beats nothing is logged; what comes too soon for a line is told with the next one.
-        """
+        """Log the number of late beats and the worst of them since the last line, at most once in NEWS_NS."""
         now_ns = self._clock_ns()
         if self._late and now_ns >= self._tell_ns:
             took_ns, culprit, share_ns = self._worst
@@ -156,11 +129,7 @@ class Phases:
             self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
-        """Run one part and keep its times; return False, and keep none, where it returned False: it had nothing to do.
-
-        Any other result counts as something done. So does an exception, which is logged unless its message is that
-        part's last one.
-        """
+        """Run one part and keep its times; return False, and keep none, where it returned False: it had nothing to do."""
         start_ns = self._clock_ns()
         try:
             is_done = part(beat) is not False

@@ -10,12 +10,7 @@ MAX_PACKET = 65_536
 
 
 def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
-    """Start `python -m module DESCRIPTOR`, with the socket `its_end` as that descriptor, and return the process.
-
-    Does not wait for it. It gets no signal of our process group: it is to end once our end of the socket is closed. Its
-    stdin is empty, its stdout and stderr are ours. The caller closes `its_end` here, and waits for the process. Raises
-    OSError where it does not start; a wrong `module` shows only in its end.
-    """
+    """Start `python -m module DESCRIPTOR`, with the socket `its_end` as that descriptor, and return the process."""
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
     # a session of its own: signals to our process group must not end it before us
@@ -23,11 +18,7 @@ def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes
 
 
 class Beside:
-    """Our end of a process that runs `module`, and of the packet socket to it. Sends never wait.
-
-    Create it before this process becomes a real-time one: the other would inherit its processors. Raises OSError where
-    the process does not start; no method does.
-    """
+    """Our end of a process that runs `module`, and of the packet socket to it. Sends never wait."""
 
     def __init__(self, module: str) -> None:
         self.socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -38,11 +29,7 @@ class Beside:
         "Whether the process was found to have ended, or this end is closed."
 
     def send(self, data: bytes) -> bool:
-        """Send one packet without waiting, and return whether the socket took it, which does not say that it was read.
-
-        False where the socket is full, the packet is too long, `close` was called, or the process has ended. The last
-        sets `is_gone`.
-        """
+        """Send one packet without waiting, and return whether the socket took it, which does not say that it was read."""
         try:
             self.socket.send(data)
         except ConnectionError:
@@ -52,10 +39,7 @@ class Beside:
         return not self.is_gone
 
     def receive(self, wait_s: float = 0.0) -> bytes | None:
-        """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process has ended.
-
-        0 does not wait. The end of the process sets `is_gone`. Of a packet over MAX_PACKET bytes the rest is lost.
-        """
+        """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process has ended."""
         try:
             if wait_s:
                 select.select([self.socket], [], [], wait_s)
@@ -68,9 +52,6 @@ class Beside:
         return data or None
 
     def close(self) -> None:
-        """Close our end of the socket, which tells the process to end. Does not wait for it.
-
-        `send` returns False from then on.
-        """
+        """Close our end of the socket, which tells the process to end."""
         self.is_gone = True
         self.socket.close()

@@ -44,12 +44,7 @@ log = logging.getLogger(__name__)
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
-    """Return the header of a black box of `core`: what a replay needs to build the same core again.
-
-    Keys: `format`, `version`, `build`, `sources_sha256`, `platform`, `config` and `scene` (both JSON), `config_sha256`,
-    `scene_sha256`, `scene_folder`, `model_sha256`. `columns` has the names of a tick's values, a list in JSON. Reads
-    the sources' files for their hash.
-    """
+    """Return the header of a black box of `core`: what a replay needs to build the same core again."""
     configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
         "format": str(FORMAT),
@@ -68,12 +63,7 @@ def header(config: Config, core: Core) -> dict[str, str]:
 
 
 class BlackBox:
-    """Hands the core's journal to the keeper, a process that writes black boxes into `folder`.
-
-    Nothing is kept where `folder` is None, where mcap is not installed, or where the keeper does not start. `report`
-    then says why. `key` names the file with the key that seals black boxes; empty for none. `journal` takes the
-    entries.
-    """
+    """Hands the core's journal to the keeper, a process that writes black boxes into `folder`."""
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int, key: str = "") -> None:
         self._folder, self._key = folder, key
@@ -101,32 +91,20 @@ class BlackBox:
         self._asked: deque[Write] = deque(maxlen=MAX_ASKED)
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
-        """Begin the journal with a snapshot of both states, which are those before the first tick.
-
-        The journal becomes `connection.traffic`: it also takes what passes to and from the device. Does nothing without
-        a keeper.
-        """
+        """Begin the journal with a snapshot of both states, which are those before the first tick."""
         if self._beside is not None:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
-        """Begin anew with the core of another scene, from a snapshot of these states. Does nothing without a keeper.
-
-        The keeper gets the new `header` and forgets all entries of the scene before, as do journal and packer here.
-        """
+        """Begin anew with the core of another scene, from a snapshot of these states."""
         self.journal.take()
         self._packer.take()
         self._send(Begin(str(self._folder), header, self._key))
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
-        """Add the record of a control period to the journal, and encode all entries since the last call.
-
-        Does nothing without a keeper. Every PART_TICKS periods the entries go to the keeper; what its socket does not
-        take is lost, and the part is counted. After a loss, and every SNAPSHOT_S, a snapshot of both states follows. An
-        entry that cannot be encoded ends the black box, and is logged.
-        """
+        """Add the record of a control period to the journal, and encode all entries since the last call."""
         if self._beside is None:
             return
         self.journal.ticked(record)
@@ -148,12 +126,7 @@ class BlackBox:
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
-        the ms.
-
-        `reason` is not checked for what a file's name may hold. `details`, of the caller's choice, goes into the file's
-        metadata. The box also holds what comes in the next `after_s`. Clears the last refusal; `look` notes how the
-        writing ended. A ninth request that waits drops the oldest. Raises RefusedError without a keeper.
-        """
+        the ms."""
         if self._folder is None or self._beside is None:
             raise RefusedError(
                 "no_black_box",
@@ -169,10 +142,7 @@ class BlackBox:
         return self._folder / name
 
     def look(self) -> None:
-        """Send the keeper the requests that wait, and note its answers in `report` and in the log. Never waits.
-
-        A keeper that has ended ends the black box for good: nothing starts another. Without a keeper nothing happens.
-        """
+        """Send the keeper the requests that wait, and note its answers in `report` and in the log."""
         self._send_requests()
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
@@ -188,11 +158,7 @@ class BlackBox:
         self._stop_if_gone()
 
     def report(self) -> BlackBoxReport:
-        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since the start.
-
-        File and failure show once `look` has noted them; the next request for a box clears the failure. A text is empty
-        where there is none: no folder, no file in this run, nothing wrong.
-        """
+        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since the start."""
         return BlackBoxReport(
             folder="" if self._folder is None else str(self._folder),
             newest=self._newest,
@@ -201,10 +167,7 @@ class BlackBox:
         )
 
     def close(self) -> None:
-        """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and leave it then.
-
-        Call it at the end: nothing is kept any more. Does nothing without a keeper.
-        """
+        """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and leave it then."""
         beside = self._beside
         if beside is not None:
             self._send(End())
@@ -216,7 +179,6 @@ class BlackBox:
                 log.info("the black box is still being written, and will be there when its process has ended")
 
     def _send_requests(self) -> None:
-        """Send the keeper the requests that wait; those that the socket does not take wait on."""
         while self._asked and self._send(self._asked[0]):
             self._asked.popleft()
 
@@ -224,21 +186,17 @@ class BlackBox:
         self.journal.snapshot(stepper, planner, None if self._connection is None else self._connection.memory())
 
     def _send(self, what: Said) -> bool:
-        """Send one message to the keeper, and return whether the socket took it. A dead keeper ends the black box."""
+        """Send one message to the keeper, and return whether the socket took it."""
         is_taken = self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
         self._stop_if_gone()
         return is_taken
 
     def _stop_if_gone(self) -> None:
-        """End the black box where the keeper has ended."""
         if self._beside is not None and self._beside.is_gone:
             self._stop("the process that keeps it has ended")
 
     def _stop(self, reason: str) -> None:
-        """End the black box: close the socket, stop the journal and drop its entries. Control goes on.
-
-        `reason` goes into the log, as an error, and into `report`. The keeper sees a closed socket without an End.
-        """
+        """End the black box: close the socket, stop the journal and drop its entries."""
         self._refusal = reason
         log.error("no black box is kept any more: %s; next: start the daemon again", reason)
         if self._beside is not None:

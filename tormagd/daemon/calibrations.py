@@ -25,11 +25,7 @@ class Made(NamedTuple):
 
 
 class Calibrations:
-    """Puts the calibration of each device that answers into force, from `folder`; None: none is read.
-
-    A file is SERIAL.toml, the serial number in eight hexadecimal digits. `configured` is the configuration without any.
-    `take` puts a core, and the configuration that it was made of, in the place of the running ones.
-    """
+    """Puts the calibration of each device that answers into force, from `folder`; None: none is read."""
 
     def __init__(self, folder: Path | None, configured: Config, take: Callable[[Config, Core], None]) -> None:
         self.configured = configured
@@ -39,22 +35,11 @@ class Calibrations:
         self._file = self._refusal = ""
 
     def is_awaited(self, serial_number: int | None) -> bool:
-        """Tell whether the device with this serial number may not be driven yet: its calibration is not in force.
-
-        False without a folder, and for None, a device that is not known yet. A device without a file is awaited until
-        that was found out.
-        """
+        """Tell whether the device with this serial number may not be driven yet: its calibration is not in force."""
         return self._folder is not None and serial_number not in (None, self._of)
 
     def look(self, serial_number: int | None, running: Config, *, is_idle: bool) -> None:
-        """Bring the connected device's calibration into force, step by step, while the device `is_idle`. Never waits.
-
-        The first look begins to read the file and to build a core, in another thread. A later one calls `take`, unless
-        the calibrated configuration equals `running`, that in force. None, an unknown serial number, does nothing. A
-        refused calibration is logged, and the device runs by the configuration alone. Where no core can be built by
-        that, the device stays awaited: nothing is tried again before `read_again`, another device or another
-        configuration. A core of another configuration than now is not taken, but made anew. Needs a running event loop.
-        """
+        """Bring the connected device's calibration into force, step by step, while the device `is_idle`."""
         if not is_idle or serial_number is None or self._folder is None or serial_number == self._of:
             return
         # the scene may have changed while the device was away
@@ -77,11 +62,7 @@ class Calibrations:
         return CalibrationReport(file=self._file, refusal=self._refusal, folder=str(self._folder or ""))
 
     def _note(self, serial_number: int, making: "asyncio.Future[Made]") -> None:
-        """Put a finished calibration into force: call `take` with its core, if there is a new one, and log the file.
-
-        Where no core could be built, the device stays awaited. A refusal goes into `report`, and into the log where it
-        is another than before.
-        """
+        """Put a finished calibration into force: call `take` with its core, if there is a new one, and log the file."""
         refusal_before = self._refusal
         try:
             made = making.result()
@@ -98,11 +79,7 @@ class Calibrations:
 
 
 def _make(path: Path, serial_number: int, configured: Config, running: Config) -> Made:
-    """Return what the device `serial_number` is to run by. `running` is the configuration in force.
-
-    A missing file is no calibration. One that is refused, or with which no core is built, is left out, and `refusal`
-    says why. Raises ConfigError where no core is built by `configured`, the configuration alone, either.
-    """
+    """Return what the device `serial_number` is to run by."""
     try:
         config = load_calibration(path, configured, serial_number)
     except ConfigError as error:

@@ -24,21 +24,13 @@ class Causes:
         self._told: dict[str, str] = {}
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:
-        """Set `stall` where the step that just ran has taken its own delay for a stall; else change nothing.
-
-        `delay` names the part to blame; the length is the step's own, ms to a tenth. A stall of the same length as the
-        last counts as the same one.
-        """
+        """Set `stall` where the step that just ran has taken its own delay for a stall; else change nothing."""
         sight, known, stall_ms = stepper.measure.sight, self.stall, round(stepper.measure.sight.stall_s * 1e3, 1)
         if sight.stalled_s == stepper.time_s and (known is None or known.ms != stall_ms):
             self.stall = StallReport(stall_ms, delay.culprit)
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
-        """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes.
-
-        `measurement` is the newest; None without a device: only HOST_STALL then has figures. A fault without figures
-        keeps its cause in words alone, and what was remembered of it before is dropped. The figures serve `of_faults`.
-        """
+        """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes."""
         figures = {} if measurement is None else _figures(stepper, measurement)
         for fault in faults:
             self._told.pop(fault, None)
@@ -58,11 +50,7 @@ class Causes:
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
-        """Return each fault with its cause and its remedy, in the order of `faults`.
-
-        A cause has the figures of when the fault was given to `tell`, where there are any. Raises KeyError for a code
-        that FAULTS does not have.
-        """
+        """Return each fault with its cause and its remedy, in the order of `faults`."""
         return _explained(faults, FAULTS, self._told)
 
     def of_limits(
@@ -72,12 +60,7 @@ class Causes:
         of_sources: Mapping[Limit, Explanation],
         measurement: Measurement | None,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of `limits`.
-
-        `replaced` names the model's inputs that were held to its range; only MODEL_RANGE uses it. `of_sources` are
-        explanations of limits about publishers, and go before those of LIMITS. `measurement` is the newest; None
-        without a device: LINK_DEGRADED and CLOCK then have no figures. Raises KeyError for a code that neither has.
-        """
+        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of `limits`."""
         told = {
             Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered",
             Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}",
@@ -93,11 +76,6 @@ class Causes:
 
 
 def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
-    """Return figures, as texts, for those faults that have any now; the others are no keys.
-
-    Ages and distances are of `measurement` at the last step. ENCODER is a key only after a leap of an encoder. The
-    faults of homing and opening are those that the step itself has found.
-    """
     leap, homing, opening = stepper.measure.leap, stepper.homing, stepper.opening
     return {
         Fault.SENSE_STALE: f"for {(stepper.time_s - measurement.sensed_s) * 1e3:.0f} ms",
@@ -115,9 +93,4 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
 def _explained(
     codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str]
 ) -> tuple[Explained, ...]:
-    """Return each code with its cause and remedy from `table`, in the order of `codes`; empty for none.
-
-    A cause in `told` goes before the table's; other keys of it do not matter. Raises KeyError for a code that `table`
-    does not have, also where `told` has it.
-    """
     return tuple(Explained(str(code), told.get(code, table[code].cause), table[code].remedy) for code in codes)

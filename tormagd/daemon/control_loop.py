@@ -18,11 +18,7 @@ log = logging.getLogger(__name__)
 
 
 class ControlLoop:
-    """The control loop: each period, step the core on the newest measurement and drive the device.
-
-    It keeps the last step's `output`, its plan `used` and its `measurement`, the loop's `timing`, and the newest
-    `arming`.
-    """
+    """The control loop: each period, step the core on the newest measurement and drive the device."""
 
     def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
         self.stepper, self._connection, self._journal = stepper, connection, journal
@@ -36,12 +32,7 @@ class ControlLoop:
         self._known_faults: tuple[Fault, ...] = ()
 
     def drive(self, beat: Beat, plan: Plan) -> None:
-        """Step the core along `plan` with the newest measurement, and send its output to the device.
-
-        Without a device the measurement is None: the core is stepped all the same, and the connection may open its
-        port. Keeps output, plan and measurement in `output`, `used` and `measurement`. Notes in the journal that a step
-        ran, not the tick's record. Records the beat's times, from when it was due to now, in `timing`.
-        """
+        """Step the core along `plan` with the newest measurement, and send its output to the device."""
         now_s = time.monotonic()  # now, not when the beat began: a stall within the beat counts, too
         self.used, self.measurement = plan, self._connection.measurement
         self._journal.stepped()
@@ -53,22 +44,13 @@ class ControlLoop:
         self.timing.record(beat.due_ns, beat.start_ns, time.monotonic_ns(), beat.merged)
 
     def command(self, name: str, conditions: Conditions) -> None:
-        """Carry out an operator's command, note it in the journal, and log it if it was taken.
-
-        `name` is one of `operating_state.COMMANDS`, which `arm` is not. Raises RefusedError for any other, and where
-        `conditions` or the state do not allow it. An arming under way ends first, as overtaken, whether or not the
-        command is then refused.
-        """
+        """Carry out an operator's command, note it in the journal, and log it if it was taken."""
         if self.arming is not None:
             self.arming.end(RefusedError("overtaken", f"{name} came before it was armed", "tormagctl arm"))
         self._give(name, conditions)
 
     def arm(self, conditions: Conditions) -> None:
-        """Begin an arming, or go on with the one under way, and give its next command if its time has come.
-
-        An arming that begins may clear the faults that are latched now. It is rarely over with this call: see
-        `go_on_arming` and `arming.is_over`. Raises RefusedError where it ends refused in this call.
-        """
+        """Begin an arming, or go on with the one under way, and give its next command if its time has come."""
         if self.arming is None or self.arming.is_over:
             self.arming = Arming(time.monotonic(), self.stepper.safety.faults)
         self.go_on_arming(conditions)
@@ -76,11 +58,7 @@ class ControlLoop:
             raise self.arming.refusal
 
     def go_on_arming(self, conditions: Conditions) -> None:
-        """Give the next command of an arming under way, if its time has come; else do nothing. Call it again and again.
-
-        Without an arming, or after its end, nothing is done. A refusal ends the arming, is logged and kept in
-        `arming.refusal`, and is not raised.
-        """
+        """Give the next command of an arming under way, if its time has come; else do nothing."""
         arming = self.arming
         if arming is None or arming.is_over:
             return
@@ -89,11 +67,7 @@ class ControlLoop:
             log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
 
     def _give(self, name: str, conditions: Conditions) -> None:
-        """Give an operator's command to the core under `conditions`, note it in the journal, and log it if taken.
-
-        `name` is one of `operating_state.COMMANDS`. Raises RefusedError for any other, and where `conditions` or the
-        state do not allow it; the journal notes that, too.
-        """
+        """Give an operator's command to the core under `conditions`, note it in the journal, and log it if taken."""
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
             self.stepper.command(name, now_s, conditions)
@@ -114,10 +88,7 @@ class ControlLoop:
         self.stepper.lose_link()
 
     def new_faults(self) -> tuple[Fault, ...]:
-        """Return the faults latched since the last call; at the first call, all that are latched.
-
-        A fault that was cleared and latched again is new only where a call came in between.
-        """
+        """Return the faults latched since the last call; at the first call, all that are latched."""
         faults, known = self.stepper.safety.faults, self._known_faults
         self._known_faults = faults
         return tuple(fault for fault in faults if fault not in known)

@@ -52,13 +52,7 @@ log = logging.getLogger(__name__)
 
 
 class Daemon:
-    """The daemon: runs one scene on one device until it is told to end. Create it inside the event loop.
-
-    `read_again` returns the configuration as its file is now, and raises ConfigError. `refused` lists what the kernel
-    did not grant at the start.
-
-    Raises OSError where an endpoint cannot be bound.
-    """
+    """The daemon: runs one scene on one device until it is told to end. Create it inside the event loop."""
 
     def __init__(
         self,
@@ -72,11 +66,7 @@ class Daemon:
         beside: SearchProcess | None = None,
         config_file: str | None = None,
     ) -> None:
-        """Bind the endpoints and put the loops together; the device is opened in `run`.
-
-        `keys` is None where no endpoint is guarded. `box` has its keeper running already; None: no black box is kept.
-        `beside` is the search where it runs in a process of its own. `config_file` is None for the defaults.
-        """
+        """Bind the endpoints and put the loops together; the device is opened in `run`."""
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
@@ -146,13 +136,7 @@ class Daemon:
         return Profiles(of_insert, self._inference.planner.believe, self._inference.teach)
 
     async def run(self) -> None:
-        """Open the device and run until SIGTERM or SIGINT; then open the gap, keep the profile and close everything.
-
-        The end takes up to LONGEST_RETRACT_S and NAMED_S. Systemd is told that the daemon stops. The black box is
-        finished, and the search's process ended. SIGHUP reads keys and configuration again. Freezes the garbage
-        collector and shortens the interpreter's switch interval, both for the whole process. A device that cannot be
-        opened is tried again while it runs. Raises OSError where the kernel gives no timer. Call it once.
-        """
+        """Open the device and run until SIGTERM or SIGINT; then open the gap, keep the profile and close everything."""
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, self._ended.set)
         self._loop.add_signal_handler(signal.SIGHUP, self._begin_reload)
@@ -200,12 +184,7 @@ class Daemon:
         self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
 
     def _drive(self, beat: Beat) -> None:
-        """Drive the device along the newest plan.
-
-        A tick that ends more than a period after it was due is put down to the part that delayed it. New faults are
-        explained in the log. A black box named after the first is asked for, which goes on for AFTER_FAULT_S; without a
-        black box nothing is.
-        """
+        """Drive the device along the newest plan."""
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
         if timing.delay_ns > timing.period_ns:
@@ -220,11 +199,7 @@ class Daemon:
 
     async def _build(self, scene: str) -> Core:
         """Build the core of another scene at the running rates, in another thread; wait for a profile that is being
-        written.
-
-        The running core stays. Raises ConfigError for a scene that is refused. It also does where the search of either
-        scene runs in its own process.
-        """
+        written."""
         # in a thread: no beat waits for it
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
         if core.element.is_beside or self._inference.beside is not None:
@@ -233,15 +208,10 @@ class Daemon:
         return core
 
     def _require_disabled(self) -> None:
-        """Check that the scene may be changed now. Raises RefusedError; an arming under way ends in any case."""
         self._control.command("use-scene", self._telemetry.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
-        """Replace the running core by `core`, made for `scene`, as `_run_core` does.
-
-        What was learned of the device stays where insert and model do. The scene also becomes that of the configuration
-        without calibration.
-        """
+        """Replace the running core by `core`, made for `scene`, as `_run_core` does."""
         before, learned = self._core, self._inference.planner.believe.learned()
         self._calibrations.configured = msgspec.structs.replace(self._calibrations.configured, scene=scene)
         self._run_core(msgspec.structs.replace(self._config, scene=scene), core)
@@ -249,12 +219,7 @@ class Daemon:
             self._inference.teach(learned)
 
     def _run_core(self, config: Config, core: Core) -> None:
-        """Replace the running core by `core`, made of `config`, between two beats.
-
-        Operating state, latched faults and the device's own homing stay. The newest setpoint is forgotten, and what was
-        learned of the device, whose profile is read again. Telemetry reports on the new core, and the black box begins
-        anew. Rates have to be the same, which is not checked.
-        """
+        """Replace the running core by `core`, made of `config`, between two beats."""
         control, inference, now_s = self._control, self._inference, time.monotonic()
         safety, stepper, planner = control.stepper.safety, core.stepper(now_s), core.planner(now_s)
         stepper.safety = safety
@@ -273,12 +238,7 @@ class Daemon:
         self._reloading.add_done_callback(asyncio.Task.result)
 
     async def _reload(self) -> None:
-        """Read keys and configuration again, and take over what may change while control runs.
-
-        The device's calibration is read again, too. Logs which keys of the configuration changed, and which wait for a
-        restart. Lists of keys that are refused stay as they were, and so does a configuration that is refused: both are
-        logged, not raised. The event loop reports any other error.
-        """
+        """Read keys and configuration again, and take over what may change while control runs."""
         # in threads: no beat waits for a file
         try:
             if self._keys is None:
@@ -304,12 +264,7 @@ class Daemon:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     async def _open_gap(self) -> None:
-        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the beat goes on.
-
-        In FAULT nothing is commanded: a fault has asked the device to open. Without a device there is no wait either.
-        Where the gap is still closed after the wait, wait NAMED_S more: its fault is logged by then. Nothing is
-        returned or raised where it stays closed.
-        """
+        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the beat goes on."""
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S

@@ -46,8 +46,7 @@ DRAIN = 32
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
 SUBSCRIPTIONS = 16
-"""What waits of one subscriber's subscriptions: libzmq works off all that there are in the thread that publishes. A
-thousand, as of all else, would make a tick late (`tools/endure.py siege`)."""
+"""What waits of one subscriber's subscriptions: libzmq works off all that there are in the thread that publishes."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. One that says more is cut off, and may connect again."
 TAKEN, TAKEN_NS = 64, 80_000
@@ -66,14 +65,7 @@ Answer = Callable[[Request], Any]
 
 
 class Endpoint:
-    """The daemon's four sockets: takes setpoints, publishes telemetry and recording, answers requests.
-
-    With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO. `sources` says who may take
-    the brake from whom, and how long setpoints are held back. `keys` is None where no endpoint is guarded. It holds the
-    `inbox` of setpoints, the waiting `requests`, the `admission` of peers, and the topics' `listeners`.
-
-    Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
-    """
+    """The daemon's four sockets: takes setpoints, publishes telemetry and recording, answers requests."""
 
     def __init__(
         self,
@@ -111,11 +103,7 @@ class Endpoint:
 
     def take_setpoints(self) -> bool:
         """Read the waiting setpoints, DRAIN messages at most, into `inbox`; return True if another setpoint is in
-        force.
-
-        One that waited in the playout may be it. What a publisher sends beyond its allowance, or with a key that is off
-        the list, is dropped and counted. A message of several parts is refused. Nothing is raised.
-        """
+        force."""
         is_newer = False
         for _ in range(DRAIN):
             if not self.arrivals.has(self._setpoints):
@@ -137,23 +125,15 @@ class Endpoint:
         return self.inbox.playout.update(time.monotonic()) or is_newer
 
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
-        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its first part.
-
-        Never waits: a subscriber that is too slow misses it.
-        """
+        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its first part."""
         self._send(self._telemetry, "telemetry", *topic, encode(message))
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
-        """Send control ticks to all subscribers of the recording, a row each with the fields `columns`. Never waits."""
+        """Send control ticks to all subscribers of the recording, a row each with the fields `columns`."""
         self._send(self._recording, "recording", encode_ticks(rows, columns))
 
     def take_requests(self, answer: Answer) -> None:
-        """Take waiting requests from the socket, TAKEN at most, for TAKEN_NS; answer `stop` and `disable` at once.
-
-        All others wait for `serve`; what is more than may wait is dropped and counted. `answer` returns the result of a
-        request, or raises RefusedError, which becomes the reply. Any other error of `answer` is raised, and that
-        request gets no reply.
-        """
+        """Take waiting requests from the socket, TAKEN at most, for TAKEN_NS; answer `stop` and `disable` at once."""
         until_ns = time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
             if not self.arrivals.has(self._control):
@@ -168,12 +148,7 @@ class Endpoint:
                 return
 
     def serve(self, answer: Answer, most: int) -> int:
-        """Answer the waiting requests, `most` at most, for about ANSWERS_NS; return the number answered.
-
-        `answer` returns the result of a request, or raises RefusedError, which becomes the reply; any other error is
-        raised. A request that cannot be decoded, is not permitted or was overtaken is answered with the reason. A reply
-        to a client that has gone is dropped.
-        """
+        """Answer the waiting requests, `most` at most, for about ANSWERS_NS; return the number answered."""
         until_ns = time.monotonic_ns() + ANSWERS_NS
         for number in range(most):
             if time.monotonic_ns() > until_ns or (waiting := self.requests.next()) is None:
@@ -187,10 +162,7 @@ class Endpoint:
         self.admission.refusals.tell(now_s)
 
     def report(self) -> PeersReport:
-        """Return the connections of each endpoint, refused peers, and peers whose messages were dropped.
-
-        Counts are since the start. Of `refusals` the newest is last, of `drops` the most frequent first.
-        """
+        """Return the connections of each endpoint, refused peers, and peers whose messages were dropped."""
         return PeersReport(
             connections=self.admission.connections(),
             refused=self.admission.refusals.total,
@@ -200,7 +172,7 @@ class Endpoint:
         )
 
     def close(self) -> None:
-        """Close all sockets and remove their files, without waiting for anybody. Call it once."""
+        """Close all sockets and remove their files, without waiting for anybody."""
         self.admission.close()
         for file in self._files:
             file.close()
@@ -208,12 +180,7 @@ class Endpoint:
 
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
         """Return a new socket of this `kind`, guarded where `endpoints` says so, bound to `address`, with bounded
-        queues.
-
-        Of an `ipc://` address the file is made. `close` removes it and closes the socket, also one that could not be
-        bound. An XPUB passes on every subscription, also repeated ones. Raises OSError naming the endpoint, the address
-        and why it cannot be bound.
-        """
+        queues."""
         made = self._context.socket(kind)
         options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
         if kind == zmq.XPUB:
@@ -235,11 +202,7 @@ class Endpoint:
         return made
 
     def _send(self, to: "zmq.Socket[bytes]", name: str, *parts: bytes) -> None:
-        """Send to all subscribers, then read what they say, DRAIN messages at most. Never waits.
-
-        Those that do not keep up miss it. Subscriptions to topics of the telemetry socket are counted in `listeners`. A
-        subscriber that says more than its allowance is cut off and counted.
-        """
+        """Send to all subscribers, then read what they say, DRAIN messages at most."""
         # drops for a subscriber that does not keep up; it never blocks
         with contextlib.suppress(zmq.Again):
             to.send_multipart(parts, zmq.NOBLOCK)
@@ -258,16 +221,11 @@ class Endpoint:
                 self.admission.cut_off(name, peer.address)
 
     def _sender(self, frame: zmq.Frame, name: str) -> Peer:
-        """Return the peer that sent a message, with its key where the endpoint is guarded."""
         key = str(frame.get("User-Id")) if name in self._guarded else ""
         return Peer(str(frame.get("Peer-Address")), key)
 
     def _next_request(self) -> Waiting | None:
-        """Read the next message; None for a further part of a message read before, which is dropped.
-
-        A message must be waiting: zmq.Again is raised otherwise. One of too many parts is returned without data, so
-        that it is answered as no request. The request keeps how often the gap had been told to open by now.
-        """
+        """Read the next message; None for a further part of a message read before, which is dropped."""
         if self._is_in_parts_of_request:
             self._is_in_parts_of_request = self._control.recv(zmq.NOBLOCK, copy=False).more
             return None
@@ -281,11 +239,7 @@ class Endpoint:
         return Waiting(envelope, data, self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
-        """Carry out and answer a `stop` or `disable`, and return True, also where it was refused.
-
-        Where it succeeds, `requests.opens` rises, so that requests that came before it count as overtaken. Returns
-        False, with nothing done, for anything else, also for what cannot be decoded.
-        """
+        """Carry out and answer a `stop` or `disable`, and return True, also where it was refused."""
         try:
             request = decode(waiting.data, Request)
         except MessageError:
@@ -298,11 +252,7 @@ class Endpoint:
         return True
 
     def _answered(self, waiting: Waiting, answer: Answer) -> Reply:
-        """Carry out a request, and return the reply. What cannot be decoded is answered with `bad_request`, and has no
-        id.
-
-        A refusal becomes the reply, as in `_carried_out`.
-        """
+        """Carry out a request, and return the reply."""
         try:
             request = decode(waiting.data, Request)
         except MessageError as error:
@@ -312,10 +262,7 @@ class Endpoint:
 
     def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:
         """Carry out a request that is permitted, and return the reply; a RefusedError becomes the reply, with `ok`
-        False.
-
-        Any other error of `answer` is raised.
-        """
+        False."""
         try:
             self._require_permitted(request, waiting)
             return Reply(v=VERSION, id=request.id, ok=True, result=answer(request))
@@ -323,11 +270,7 @@ class Endpoint:
             return Reply(v=VERSION, id=request.id, ok=False, error=ErrorReply(error.code, error.message, error.hint))
 
     def _require_permitted(self, request: Request, waiting: Waiting) -> None:
-        """Raise RefusedError where the peer's key lacks the role for a request, and count it as dropped.
-
-        Peers of an open endpoint have no key, and may do everything. Raise it also where a `stop` or `disable` came
-        later and was carried out before; `status` and `describe` are never overtaken.
-        """
+        """Raise RefusedError where the peer's key lacks the role for a request, and count it as dropped."""
         is_observed, key = request.command in OBSERVED, waiting.peer.key
         if key and not self.admission.has_role(key, MAY["control"] if is_observed else OPERATOR):
             self._drops.add("control", waiting.peer, NOT_ALLOWED)
@@ -353,11 +296,7 @@ class Endpoint:
 
 
 def context(io_priority: int) -> "zmq.Context[zmq.Socket[bytes]]":
-    """Return a ZeroMQ context whose threads run at this priority of SCHED_FIFO; 0: at none, as ordinary threads.
-
-    The caller closes it. A refused priority ends the process when the first socket is made: see
-    `realtime.priority_of_threads`.
-    """
+    """Return a ZeroMQ context whose threads run at this priority of SCHED_FIFO; 0: at none, as ordinary threads."""
     made = zmq.Context()
     if io_priority:
         made.set(zmq.THREAD_SCHED_POLICY, os.SCHED_FIFO)

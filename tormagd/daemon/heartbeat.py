@@ -15,10 +15,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Heartbeat:
-    """A periodic timer of the kernel on CLOCK_MONOTONIC (timerfd), which the event loop watches.
-
-    Raises OSError where the kernel gives none.
-    """
+    """A periodic timer of the kernel on CLOCK_MONOTONIC (timerfd), which the event loop watches."""
 
     def __init__(self, period_ns: int) -> None:
         self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
@@ -40,11 +37,7 @@ class Heartbeat:
         return self._fd
 
     def beats(self) -> int:
-        """Return the number of beats due since the last call: 0 if none is, more than 1 if some were missed.
-
-        Sets `due_ns`, of the monotonic clock, to when the newest was due; the first is due a period after the timer was
-        made. Never waits. Not to be called after `close`.
-        """
+        """Return the number of beats due since the last call: 0 if none is, more than 1 if some were missed."""
         try:
             expirations: int = struct.unpack("=Q", os.read(self._fd, 8))[0]
         except BlockingIOError:
@@ -53,5 +46,5 @@ class Heartbeat:
         return expirations
 
     def close(self) -> None:
-        """Close the timer's descriptor. Call it once, after the event loop has stopped watching it."""
+        """Close the timer's descriptor."""
         os.close(self._fd)

@@ -7,11 +7,7 @@ from typing import NamedTuple
 
 
 class Hold(NamedTuple):
-    """Which source holds the brake; "" before the first.
-
-    `number` grows with every change of the publisher, also of the process behind one source. The force then goes from
-    one to the other along a ramp. `is_given` says that an operator has chosen the source.
-    """
+    """Which source holds the brake; "" before the first."""
 
     source: str = ""
     number: int = 0
@@ -19,12 +15,7 @@ class Hold(NamedTuple):
 
 
 def is_passed(hold: Hold, source: str, priority: tuple[str, ...], *, is_stale: bool) -> bool:
-    """Tell whether a message of `source`, which does not hold the brake, makes it the holder.
-
-    It does where the holder's newest setpoint is too old (`is_stale`). It also does where `source` comes before the
-    holder in `priority`, the first of all, unless an operator has chosen the holder. Sources that are not listed come
-    last, all alike. Nothing is changed.
-    """
+    """Tell whether a message of `source`, which does not hold the brake, makes it the holder."""
     # an operator's choice goes before the configured order, and what is not listed comes after all that is
     ranks = {name: place for place, name in enumerate(priority)}
     goes_before = ranks.get(source, len(ranks)) < ranks.get(hold.source, len(ranks))

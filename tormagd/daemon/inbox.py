@@ -54,10 +54,7 @@ log = logging.getLogger(__name__)
 
 
 class _Source:
-    """One publisher: its newest setpoint, sequence, clock, unit of stamps, manner of sending, and counts.
-
-    `cause` and `remedy` tell what is wrong with its clock or stamps, as of the last `refresh`; empty where nothing is.
-    """
+    """One publisher: its newest setpoint, sequence, clock, unit of stamps, manner of sending, and counts."""
 
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
         self.setpoint, self.heard_s = setpoint, now_s
@@ -71,10 +68,7 @@ class _Source:
 
     def refresh(self, now_s: float) -> bool:
         """Update the reported figures: delays, the clock's line `fit`, and `cause` and `remedy` of wrong clock or
-        stamps.
-
-        Returns True if something is newly wrong since the last call, once the clock's offset is known.
-        """
+        stamps."""
         self.delays.refresh()
         self.fit = self.clock.line.fit()
         self.cause, self.remedy = _of_clock(self.clock, self.fit, now_s, self.setpoint.stamp_ns)
@@ -84,15 +78,10 @@ class _Source:
         return self.is_named and not was_named
 
     def is_stale(self, now_s: float) -> bool:
-        """Tell whether the newest setpoint is no longer valid at `now_s`; True also before the first one was taken."""
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
-        """Make `setpoint` the source's newest, heard at `now_s` and stamped `delay_s`, its age on arrival, before.
-
-        `delay_s` is by the corrected clock; below 0 counts as 0. Once the clock's offset is known, the scene's `needs`
-        judge delay and manner of sending. With `playout_s`, s, they judge the age when it is followed.
-        """
+        """Make `setpoint` the source's newest, heard at `now_s` and stamped `delay_s`, its age on arrival, before."""
         clock = self.clock
         if clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
@@ -103,12 +92,8 @@ class _Source:
 
 
 class SetpointInbox:
-    """Chooses the setpoint to plan for, `newest`: the newest valid one of the source that holds the brake,
-    once it is due.
-
-    No sockets, no clock. It keeps up to SOURCES sources, counts messages as `accepted`, `refused` or `dropped`, and
-    keeps the `last_refusal`.
-    """
+    """Chooses the setpoint to plan for, `newest`: the newest valid one of the source that holds the brake, once it is
+    due."""
 
     def __init__(self, sources: Sources = EQUAL_SOURCES) -> None:
         self.has_way = True
@@ -121,8 +106,7 @@ class SetpointInbox:
         self._needs = Needs()
         self.hold = Hold()
         self.sources = sources
-        """Who goes before whom, and how long setpoints wait. May be set anew at any time; holder and waiting setpoints
-        stay until another message comes."""
+        """Who goes before whom, and how long setpoints wait."""
         self._sources: dict[str, _Source] = {}
         self._other, self._other_s = "", -SILENT_S
         "The source that was refused last, because another holds the brake, and when."
@@ -131,12 +115,7 @@ class SetpointInbox:
         self._turn = 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
-        """Decode and judge one message, and count it; return True if another setpoint is in force after it.
-
-        Nothing is raised. Old or repeated messages count in `dropped`, refused ones in `refused`, others in `accepted`.
-        `last_refusal` says why, unless another source holds the brake. `now_s` is the control clock, `realtime_ns`
-        CLOCK_REALTIME of the same moment. False also stands for a setpoint that waits in the playout.
-        """
+        """Decode and judge one message, and count it; return True if another setpoint is in force after it."""
         try:
             setpoint = decode(data, Setpoint)
             if not self.has_way:
@@ -147,12 +126,7 @@ class SetpointInbox:
             return False
 
     def give(self, name: str, now_s: float) -> None:
-        """Make the source `name` the holder of the brake, as an operator's choice.
-
-        Its newest setpoint becomes the one to plan for when it is due, and a log line is queued for `tell`. The holder
-        itself only becomes the operator's choice. Sources of higher priority do not take the brake from it, until it is
-        stale. Raises RefusedError for a source that is not known, or whose newest setpoint is no longer valid.
-        """
+        """Make the source `name` the holder of the brake, as an operator's choice."""
         source = self._sources.get(name)
         if source is None:
             known = ", ".join(sorted(self._sources)) or "none"
@@ -174,34 +148,23 @@ class SetpointInbox:
         return None if in_force is None else in_force.setpoint
 
     def passed_over(self) -> tuple[str, int] | None:
-        """Return source and newest `seq` of the source last refused because another one holds the brake.
-
-        None where none was refused, and where it has got the brake since or is forgotten.
-        """
+        """Return source and newest `seq` of the source last refused because another one holds the brake."""
         other = self._sources.get(self._other)
         return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
 
     def begin_scene(self, scene: Scene) -> None:
-        """Judge by the needs of `scene` from now on, and forget the newest setpoint and those that wait.
-
-        Sources, their counts and the holder stay. In a scene whose element is a pad, setpoints with `withdraw_cf` or
-        `contact` are refused.
-        """
+        """Judge by the needs of `scene` from now on, and forget the newest setpoint and those that wait."""
         self.playout.forget()
         self.has_way, self._needs = scene.element == "torque", needs_of(scene)
 
     def withdraw(self, reason: str) -> None:
         """Forget the setpoint to plan for and those that wait; count one refused message, with `reason` as
-        `last_refusal`.
-
-        Holder and sources stay. Without a setpoint to plan for do nothing, also where some wait.
-        """
+        `last_refusal`."""
         if self.playout.in_force is not None:
             self.playout.forget()
             self._refuse(reason)
 
     def _refuse(self, reason: str) -> None:
-        """Count a refused message, and keep the beginning of `reason`."""
         self.refused += 1
         self.last_refusal = reason[:LONGEST_REFUSAL]
 
@@ -212,11 +175,7 @@ class SetpointInbox:
             log.warning("%s", self._news.popleft())
 
     def told(self, now_s: float) -> dict[Limit, Explanation]:
-        """Return explanations of the limits about sources, as things are now, whether the limits are in force or not.
-
-        STALE and OTHER_SOURCE are always keys, the others where the holder's manner of sending is wrong. Empty while no
-        source holds the brake.
-        """
+        """Return explanations of the limits about sources, as things are now, whether the limits are in force or not."""
         holder = self._sources.get(self.hold.source)
         if holder is None:
             return {}
@@ -224,10 +183,7 @@ class SetpointInbox:
         return why | holder.manner.found
 
     def refresh(self, now_s: float) -> None:
-        """Update the reported figures of the playout, and those of one source, the next in turn.
-
-        Queues a log line if that source's clock or stamps are newly wrong. Does nothing before the first source.
-        """
+        """Update the reported figures of the playout, and those of one source, the next in turn."""
         if self._sources:
             self._turn += 1
             if self.sources.playout_ms > 0.0:
@@ -238,12 +194,7 @@ class SetpointInbox:
 
     def report(self, now_s: float, oversize: int = 0) -> SetpointReport:
         """Return counts, the last refusal, and each source's `seq`, with full reports on the holder and the newest
-        others.
-
-        There are REPORTED full reports at most, the holder's first. At `now_s` a source is stale or not, and silent for
-        so long. Delays and the judgement of a clock are those of the source's last `refresh`. `oversize` messages never
-        come here; it is reported as it is.
-        """
+        others."""
         newest = sorted(self._sources, key=lambda name: (name != self.hold.source, -self._sources[name].heard_s))
         return SetpointReport(
             accepted=self.accepted,
@@ -258,13 +209,7 @@ class SetpointInbox:
         )
 
     def _judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> bool:
-        """Judge a decoded setpoint and count it; return True if another one is in force after it.
-
-        A stray of its sequence is dropped. One whose source may not take the brake, or that is stale itself beside
-        another holder, is refused; `last_refusal` stays. A new run of the holder's begins a ramp. Raises MessageError
-        for one source too many, for stamps that do not count ns, and for a stamp too far ahead: the caller counts
-        these.
-        """
+        """Judge a decoded setpoint and count it; return True if another one is in force after it."""
         source, order = self._sources.get(setpoint.source), Order.NEWER
         if source is None:
             self._make_room(setpoint.source, now_s)
@@ -303,19 +248,11 @@ class SetpointInbox:
         return self._play(source, now_s)
 
     def _play(self, source: _Source, now_s: float) -> bool:
-        """Give the source's newest setpoint to the playout; return True if another one is in force after it.
-
-        False where it has to wait.
-        """
         setpoint = source.setpoint
         return self.playout.update(now_s, Taken(self._timed(source, now_s), setpoint.source, setpoint.seq))
 
     def _hand_over(self, name: str, why: str, *, is_given: bool = False) -> None:
-        """Make the source `name` the holder; queue a log line that says `why`, and begin a ramp.
-
-        The first holder ever has neither. `is_given` marks an operator's choice. A source that was passed over is so no
-        longer.
-        """
+        """Make the source `name` the holder; queue a log line that says `why`, and begin a ramp."""
         if self.hold.source:
             self._news.append(f"source {name!r} holds the brake instead of {self.hold.source!r}: {why}")
         # of the first ever, there is nobody to take over from
@@ -324,11 +261,7 @@ class SetpointInbox:
             self._other_s = -SILENT_S
 
     def _timed(self, source: _Source, now_s: float) -> TimedSetpoint:
-        """Return the source's newest setpoint, stamped on the control clock, for the planner.
-
-        Its limits: OTHER_SOURCE while another source, or a second publisher of the same name, sends too; and what its
-        `manner` found. An absent preview is empty, with a step of 0; other absent fields are None.
-        """
+        """Return the source's newest setpoint, stamped on the control clock, for the planner."""
         setpoint = source.setpoint
         wall = setpoint.contact
         is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
@@ -349,11 +282,7 @@ class SetpointInbox:
         )
 
     def _make_room(self, name: str, now_s: float) -> None:
-        """Forget one source where SOURCES are kept, so that `name` can be added. Raises MessageError where none may go.
-
-        The source that was silent for longest goes, if for over SILENT_S. Otherwise the most silent one without
-        priority goes for one that has. The holder stays. With fewer sources nothing happens.
-        """
+        """Forget one source where SOURCES are kept, so that `name` can be added."""
         if len(self._sources) < SOURCES:
             return
         others = [source for other, source in self._sources.items() if other != self.hold.source]
@@ -368,10 +297,7 @@ class SetpointInbox:
 
     def _why_stale(self, holder: _Source, now_s: float) -> Explanation:
         """Return why a setpoint of the `holder` is stale: it has fallen silent, its messages come late, or they wait
-        too long.
-
-        It is not checked whether one is: where none of these is so, it says that they come late.
-        """
+        too long."""
         name, silent_ms = self.hold.source, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
@@ -395,10 +321,7 @@ class SetpointInbox:
 
     def _why_other(self, holder: _Source, now_s: float) -> Explanation:
         """Return why setpoints compete: two publishers of the holder's name, or else the source that was passed over
-        last.
-
-        It is not checked whether any does; without another source its name is empty.
-        """
+        last."""
         if holder.sequence.is_doubled(now_s):
             return Explanation(
                 f"two publishers call themselves {self.hold.source!r}, or one repeats itself: one of them is followed",
@@ -410,12 +333,7 @@ class SetpointInbox:
         )
 
     def _source_report(self, name: str, now_s: float) -> SourceReport:
-        """Return the report on one known source, with the figures of its last `refresh`.
-
-        `state` is `stale` for a setpoint that is no longer valid, else `holds` for the holder of the brake, else
-        `refused`. `clock_behind_ms` is None until the offset is known, `clock` until there is a line. Raises KeyError
-        for an unknown source.
-        """
+        """Return the report on one known source, with the figures of its last `refresh`."""
         source = self._sources[name]
         clock, sequence = source.clock, source.sequence
         state = "holds" if name == self.hold.source else "refused"
@@ -446,12 +364,7 @@ def _refuse_way(setpoint: Setpoint) -> None:
 
 
 def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
-    """Raise MessageError where the source's stamps do not count ns, or where this is not known yet.
-
-    A stamp within a day of our clock, `realtime_ns`, counts ns at once. Others are refused until LOOKED_AT messages,
-    over MIN_S or more, show what they count. Also where it raises, it notes the stamp for this judgement, and that
-    the source was heard at `now_s`.
-    """
+    """Raise MessageError where the source's stamps do not count ns, or where this is not known yet."""
     unit = source.unit
     unit.hear(now_s, setpoint.stamp_ns, realtime_ns)
     source.heard_s = now_s
@@ -465,12 +378,7 @@ def _require_ns(source: _Source, setpoint: Setpoint, now_s: float, realtime_ns: 
 
 
 def _of_clock(clock: SourceClock, fit: ClockReport | None, now_s: float, stamp_ns: int) -> tuple[str, str]:
-    """Return what is wrong with a publisher's clock, and the remedy; two empty texts where nothing is.
-
-    Wrong are an offset that is not known yet, one beyond AHEAD_S, and a clock that was never set. So are a clock set
-    within STEP_NAMED_S, and a drift surely over MAX_DRIFT_PPM. `fit` is the clock's line, None without one. `stamp_ns`
-    is the publisher's newest stamp.
-    """
+    """Return what is wrong with a publisher's clock, and the remedy; two empty texts where nothing is."""
     if not clock.is_settled:
         return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"
     causes = []

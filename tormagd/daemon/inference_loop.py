@@ -22,11 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class InferenceLoop:
-    """The inference loop: plans for the inbox's newest setpoint, and calls `on_failure` for a plan that failed.
-
-    It holds the `planner` with the newest plan, the loop's `timing`, and the search `beside` the plans, None without
-    one.
-    """
+    """The inference loop: plans for the inbox's newest setpoint, and calls `on_failure` for a plan that failed."""
 
     def __init__(
         self,
@@ -52,23 +48,12 @@ class InferenceLoop:
         self.planner.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word that the device has changed, or that its sensor is wrong; note it in the journal.
-
-        `wrong` is "device" or "sensor", which is not checked. Without a dispute the planner does nothing, but the
-        journal has it.
-        """
+        """Take the operator's word that the device has changed, or that its sensor is wrong; note it in the journal."""
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
-        """Make a plan if a setpoint has come (`is_asked`) or if one is due; else do nothing. It becomes
-        `planner.planned`.
-
-        `measured` is the last step's measurement, None while the device is silent. `is_followed` says whether that step
-        followed the plan. The next is due a period after this one was; what was missed is not made up for. Where
-        planning fails, nothing is raised: the newest setpoint is withdrawn, the planner is reset, and `on_failure` is
-        called. Records the times in `timing`.
-        """
+        """Make a plan if a setpoint has come (`is_asked`) or if one is due; else do nothing."""
         period_ns = self.timing.period_ns
         # counted from when beats are due, not when they begin: lateness does not lower the rate
         if not is_asked and beat.due_ns < self._due_ns:
@@ -81,11 +66,7 @@ class InferenceLoop:
         self._due_ns = period_ns + (self._due_ns if is_regular else beat.due_ns)
 
     def foresee(self, _beat: Beat) -> bool:
-        """Make the forecast for the next plans, if one is due; return False where none is. The journal notes it.
-
-        Where that fails, True is returned and nothing raised: the newest setpoint is withdrawn, the planner is reset,
-        and `on_failure` is called.
-        """
+        """Make the forecast for the next plans, if one is due; return False where none is."""
         try:
             is_made = self.planner.foresee()
         except PLAN_ERRORS as error:
@@ -96,12 +77,7 @@ class InferenceLoop:
         return is_made
 
     def _make_plan(self, now_s: float, measured: Measured | None, is_followed: bool) -> None:
-        """Take the search's newest answer, plan at `now_s` for the inbox's newest setpoint, and ask the next question.
-
-        The plan becomes `planner.planned`. `measured` is None while the device is silent; `is_followed` says whether
-        the gap follows the plans. A plan that fails is not raised: see `_begin_afresh`. Without a search beside the
-        plans nothing is asked. Answer and plan are noted in the journal.
-        """
+        """Take the search's newest answer, plan at `now_s` for the inbox's newest setpoint, and ask the next question."""
         setpoint, beside = self._inbox.newest, self.beside
         answer = None if beside is None else beside.answer()
         if answer is not None:
@@ -117,11 +93,7 @@ class InferenceLoop:
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
         """Reset the planner at `now_s` after a plan or forecast that failed, withdraw the setpoint, and call
-        `on_failure`.
-
-        The setpoint counts as refused. The journal notes the reset. `error` is logged with its trace, unless its
-        message is that of the last one.
-        """
+        `on_failure`."""
         if str(error) != self._failure:  # the first failure is news, the same one again is not
             self._failure = str(error)
             log.error(

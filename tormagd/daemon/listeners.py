@@ -14,35 +14,24 @@ PEERS = 16
 
 
 class Listeners:
-    """Counts who subscribes to each of TOPICS by its name.
-
-    A peer that subscribes to everything is not counted: a topic is published for it only while another asks for it.
-    """
+    """Counts who subscribes to each of TOPICS by its name."""
 
     def __init__(self) -> None:
         self._asked: dict[bytes, Counter[Peer | None]] = {topic: Counter() for topic in TOPICS}
         self._gone = dict.fromkeys(TOPICS, 0)
 
     def has(self, topic: bytes) -> bool:
-        """Tell whether a peer subscribes to `topic` by its name. Raises KeyError for one that is not of TOPICS."""
+        """Tell whether a peer subscribes to `topic` by its name."""
         return bool(self._asked[topic])
 
     def hear(self, word: bytes, peer: Peer | None) -> None:
-        """Count what a subscriber says to an XPUB socket: byte 1 to subscribe or 0 to end, then the topic's name.
-
-        `peer` is None where libzmq ends the subscription of a peer that has gone. Words about other topics, also empty
-        ones, are passed over.
-        """
+        """Count what a subscriber says to an XPUB socket: byte 1 to subscribe or 0 to end, then the topic's name."""
         for topic in TOPICS:
             if word[1:] == topic:
                 self._count(topic, self._asked[topic], peer, is_subscription=word[0] == 1)
 
     def _count(self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
-        """Count one subscription to `topic`, or its end, in `asked`. Peers beyond PEERS are counted together.
-
-        `peer` None with an end: it is not known whose subscription libzmq ends. So a topic has no listener once as many
-        are gone as are counted.
-        """
+        """Count one subscription to `topic`, or its end, in `asked`."""
         if peer not in asked and (len(asked) >= PEERS or not is_subscription):
             peer = None if peer is None else Peer(OTHERS)
         if is_subscription:

@@ -8,10 +8,7 @@ from tormagd_client.printable import printable
 
 
 def log_to_stderr() -> None:
-    """Send the log of this process, from INFO on, to stderr, a line a record: level, logger's name and message.
-
-    Times are added only on a terminal: a journal has its own. Does nothing where the process logs already.
-    """
+    """Send the log of this process, from INFO on, to stderr, a line a record: level, logger's name and message."""
     handler = logging.StreamHandler(sys.stderr)
     time_first = "%(asctime)s " if sys.stderr is not None and sys.stderr.isatty() else ""
     handler.setFormatter(LogFormatter(f"{time_first}%(levelname)s %(name)s: %(message)s"))

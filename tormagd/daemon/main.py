@@ -18,10 +18,7 @@ SIGHUP reads keys and configuration again."""
 
 
 def parser() -> Parser:
-    """Return the parser of `tormagd`'s command line: --config, --scene, --check and --version.
-
-    Its errors are UsageError; `--help` and `--version` print and raise SystemExit. The man page is made from it, too.
-    """
+    """Return the parser of `tormagd`'s command line: --config, --scene, --check and --version."""
     made = Parser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
     made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
     made.add_argument("--scene", metavar="NAME", help="this scene, or scene file, in place of the configuration's")
@@ -31,12 +28,7 @@ def parser() -> Parser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run `tormagd` with `arguments`, None: those of the process; return the exit code.
-
-    0: ended on request; 1: could not run; 2: command line or configuration refused. Errors go to stderr, as does the
-    log. Until the daemon runs, Ctrl-C ends the process at once; the handler of SIGINT is put back at the end. `--help`
-    and `--version` raise SystemExit.
-    """
+    """Run `tormagd` with `arguments`, None: those of the process; return the exit code."""
     write_in_any_encoding()
     try:
         options = parser().parse_args(arguments)

@@ -24,7 +24,6 @@ class Taken(NamedTuple):
 
     @property
     def due_s(self) -> float:
-        """Return when it is to be followed first, s."""
         return self.setpoint.stamp_s + self.setpoint.playout_s
 
 
@@ -47,16 +46,11 @@ class Playout:
 
     @property
     def newest(self) -> Taken | None:
-        """Return the setpoint that was taken last; None before the first."""
         return self._waiting[-1] if self._waiting else self.in_force
 
     def update(self, now_s: float, taken: Taken | None = None) -> bool:
         """Take a setpoint, if there is one, and put the newest that is due in force; return True where `in_force`
-        changed.
-
-        Those that wait for the same time as `taken`, or a later one, are dropped for it. One that is held back and due
-        already is followed at once, and counts as late. Of over MAX_WAITING the oldest are dropped.
-        """
+        changed."""
         if taken is not None:
             self._count(now_s, taken)
             while self._waiting and self._waiting[-1].due_s >= taken.due_s:
@@ -68,11 +62,7 @@ class Playout:
         return self.in_force is not before
 
     def report(self, playout_ms: float) -> PlayoutReport | None:
-        """Return the delay that is added, the jitter that is taken out, and counts; None where `playout_ms` is 0.
-
-        `playout_ms` is the one in force. Counts are since the start, the jitter is RFC 3550's running mean. Percentiles
-        are those of the last refresh of `held`.
-        """
+        """Return the delay that is added, the jitter that is taken out, and counts; None where `playout_ms` is 0."""
         if playout_ms == 0.0:
             return None
         return PlayoutReport(
@@ -84,10 +74,7 @@ class Playout:
         )
 
     def _count(self, now_s: float, taken: Taken) -> None:
-        """Count a setpoint that is to be held, for how long, and by how much that differs from the one before.
-
-        Does nothing for one without a playout. One that is due already counts as held for 0 s, and as late.
-        """
+        """Count a setpoint that is to be held, for how long, and by how much that differs from the one before."""
         if taken.setpoint.playout_s == 0.0:
             return
         held_s = max(taken.due_s - now_s, 0.0)

@@ -23,35 +23,23 @@ log = logging.getLogger(__name__)
 
 
 def state_folder(configured: str, name: str) -> Path | None:
-    """Return the folder `configured`, or else `name` in the service's $STATE_DIRECTORY; None without either.
-
-    An empty `configured` is none. Of several folders in $STATE_DIRECTORY the first counts. The folder need not exist,
-    and is not made.
-    """
+    """Return the folder `configured`, or else `name` in the service's $STATE_DIRECTORY; None without either."""
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(configured) if configured else Path(state, name) if state else None
 
 
 class ProfileFolder:
-    """The profile files of one scene's insert and model: one file for each device, by its serial number.
-
-    `gains` is the fingerprint of what the carriages are driven with.
-    """
+    """The profile files of one scene's insert and model: one file for each device, by its serial number."""
 
     def __init__(self, folder: Path, insert: str, model: str, bounds: DeviceBounds, gains: str = "") -> None:
         self.folder, self.insert, self.model, self.gains, self._bounds = folder, insert, model, gains, bounds
 
     def path(self, serial_number: int) -> Path:
-        """Return the path of a device's profile: serial number in eight hexadecimal digits, and insert. The file need
-        not exist."""
+        """Return the path of a device's profile: serial number in eight hexadecimal digits, and insert."""
         return self.folder / f"{serial_number:08x}-{self.insert}.json"
 
     def read(self, serial_number: int) -> Profile | None:
-        """Read the profile of the device with this serial number, and return it; None where there is no file.
-
-        Raises ProfileError, naming the file, where it cannot be read, is over MAX_BYTES, or is no profile. It does,
-        too, for another device, insert or model, and for values out of bounds; other `gains` are no reason.
-        """
+        """Read the profile of the device with this serial number, and return it; None where there is no file."""
         path = self.path(serial_number)
         try:
             data = read_bounded(path, MAX_BYTES)
@@ -66,11 +54,7 @@ class ProfileFolder:
             raise ProfileError(f"{path}: {error}") from error
 
     def write(self, profile: Profile) -> None:
-        """Write `profile` to its device's file, by way of another file: the old one stays until the new one is whole.
-
-        Makes the folder, and those above it, where they are missing. Whether it fits insert and model is not checked.
-        Raises ProfileError, naming the file, where it could not be written.
-        """
+        """Write `profile` to its device's file, by way of another file: the old one stays until the new one is whole."""
         path = self.path(profile.serial_number)
         try:
             self.folder.mkdir(mode=0o750, parents=True, exist_ok=True)
@@ -83,11 +67,7 @@ class ProfileFolder:
 
 
 class Profiles:
-    """Keeps what each device has shown of itself, and teaches it when the device is connected again.
-
-    `believe` holds what is learned, `teach` replaces it. A `folder` of None keeps nothing. It knows the connected
-    device's serial number, whether its profile is used, and that profile's `digest`.
-    """
+    """Keeps what each device has shown of itself, and teaches it when the device is connected again."""
 
     def __init__(self, folder: ProfileFolder | None, believe: Believe, teach: Callable[[Learned], None]) -> None:
         self._folder, self._believe, self._teach = folder, believe, teach
@@ -102,12 +82,7 @@ class Profiles:
         self._refusal = "" if folder is not None else "no folder is named for profiles"
 
     def look(self, serial_number: int | None, is_driven: bool) -> None:
-        """Note the connected device's serial number, None where it is not known, and whether it is driven. Never waits.
-
-        A new device's profile begins to be read; what was learned of another device is dropped first. None changes no
-        device. Once a device is no longer driven, its profile is kept, as by `keep`. A profile that the device
-        contradicts counts as unused, and is logged. Needs a running event loop.
-        """
+        """Note the connected device's serial number, None where it is not known, and whether it is driven."""
         if serial_number is not None and serial_number != self._serial_number:
             if self._serial_number is not None:
                 self._teach(NOTHING_LEARNED)  # what was learned is of another device
@@ -126,11 +101,7 @@ class Profiles:
         self._was_driven = is_driven
 
     def keep(self) -> None:
-        """Begin to write what was learned as the device's profile, in another thread; `finished` waits for it.
-
-        Does nothing without a folder or device, and while the sensor is disputed. So it does where nothing was learned,
-        or nothing new since the profile was read or written. A failure is logged and reported.
-        """
+        """Begin to write what was learned as the device's profile, in another thread; `finished` waits for it."""
         learned, is_disputed = self._believe.learned(), self._believe.sensor.is_disputed
         is_news = learned.device is not UNSEEN and learned != self._on_disk
         if self._folder is None or self._serial_number is None or not is_news or is_disputed:
@@ -149,10 +120,7 @@ class Profiles:
         self._writing.add_done_callback(self._note)
 
     def close(self) -> None:
-        """Drop a profile that is still being read. One that is being written goes on: see `finished`.
-
-        Call no `look` after it.
-        """
+        """Drop a profile that is still being read."""
         self._serial_number = None
 
     async def finished(self) -> None:
@@ -161,11 +129,7 @@ class Profiles:
             await asyncio.wait([self._writing])
 
     def report(self) -> ProfileReport:
-        """Return whether a profile is used, how old the one on the disk is, its folder, and why none is used or kept.
-
-        The age, s, is None where none was read or written for this device; texts are empty without a folder or a
-        reason.
-        """
+        """Return whether a profile is used, how old the one on the disk is, its folder, and why none is used or kept."""
         return ProfileReport(
             is_used=self._is_used,
             age_s=None if self._saved_ns is None else round(max(0.0, (time.time_ns() - self._saved_ns) * 1e-9), 1),
@@ -174,11 +138,7 @@ class Profiles:
         )
 
     def _take(self, reading: "asyncio.Future[Profile | None]") -> None:
-        """Teach the profile that was read, note its digest, and log its age.
-
-        One that was refused is logged, and `report` says why. It is dropped where another device is connected by now,
-        or where this one has already shown its strength. Without a file nothing happens.
-        """
+        """Teach the profile that was read, note its digest, and log its age."""
         try:
             profile = reading.result()
         except ProfileError as error:
@@ -198,10 +158,7 @@ class Profiles:
         log.info("the device's profile of %.1f hours ago is used: scale %.3f", hours, profile.scale)
 
     def _note(self, writing: "asyncio.Future[None]") -> None:
-        """Note whether a profile was written. A failure is logged and reported, and the next `keep` writes again.
-
-        A success ends an earlier refusal.
-        """
+        """Note whether a profile was written."""
         try:
             writing.result()
         except ProfileError as error:

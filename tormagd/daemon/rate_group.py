@@ -22,11 +22,7 @@ _BINS: Final = _EXACT + 32 * _DOUBLINGS
 
 @final
 class Histogram:
-    """Counts durations, us, in bins, over one to two horizons (HORIZON_NS).
-
-    Adding costs a fraction of a microsecond, however many there are. Percentiles cost a hundred times that; `report`
-    has those of the last `refresh`.
-    """
+    """Counts durations, us, in bins, over one to two horizons (HORIZON_NS)."""
 
     def __init__(self) -> None:
         self._now = [0] * _BINS
@@ -38,11 +34,7 @@ class Histogram:
         self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
-        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0, and so does NaN.
-
-        Forgets durations from two horizons ago. `report` stays as it is until `refresh`. What is beyond the last bin,
-        about 67 s, counts in it; infinity raises OverflowError.
-        """
+        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0, and so does NaN."""
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s
             self._before, self._now = self._now, [0] * _BINS
@@ -52,11 +44,7 @@ class Histogram:
             self._max_now = value_us
 
     def refresh(self) -> None:
-        """Compute `report` anew from what is counted: p50, p99, p99.9 and the largest, us; 0 while nothing is.
-
-        A percentile is the upper edge of its bin, but not above the largest, which is rounded to 0.1 us. What was added
-        longer ago than two horizons is still in it where nothing was added since.
-        """
+        """Compute `report` anew from what is counted: p50, p99, p99.9 and the largest, us; 0 while nothing is."""
         most = round(max(self._max_now, self._max_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []
@@ -69,10 +57,7 @@ class Histogram:
 
 
 def _bin(value_us: float) -> int:
-    """Return the bin of a duration, us, from 0; what is longer than the last bin falls into that.
-
-    A duration that is not above 0, or NaN, is in bin 0. Infinity raises OverflowError.
-    """
+    """Return the bin of a duration, us, from 0; what is longer than the last bin falls into that."""
     whole = int(value_us) if value_us > 0.0 else 0
     if whole < _EXACT:
         return whole
@@ -99,11 +84,7 @@ class _Mark(NamedTuple):
 
 @final
 class RateGroup:
-    """The timing of one periodic activity: counts, lateness and execution time of its runs.
-
-    Counts of `runs`, `merged`, `overruns` and `stalls` are since the start; `lateness_us`, `exec_us` and `delay_ns` are
-    the newest run's.
-    """
+    """The timing of one periodic activity: counts, lateness and execution time of its runs."""
 
     def __init__(self, name: str, period_ns: int) -> None:
         self.name = name
@@ -124,12 +105,7 @@ class RateGroup:
         self._newest_ns = 0
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
-        """Count one run that was due, began and ended at these times, and stands for `merged` missed ones, too.
-
-        Times are ns of one clock that does not fall. A run that ended over WARNING_PERIODS after it was due is an
-        overrun; beyond ERROR_PERIODS it is also a stall. Where some were missed, the first of them counts. Sets
-        `lateness_us`, `exec_us` and `delay_ns`.
-        """
+        """Count one run that was due, began and ended at these times, and stands for `merged` missed ones, too."""
         if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
             self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
         self.lateness_us = (start_ns - due_ns) * 1e-3
@@ -147,11 +123,7 @@ class RateGroup:
                 self.stalls += 1
 
     def report(self) -> RateReport:
-        """Return counts and worst lateness since the start, and rate, grade and percentiles over one to two horizons.
-
-        Percentiles are those of the last `refresh` of the histograms. The grade is `error` for a stall in this time,
-        `warning` for an overrun, else `good`. 0 Hz stands for fewer than two runs; merged ones do not count as runs.
-        """
+        """Return counts and worst lateness since the start, and rate, grade and percentiles over one to two horizons."""
         since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"
         if self._newest_ns > since.time_ns:

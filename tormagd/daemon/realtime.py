@@ -20,12 +20,7 @@ log = logging.getLogger(__name__)
 
 
 def prepare(settings: RealTime) -> list[str]:
-    """Ask the kernel for these settings, for this thread and process; return and log what it refused, a line each.
-
-    A setting of 0, False or () asks for nothing; nothing is raised. FIFO is set on this thread only and reset on fork,
-    so that child processes and threads stay ordinary. Without FIFO this thread, and those that it begins, get short
-    slices. `keep_awake` holds until the process ends.
-    """
+    """Ask the kernel for these settings, for this thread and process; return and log what it refused, a line each."""
     refused = []
     if settings.cpus:
         try:
@@ -53,12 +48,7 @@ def prepare(settings: RealTime) -> list[str]:
 
 
 def priority_of_threads() -> int:
-    """Return the FIFO priority that threads begun by this one may take: one below its own, or its own if that is 1.
-
-    0, for none, where this thread has no FIFO priority, or where the kernel refuses it; a refusal is logged. It is
-    tried in a short-lived thread; nothing of this one changes. ZeroMQ's threads use it: a setpoint passes through one,
-    and would wait there for whatever else the machine runs.
-    """
+    """Return the FIFO priority that threads begun by this one may take: one below its own, or its own if that is 1."""
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0
     priority = max(os.sched_getparam(0).sched_priority - 1, os.sched_get_priority_min(os.SCHED_FIFO))

@@ -13,10 +13,7 @@ LIVE = frozenset({"sources.priority", "sources.playout_ms", "realtime.watchdog_m
 
 
 class Reread(NamedTuple):
-    """The configuration in force after a reload, the keys taken over, and the keys that wait for a restart.
-
-    Keys are paths, `a.b`.
-    """
+    """The configuration in force after a reload, the keys taken over, and the keys that wait for a restart."""
 
     config: Config
     taken: tuple[str, ...]
@@ -24,11 +21,7 @@ class Reread(NamedTuple):
 
 
 def reread(running: Config, read: Config) -> Reread:
-    """Return `running` with the keys in LIVE taken from `read`, which may change while control runs.
-
-    The result also lists the keys that were taken, and those that differ but wait for a restart, each as a path.
-    Neither argument is changed. Raises ValueError for a watchdog that is not above the running command timeout.
-    """
+    """Return `running` with the keys in LIVE taken from `read`, which may change while control runs."""
     timeout_ms, watchdog_ms = running.device.command_timeout_ms, read.realtime.watchdog_ms
     require(
         watchdog_ms > timeout_ms,
@@ -47,11 +40,7 @@ def reread(running: Config, read: Config) -> Reread:
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:
-    """Yield the paths of the keys whose values differ between two nested tables, sorted within each table.
-
-    `path` is put before each, with its own point. A key that only one table has differs. A table beside another kind of
-    value is one key.
-    """
+    """Yield the paths of the keys whose values differ between two nested tables, sorted within each table."""
     for name in sorted(before.keys() | after.keys()):
         old, new = before.get(name), after.get(name)
         if isinstance(old, dict) and isinstance(new, dict):

@@ -14,10 +14,7 @@ WAITING = 1_024
 
 
 class Waiting(NamedTuple):
-    """A request as it came, still encoded, and the peer that sent it.
-
-    `envelope` leads back to the client. `opens` is how often the gap had been told to open before.
-    """
+    """A request as it came, still encoded, and the peer that sent it."""
 
     envelope: list[bytes]
     data: bytes
@@ -36,10 +33,7 @@ class Requests:
         "How often the gap has been told to open."
 
     def put(self, waiting: Waiting) -> bool:
-        """Add a request behind its client's others; the client is the first frame of its envelope.
-
-        Returns False, with nothing added, where WAITING requests wait, or WAITING_PER_CLIENT of this client.
-        """
+        """Add a request behind its client's others; the client is the first frame of its envelope."""
         client = waiting.envelope[0]
         if self.count >= WAITING or len(self._waiting.get(client, ())) >= WAITING_PER_CLIENT:
             return False
@@ -48,10 +42,7 @@ class Requests:
         return True
 
     def next(self) -> Waiting | None:
-        """Remove and return the next request; None where none waits.
-
-        Clients take turns: each that has requests has one answered in a round, its oldest.
-        """
+        """Remove and return the next request; None where none waits."""
         for client, of_client in self._waiting.items():
             taken = of_client.popleft()
             del self._waiting[client]
@@ -63,8 +54,5 @@ class Requests:
 
 
 def may_go_first(data: bytes) -> bool:
-    """Tell whether an encoded request may be a `stop` or `disable`: whether either word is anywhere in its bytes.
-
-    msgpack keeps a text's bytes as they are, so no such command is missed.
-    """
+    """Tell whether an encoded request may be a `stop` or `disable`: whether either word is anywhere in its bytes."""
     return any(sign in data for sign in _SIGNS)

@@ -16,11 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneChange:
-    """Changes the running scene, one change at a time; `newest` reports on the newest change.
-
-    `build` makes the core of a scene and raises ConfigError. `require` raises RefusedError where the device is in use.
-    `take` puts the core in the place of the running one.
-    """
+    """Changes the running scene, one change at a time; `newest` reports on the newest change."""
 
     def __init__(
         self, build: Callable[[str], Awaitable[Core]], require: Callable[[], None], take: Callable[[str, Core], None]
@@ -31,11 +27,7 @@ class SceneChange:
         self._changing: asyncio.Task[None] | None = None
 
     def begin(self, scene: object) -> None:
-        """Begin to change to `scene`, a name or a path, in a task of its own; `newest` says how it ends.
-
-        Raises RefusedError for what is no text of 1..LONGEST_NAME characters, while another change goes on, and where
-        the device is in use. Whether there is such a scene shows only in `newest`. Needs a running event loop.
-        """
+        """Begin to change to `scene`, a name or a path, in a task of its own; `newest` says how it ends."""
         if not isinstance(scene, str) or not 0 < len(scene) <= LONGEST_NAME:
             raise RefusedError(
                 "bad_scene", f"args.scene is no text of 1..{LONGEST_NAME} characters", "tormagctl scene list"
@@ -49,11 +41,7 @@ class SceneChange:
         self._changing.add_done_callback(asyncio.Task.result)
 
     async def _change(self, scene: str) -> None:
-        """Build the core and put it in place, if the device is still not in use; note in `newest` and log how it ended.
-
-        A refusal leaves the running scene as it is, and is not raised. Any other error is raised, and `newest` then
-        stays as one that is not over.
-        """
+        """Build the core and put it in place, if the device is still not in use; note in `newest` and log how it ended."""
         error = None
         try:
             core = await self._build(scene)

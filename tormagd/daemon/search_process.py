@@ -25,11 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class SearchProcess:
-    """The daemon's end of the process that searches for the field of `core`.
-
-    Waits for the process to be ready, STARTS_S at most. Raises ConfigError where it is not by then, OSError where it
-    does not start.
-    """
+    """The daemon's end of the process that searches for the field of `core`."""
 
     def __init__(self, core: Core) -> None:
         self.timing = RateGroup("search", 1_000_000_000 // core.config.rates.inference_hz)
@@ -45,11 +41,7 @@ class SearchProcess:
             )
 
     def answer(self) -> Answer | None:
-        """Return the answer that has come since the last call; None where none has, or the process has ended.
-
-        Never waits. A search that found no field is logged, and gives None, too. Either ends the open question, and is
-        recorded in `timing`.
-        """
+        """Return the answer that has come since the last call; None where none has, or the process has ended."""
         data = None if self._is_idle else self._beside.receive()
         if data is None:
             return None
@@ -62,11 +54,7 @@ class SearchProcess:
         return None
 
     def ask(self, question: Question | None) -> None:
-        """Send `question` to the search, unless it is None, another is open, or the next is not due yet. Never waits.
-
-        One that is not sent is dropped. A search process that has ended is logged once; plans fail once the last answer
-        is too old.
-        """
+        """Send `question` to the search, unless it is None, another is open, or the next is not due yet."""
         if self._beside.is_gone and not self._is_told:
             self._is_told = True
             log.error("the search beside the plans has ended; next: start the daemon again")
@@ -80,20 +68,14 @@ class SearchProcess:
         self._is_idle = not self._beside.send(pickle.dumps(question))
 
     def close(self) -> None:
-        """Close the socket, kill the process and wait for its end. It may be called twice."""
+        """Close the socket, kill the process and wait for its end."""
         self._beside.close()
         self._beside.process.kill()
         self._beside.process.wait()
 
 
 def main() -> None:
-    """Answer questions that come in over a socket until its other end is closed.
-
-    The socket's descriptor is the process's first argument. The first packet is a pickled (config, scene, folder of
-    models), of which the core is built; `ready` says that it is. A question is a pickled Question. Its answer is a
-    pickled Answer, or the ValueError of a search that found no field. SIGTERM is ignored. Raises ConfigError where no
-    core is built.
-    """
+    """Answer questions that come in over a socket until its other end is closed."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd signals the whole service, and the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:
         config, scene, models = pickle.loads(asked.recv(MAX_PACKET))

@@ -29,10 +29,7 @@ class Order(Enum):
 
 @final
 class Sequence:
-    """Follows a publisher's count `seq` through restarts. `session` is None where the publisher states none.
-
-    Counts messages that are missing in `lost`, and new runs in `restarts`.
-    """
+    """Follows a publisher's count `seq` through restarts. `session` is None where the publisher states none."""
 
     def __init__(self, session: int | None, seq: int) -> None:
         self.session, self.seq = session, seq
@@ -41,18 +38,11 @@ class Sequence:
         self.restarts = 0
         self._latest_session = session
         self._step = 0
-        "Least step of `seq`; 0 before the first step. A publisher may count in nanoseconds."
         self._stray_session, self._stray_seq, self._in_row = session, seq, 0
         self._strays, self._strays_since_s = 0, 0.0
 
     def order(self, now_s: float, session: int | None, seq: int, *, is_over: bool) -> Order:
-        """Judge one message by its numbers, and follow it unless it is a stray.
-
-        A `seq` above the newest is NEWER, unless it leaps by over LONGEST_JUMP steps; a `session` above all before is
-        RESTARTED. RUN messages in a row that fit neither are a run of their own: REPLACED. After `is_over`, when the
-        newest message taken is no longer valid, the first that is no repetition is enough. All others are STRAY. Counts
-        lost messages, restarts and strays. `now_s` is only for `is_doubled`.
-        """
+        """Judge one message by its numbers, and follow it unless it is a stray."""
         if session == self.session and seq > self.seq:
             step = seq - self.seq
             known = self._step

@@ -14,10 +14,7 @@ _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
 
 
 class Service:
-    """What systemd is to be told of the daemon: ready, status, alive. No socket, no clock: `notify` sends it.
-
-    It keeps what was told last, and when the device was last heard.
-    """
+    """What systemd is to be told of the daemon: ready, status, alive. No socket, no clock: `notify` sends it."""
 
     def __init__(self) -> None:
         self.is_ready = False
@@ -28,13 +25,7 @@ class Service:
     def is_alive(
         self, now_s: float, limit_s: float, planned_s: float | None, link: LinkState, received_s: float | None
     ) -> bool:
-        """Tell whether plans and device states are fresh, so that systemd's watchdog may be fed.
-
-        `planned_s` and `received_s` are the times of the newest plan and state, None before the first; `limit_s` is how
-        old they may be. False before the first plan. A device that was identified and has fallen silent while its port
-        is open counts as not fresh. With a port that is not open, a device not yet identified, or a refused firmware,
-        only the plan counts. Call it at each look: it remembers when a device was last heard.
-        """
+        """Tell whether plans and device states are fresh, so that systemd's watchdog may be fed."""
         if planned_s is None or now_s - planned_s > limit_s:
             return False
         if link is LinkState.RUNNING:
@@ -44,12 +35,7 @@ class Service:
         return now_s - self._heard_s < limit_s
 
     def news(self, is_alive: bool, link: LinkState, status: str) -> list[str]:
-        """Return the messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives.
-
-        Empty where none is. Before READY, a daemon that lives also asks for EXTENSION_S more to start. Each counts as
-        told with this call: READY and STATUS do not come again where they are not sent. `status` must be one line,
-        which is not checked.
-        """
+        """Return the messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives."""
         messages = []
         if not self.is_ready and link is LinkState.RUNNING:
             self.is_ready = True
@@ -67,12 +53,7 @@ class Service:
 def status_line(
     link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
 ) -> str:
-    """Return one line for `systemctl status`: the operating state with its faults, or else with the scene.
-
-    Then comes the next command, if one is needed: `tormagctl status` with faults, `tormagctl arm` where it is not
-    homed. While the link does not run, its state, `cause` and `remedy` stand in place of the next command; their line
-    ends become spaces.
-    """
+    """Return one line for `systemctl status`: the operating state with its faults, or else with the scene."""
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:
         # a text of the device or the kernel may have several lines; the status must be one
@@ -84,11 +65,7 @@ def status_line(
 
 
 def notify(message: str) -> bool:
-    """Send `message`, lines of `NAME=value`, to the service manager, as sd_notify(3) does. Never waits.
-
-    Returns False where there is no service manager ($NOTIFY_SOCKET is not set), or where it does not take the message.
-    A $NOTIFY_SOCKET that begins with `@` is an abstract socket.
-    """
+    """Send `message`, lines of `NAME=value`, to the service manager, as sd_notify(3) does."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return False

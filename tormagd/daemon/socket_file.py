@@ -9,12 +9,7 @@ from pathlib import Path
 
 
 class SocketFile:
-    """A listening socket bound to `path`, which one process has at a time. Raises OSError saying what is in the way.
-
-    Makes missing folders, and replaces the socket that a killed process left. Anything else at `path` is refused and
-    left alone. A lock on `PATH.lock` keeps other processes out until this one ends. libzmq by itself would take the
-    path from whoever listens there; so it is handed this socket (ZMQ_USE_FD).
-    """
+    """A listening socket bound to `path`, which one process has at a time. Raises OSError saying what is in the way."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._lock_path = path, path.with_name(f"{path.name}.lock")
@@ -33,10 +28,7 @@ class SocketFile:
         self._identity = _identity(path)
 
     def close(self) -> None:
-        """Close the socket, and remove its path and its lock, unless others have been put in their place.
-
-        The socket is not closed where it was detached. A path that cannot be removed stays. Call it once.
-        """
+        """Close the socket, and remove its path and its lock, unless others have been put in their place."""
         self.listener.close()
         if self._identity is not None and _identity(self._path) == self._identity:
             with contextlib.suppress(OSError):
@@ -61,11 +53,7 @@ def ipc_path(address: str) -> Path | None:
 
 
 def _locked(path: Path) -> int:
-    """Lock the file `path`, write our process number into it, and return its descriptor, which holds the lock.
-
-    The caller closes it. Makes the file where it is missing, in a folder that must exist. Raises OSError where it
-    cannot be opened, is not a lock's, or is locked by another process. Never waits for the lock.
-    """
+    """Lock the file `path`, write our process number into it, and return its descriptor, which holds the lock."""
     while True:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o660)
@@ -85,10 +73,7 @@ def _locked(path: Path) -> int:
 
 
 def _lock(path: Path, descriptor: int) -> None:
-    """Lock an open file without waiting. `path` is for the messages.
-
-    Raises OSError where it holds anything but a number, or is locked by another. An empty one is fine.
-    """
+    """Lock an open file without waiting."""
     content = os.pread(descriptor, 32, 0).decode(errors="replace").strip()
     if content and not content.isdecimal():
         raise OSError(f"{path} is not a lock of this program; it is left alone: name another path")
@@ -101,11 +86,7 @@ def _lock(path: Path, descriptor: int) -> None:
 
 
 def _listening(path: Path) -> socket.socket:
-    """Return a socket that listens at `path`, in place of one that was left there. Call with the lock held.
-
-    It does not block, and the caller closes it. Raises OSError where something else is at `path`, which stays, or where
-    it cannot be bound.
-    """
+    """Return a socket that listens at `path`, in place of one that was left there."""
     if _identity(path) is not None and not stat.S_ISSOCK(path.lstat().st_mode):
         raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)

@@ -15,11 +15,10 @@ from typing import final
 from tormagd.hardware.link_statistics import DeviceClock
 
 MAX_WAY_S = 0.2
-"""A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take. More is
-the clock."""
+"""A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take."""
 MAX_LATE_S = 1.0
 """A least lateness between the two may be either: the clock is corrected by it, and the limits of sources count it as
-the way. More is a wrong clock."""
+the way."""
 AHEAD_S = 0.05
 "A stamp may be this far ahead before its clock has shown itself; a clock that is further off than this is wrong."
 SETTLED_S = 0.2
@@ -36,11 +35,7 @@ JITTER_SHARE = 1.0 / 16.0
 
 @final
 class SourceClock:
-    """Estimates one publisher's clock offset and the delay of its messages, from stamps and arrivals.
-
-    Give it each message in the order of sending. No clock of its own. It keeps `offset_s`, the constant part of the way
-    `way_s`, the jitter, and how often and when the clock was set.
-    """
+    """Estimates one publisher's clock offset and the delay of its messages, from stamps and arrivals."""
 
     def __init__(self) -> None:
         self.offset_s = 0.0
@@ -63,26 +58,18 @@ class SourceClock:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the clock's offset is known; not for SETTLED_S after a first lateness that no way takes."""
         return self._settles_s is None
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the clock's offset is known and beyond AHEAD_S, so that the clock should be set."""
         return self.is_settled and not -AHEAD_S <= self.offset_s <= AHEAD_S
 
     @property
     def hidden_s(self) -> float:
-        """Return the part of `offset_s`, s, that may as well be the way; 0 once the clock was seen to be set."""
         return self.offset_s if 0.0 < self.offset_s < MAX_LATE_S and not self.steps else 0.0
 
     def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
-        """Take the message that came at `now_s`, and return its delay, s. `lateness_s` is our time less its stamp.
-
-        The delay is by the corrected clock, and not negative. While a clock is not settled, `lateness_s` itself is
-        returned, which is negative for a stamp ahead of us. With `is_continued` False the publisher may be another
-        process, on another machine. Times must not fall, which is not checked.
-        """
+        """Take the message that came at `now_s`, and return its delay, s."""
         if self._heard_s is None:
             self._begin(now_s, lateness_s)
         else:
@@ -96,11 +83,7 @@ class SourceClock:
         return max(lateness_s - self.offset_s, 0.0)
 
     def _begin(self, now_s: float, lateness_s: float) -> None:
-        """Begin with nothing known but this lateness, and a new line; the counts of steps stay.
-
-        What a way can take counts as the way at once. More counts as the clock's offset once it has stayed for
-        SETTLED_S.
-        """
+        """Begin with nothing known but this lateness, and a new line; the counts of steps stay."""
         self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
         self._settles_s = now_s + SETTLED_S
         self.line = DeviceClock()
@@ -114,12 +97,7 @@ class SourceClock:
             self.offset_s, self.way_s = 0.0, self.offset_s
 
     def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
-        """Update offset, way and jitter from a message that came `gap_s` after the last, both on our clock.
-
-        A stamp that runs back shows that the clock was set; else the offset rises by what drift allows. After
-        FORGOTTEN_S of silence, or from another process, neither is done. A lateness that does not fit then begins the
-        clock anew.
-        """
+        """Update offset, way and jitter from a message that came `gap_s` after the last, both on our clock."""
         rise_s = lateness_s - self._lateness_s
         if not is_continued or gap_s > FORGOTTEN_S:
             above_s = lateness_s - self.offset_s - self.way_s
@@ -140,11 +118,7 @@ class SourceClock:
             self._fall(now_s, fall_s)
 
     def _fall(self, now_s: float, fall_s: float) -> None:
-        """Lower offset and way by `fall_s`, not negative: the message was less late than both of them together.
-
-        First goes what was granted to drift, then the way. What is left is the clock's. Above STEP_S, a settled clock
-        counts as set forward, unless its offset may be the way, and still may be.
-        """
+        """Lower offset and way by `fall_s`, not negative: the message was less late than both of them together."""
         granted_s = min(fall_s, self._leaked_s)
         self.offset_s -= granted_s
         self._leaked_s -= granted_s

@@ -33,11 +33,7 @@ class Needs(NamedTuple):
 
 
 def needs_of(scene: Scene) -> Needs:
-    """Return what a scene needs of its publisher: setpoints a second, and their greatest delay, s.
-
-    Where the scene states no rate, setpoints may be as far apart as the slope carries over, AHEAD_S. Where it states no
-    delay, they may be late by MAX_LATE_S.
-    """
+    """Return what a scene needs of its publisher: setpoints a second, and their greatest delay, s."""
     stated = UNSET if scene.signal is None else scene.signal.setpoint_hz
     delay_ms = scene.budget.delay_ms
     return Needs(
@@ -47,14 +43,7 @@ def needs_of(scene: Scene) -> Needs:
 
 
 class Arrival(NamedTuple):
-    """How one message came.
-
-    delay_s    after its stamp, by the corrected clock
-    hidden_s   the part of its way that counts as the clock's offset, and is not in `delay_s`
-    playout_s  how long after its stamp it is followed first
-    lost       messages missing so far, of all
-    preview_s  the length of its preview, 0 without one
-    """
+    """How one message came."""
 
     delay_s: float
     hidden_s: float
@@ -64,11 +53,7 @@ class Arrival(NamedTuple):
 
 
 class SourceManner:
-    """Judges how the setpoints of one publisher come, window by window. Give it each message.
-
-    A window is full after WINDOW_S and MIN_MESSAGES messages. `found` has what was wrong in the newest full window,
-    by limit.
-    """
+    """Judges how the setpoints of one publisher come, window by window. Give it each message."""
 
     def __init__(self) -> None:
         self.found: dict[Limit, Explanation] = {}
@@ -78,12 +63,7 @@ class SourceManner:
         self._least_s, self._most_s, self._sum_s = MAX_LATE_S, 0.0, 0.0
 
     def hear(self, now_s: float, arrival: Arrival, needs: Needs) -> None:
-        """Take a message that came at `now_s`, and set `found` anew, by `needs`, when it fills the window.
-
-        `found` is emptied where that window is fine. Until then it stays, also while no message comes. The very first
-        message only begins a window. A message is late by its delay or its playout, whichever is longer: only then is
-        it followed.
-        """
+        """Take a message that came at `now_s`, and set `found` anew, by `needs`, when it fills the window."""
         if self._began_s is None:
             self._begin(now_s, arrival.lost)
             return
@@ -102,10 +82,7 @@ class SourceManner:
 
     def _judged(self, past_s: float, last: Arrival, needs: Needs) -> dict[Limit, Explanation]:
         """Return what is wrong in a window of `past_s`, s, that `last` has ended, with cause and remedy; empty where
-        nothing is.
-
-        Keys are SOURCE_LOSS, SOURCE_SELDOM, SOURCE_LATE and SOURCE_JITTER. The window has one message at least.
-        """
+        nothing is."""
         lost = last.lost - self._lost
         sent = self._messages + lost
         found = {}
@@ -136,11 +113,7 @@ class SourceManner:
 
 
 def _steadied(most_ms: float) -> str:
-    """Return the remedy for jitter of up to `most_ms` after the stamp, as a text for people.
-
-    It is the playout that takes the jitter out, rounded up to PLAYOUT_STEP_MS; or a preview where that is over
-    MAX_PLAYOUT_MS.
-    """
+    """Return the remedy for jitter of up to `most_ms` after the stamp, as a text for people."""
     playout_ms = math.ceil(most_ms / PLAYOUT_STEP_MS) * PLAYOUT_STEP_MS
     if playout_ms > MAX_PLAYOUT_MS:
         return "send a preview_N that is longer than that differs, or take a steadier way"

@@ -15,10 +15,7 @@ SLOW = 0.03
 
 
 class StampUnit:
-    """Finds out whether the stamps of one publisher count ns. Give it each message.
-
-    `is_known` says that it was found out, `wrong` names another unit; empty for ns.
-    """
+    """Finds out whether the stamps of one publisher count ns. Give it each message."""
 
     def __init__(self) -> None:
         self.is_known = False
@@ -29,16 +26,10 @@ class StampUnit:
 
     @property
     def remedy(self) -> str:
-        """What the publisher has to do about its unit; empty where no other unit than ns was found."""
         return f"send ns since 1970 (CLOCK_REALTIME): {FACTORS[self.wrong]} times as much" if self.wrong else ""
 
     def hear(self, now_s: float, stamp_ns: int, realtime_ns: int) -> None:
-        """Take a message that came at `now_s`; `realtime_ns` is our CLOCK_REALTIME then.
-
-        A stamp within FAR_NS of it counts ns, whatever was found before. Stamps further off are judged by how fast they
-        run, after LOOKED_AT messages and MIN_S. `is_known` and `wrong` then say what was found, and stay until the next
-        judgement. Of such slow stamps `wrong` is the unit that brings them nearest to our clock.
-        """
+        """Take a message that came at `now_s`; `realtime_ns` is our CLOCK_REALTIME then."""
         if abs(realtime_ns - stamp_ns) < FAR_NS:
             self.is_known, self.wrong, self._from = True, "", None
             return

@@ -25,13 +25,7 @@ from tormagd_client.printable import printable
 
 
 def start(options: argparse.Namespace) -> int:
-    """Build the core and run the daemon as the command line and its configuration say; return the exit code.
-
-    `options` has `config`, `scene` and `check`, as `main.parser` makes them. 0: ended on request; 1: could not run,
-    with the reason on stderr. `--check` prints what would run, as JSON, and runs nothing; 1 then says that it could not
-    be printed. Raises ConfigError where configuration, scene, keys or backend are refused, with the file's line where
-    one is to blame.
-    """
+    """Build the core and run the daemon as the command line and its configuration say; return the exit code."""
     try:
         config = _configured(options)
         keys = KeyRing(config.endpoints) if any(map(config.endpoints.is_guarded, ENDPOINTS)) else None
@@ -51,11 +45,7 @@ def start(options: argparse.Namespace) -> int:
 
 def _configured(options: argparse.Namespace) -> Config:
     """Return the file's configuration, or the defaults, with the command line's scene in place of its own, if there is
-    one.
-
-    Where `rates.of_scene` is set, the rates are those of the scene. Reads both files. Raises ConfigError where either
-    is refused, or the scene's rates are.
-    """
+    one."""
     config = load_config(options.config)
     if options.scene is not None:
         config = msgspec.structs.replace(config, scene=options.scene)
@@ -69,11 +59,7 @@ async def _run(
     keys: KeyRing | None,
     options: argparse.Namespace,
 ) -> None:
-    """Start the processes of black box and search, make this thread a real-time one, and run the daemon to its end.
-
-    The search's process is begun only where the scene's search runs beside the plans. Raises ConfigError where it does
-    not get ready, OSError where it does not start, an endpoint cannot be bound, or there is no timer.
-    """
+    """Start the processes of black box and search, make this thread a real-time one, and run the daemon to its end."""
     # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     known = {} if folder is None else header(config, core)
@@ -86,13 +72,7 @@ async def _run(
 
 def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
     """Return what `--check` prints, a JSON object with `config`, `scene`, `derived`, which follows from both, and
-    `backends`.
-
-    `config` has `options`, the chosen backend's, with its defaults. Keys of `derived`: `least_N`, `most_N`,
-    `phase_margin_deg`, `gain_margin_dB`, `solver`, `control_hz`, `inference_hz`, `fingerprint`, `terms_out`,
-    `least_resolution_N`, `missed_rms_N`, `missed_share`, `approaches_s`. What the gap's speed misses is null where the
-    scene has no signal. `backends` has by name `loads`, or why one does not.
-    """
+    `backends`."""
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
         "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),

@@ -21,11 +21,7 @@ class Peer(NamedTuple):
 
 
 class Tally:
-    """Counts refusals by endpoint, peer and reason. `line` is the log's format, for a count and the newest entry.
-
-    At most `most` entries are told apart; the one counted longest ago joins the OTHERS of its endpoint. `name` returns
-    a key as people know it. `total` is the count of all.
-    """
+    """Counts refusals by endpoint, peer and reason. `line` is the log's format, for a count and the newest entry."""
 
     def __init__(self, most: int, line: str, name: Callable[[str], str]) -> None:
         self.most, self._line, self._name = most, line, name
@@ -34,11 +30,7 @@ class Tally:
         self._counts: dict[tuple[str, Peer, str], int] = {}
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
-        """Count one more refusal of `peer` at `endpoint` for `reason`, all of which make up its entry.
-
-        Beyond `most` entries, the one counted longest ago joins the OTHERS of its endpoint, under its reason's text up
-        to a colon. Nothing is logged: see `tell`.
-        """
+        """Count one more refusal of `peer` at `endpoint` for `reason`, all of which make up its entry."""
         self.total += 1
         self._add((endpoint, peer, reason), 1)
         if len(self._counts) > self.most:
@@ -54,11 +46,7 @@ class Tally:
 
     def tell(self, now_s: float) -> None:
         """Log, as a warning, the number of refusals since the last line, and the newest entry; at most one line in
-        NEWS_S.
-
-        Where the newest refusal made an entry join OTHERS, these are the newest. Without new refusals nothing is
-        logged. What comes too soon for a line is told with the next one.
-        """
+        NEWS_S."""
         if self.total > self._told and now_s >= self._tell_s:
             it = self.report()[-1]
             newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
@@ -70,11 +58,7 @@ class Tally:
 
 
 def shown(address: str) -> str:
-    """Return a peer's address, as libzmq names it, for people: the host, or `process N of user N`.
-
-    An empty one is a peer that was gone before it was seen. Raises ValueError for a `localhost:` of other than four
-    parts.
-    """
+    """Return a peer's address, as libzmq names it, for people: the host, or `process N of user N`."""
     if address.startswith("localhost:"):
         _, user, _, process = address.split(":")
         return f"process {process} of user {user}"

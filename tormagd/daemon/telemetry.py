@@ -20,13 +20,7 @@ def tick_record(
     exec_us: float,
     number: int = 0,
 ) -> TickRecord:
-    """Return the record of one control tick, number `number`, along `plan`. Call right after the step.
-
-    It is stamped with CLOCK_REALTIME now. `lateness_us` and `exec_us` are the tick's. `measurement` is what the step
-    was given, None without a device: its fields are None then, `device_switches` and `device_faults` empty. `left_mm`
-    and `right_mm` are None unless homed. `governed_cf` is None and `limits` empty unless the device is driven. Fields
-    are given by position: by name it takes ten times as long.
-    """
+    """Return the record of one control tick, number `number`, along `plan`."""
     measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
     is_placed = measured is not None and measured.is_homed
     link = None if measurement is None else measurement.link
@@ -121,12 +115,7 @@ def snapshot(
     verdict: Verdict | None = None,
     mark: Mark | None = None,
 ) -> Telemetry:
-    """Return the telemetry message `sequence` of the newest `tick`.
-
-    `age_s` is the setpoint's, None without one. `handle` is the handle's place, mm, and rate, mm/s, positive pushing
-    on; None without a device. `verdict` is None without a setpoint, `mark` before the first. Gap, carriages and skew
-    are None unless homed, the field while the device is not driven. `belief` is sent as it is, by name.
-    """
+    """Return the telemetry message `sequence` of the newest `tick`."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
     return Telemetry(

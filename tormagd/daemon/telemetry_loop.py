@@ -66,12 +66,7 @@ log = logging.getLogger(__name__)
 
 
 class TelemetryLoop:
-    """The telemetry loop: publishes what the control and inference loops do, and answers requests.
-
-    `record` and `publish` are phases of every beat, `tell` and `serve` slices. `not_granted` is what the kernel refused
-    at the start. `config_file` names the file of `config`, None for the defaults. It keeps the ticks that are not
-    published yet, the newest snapshot and status, and the newest mark.
-    """
+    """The telemetry loop: publishes what the control and inference loops do, and answers requests."""
 
     def __init__(
         self,
@@ -113,12 +108,7 @@ class TelemetryLoop:
         self.run_scene(config, core, profiles)
 
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
-        """Publish and report on `core` from now on, with its configuration and profiles. Call it between two beats.
-
-        The next `status` is made anew, and how well the force is followed counts from now. Ticks that are not published
-        yet, the newest snapshot and the newest mark stay. `config` must have the same rates as before, which is not
-        checked.
-        """
+        """Publish and report on `core` from now on, with its configuration and profiles."""
         self.config = config
         "Replaced by a reload, which changes only keys that are looked at each time they are used."
         self._core, self.topics.core, self._profiles = core, core, profiles
@@ -127,11 +117,7 @@ class TelemetryLoop:
         self._reported_s = -math.inf
 
     def record(self, _beat: Beat) -> None:
-        """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing.
-
-        Also counts the delay of a new setpoint. Where MAX_TICKS records wait, as telemetry is slow, they are published
-        first.
-        """
+        """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing."""
         control = self._control
         if control.output is None or control.used is None:
             return
@@ -153,12 +139,7 @@ class TelemetryLoop:
         self._box.ticked(record, control.stepper, self._inference.planner)
 
     def publish(self, beat: Beat) -> bool:
-        """Publish the snapshot and the ticks of a telemetry period; return False where none is due.
-
-        The snapshot is made only where a peer listens or a request waits. The requests that wait now, REQUESTS at most,
-        are then answered by `serve`. Ticks that nobody listens to are dropped. Calibrations and profiles look at the
-        connected device. The newest tick counts for how well the force is followed.
-        """
+        """Publish the snapshot and the ticks of a telemetry period; return False where none is due."""
         if self._left > 0 or not self._ticks:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
@@ -186,11 +167,7 @@ class TelemetryLoop:
         return True
 
     def _look_at_device(self) -> None:
-        """Let calibrations and profiles look at the connected device.
-
-        Calibrations do while it is neither driven nor busy, and no scene is being changed. Profiles see no device while
-        its calibration is awaited.
-        """
+        """Let calibrations and profiles look at the connected device."""
         serial_number, is_driven = self._connection.serial_number, self._control.stepper.safety.is_driven
         change = self._scene_change.newest
         is_idle = not (is_driven or self.is_busy()) and (change is None or change.is_over)
@@ -205,10 +182,7 @@ class TelemetryLoop:
         self._ticks = []
 
     def tell(self, _beat: Beat) -> bool:
-        """Every TELL_S, feed log, systemd and black box, and go on arming; return False where it is not time.
-
-        Also computes the percentiles of REFRESHED histograms, the next in turn, and the figures of one source anew.
-        """
+        """Every TELL_S, feed log, systemd and black box, and go on arming; return False where it is not time."""
         now_s = time.monotonic()
         if now_s - self._told_s < TELL_S:
             return False
@@ -225,21 +199,13 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answer requests that waited at the last snapshot, for a limited time; return False where none was answered.
-
-        What is left waits for the next call. Later requests wait for the next snapshot.
-        """
+        """Answer requests that waited at the last snapshot, for a limited time; return False where none was answered."""
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
 
     def keep(self, reason: str, after_s: float) -> Path:
-        """Ask for a black box that also holds the next `after_s`, and return the path it will have.
-
-        `reason` becomes part of its name, and is not checked. Its details are `firmware`, `serial_number` in eight
-        hexadecimal digits and `profile_sha256`, each empty where it is not known or not used. Raises RefusedError where
-        none is kept.
-        """
+        """Ask for a black box that also holds the next `after_s`, and return the path it will have."""
         link = self._connection.report()
         details = {
             "firmware": link.firmware or "",
@@ -249,10 +215,7 @@ class TelemetryLoop:
         return self._box.write(reason, after_s, details)
 
     def conditions(self) -> Conditions:
-        """Return the conditions, as they are now, on which a command is taken or refused.
-
-        A device whose calibration is not in force yet is busy, although it does not move.
-        """
+        """Return the conditions, as they are now, on which a command is taken or refused."""
         control, doubted = self._control, self._inference.planner.believe.sensor.is_doubted
         found = conditions(
             time.monotonic(), self.config, self._connection, control.stepper, control.output, sensor_doubted=doubted
@@ -273,11 +236,6 @@ class TelemetryLoop:
         return is_homed(self._connection.measurement, self._control.stepper.measured)
 
     def _snapshot(self, now_s: float) -> Telemetry:
-        """Return the telemetry message of the newest tick, with states and beliefs as they are at `now_s`.
-
-        A tick must be kept: IndexError is raised otherwise. The message has the setpoint's age (None without one), the
-        handle's motion, the verdict and the newest mark. Its number is that of the telemetry periods so far.
-        """
         newest = self._endpoint.inbox.newest
         return snapshot(
             self._ticks[-1],
@@ -292,12 +250,7 @@ class TelemetryLoop:
         )
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
-        """Tell systemd what is new: readiness, which is logged, the status line, and that the daemon lives.
-
-        It lives while the newest plan is no older than `realtime.watchdog_ms`. Once a device was identified, its newest
-        state may be no older either, while its port is open and its firmware is not refused. Else nothing says so, and
-        systemd's watchdog runs out. Without systemd the log alone is told. `is_homed_` is for the status line.
-        """
+        """Tell systemd what is new: readiness, which is logged, the status line, and that the daemon lives."""
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
         is_alive = service.is_alive(
@@ -322,21 +275,14 @@ class TelemetryLoop:
             notify(message)
 
     def _in_turn(self) -> Iterator[Histogram]:
-        """Yield all histograms of rates, way and phases, again and again, without end.
-
-        A beat computes the percentiles of a few: all of them would take too long.
-        """
+        """Yield all histograms of rates, way and phases, again and again, without end."""
         while True:
             for group in self._groups:
                 yield from (group.lateness, group.exec)
             yield from (self._way.to_duty, *self._phases.spent.values())
 
     def _answer(self, request: Request) -> Any:
-        """Return the result of a request: for `status` and `describe` a report, for any other what `command` returns.
-
-        A `status` is packed once, as msgpack, for all who ask in a telemetry period; a snapshot must have been made
-        before. Raises RefusedError for a request that is refused.
-        """
+        """Return the result of a request: for `status` and `describe` a report, for any other what `command` returns."""
         if request.command == "status":
             # built once for everybody who asks in this period
             if self._status is None:
@@ -345,11 +291,7 @@ class TelemetryLoop:
         return self._describe() if request.command == "describe" else self.command(request)
 
     def _describe(self) -> Description:
-        """Return what does not change from tick to tick.
-
-        Firmware and serial number are None until a device has said them. `portrait` has forces, N, from the open gap to
-        the closed one, and their rates at the gap's speed, N/s, as learned by now. It has every PORTRAIT_STEP-th point.
-        """
+        """Return what does not change from tick to tick."""
         link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
         scaled_mm_s = device.scale * self._core.gap_speed_mm_s
         return Description(
@@ -369,16 +311,7 @@ class TelemetryLoop:
         )
 
     def command(self, request: Request) -> dict[str, Any]:
-        """Carry out a request that is no question, and return its result as plain data.
-
-        `take` gives the brake, `confirm` settles a dispute, and `mark` adds a mark: see `_give`, `_confirm` and
-        `_add_mark`. `blackbox` asks for a black box, and returns the `file` that it will have.
-
-        `arm` begins an arming, `use-scene` a change of the scene; neither is over then. Any other name goes to the
-        operating state. These return the `operating_state` of now, and whether a device `is_connected`. Raises
-        RefusedError for an unknown name, and where the state or the arguments do not allow it. The next `status` is
-        made anew.
-        """
+        """Carry out a request that is no question, and return its result as plain data."""
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
             return self._give(request.args.get("source"))
@@ -401,11 +334,7 @@ class TelemetryLoop:
         }
 
     def _add_mark(self, text: object) -> dict[str, Any]:
-        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns` and `text`.
-
-        It takes the place of the newest mark, and is logged. Raises RefusedError for what is not 1..MAX_MARK_CHARACTERS
-        printable characters.
-        """
+        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns` and `text`."""
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
             raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")
@@ -414,11 +343,7 @@ class TelemetryLoop:
         return msgspec.to_builtins(self._mark)  # type: ignore[no-any-return]
 
     def _confirm(self, what: object) -> dict[str, Any]:
-        """Take the operator's word on what is wrong, "device" or "sensor"; log it and return `{"confirmed": what}`.
-
-        "device": the device has changed, and the planner ends the dispute. "sensor": it stops believing the sensor. The
-        journal notes it. Raises RefusedError for any other word, and where the readings agree with the device.
-        """
+        """Take the operator's word on what is wrong, "device" or "sensor"; log it and return `{"confirmed": what}`."""
         try:
             wrong = msgspec.convert(what, Disputed)
         except msgspec.ValidationError as error:
@@ -437,12 +362,7 @@ class TelemetryLoop:
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
-        """Give the brake to the source of this name, log it, and return its name and that of the holder before.
-
-        The keys are `source` and `instead_of`. The latter is empty where none held it, and the same name where it held
-        it already. Raises RefusedError for what is no text, an unknown source, and one whose newest setpoint is no
-        longer valid.
-        """
+        """Give the brake to the source of this name, log it, and return its name and that of the holder before."""
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
         inbox = self._endpoint.inbox
@@ -452,10 +372,7 @@ class TelemetryLoop:
         return {"source": source, "instead_of": before}
 
     def _build_status(self, newest: Telemetry) -> Status:
-        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and remedies.
-
-        Reports on link, peers, sources, rates and black box may be up to TELL_S old: see `_slowly_changing`.
-        """
+        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and remedies."""
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device
@@ -508,10 +425,7 @@ class TelemetryLoop:
         )
 
     def _arm_report(self) -> ArmReport | None:
-        """Return the report on the newest arming: commands given, whether it is over, and why it failed.
-
-        `error` is None where it goes on or has ended in ENABLED. None before the first arming.
-        """
+        """Return the report on the newest arming: commands given, whether it is over, and why it failed."""
         arming = self._control.arming
         if arming is None:
             return None
@@ -520,11 +434,7 @@ class TelemetryLoop:
         return ArmReport(given=arming.given, is_over=arming.is_over, error=ended)
 
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:
-        """Return the reports that take most of a status' time, by the names of its fields.
-
-        They are `link`, `profile`, `calibration`, `setpoints`, `peers`, `rates`, `phases_us`, `late_ticks_by`, `way`
-        and `black_box`. They are made anew every TELL_S, after a command, and when the state of the link changes.
-        """
+        """Return the reports that take most of a status' time, by the names of its fields."""
         if now_s - self._reported_s >= TELL_S or self._connection.state is not self._reported_state:
             self._reported_s, self._reported_state = now_s, self._connection.state
             link = self._connection.report()

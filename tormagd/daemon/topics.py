@@ -17,10 +17,7 @@ NS = 1_000_000_000
 
 
 class Topics:
-    """Publishes the topics `motion` and `verdict` as a phase of every beat, and makes both for snapshots, too.
-
-    It keeps which motion and which setpoints were published last, and the running scene's `core`.
-    """
+    """Publishes the topics `motion` and `verdict` as a phase of every beat, and makes both for snapshots, too."""
 
     def __init__(
         self, config: Config, core: Core, control: ControlLoop, inference: InferenceLoop, endpoint: Endpoint
@@ -35,10 +32,7 @@ class Topics:
         self._passed_over: tuple[str, int] | None = None
 
     def publish(self, beat: Beat) -> bool:
-        """Publish a verdict where one is new, and the handle's motion where it is due; return False where neither was.
-
-        Topics that nobody subscribes to by name are skipped. Never waits.
-        """
+        """Publish a verdict where one is new, and the handle's motion where it is due; return False where neither was."""
         listeners = self._endpoint.listeners
         is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
         return (listeners.has(MOTION_TOPIC) and self._publish_motion(beat)) or is_said
@@ -54,11 +48,7 @@ class Topics:
         return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
-        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without a device.
-
-        It is stamped with CLOCK_REALTIME of when it was sensed; place and rate are positive pushing on. It is due
-        `motion_hz` times a second; due times that were missed are not made up for.
-        """
+        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without a device."""
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
             return False
@@ -74,11 +64,7 @@ class Topics:
         return True
 
     def _publish_verdicts(self) -> bool:
-        """Publish the verdict on the setpoint in force, and on one refused because another source holds the brake.
-
-        Each is judged once, when it is new; of several that came between two beats, the newest. Returns False where
-        neither is new.
-        """
+        """Publish the verdict on the setpoint in force, and on one refused because another source holds the brake."""
         in_force, is_said = self._endpoint.inbox.playout.in_force, False
         # a setpoint is a new object, even where its source begins its numbers anew
         if in_force is not None and in_force is not self._judged:
@@ -93,10 +79,7 @@ class Topics:
         return is_said
 
     def _judge(self) -> Judged:
-        """Return the judgement on the newest setpoint, by the newest plan and the measured gap.
-
-        Without a homed device, out of ENABLED or without a setpoint it is `cannot`.
-        """
+        """Return the judgement on the newest setpoint, by the newest plan and the measured gap."""
         planner, stepper, core = self._inference.planner, self._control.stepper, self.core
         measured, believe, force = stepper.measured, planner.believe, core.scene.force
         return judged(
@@ -113,8 +96,6 @@ class Topics:
 
     @staticmethod
     def _verdict(source: str, seq: int, found: Judged) -> Verdict:
-        """Return the judgement `found` as the message for the setpoint `seq` of `source`, stamped with CLOCK_REALTIME
-        now."""
         return Verdict(
             v=VERSION,
             t_ns=time.time_ns(),

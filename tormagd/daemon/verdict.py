@@ -18,11 +18,7 @@ FIELD = "field_mT"
 
 
 class Judged(NamedTuple):
-    """A judgement on a setpoint: rendered, arrives or cannot.
-
-    `arrives_ms` is 0 where the force is rendered, None where it cannot be. `why` names the limits or the state that
-    keep it from coming.
-    """
+    """A judgement on a setpoint: rendered, arrives or cannot."""
 
     outcome: str
     arrives_ms: float | None
@@ -42,15 +38,7 @@ def judged(
     release_N_s: float,
 ) -> Judged:
     """Return the judgement on the setpoint that `plan` was made for: RENDERED, ARRIVES in some time, or CANNOT, and
-    why.
-
-    `gap_mm` is the measured gap, None without a homed device. RENDERED means within the scene's tolerance. CANNOT: not
-    ENABLED, no homed device, no valid setpoint, or a limit that keeps the force away for good. `why` is the state, also
-    without a homed device, or the limits. It is empty unless CANNOT, and where there is no setpoint at all.
-
-    `arrives_ms` is the time of the gap's way at its speed, or of a takeover's ramp where that is longer, plus the lag.
-    It is 0 where RENDERED, None where CANNOT.
-    """
+    why."""
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:
         return Judged(CANNOT, None, (str(state),))
@@ -71,12 +59,7 @@ def judged(
 
 
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
-    """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there.
-
-    The ceiling does where the aim is a smaller gap than it allows, and the model's range where it bounds the field.
-    F_MIN does unless a ramp leads up from it to a greater force. The others in HOLDING always do, all else never.
-    Whether `plan` has the limit is not checked.
-    """
+    """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there."""
     if limit is Limit.CEILING:
         return aim_mm < plan.min_gap_mm
     if limit is Limit.F_MIN:

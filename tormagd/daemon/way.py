@@ -19,10 +19,7 @@ BUDGET_MS = 400.0
 
 
 class Way:
-    """Measures the delay from a setpoint's stamp to the first duty that follows it. Give it each control tick.
-
-    `to_duty` has the delays, us.
-    """
+    """Measures the delay from a setpoint's stamp to the first duty that follows it. Give it each control tick."""
 
     def __init__(self) -> None:
         self.to_duty = Histogram()
@@ -30,11 +27,7 @@ class Way:
 
     def ticked(self, now_s: float, used: Plan) -> None:
         """Count in `to_duty` the delay of a setpoint at its first control tick, at `now_s`, along the plan `used` for
-        it.
-
-        Later ticks for the same setpoint count nothing, nor do plans without one. Two setpoints of one stamp count as
-        one.
-        """
+        it."""
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
@@ -42,12 +35,7 @@ class Way:
                 self.to_duty.add(now_s, (now_s - stamp_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float, budget: Budget) -> WayReport:
-        """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known.
-
-        `device_us` is the link's median round trip, us, None without one; `lag_s` is the carriages' lag. The sum, ms,
-        has the 99th percentile of the delay to the duty, as of the last refresh of `to_duty`. `budget` is
-        the scene's; where it states no delay, that is BUDGET_MS.
-        """
+        """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known."""
         to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
             total_ms = round((to_duty_us.p99 + device_us) * 1e-3 + carriages_ms, 2)

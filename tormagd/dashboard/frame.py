@@ -23,11 +23,7 @@ class Held(msgspec.Struct, frozen=True):
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True):
-    """One update of the page: curves of equal length, the oldest first; `t_s` is since 1970, None is not known.
-
-    A live frame's curves hold only what is new. Limits, faults and `late_counts` (control ticks by lateness, between
-    LATE_US) are always those of all seconds shown; state and `belief` those at their end.
-    """
+    """One update of the page: curves of equal length, the oldest first; `t_s` is since 1970, None is not known."""
 
     t_s: Sequence[float]
     asked_N: Sequence[float | None]
@@ -44,10 +40,6 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def late_counts(lateness_us: Iterable[float]) -> list[int]:
-    """Count these latenesses, us, by bar of the histogram that LATE_US bounds, one bar more than bounds.
-
-    The first bar is what is under the first bound, the last what is at or over the last one; NaN counts there. A
-    lateness at a bound counts in the bar above. Without any all are 0.
-    """
+    """Count these latenesses, us, by bar of the histogram that LATE_US bounds, one bar more than bounds."""
     counts = Counter(bisect_right(LATE_US, late_us) for late_us in lateness_us)
     return [counts[bar] for bar in range(len(LATE_US) + 1)]

@@ -18,11 +18,7 @@ def page(title: str, parts: Iterable[str]) -> str:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], is_bad: Sequence[bool] = ()) -> str:
-    """Return an HTML table of these texts; "None." where it has no row. Rows that are bad are red.
-
-    `is_bad` may be shorter than the rows; the others are good. Texts are escaped; what stands in backticks becomes
-    code, but not in `heads`. That rows are as long as `heads` is not checked.
-    """
+    """Return an HTML table of these texts; "None." where it has no row."""
     lines = ["".join(f"<td>{_with_code(cell)}</td>" for cell in row) for row in rows]
     if not lines:
         return "<p>None.</p>"

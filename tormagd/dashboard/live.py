@@ -28,10 +28,7 @@ WAITING = 50
 
 
 class Live:
-    """Listens to one daemon and sends every browser the same events; `run` has to run beside the browsers.
-
-    Holds the snapshots kept and those not sent yet, status, portrait, explanations of codes, and each browser's queue.
-    """
+    """Listens to one daemon and sends every browser the same events; `run` has to run beside the browsers."""
 
     about: ClassVar[dict[str, Any]] = {"kind": "live"}
     "What the page begins with."
@@ -48,23 +45,14 @@ class Live:
         self._learn(status)
 
     async def run(self) -> None:
-        """Listen and publish to the browsers without end; a daemon that is gone is waited for.
-
-        It ends by being cancelled. Any other error than those which a silent or odd daemon makes ends it, too, within
-        an ExceptionGroup. The client stays open.
-        """
+        """Listen and publish to the browsers without end; a daemon that is gone is waited for."""
         async with asyncio.TaskGroup() as tasks:
             for each in (self._listen(), self._tell(), self._ask()):
                 tasks.create_task(each)
 
     @contextlib.contextmanager
     def browser(self) -> Iterator[asyncio.Queue[bytes]]:
-        """Add a browser for this context, and give the queue of its events, each encoded as `event` does it.
-
-        Events are `frame`, `status`, `portrait` and `silence`. The first are the seconds kept so far, where there are
-        any, the status, and what the device can render. The queue takes WAITING events; of a browser that does not read
-        the oldest are lost. At the end the browser is removed. How many there may be is not checked.
-        """
+        """Add a browser for this context, and give the queue of its events, each encoded as `event` does it."""
         events: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
         if self._kept:
             events.put_nowait(event("frame", self._frame(self._kept)))
@@ -77,10 +65,7 @@ class Live:
             self.browsers.discard(events)
 
     async def _listen(self) -> None:
-        """Keep each snapshot, and when it came, without end; after one that cannot be decoded listen anew.
-
-        That one is noted as the reason for silence, until the next good one.
-        """
+        """Keep each snapshot, and when it came, without end; after one that cannot be decoded listen anew."""
         while True:
             try:
                 async for snapshot in self._client.telemetry():
@@ -91,11 +76,7 @@ class Live:
                 self._why_silent = f"what comes is not understood: {printable(str(error))}"
 
     async def _tell(self) -> None:
-        """Publish new snapshots every FRAME_S as `frame`, without end.
-
-        After SILENT_S without any, publishes `silence`: for how many `seconds` nothing has been heard, and `why`, empty
-        where that is not known.
-        """
+        """Publish new snapshots every FRAME_S as `frame`, without end."""
         while True:
             await asyncio.sleep(FRAME_S)
             silent_s = time.monotonic() - self._heard_s
@@ -107,11 +88,7 @@ class Live:
 
     async def _ask(self) -> None:
         """Ask for the status every STATUS_S, and each PORTRAIT_EVERY-th time for the portrait, and publish them,
-        without end.
-
-        A client's error is passed over. While nothing is heard, nothing is asked: requests would wait, and come at
-        once.
-        """
+        without end."""
         for number in itertools.count(1):
             await asyncio.sleep(STATUS_S)
             if time.monotonic() - self._heard_s < SILENT_S:
@@ -124,7 +101,7 @@ class Live:
                         self._publish("portrait", self._portrait)
 
     def _publish(self, name: str, value: object) -> None:
-        """Queue an event for every browser, encoded once; a full queue loses its oldest. Raises as `event`."""
+        """Queue an event for every browser, encoded once; a full queue loses its oldest."""
         data = event(name, value)
         for events in self.browsers:
             if events.full():
@@ -132,7 +109,6 @@ class Live:
             events.put_nowait(data)
 
     def _learn(self, status: Status) -> None:
-        """Remember why and what to do for every limit and fault the daemon has told of."""
         self._explained["limits"] |= {each.code: each for each in status.limit_details}
         self._explained["faults"] |= {each.code: each for each in status.fault_details}
 
@@ -140,11 +116,7 @@ class Live:
         return {"status": self._status, "explained": self._explained}
 
     def _frame(self, snapshots: Sequence[Telemetry]) -> Frame:
-        """Make a frame with curves of `snapshots`, and limits and latenesses of all that are kept.
-
-        `snapshots` must not be empty, the oldest first. State, faults and belief are those of the last; the field is
-        None outside DRIVEN. Shares of limits are of the snapshots kept.
-        """
+        """Make a frame with curves of `snapshots`, and limits and latenesses of all that are kept."""
         newest, kept = snapshots[-1], self._kept
         times = Counter(code for each in kept for code in each.limits)
         return Frame(
@@ -164,8 +136,5 @@ class Live:
 
 
 def event(name: str, value: object) -> bytes:
-    """Return a server-sent event called `name`, which is not escaped, with `value` as JSON; NaN becomes null.
-
-    Raises TypeError for what msgspec cannot encode.
-    """
+    """Return a server-sent event called `name`, which is not escaped, with `value` as JSON; NaN becomes null."""
     return b"event: %s\ndata: %s\n\n" % (name.encode(), msgspec.json.encode(value))

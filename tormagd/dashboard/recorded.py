@@ -46,10 +46,7 @@ class Moment(Glance, total=False):
 
 
 class Moments:
-    """Ticks or snapshots of a recording: times in seconds since its start, shape (n,), and quantities, shape (n, 8).
-
-    Quantities are NaN where not known; `messages` are the n messages themselves.
-    """
+    """Ticks or snapshots of a recording: times in seconds since its start, shape (n,), and quantities, shape (n, 8)."""
 
     def __init__(self, seen: Sequence[Seen], start_ns: int) -> None:
         self.messages = [each.message for each in seen]
@@ -59,19 +56,12 @@ class Moments:
 
     def newest(self, times_s: Floats) -> list[int]:
         """Return for each time, s, the index of the newest message; -1 where it is over BREAK_S old, or none came
-        before.
-
-        An empty list, whatever the times, where there are no messages.
-        """
+        before."""
         at = np.searchsorted(self.t_s, times_s, side="right") - 1
         return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= BREAK_S, at, -1).tolist()
 
     def curve(self, name: str, times_s: Floats) -> list[float | None] | None:
-        """Return the newest value of the quantity `name` at each time, None where too old or not known.
-
-        None instead of a list where no value is known at all, also without messages. Raises ValueError for a name that
-        is none of QUANTITIES.
-        """
+        """Return the newest value of the quantity `name` at each time, None where too old or not known."""
         values = self._values[:, QUANTITIES.index(name)]
         if not np.isfinite(values).any():
             return None
@@ -85,10 +75,7 @@ class Moments:
 
 
 class Recorded:
-    """A recording with messages, for the page; times given to it are seconds since its first message.
-
-    Keeps the stretch that was read last, with its ticks and snapshots.
-    """
+    """A recording with messages, for the page; times given to it are seconds since its first message."""
 
     def __init__(self, file: RecordingFile) -> None:
         """Raise ValueError where the recording has no message."""
@@ -100,12 +87,7 @@ class Recorded:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Return what the page begins with, as data for JSON.
-
-        Keys: `kind`, `name` of the file, `start_s` since 1970, `duration_s`, `notes`, and `followed` in words. `scene`
-        is its name, empty where not recorded; `portrait` is None there. `overview` is as `_glance`. `explained` has for
-        `limits` and `faults` what each code means.
-        """
+        """Return what the page begins with, as data for JSON."""
         file = self._file
         return {
             "kind": "recording",
@@ -126,12 +108,7 @@ class Recorded:
 
     def frame(self, at_s: float) -> Frame:
         """Return the frame of the SHOWN_S that end at `at_s`, which is clamped to the recording; its curves have a
-        point every STEP_S.
-
-        The last point is at `at_s` itself. Curves come from the ticks, or the snapshots where ticks have no value; the
-        field is None outside DRIVEN. The state is empty where no message is near. Keeps what was read for the next
-        call. Raises RecordingError where the recording cannot be read, ValueError for NaN.
-        """
+        point every STEP_S."""
         at_s = min(max(at_s, 0.0), self.duration_s)
         from_s = max(at_s - SHOWN_S, 0.0)
         at_ns = self._start_ns + round(at_s * 1e9)
@@ -165,22 +142,14 @@ class Recorded:
         )
 
     def _between(self, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-        """Return ticks and snapshots of at least this time, ns since 1970, and often of more.
-
-        Reads AHEAD_NS more on both sides, and keeps them: a time within that is not read again. Raises as `moments`.
-        """
+        """Return ticks and snapshots of at least this time, ns since 1970, and often of more."""
         if self._read is None or not self._read[0] <= from_ns < to_ns <= self._read[1]:
             span = from_ns - AHEAD_NS, to_ns + AHEAD_NS
             self._read = (*span, *moments(self._file, *span))
         return self._read[2:]
 
     def _glance(self) -> dict[str, Any]:
-        """Return the measured force over the whole length (else the asked one), and what came meanwhile; times in s.
-
-        They count from the start. Each stretch has its middle in `t_s` and its least and greatest force in `low_N` and
-        `high_N`, None where not known. All three are empty where no force is known. `limits` and `faults` are spans,
-        from and to, without codes; `marks` are times with their texts.
-        """
+        """Return the measured force over the whole length (else the asked one), and what came meanwhile; times in s."""
         overview = self._overview
         known = overview.series("measured_cf") or overview.series("setpoint_cf")
         spans: dict[str, Any] = {
@@ -196,20 +165,14 @@ class Recorded:
 
 
 def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-    """Read the ticks and the snapshots from `from_ns` to `to_ns`, ns since 1970, both included; either may be empty.
-
-    Raises RecordingError where the file cannot be read or is damaged, or too many messages are in this time.
-    """
+    """Read the ticks and the snapshots from `from_ns` to `to_ns`, ns since 1970, both included; either may be empty."""
     seen, start_ns = file.between(from_ns, to_ns, Moment), file.overview.start_ns
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
     return Moments(ticks, start_ns), Moments(snapshots, start_ns)
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
-    """Return the belief in the newest snapshot up to `at_s`, s since the start, by quantity, without unknown values.
-
-    Empty where that snapshot is over BREAK_S old, there is none, or it tells of no belief.
-    """
+    """Return the belief in the newest snapshot up to `at_s`, s since the start, by quantity, without unknown values."""
     place = (snapshots.newest(np.array([at_s])) or [-1])[0]
     told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
     return {
@@ -220,10 +183,7 @@ def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
 
 
 def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
-    """Return the limits present from `from_s` up to `at_s`, s since the start, the largest share of that time first.
-
-    `now` has the codes that are present at the end. A message's limits hold until the next, for BREAK_S at most.
-    """
+    """Return the limits present from `from_s` up to `at_s`, s since the start, the largest share of that time first."""
     held_s: defaultdict[str, float] = defaultdict(float)
     steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
     for place in shown.within(from_s, at_s):

@@ -23,11 +23,7 @@ MAX_TOLD = 20
 
 
 def report(of: Sequence[RecordingFile]) -> str:
-    """Return one HTML page on these recordings, side by side, in their order; pictures are within it.
-
-    How many there are is not checked. Raises ValueError for a recording without messages, and RecordingError, one too,
-    where its end cannot be read again.
-    """
+    """Return one HTML page on these recordings, side by side, in their order; pictures are within it."""
     names = [each.path.name for each in of]
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
@@ -64,12 +60,7 @@ def _succession(of: Sequence[RecordingFile]) -> list[str]:
 
 
 def _figures(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a table's rows: a name, and a text for each recording.
-
-    They are when it began, UTC, how long it lasts and was enabled, how well the force was followed and for how long.
-    Then come the ranges of forces, counts, scene, device and version. What a recording does not say is empty, or in
-    words.
-    """
+    """Return a table's rows: a name, and a text for each recording."""
 
     def known(each: RecordingFile) -> dict[str, str]:
         overview = each.overview
@@ -110,12 +101,7 @@ def _picture(of: RecordingFile) -> str:
 def _codes(
     of: Sequence[RecordingFile], kind: str, explained: Mapping[Any, Explanation], told: Callable[[Codes, float], str]
 ) -> str:
-    """Return an HTML table of the codes of a kind, "limits" or "faults", that any of the recordings has.
-
-    A row has the code, then for each recording what `told` says of it, empty where it was not there. Then come why, and
-    what to do. `told` is given the code's spans and the recording's length, s. A code that is not `explained` has
-    neither.
-    """
+    """Return an HTML table of the codes of a kind, "limits" or "faults", that any of the recordings has."""
     names = dict.fromkeys(code for each in of for code in each.overview.codes[kind])
     texts = {str(code): known for code, known in explained.items()}
     rows = []
@@ -128,22 +114,16 @@ def _codes(
 
 
 def _held(codes: Codes, lasts_s: float) -> str:
-    """Say for how long a code held, and its share of the recording."""
     held_s = codes.held_ns * 1e-9
     return f"{held_s:.2f} s, {100.0 * held_s / max(lasts_s, 1e-3):.1f}%"
 
 
 def _moments(codes: Codes, _lasts_s: float) -> str:
-    """Say when a code's first MAX_TOLD spans began."""
     more = f" and {len(codes.spans_ns) - MAX_TOLD} more" if len(codes.spans_ns) > MAX_TOLD else ""
     return "at " + ", ".join(f"{begin * 1e-9:.2f}" for begin, _ in codes.spans_ns[:MAX_TOLD]) + f" s{more}"
 
 
 def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each mark, one recording after the other: when, and its text in that recording's column.
-
-    Seconds count from that recording's start.
-    """
     return [
         [f"{(mark.t_ns - each.overview.start_ns) * 1e-9:.2f} s", *(mark.text if it is each else "" for it in of)]
         for each in of
@@ -152,10 +132,7 @@ def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
 
 
 def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each quantity that was believed and acted at any recording's end: its name, and a text for each.
-
-    Value, deviation and unit stand there; empty where it did not act. Reads the files again. Raises as `moments`.
-    """
+    """Return a row for each quantity that was believed and acted at any recording's end: its name, and a text for each."""
     found = []
     for each in of:
         end_ns = each.overview.end_ns
@@ -179,5 +156,4 @@ def _lateness(of: Sequence[RecordingFile]) -> list[list[str]]:
 
 
 def _rows(columns: Sequence[Mapping[str, str]]) -> list[list[str]]:
-    """Return a row for each key of any column, with each column's value, empty where it has none."""
     return [[key, *(column.get(key, "") for column in columns)] for key in dict.fromkeys(k for c in columns for k in c)]

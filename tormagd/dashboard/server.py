@@ -30,13 +30,7 @@ HEADERS = {
 
 
 def application(shown: Live | Recorded) -> web.Application:
-    """Return the web application for a live daemon or a recording. Every route is a GET, for hosts in NAMES only.
-
-    `/` is the page, with files in `/page`, and `/about` what it begins with, as JSON. `/live` streams the events of
-    `Live.browser`, and answers 503 beyond MAX_BROWSERS. `/frame?at_s=` gives a recording's Frame as JSON: 400 for no
-    finite number, 410 where it cannot be read. Of the two only that of `shown` is there. It listens to no daemon, and
-    takes no port.
-    """
+    """Return the web application for a live daemon or a recording."""
 
     async def page(request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / "index.html")
@@ -73,11 +67,7 @@ def application(shown: Live | Recorded) -> web.Application:
 
 
 async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None]) -> None:
-    """Serve the page on LOOPBACK until SIGINT or SIGTERM, then close what is open; `port` 0 takes a free one.
-
-    Calls `ready` once with the page's address. Takes both signals over for this event loop, which has to run in the
-    main thread. `Live.run` is not called here: it has to run beside. Raises OSError where the port is taken.
-    """
+    """Serve the page on LOOPBACK until SIGINT or SIGTERM, then close what is open; `port` 0 takes a free one."""
     over = asyncio.Event()
     runner = web.AppRunner(application(shown), access_log=None, shutdown_timeout=0.5)
     await runner.setup()
@@ -108,7 +98,7 @@ def _json(value: object) -> web.Response:
 
 
 def _seconds(text: str) -> float:
-    """Parse the query's `at_s`, s. Raises HTTPBadRequest, which says what is allowed, where it is no finite number."""
+    """Parse the query's `at_s`, s."""
     try:
         seconds = float(text)
     except ValueError:

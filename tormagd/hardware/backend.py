@@ -30,10 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class BackendError(OSError):
-    """The device is gone, or cannot be opened. The text says what happened.
-
-    `remedy` says what to do; it is empty where the usual advice for the connection's state will do.
-    """
+    """The device is gone, or cannot be opened. The text says what happened."""
 
     def __init__(self, cause: str, remedy: str = "") -> None:
         super().__init__(cause)
@@ -53,10 +50,7 @@ class LinkStatistics(Protocol):
     unsent: int
     """Messages that the wire did not take at once."""
     refused: dict[str, str]
-    """Why the newest refused message was refused, by its name, or by "frame" for bytes that were no message yet.
-
-    For example `{"State": "CRC-8"}`.
-    """
+    """Why the newest refused message was refused, by its name, or by "frame" for bytes that were no message yet."""
 
 
 Stream: TypeAlias = FrameStream | CanStream
@@ -109,12 +103,8 @@ class Chosen(NamedTuple):
 
 
 def installed() -> dict[str, str]:
-    """Load every installed backend plugin; return by its name, sorted, why it does not load, "" where it does.
-
-    A plugin that does not load is logged as a warning: a third party's package stops nobody else. Their modules stay
-    imported. No device is opened, and no setting is looked at. Raises what a module raises besides PLUGIN_ERRORS, such
-    as SystemExit.
-    """
+    """Load every installed backend plugin; return by its name, sorted, why it does not load, "" where it does. Raises
+    what a module raises besides PLUGIN_ERRORS, such as SystemExit."""
     found = {}
     for entry in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         found[entry.name] = ""
@@ -128,10 +118,8 @@ def installed() -> dict[str, str]:
 
 def choose(device: Device, rates: Rates) -> Chosen:
     """Import the backend plugin that `device.backend` names, check the settings, and return it ready to be opened.
-
-    No other plugin is imported, and nothing is opened: `Chosen.open` does that, each time anew. Raises ConfigError
-    where no such plugin is installed, where it does not load, and where it refuses `device.options` or `rates`.
-    """
+    Raises ConfigError where no such plugin is installed, where it does not load, and where it refuses `device.options`
+    or `rates`."""
     found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if device.backend not in found:
         installed_are = f"installed are {', '.join(sorted(found)) or 'none'}"
@@ -148,7 +136,7 @@ def choose(device: Device, rates: Rates) -> Chosen:
 
 
 def _load(entry: metadata.EntryPoint) -> Driver[Any]:
-    """Import the driver of an entry point. Raises TypeError for one that is no Driver, and what its import raises."""
+    """Import the driver of an entry point."""
     loaded = entry.load()
     if not isinstance(loaded, Driver):
         raise TypeError(f"{entry.value} is {loaded!r:.80}: allowed is a {Driver.__module__}.{Driver.__name__}")

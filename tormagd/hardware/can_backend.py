@@ -62,10 +62,7 @@ class CanBackend:
     """
 
     def __init__(self, port: str, options: CanOptions, bus: can.BusABC, held: int | None = None) -> None:
-        """Take over the open `bus`; `close` shuts it down.
-
-        `held` is a descriptor whose lock keeps other programs from the adapter; `close` closes it. None: no lock.
-        """
+        """Take over the open `bus`; `close` shuts it down."""
         self._port, self._options, self._bus, self._held = port, options, bus, held
         self._fd: int = bus.fileno()
         self.stream = CanStream(options.node)
@@ -76,16 +73,10 @@ class CanBackend:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Counters since the bus was opened."""
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the node's messages among the frames that have arrived, in their order; none where none has.
-
-        Takes FRAMES_AT_ONCE frames at most; the others wait. Frames that cannot be read are counted as corrupt.
-        `stream.received` is begun anew and holds the node's frames. Raises BackendError when the bus is off or gone, or
-        when another host drives the node: then the messages before are lost.
-        """
+        """Return the node's messages among the frames that have arrived, in their order; none where none has."""
         self.stream.received = []
         messages: list[Message] = []
         for _ in range(FRAMES_AT_ONCE):
@@ -109,12 +100,7 @@ class CanBackend:
         return messages
 
     def send(self, message: Message) -> None:
-        """Hand one frame to the bus, and keep it in `stream.sent`, also where the bus does not take it.
-
-        A frame that the bus does not take at once is dropped, and counted as unsent: the next tick has a newer one.
-        Raises BackendError when the bus is off or gone, and for each untaken frame after UNSENT_FRAMES in a row. Raises
-        EncodeError for a value that does not fit the wire.
-        """
+        """Hand one frame to the bus, and keep it in `stream.sent`, also where the bus does not take it."""
         identifier, data = self.stream.pack(message)
         frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
         if self._writable.poll(0):
@@ -134,10 +120,7 @@ class CanBackend:
             )
 
     def close(self) -> None:
-        """Shut the bus down and drop the adapter's lock; it may be called again.
-
-        Errors of a bus that is gone are ignored. Afterwards neither `receive` nor `send` works.
-        """
+        """Shut the bus down and drop the adapter's lock; it may be called again."""
         with contextlib.suppress(can.CanError, OSError):
             self._bus.shutdown()
         if isinstance(self._bus, slcanBus):  # its shutdown talks to the adapter first, and if that fails keeps the port
@@ -155,11 +138,7 @@ class CanBackend:
         return f"check the device's supply, wiring, termination and bit rate ({self._options.bitrate})"
 
     def _unpack(self, frame: can.Message) -> Message | None:
-        """Return the message in a frame; None for one that is foreign, damaged or not from the device.
-
-        What is damaged, and an error frame, counts as corrupt; extended, remote and FD frames are nobody's and not
-        counted. Raises BackendError on bus-off, and when another host drives the node.
-        """
+        """Return the message in a frame; None for one that is foreign, damaged or not from the device."""
         if frame.is_error_frame:
             if frame.arbitration_id & BUS_OFF or self._bus.state is can.BusState.ERROR:
                 raise BackendError(
@@ -187,11 +166,7 @@ class CanBackend:
 
 
 def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
-    """Refuse an interface that is not installed, fails to load or has no descriptor, and a bit rate that is too low.
-
-    The bit rate has to carry `rates.control_hz` exchanges a second at MAX_LOAD. Imports the interface's driver, and
-    opens nothing; `device` is not looked at. Raises ConfigError.
-    """
+    """Refuse an interface that is not installed, fails to load or has no descriptor, and a bit rate that is too low."""
     interface = options.interface
     if interface not in BACKENDS:
         raise ConfigError(
@@ -219,12 +194,7 @@ def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
 
 
 def open_can(device: Device, options: CanOptions) -> CanBackend:
-    """Open `device.port` through `options.interface`; a slcan adapter is locked first, so that one program holds it.
-
-    Files of python-can's own configuration are not read. Raises BackendError saying why not, and what to do where that
-    is known; nothing stays open then. Call `check_can` before: what a driver raises that does not load is not caught
-    here.
-    """
+    """Open `device.port` through `options.interface`; a slcan adapter is locked first, so that one program holds it."""
     name = f"{options.interface} {device.port}"
     held = None
     try:
@@ -256,12 +226,6 @@ DRIVER = Driver(CanOptions, open_can, check_can)
 
 
 def _of_the_interface(options: CanOptions) -> dict[str, Any]:
-    """Return the arguments by name that `can.Bus` takes for `options.interface` alone; none for one not named here.
-
-    With them `recv(0)` does not block; an interface that is not named here must not block by itself. On socketcan only
-    frames of `options.node` are then received. slcan opens its port at `options.baud`. udp_multicast does not leave
-    this machine.
-    """
     fitting: dict[str, dict[str, Any]] = {
         # other nodes' frames need not wake the daemon
         "socketcan": {"can_filters": [{"can_id": options.node, "can_mask": 0xF, "extended": False}]},
@@ -278,11 +242,7 @@ def _bring_up(port: str, options: CanOptions) -> str:
 
 
 def _hold(path: str) -> int:
-    """Open `path` and return a descriptor that holds the lock of pyserial's exclusive ports; python-can takes none.
-
-    The lock lasts until the caller closes the descriptor. Never waits. Raises OSError, a BlockingIOError where another
-    program has the lock; nothing stays open then.
-    """
+    """Open `path` and return a descriptor that holds the lock of pyserial's exclusive ports; python-can takes none."""
     descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -293,10 +253,7 @@ def _hold(path: str) -> int:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """Return the errno of the system's error behind one of python-can's; None where there is none.
-
-    It is the first above 0, from `error` on along `__cause__`: an error raised without `from` is not looked behind.
-    """
+    """Return the errno of the system's error behind one of python-can's; None where there is none."""
     while error is not None:
         number = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
         if number is not None and number > 0:  # a resolver's errors have numbers of their own, under 0

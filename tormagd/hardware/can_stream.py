@@ -31,16 +31,12 @@ class SecondHostError(Exception):
 
 
 class CanStream:
-    """Both directions of one conversation with one node. A frame that does not decode is counted, never raised.
-
-    `statistics` are of the frames of this node; what the bus itself discards is not seen. Error frames count as
-    corrupt. `lost` counts the States that are missing from their counter. A repeated State is returned, not counted.
-    """
+    """Both directions of one conversation with one node. A frame that does not decode is counted, never raised."""
 
     __match_args__: ClassVar = ("node", "statistics", "_states", "_drives", "_synchronised")
 
     def __init__(self, node: int) -> None:
-        """Begin a conversation with `node`. Raises EncodeError for a node outside 0..15."""
+        """Begin a conversation with `node`."""
         self.node = node
         self.statistics = FramingStatistics()
         self._identifiers = {message: can_identifier(function, node) for message, function in FUNCTION.items()}
@@ -53,11 +49,7 @@ class CanStream:
         """The newest outgoing frame."""
 
     def pack(self, message: Message) -> tuple[int, bytes]:
-        """Return a message's CAN identifier and data, and keep both in `sent` until the next call.
-
-        A Drive's data are also kept among the last ECHOES, to know its echo by. Raises EncodeError for a value that
-        does not fit the wire; `sent` is then as before.
-        """
+        """Return a message's CAN identifier and data, and keep both in `sent` until the next call."""
         data = encode(message)
         if isinstance(message, Drive):
             self._drives.append(data)
@@ -66,11 +58,7 @@ class CanStream:
 
     def unpack_all(self, frames: Iterable[tuple[int, bytes]]) -> list[Message]:
         """Return the messages in frames (identifier, data), in their order, as `unpack` of each; UNREADABLE counts as
-        corrupt.
-
-        For recorded frames: this node's are added to `received`, which may not be `frames` itself. Raises
-        SecondHostError as `unpack`; the frames behind are then not read.
-        """
+        corrupt."""
         messages: list[Message] = []
         for identifier, data in frames:
             if identifier == UNREADABLE[0]:
@@ -80,13 +68,7 @@ class CanStream:
         return messages
 
     def unpack(self, identifier: int, data: bytes) -> Message | None:
-        """Return the message in a frame; None for a frame of another node, of a host, or one that does not decode.
-
-        Frames with this node's number are added to `received`. Of these the device's messages count in `statistics`,
-        and a frame that does not decode counts as corrupt. The device's first message after a corrupt frame counts as a
-        resynchronisation, a gap in the States' counter as lost States. Raises SecondHostError for a Drive to this node
-        that is not the echo of one of the last ECHOES sent.
-        """
+        """Return the message in a frame; None for a frame of another node, of a host, or one that does not decode."""
         if identifier & 0xF != self.node:
             return None
         self.received.append((identifier, data))

@@ -49,15 +49,10 @@ class Traffic(Protocol):
 
 
 class Connection:
-    """The connection to one device, over as many openings of its port as it takes.
-
-    Its state changes only in calls, `receive` and `exchange` once a control period each; it has no clock and no timers.
-    Times `now_s` are s of one clock that only rises. Whenever a running device is lost, it counts the loss, logs a
-    warning and calls `on_loss`; `close` does not.
-    """
+    """The connection to one device, over as many openings of its port as it takes."""
 
     def __init__(self, device: Device, open_backend: Callable[[], Backend], on_loss: Callable[[], None]) -> None:
-        """Begin closed. `on_loss` is called whenever `state` leaves RUNNING, but not by `close`."""
+        """Begin closed."""
         self._device, self._open_backend, self._on_loss = device, open_backend, on_loss
         self._backend: Backend | None = None
         self._stream: Stream | None = None
@@ -76,16 +71,11 @@ class Connection:
 
     @property
     def state(self) -> LinkState:
-        """The state of the conversation while the port is open; else CLOSED, BACK_OFF or LOST."""
         return self._waiting if self._link is None else self._link.state
 
     @property
     def cause(self) -> str:
-        """Why the device does not run, or what a measurement still lacks; empty when it runs and is measured.
-
-        Without an open port it says why the port is not open. For a device that sends no Identity it also says whether
-        it is silent or sends something else, and which messages were refused.
-        """
+        """Why the device does not run, or what a measurement still lacks; empty when it runs and is measured."""
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return self._cause
@@ -115,21 +105,14 @@ class Connection:
 
     @property
     def measurement(self) -> Measurement | None:
-        """The newest measurement; None unless the device runs and has sent all that a measurement needs."""
         return self._link.measurement if self._link is not None and self._link.state is LinkState.RUNNING else None
 
     @property
     def pending(self) -> DeviceRequest:
-        """The request that the device has not acknowledged, also of a device that is lost; NONE where there is none."""
         return self._unfinished if self._link is None else self._link.pending
 
     def open(self, now_s: float) -> None:
-        """Open the port and begin a conversation, in which an unfinished RETRACT is sent again; tell `traffic` so.
-
-        Where the port does not open, `exchange` tries again later, and `cause` says why. That is logged, the same
-        reason as before for debugging only. Call `close` before another `open`: a port that is open is not closed by
-        it. Raises what a plugin's backend raises besides BackendError.
-        """
+        """Open the port and begin a conversation, in which an unfinished RETRACT is sent again; tell `traffic` so."""
         try:
             self._backend = self._open_backend()
         except BackendError as error:
@@ -151,11 +134,7 @@ class Connection:
         self._notice()
 
     def receive(self, now_s: float) -> None:
-        """Read what has come from the device, and hand it to `traffic` and the conversation; never wait.
-
-        What came shows in `state` and `measurement`. Nothing happens while the port is closed. A port that fails is
-        closed, as a loss; a later `exchange` opens it again. BackendError is not raised.
-        """
+        """Read what has come from the device, and hand it to `traffic` and the conversation; never wait."""
         backend, link = self._backend, self._link
         if backend is None or link is None:
             return
@@ -173,14 +152,7 @@ class Connection:
     def exchange(
         self, now_s: float, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
     ) -> None:
-        """Send this period's Drive to a running device, then the Hello or command that is due; tell `traffic`.
-
-        Opens the port first when it is wanted and time to, and closes a port that fails or whose device is lost. A
-        `request` is taken once for each new `number`, as soon as the port is open. Unless it is RETRACT, it is dropped
-        where the device does not run then. Duties are -1..1, positive opens. The link's quality is renewed when that is
-        due. Call it after `receive`, so that what has come by then does not count as silence. Raises EncodeError for a
-        value that does not fit the wire; BackendError is not raised.
-        """
+        """Send this period's Drive to a running device, then the Hello or command that is due; tell `traffic`."""
         if self._link is None and self._waiting is not LinkState.CLOSED and now_s >= self._reopen_s:
             self.open(now_s)
         link, backend = self._link, self._backend
@@ -209,46 +181,26 @@ class Connection:
             self._lose(now_s, link.cause, "")
 
     def close(self) -> None:
-        """Close the port; it stays closed until `open`.
-
-        `traffic` is told, if a port was open; `on_loss` is not called. What this conversation has pending is dropped,
-        RETRACT too. A running device hears no more Drives, and opens its gap by its own command timeout. It may be
-        called again.
-        """
+        """Close the port; it stays closed until `open`."""
         self._release()
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
         self._seen = LinkState.CLOSED
 
     def memory(self) -> Any:
-        """Return the conversation's state as plain data, from which `remember` continues it elsewhere.
-
-        That is `requested`, the newest request's number, and `link` and `stream` as `exact.plain` gives them. What the
-        wire holds is not in it. None while the port is closed, and for a backend without a stream.
-        """
+        """Return the conversation's state as plain data, from which `remember` continues it elsewhere."""
         if self._link is None or self._stream is None:
             return None
         return {"requested": self._requested, "link": plain(self._link), "stream": plain(self._stream)}
 
     def remember(self, memory: Any, known: Kinds) -> None:
-        """Continue a conversation from `memory`, which `memory()` returned, on this connection's open port.
-
-        `known` are the types that `memory` may contain. A change of state that it brings is no loss and not logged.
-        Raises InexactError for data that fit no known type, and LookupError or TypeError for `memory` of another form,
-        such as None. The state is then set in part: drop the connection.
-        """
+        """Continue a conversation from `memory`, which `memory()` returned, on this connection's open port."""
         self._requested = memory["requested"]
         restore(self._link, memory["link"], known)
         restore(self._stream, memory["stream"], known)
         self._seen = self.state
 
     def report(self) -> LinkReport:
-        """Return the link's report for `status`; None in it for what is not known yet or needs an open port.
-
-        Without an open port `refused` is empty. Counters are those since the port was last opened; `losses` and
-        `last_loss`, the cause of the newest, are of all openings. `unanswered_share` and `damaged_share` are of the
-        link's newest judgement. `repeated` has the States that the link dropped, too. Half of the shortest round trip,
-        a State's way, is taken off the clock's offset. Changes nothing.
-        """
+        """Return the link's report for `status`; None in it for what is not known yet or needs an open port."""
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
         round_trip = None if link is None else link.round_trip.report()
@@ -285,10 +237,7 @@ class Connection:
             sent.append(self._stream.sent)
 
     def _lose(self, now_s: float, cause: str, remedy: str) -> None:
-        """End the conversation as lost for `cause`, close the port, and wait in LOST until it is opened again.
-
-        The unacknowledged request is remembered. A device that ran counts as a loss, which is told once.
-        """
+        """End the conversation as lost for `cause`, close the port, and wait in LOST until it is opened again."""
         assert self._link is not None, "only an open port can be lost"
         self._link.lose(cause)
         self._notice()
@@ -297,10 +246,7 @@ class Connection:
         self._wait(now_s, LinkState.LOST, cause, remedy)
 
     def _release(self) -> None:
-        """Close the backend and tell `traffic`; forget link and stream, with what the link has pending.
-
-        Without an open one nothing happens. `state` is then what `_wait` or `close` sets.
-        """
+        """Close the backend and tell `traffic`; forget link and stream, with what the link has pending."""
         if self._backend is not None:
             self._backend.close()
             if self.traffic is not None:
@@ -314,12 +260,7 @@ class Connection:
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
 
     def _notice(self) -> None:
-        """Act on a change of state since the last call, if there was one.
-
-        When RUNNING begins, the back-off begins anew. When RUNNING has ended, the loss is counted, its cause kept, and
-        `on_loss` called. Both are logged, and so are REFUSED and UNANSWERED. Call it after each change: two at once
-        count as the second alone.
-        """
+        """Act on a change of state since the last call, if there was one."""
         before, state = self._seen, self.state
         if state is before:
             return
@@ -337,10 +278,7 @@ class Connection:
 
 
 def clock_report(fit: ClockReport | None, way_s: float = 0.0) -> ClockReport | None:
-    """Return a clock's fit, rounded for `status`; None for None.
-
-    `way_s` is how long the clock's messages were on their way, s; it is taken off the offset.
-    """
+    """Return a clock's fit, rounded for `status`; None for None."""
     if fit is None:
         return None
     return ClockReport(

@@ -22,26 +22,17 @@ class FrameStream:
 
     @property
     def statistics(self) -> FramingStatistics:
-        """Counters since the conversation began."""
         return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
-        """Return a message's frame, with the next sequence number, 0..255, and keep it in `sent` until the next call.
-
-        Raises EncodeError for a value that does not fit the wire; number and `sent` are then as before.
-        """
+        """Return a message's frame, with the next sequence number, 0..255, and keep it in `sent` until the next call."""
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         self.sent = frame
         return frame
 
     def unpack(self, data: bytes) -> list[Message]:
-        """Return the valid messages that `data` completes, in their order, and keep `data` in `received`.
-
-        An incomplete frame waits for the next bytes. A frame that does not decode is counted as corrupt;
-        `statistics.refused` says why. A frame that repeats the last byte for byte gives no message. Raises nothing for
-        any bytes.
-        """
+        """Return the valid messages that `data` completes, in their order, and keep `data` in `received`."""
         self.received = data
         messages: list[Message] = []
         for frame in self._decoder.feed(data):

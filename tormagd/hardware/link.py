@@ -41,9 +41,7 @@ SILENT_S: Final = 0.08
 UNANSWERED_S: Final = 1.0
 "A device that has sent no Identity for this long gets a Hello only every HELLO_S: it may be another make's."
 FIRST_NONCE: Final = 255
-"""The nonce of a Hello until a command is acknowledged. Commands count from 1 to 254, so that theirs always differs.
-
-A device shows 0 after a reset."""
+"""The nonce of a Hello until a command is acknowledged. Commands count from 1 to 254, so that theirs always differs."""
 OVERTAKEN: Final = 16
 "A State whose counter is behind by less than this repeats an earlier one, or was overtaken; it is no measurement."
 
@@ -60,16 +58,7 @@ _COMMANDS: Final[dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]]] 
 
 
 class LinkState(StrEnum):
-    """Where a connection stands. In CLOSED, BACK_OFF and LOST the port is not open.
-
-    CLOSED       never opened, or closed on purpose
-    BACK_OFF     the port did not open
-    IDENTIFYING  the device is asked who it is
-    UNANSWERED   the device has not answered for UNANSWERED_S
-    REFUSED      the firmware has another protocol schema
-    RUNNING      the device is known, and is sent Drives
-    LOST         the port failed, or a running device fell silent
-    """
+    """Where a connection stands. In CLOSED, BACK_OFF and LOST the port is not open."""
 
     CLOSED = "CLOSED"
     BACK_OFF = "BACK_OFF"
@@ -89,12 +78,7 @@ _NO_REQUEST: Final = DeviceRequest.NONE
 
 @final
 class DeviceLink:
-    """One conversation with a device, from the opening of the port to its loss. A new opening needs a new link.
-
-    It keeps `state` and its `cause`, the device's `identity`, the pending request, and the newest messages, of which it
-    makes a measurement. `round_trip`, `clock` and `quality` tell how the wire carries. No I/O and no clock: times
-    `now_s` are s of one clock of the host, which only rises.
-    """
+    """One conversation with a device, from the opening of the port to its loss. A new opening needs a new link."""
 
     __match_args__: ClassVar = (
         "_acknowledged", "_asked_s", "_broken", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
@@ -114,11 +98,7 @@ class DeviceLink:
 
     def _begin(self, now_s: float, cause: str) -> None:
         """Begin to identify the device, at first and after a reset or a replacement, and forget all that was known of
-        it.
-
-        `cause` becomes the link's. A pending RETRACT stays; any other request is dropped. A Hello is due at
-        once. The Drives' counter, the counts of Drives and States, and `repeated` go on.
-        """
+        it."""
         self.state = _IDENTIFYING
         self.cause = cause
         self.identity: Identity | None = None
@@ -138,7 +118,6 @@ class DeviceLink:
         self._told: Status | None = None
         self._is_measured = False
         self._measurement: Measurement | None = None
-        """Made from the following fields when it is asked for; None when they have changed since."""
         self._number = 0
         self._received_s = 0.0
         self._sensed_s = 0.0
@@ -153,27 +132,17 @@ class DeviceLink:
 
     @property
     def measurement(self) -> Measurement | None:
-        """The newest State, with the newest Sense and Status; None until a State follows the first of both.
-
-        It is None again once `due` has acted on a reset or a replacement of the device. It stays while the device is
-        silent, and after `lose`: `received_s` says how old it is. A Status that first says HOMED counts from the next
-        State on, whose positions have the new origin.
-        """
+        """The newest State, with the newest Sense and Status; None until a State follows the first of both."""
         if self._measurement is None and self._is_measured:
             self._measurement = self._measured()
         return self._measurement
 
     @property
     def pending(self) -> DeviceRequest:
-        """The request that the device has not acknowledged; NONE where there is none."""
         return self._request
 
     def receive(self, now_s: float, message: Message) -> None:
-        """Take one message that came from the device at `now_s`: State, Sense, Status or Identity.
-
-        Any message ends silence, and UNANSWERED, so that the next `due` has a Hello; others do no more. An Identity
-        leads to RUNNING or REFUSED. A reset or a replacement changes `state` only at the next `due`.
-        """
+        """Take one message that came from the device at `now_s`: State, Sense, Status or Identity."""
         self._heard_s = now_s
         if self.state is _UNANSWERED:
             self.state = _IDENTIFYING
@@ -188,13 +157,7 @@ class DeviceLink:
             self._take_identity(message)
 
     def due(self, now_s: float) -> list[Message]:
-        """Return the Hello or the command to send at `now_s`, after the period's Drive; often none.
-
-        A command is repeated every REPEAT_S until it is acknowledged. A Hello is repeated as often until the device is
-        known, then every HELLO_S, but not beside a command. First, `state` changes on silence, a reset, a replacement
-        or a missing Identity, and a Home or Clear is given up after GIVE_UP_S. The newest Drive is noted as sent at
-        `now_s`. What is returned counts as sent.
-        """
+        """Return the Hello or the command to send at `now_s`, after the period's Drive; often none."""
         self.round_trip.drive(self._drives % 256, now_s)
         self._change_state(now_s)
         is_waiting = False
@@ -214,31 +177,18 @@ class DeviceLink:
         return messages
 
     def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
-        """Return the next Drive, with the next counter, 0..255; it counts as sent.
-
-        Duties are -1..1 of the supply voltage; positive opens. They are checked where the Drive is encoded, and that
-        the device runs is not checked at all. Call `due` after it, which notes when it was sent.
-        """
+        """Return the next Drive, with the next counter, 0..255; it counts as sent."""
         self._drives += 1
         return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._drives % 256)
 
     def request(self, now_s: float, request: DeviceRequest) -> None:
-        """Ask the device for a routine: `due` repeats the command until a Status acknowledges it.
-
-        The command waits until the device runs and has sent a Status. Replaces an unacknowledged request; NONE only
-        ends it. HOME and CLEAR are given up GIVE_UP_S after `now_s`, and when the device is reset or replaced. RETRACT
-        is given up when the device has latched a fault. `pending` says whether it still waits.
-        """
+        """Ask the device for a routine: `due` repeats the command until a Status acknowledges it."""
         self._nonce = _next_nonce(self._nonce)
         self._request = request
         self._request_due_s = self._requested_s = now_s
 
     def missing(self, refused: Mapping[str, str]) -> str:
-        """Return what a measurement of a running device still lacks, as in "no Sense yet, State refused: CRC-8".
-
-        `refused` says by a message's name why the newest was refused, as the backend's statistics have it. Empty where
-        there is a measurement, and where the device does not run.
-        """
+        """Return what a measurement of a running device still lacks, as in "no Sense yet, State refused: CRC-8"."""
         if self.state is not _RUNNING or self._is_measured:
             return ""
         lacking: list[str] = []
@@ -248,30 +198,19 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Renew `quality`, which the measurement carries from then on, from the backend's counters, where that is due.
-
-        These count frames received and damaged, and messages not taken at once, since the port was opened; they only
-        grow.
-        """
+        """Renew `quality`, which the measurement carries from then on, from the backend's counters, where that is due."""
         if self._quality_watch.is_due(now_s):
             counts = Counts(self._drives, self._states, frames, damaged, unsent)
             self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
             self._measurement = None
 
     def lose(self, cause: str) -> None:
-        """End the conversation in LOST, from any state: the port failed, for `cause`.
-
-        The last measurement and a pending request stay readable; nothing begins this conversation again.
-        """
+        """End the conversation in LOST, from any state: the port failed, for `cause`."""
         self.state = LinkState.LOST
         self.cause = cause
 
     def _change_state(self, now_s: float) -> None:
-        """Identify a device anew that was reset or replaced; else enter LOST or UNANSWERED, and say why in `cause`.
-
-        LOST is for a running device that is silent, UNANSWERED for no Identity within UNANSWERED_S of asking. Where
-        none of these is, nothing changes.
-        """
+        """Identify a device anew that was reset or replaced; else enter LOST or UNANSWERED, and say why in `cause`."""
         # the break was heard a tick ago: so the core has seen the measurement that shows it, and names it better
         if self._broken:
             self._begin(now_s, self._broken)
@@ -283,11 +222,7 @@ class DeviceLink:
             self.cause = f"the device has not said who it is for {UNANSWERED_S:g} s"
 
     def _take_identity(self, identity: Identity) -> None:
-        """Keep an Identity: enter RUNNING, or REFUSED for another protocol schema, from any state.
-
-        Round trips learn from it, as `RoundTrip.identity`, how far Drive and State counters are apart. Another serial
-        number than before is noted as a replacement of the device, which the next `due` acts on.
-        """
+        """Keep an Identity: enter RUNNING, or REFUSED for another protocol schema, from any state."""
         self.round_trip.identity()
         known, self.identity = self.identity, identity
         if known is not None and known.serial_number != identity.serial_number:
@@ -303,12 +238,7 @@ class DeviceLink:
             )
 
     def _take_status(self, now_s: float, status: Status) -> None:
-        """Keep a Status: end an acknowledged request, and note a reset or how late the device obeys.
-
-        How late is the age of the first Drive that the device does not obey yet, 0 unless it is in RUN. Of this Status
-        and the last the lesser age is measured. The first Status says from where nonces count on. A RETRACT also ends
-        when the device has latched. A reset, nonce 0 after another, is acted on by the next `due`.
-        """
+        """Keep a Status: end an acknowledged request, and note a reset or how late the device obeys."""
         if self._status is None:
             # an earlier host has counted this far; its last number again would be taken for a repetition
             self._nonce = _next_nonce(status.command_nonce)
@@ -337,10 +267,7 @@ class DeviceLink:
             self._measurement = None
 
     def _take_sense(self, now_s: float, sense: Sense) -> None:
-        """Keep a Sense and the time at which it came; once there are measurements, add the handle's travel to them.
-
-        The handle is taken to have gone the shortest way, under half of HANDLE_SPAN_MM.
-        """
+        """Keep a Sense and the time at which it came; once there are measurements, add the handle's travel to them."""
         # Sense follows the State of the same instant; the measurement takes the newest of both
         self._sensed_s = now_s
         previous = self._sense
@@ -350,12 +277,7 @@ class DeviceLink:
         self._sense = sense
 
     def _take_state(self, now_s: float, state: State) -> None:
-        """Take a State into the measurement, its positions and time unwrapped, and feed round trips and clock.
-
-        A State that repeats an earlier one or was overtaken is only counted in `repeated`. The first State after a
-        Status and a Sense begins the measurements; States before that one give no positions. Between two States the
-        time went on by under DEVICE_TIME_SPAN_S, positions by under half of POSITION_SPAN_MM.
-        """
+        """Take a State into the measurement, its positions and time unwrapped, and feed round trips and clock."""
         previous = self._state
         if previous is not None and (previous.counter - state.counter) % 256 < OVERTAKEN:
             self.repeated += 1
@@ -377,10 +299,7 @@ class DeviceLink:
         self.clock.add(now_s, self._device_time_s)
 
     def _begin_measuring(self, now_s: float, state: State) -> None:
-        """Begin measurements with this State, as number 0 and with its positions and time as they are.
-
-        The handle begins at 0 mm. Nothing happens while a Status or a Sense is still missing.
-        """
+        """Begin measurements with this State, as number 0 and with its positions and time as they are."""
         if self._status is None or self._sense is None:
             return
         self._is_measured = True
@@ -391,12 +310,7 @@ class DeviceLink:
         self._right_mm = state.right_position_mm
 
     def _measured(self) -> Measurement:
-        """Return a Measurement of the newest State and Sense, and of the newest Status that counts for this State.
-
-        A Status that first tells of a homing counts only from the next State on: the newest one is still of the old
-        origin. Call it only once measurements have begun: until then Sense or Status may be missing, which fails an
-        assertion.
-        """
+        """Return a Measurement of the newest State and Sense, and of the newest Status that counts for this State."""
         sense, status = self._sense, self._told
         assert sense is not None, "measuring begins with a Sense"
         assert status is not None, "measuring begins with a Status"
@@ -431,5 +345,4 @@ def _next_nonce(nonce: int) -> int:
 
 
 def _unwrapped(previous: float, value: float, span: float) -> float:
-    """Return the shortest way from `previous` to `value` on a circle of `span`, with its sign."""
     return (value - previous + span / 2.0) % span - span / 2.0

@@ -20,14 +20,7 @@ LOSES: Final = 0.02
 
 @final
 class LinkQuality(Value):
-    """How well the wire carried in the last second.
-
-    unanswered     share of the Drives that no State answered
-    damaged        share of the received frames that were damaged
-    unsent         messages that the wire did not take at once, as a share of the Drives
-    round_trip_s   the usual time from a Drive to its State, the lesser of the last two looks'; 0 while unknown
-    clock_drift    by which share the device's clock runs fast; 0 while unknown, -1 for a clock that stands
-    """
+    """How well the wire carried in the last second."""
 
     def __init__(
         self,
@@ -45,7 +38,6 @@ class LinkQuality(Value):
 
     @property
     def is_lossy(self) -> bool:
-        """Tell whether any of the three shares is above LOSES."""
         return self.unanswered > LOSES or self.damaged > LOSES or self.unsent > LOSES
 
     def __str__(self) -> str:
@@ -60,10 +52,7 @@ UNKNOWN_QUALITY: Final = LinkQuality()
 
 @final
 class Counts(Value):
-    """Counters of one conversation, which only grow.
-
-    Drives sent, States that were news, frames received whole and damaged, messages that the wire did not take at once.
-    """
+    """Counters of one conversation, which only grow."""
 
     def __init__(self, drives: int = 0, states: int = 0, frames: int = 0, damaged: int = 0, unsent: int = 0) -> None:
         self.drives: Final = drives
@@ -75,10 +64,7 @@ class Counts(Value):
 
 @final
 class LinkWatch:
-    """The figures of one conversation, renewed every LOOKED_S from its counters.
-
-    It keeps the counters of the last looks, and when the next is due.
-    """
+    """The figures of one conversation, renewed every LOOKED_S from its counters."""
 
     __match_args__: ClassVar = ("_counts", "_due_s", "_round_trip_s")
 
@@ -92,12 +78,7 @@ class LinkWatch:
         return now_s >= self._due_s
 
     def look(self, now_s: float, counts: Counts, round_trip_s: float, clock_drift: float) -> LinkQuality:
-        """Return the quality over the last LOOKS looks, or all so far; the next look is due LOOKED_S after `now_s`.
-
-        `counts` are the counters now, since the conversation began. `round_trip_s` is the usual one now; the quality
-        has the lesser of this and the last look's, 0 at the first. Shares are 0..1, and 0 at the first look and where
-        nothing was sent or received. `clock_drift` is handed on. Whether a look is due is not checked.
-        """
+        """Return the quality over the last LOOKS looks, or all so far; the next look is due LOOKED_S after `now_s`."""
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)
         before = self._counts[0]
@@ -116,5 +97,4 @@ class LinkWatch:
 
 
 def _share(part: int, whole: int, of_none: float = 0.0) -> float:
-    """Return part / whole, at most 1; `of_none` where the whole is 0."""
     return min(part / whole, 1.0) if whole > 0 else of_none

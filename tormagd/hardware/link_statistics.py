@@ -40,16 +40,7 @@ Windows: TypeAlias = Sequence[tuple[float, float]]
 
 @final
 class RoundTrip:
-    """Times from a Drive that is handed to the wire until its State has been read, s.
-
-    A State does not name the Drive that it answers. The device answers in order: the State before an Identity answers
-    the last Drive before the Hello. That fixes how far the two counters are apart. A Drive that is lost later, or not
-    answered, moves them further apart.
-
-    A Status names the last Drive that the device accepted. Round trips count only once a Status confirms them. Where it
-    contradicts them, all are forgotten but that of the Drive it names. One lost Drive alone looks like
-    an answer that is still on its way. Round trips are then one period too long until the next Identity.
-    """
+    """Times from a Drive that is handed to the wire until its State has been read, s."""
 
     __match_args__: ClassVar = (
         "_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure",
@@ -57,7 +48,6 @@ class RoundTrip:
 
     def __init__(self) -> None:
         self._sent_s = [math.inf] * 256
-        "A Drive that never went out has no round trip."
         self._newest = 0
         self._before_hello: int | None = None
         self._state: int | None = None
@@ -73,10 +63,7 @@ class RoundTrip:
         self._sent_s[counter] = now_s
 
     def since_next_s(self, counter: int, now_s: float) -> float:
-        """Return the time since the Drive after the one with this counter, 0..255, went out, s.
-
-        0 where none came after it, or none ever had the next counter.
-        """
+        """Return the time since the Drive after the one with this counter, 0..255, went out, s."""
         return 0.0 if counter == self._newest else max(0.0, now_s - self._sent_s[(counter + 1) % 256])
 
     def hello(self) -> None:
@@ -84,22 +71,14 @@ class RoundTrip:
         self._before_hello = self._newest
 
     def identity(self) -> None:
-        """Note that the Identity for the newest Hello came: it fixes how far Drive and State counters are apart.
-
-        Without a Hello or a State before, nothing is fixed. A second Identity for the same Hello does nothing. Round
-        trips that are known stay.
-        """
+        """Note that the Identity for the newest Hello came: it fixes how far Drive and State counters are apart."""
         if self._before_hello is not None and self._state is not None:
             self._lead = self._before_hello - self._state
         self._before_hello = None
 
     def state(self, counter: int, now_s: float) -> None:
         """Note that the State with this counter, 0..255, came at `now_s`; its round trip counts once a Status confirms
-        it.
-
-        A State that would answer a Drive which is not sent yet shows that the counters do not match. Then no round trip
-        is taken until a Status or an Identity matches them again. A repeated State is not known as one: leave it out.
-        """
+        it."""
         self._state, self._newest_s = counter, now_s
         lead = self._lead
         if lead is None:
@@ -111,11 +90,7 @@ class RoundTrip:
             self._lead = None
 
     def status(self, drive_counter: int) -> None:
-        """Take the counter of the last Drive that the device accepted: count the round trips since the last Status.
-
-        Where the counter, 0..255, contradicts them, or is the first, drop all round trips and count this Drive's alone,
-        up to the newest State. Before the first State nothing happens.
-        """
+        """Take the counter of the last Drive that the device accepted: count the round trips since the last Status."""
         state, lead = self._state, self._lead
         if state is None:
             return
@@ -136,23 +111,16 @@ class RoundTrip:
 
     @property
     def usual_s(self) -> float:
-        """The median of the newest USUAL_OF round trips, or of fewer while there are fewer, s; 0 while none is known.
-
-        A device that stood still once answers all waiting Drives late, which a mean would call a slow line.
-        """
+        """The median of the newest USUAL_OF round trips, or of fewer while there are fewer, s; 0 while none is known."""
         ordered_s = sorted(list(self._recent)[-USUAL_OF:])
         return ordered_s[len(ordered_s) // 2] if ordered_s else 0.0
 
     @property
     def least_s(self) -> float:
-        """The shortest of the recent round trips, s; 0 while none is known."""
         return min(self._recent, default=0.0)
 
     def report(self) -> dict[str, float] | None:
-        """Return `least`, `p50` (median) and `p99` of the recent round trips, us to 0.1; None while none is known.
-
-        The newest ROUND_TRIPS count, however long ago they were.
-        """
+        """Return `least`, `p50` (median) and `p99` of the recent round trips, us to 0.1; None while none is known."""
         ordered_s = sorted(self._recent)
         if not ordered_s:
             return None
@@ -162,11 +130,7 @@ class RoundTrip:
 
 @final
 class DeviceClock:
-    """The device's clock against the host's, by regression over the least delayed State of each half second.
-
-    The line starts from a median of slopes (Theil 1950, of halves), so that a quarter of the windows may be wrong by
-    any amount. Windows far from this line are left out of the least squares that follow.
-    """
+    """The device's clock against the host's, by regression over the least delayed State of each half second."""
 
     __match_args__: ClassVar = ("_ends_s", "_least", "_newest_s", "_standing", "_windows", "drift")
 
@@ -182,11 +146,7 @@ class DeviceClock:
         """By which share the clock runs fast, over DRIFT_WINDOWS; 0 while unknown, -1 for a clock that stands."""
 
     def add(self, host_s: float, device_s: float) -> None:
-        """Take a State that was latched at `device_s` on the device's clock, unwrapped, and read at `host_s`, s.
-
-        Renews `drift` when a window of WINDOW_S ends, and sets it to -1 after more than STANDING repetitions of one
-        time. `host_s` has to rise, which is not checked.
-        """
+        """Take a State that was latched at `device_s` on the device's clock, unwrapped, and read at `host_s`, s."""
         if device_s != self._newest_s:
             self._newest_s, self._standing = device_s, 0
         else:
@@ -200,22 +160,14 @@ class DeviceClock:
             self._least = (offset_s, host_s)
 
     def fit(self) -> ClockReport | None:
-        """Return the line of the host's time less the device's; None where no line fits yet.
-
-        It goes through the last half minute, or from when the clock was set. Nothing is rounded, and `offset_s` has the
-        State's way in it. A line takes MIN_WINDOWS windows, three seconds; the window that is not over yet does not
-        count. It is computed once a window.
-        """
+        """Return the line of the host's time less the device's; None where no line fits yet."""
         if not self._is_fitted:
             self._fit = _newest_line(list(self._windows))
             self._is_fitted = True
         return self._fit
 
     def _turn(self, host_s: float) -> None:
-        """End the window and begin the next at `host_s`: keep the least delayed State, if one came, and renew `drift`.
-
-        `drift` is 0 where no line fits the last DRIFT_WINDOWS. That of a clock that stands stays at -1.
-        """
+        """End the window and begin the next at `host_s`: keep the least delayed State, if one came, and renew `drift`."""
         if self._least[0] < math.inf:
             self._windows.append(self._least)
             self._is_fitted = False
@@ -227,11 +179,7 @@ class DeviceClock:
 
 
 def _newest_line(windows: Windows) -> ClockReport | None:
-    """Return the line through the newest of `windows`, which are in the order of time; None where no line fits.
-
-    The line is tried through all windows, then without the older half, and so on while MIN_WINDOWS are left. It fits
-    with a residual under MAX_RESIDUAL_US and one of the NEWEST_WINDOWS on it. None also for fewer than MIN_WINDOWS.
-    """
+    """Return the line through the newest of `windows`, which are in the order of time; None where no line fits."""
     # no line fits across a clock that was set, or stood still for a while: the older half is dropped until one does
     while len(windows) >= MIN_WINDOWS:
         fit, is_left = _robust_line(windows)
@@ -242,11 +190,7 @@ def _newest_line(windows: Windows) -> ClockReport | None:
 
 
 def _robust_line(windows: Windows) -> tuple[ClockReport, bool]:
-    """Return the line through the windows, in the order of time, and whether all of the NEWEST_WINDOWS lie off it.
-
-    Windows further than OUTLIER deviations from a line of median slope and level are left out. Raises
-    ZeroDivisionError, IndexError or ValueError for fewer than two windows, or two at one time.
-    """
+    """Return the line through the windows, in the order of time, and whether all of the NEWEST_WINDOWS lie off it."""
     newest_s = windows[-1][1]
     half = len(windows) // 2
     slope = _median([(b[0] - a[0]) / (b[1] - a[1]) for a, b in zip(windows, windows[-half:], strict=False)])

@@ -22,17 +22,7 @@ def _is_set(bits: int, place: int) -> bool:
 
 @final
 class Measurement(Value):
-    """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s.
-
-    Three streams make it, and any of them may stop. On the host's clock, `received_s` is when the newest State came.
-    `sensed_s` is when the newest Sense came (currents, force, handle), `reported_s` the newest Status (mode, switches,
-    faults, temperature, supply). `device_time_s` is the device's own clock, unwrapped from an arbitrary start.
-    `handle_mm` is the travel of the roller's surface, unwrapped. `number` counts the states since the device was
-    identified.
-
-    `delay_s` is the age of the first Drive that a Status does not show obeyed yet, at most the way there and back. It
-    is the lesser of the last two Statuses', and 0 unless the device is in RUN. `link` is how well the wire carries.
-    """
+    """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s."""
 
     def __init__(
         self,
@@ -77,11 +67,7 @@ class Measurement(Value):
     @property
     def is_finite(self) -> bool:
         """Tell whether the numbers are finite and small enough to compute with: the root of their squares' sum is at
-        most 1e10.
-
-        False for NaN. The codec gives no others; the backend of a plugin may. The three shares of `link` are not looked
-        at.
-        """
+        most 1e10."""
         link = self.link
         # one comparison, as it stands in every tick: a sum of squares with NaN is not less, and nothing cancels
         squares = (
@@ -105,22 +91,18 @@ class Measurement(Value):
 
     @property
     def is_homed(self) -> bool:
-        """Tell whether the device says that it knows where its carriages are."""
         return _is_set(self.switches, _HOMED)
 
     @property
     def is_left_open(self) -> bool:
-        """Tell whether the left carriage is at its open switch."""
         return _is_set(self.switches, _LEFT_OPEN)
 
     @property
     def is_right_open(self) -> bool:
-        """Tell whether the right carriage is at its open switch."""
         return _is_set(self.switches, _RIGHT_OPEN)
 
     @property
     def is_busy(self) -> bool:
-        """Tell whether the device homes or opens by its own routine, and takes no drive commands."""
         return self.mode in _BUSY
 
     @property

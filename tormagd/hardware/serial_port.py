@@ -18,10 +18,7 @@ UNSENT_BYTES: Final = 512
 
 @final
 class SerialPort:
-    """An open, exclusively held serial port and the conversation on it: a `Backend`. Nothing here waits.
-
-    It keeps the bytes that the driver has not taken yet.
-    """
+    """An open, exclusively held serial port and the conversation on it: a `Backend`. Nothing here waits."""
 
     def __init__(self, port: serial.Serial) -> None:
         self._port = port
@@ -31,15 +28,10 @@ class SerialPort:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Counters since the port was opened."""
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the valid messages in the next READ_BYTES bytes that have arrived; none where none has.
-
-        Further bytes, and an incomplete frame, wait for the next call. What is damaged is counted in `statistics`.
-        Raises BackendError when the device was unplugged or the port cannot be read.
-        """
+        """Return the valid messages in the next READ_BYTES bytes that have arrived; none where none has."""
         try:
             # `read` on an empty terminal waits for a kernel worker (flush_to_ldisc), up to 100 ms on a busy machine
             if not self._port.in_waiting:
@@ -50,11 +42,7 @@ class SerialPort:
         return self.stream.unpack(data)
 
     def send(self, message: Message) -> None:
-        """Write one frame behind what the driver had not taken yet; bytes that it does not take now are kept.
-
-        A call after which bytes are left counts in `statistics.unsent`; the next call sends them. Raises BackendError
-        when the port is gone or more than UNSENT_BYTES wait, and EncodeError for a value that does not fit the wire.
-        """
+        """Write one frame behind what the driver had not taken yet; bytes that it does not take now are kept."""
         data = self._unsent + self.stream.pack(message)
         try:
             written = os.write(self._fd, data)
@@ -69,10 +57,7 @@ class SerialPort:
             raise BackendError(f"{self._port.port}: nobody reads at the other end")
 
     def close(self) -> None:
-        """Close the port and drop its lock; unsent bytes are discarded. Never waits, and may be called again.
-
-        Errors of a device that is gone are ignored.
-        """
+        """Close the port and drop its lock; unsent bytes are discarded."""
         # closing would wait for unsent bytes, up to half a minute
         with contextlib.suppress(OSError, termios.error):
             self._port.reset_output_buffer()

@@ -15,11 +15,7 @@ log = logging.getLogger(__name__)
 
 
 def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
-    """Return the latency timer of the port with the path `port`, or of the port that a link leads to, ms.
-
-    `sysfs` is the folder of the drivers' ports. None where the port does not exist, has none, or the timer cannot be
-    read. Nothing is opened but the timer's file.
-    """
+    """Return the latency timer of the port with the path `port`, or of the port that a link leads to, ms."""
     try:
         return int((sysfs / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii"))
     except (OSError, ValueError):
@@ -27,11 +23,7 @@ def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
 
 
 def make_prompt(port: serial.Serial, sysfs: Path = SYSFS) -> None:
-    """Set the latency timer of an open port to 1 ms, where it has one that is longer.
-
-    It asks the driver for ASYNC_LOW_LATENCY, which needs no rights beyond the open port; the file in sysfs, which needs
-    root's, is only read. A timer that stays longer is logged as a warning, and raises nothing.
-    """
+    """Set the latency timer of an open port to 1 ms, where it has one that is longer."""
     found_ms = latency_ms(port.port, sysfs)
     if found_ms is None or found_ms <= PROMPT_MS:
         return

@@ -30,12 +30,7 @@ SHARES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure this machine for a configuration, print the result as one JSON object, and return the exit code.
-
-    `arguments` None takes those of the process. The code is 0, or 1 where stdout cannot be written. It is 2 for a
-    configuration that is refused, or whose scene does not fit it: stderr names why, and stdout stays empty. It takes
-    some seconds. Wrong usage raises SystemExit(2). What else `measured` raises passes.
-    """
+    """Measure this machine for a configuration, print the result as one JSON object, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tormagd.headroom", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's configuration")
     options = parser.parse_args(arguments)
@@ -48,17 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
-    """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer for `timer_s`.
-
-    `timer_s` is in s of real time. `core_s` is the virtual time, s, that the core's calls are taken from; repeating
-    them takes as long again in real time. The result has `machine_us`, a median, `build`, as `build` returns it,
-    `step_us`, `plan_us` and `bare`. `bare` has `rate_hz`, `lateness_us`, `missed_share` (0..1) and `not_granted`, a
-    sentence for each thing that the kernel refused. `step_us`, `plan_us` and `lateness_us` are as `quantiles`.
-
-    Gives this thread the daemon's scheduling, and freezes the collector's objects, for good. Raises ConfigError where
-    scene and configuration do not fit each other, OSError where the kernel gives no timer, and what `calls` raises. A
-    `core_s` under half a period gives no calls, and raises IndexError.
-    """
+    """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer for `timer_s`."""
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority
     late, cost = uvloop.run(_in_real_time(config, timer_s, steps, plans))
@@ -79,23 +64,19 @@ def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
 async def _in_real_time(
     config: Config, timer_s: float, steps: list[Call], plans: list[Call]
 ) -> tuple[Lateness, CoreCost]:
-    """Run the bare timer and then the core's calls in one thread: the first asks for the scheduling of both."""
     rate_hz = config.rates.control_hz
     return await lateness(config.realtime, rate_hz, timer_s), await core_cost(steps, plans, rate_hz)
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Return `mean`, `p50`, `p99`, `p999` and `max` of `values`, in their unit, rounded to 0.1, in this order.
-
-    `values` has one at least: an empty list raises IndexError. Between two values a quantile is linear. NaN gives NaN.
-    """
+    """Return `mean`, `p50`, `p99`, `p999` and `max` of `values`, in their unit, rounded to 0.1, in this order."""
     return {"mean": round(float(np.mean(values)), 1)} | {
         name: round(float(np.percentile(values, share)), 1) for name, share in SHARES.items()
     }
 
 
 def build() -> str:
-    """Return which build of the core this interpreter runs: `compiled` or `interpreted`. Warns as `settle`."""
+    """Return which build of the core this interpreter runs: `compiled` or `interpreted`."""
     return "compiled" if settle().is_compiled else "interpreted"
 
 

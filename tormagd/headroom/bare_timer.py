@@ -29,14 +29,7 @@ class Lateness(NamedTuple):
 
 
 async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
-    """Call `on_beat` in every period until `ended` is set; missed beats are told in its arguments.
-
-    `on_beat` gets the heartbeat, the number of beats that this call stands for, 1 or more, and the time. The caller has
-    asked for the thread's scheduling (`prepare`), and runs an event loop that can wait for a file. Freezes the garbage
-    collector's present objects, for good. Beats go on until the loop comes back here, so one more may come after
-    `ended`. What `on_beat` raises, the event loop only logs; the beat goes on. Cancelled, it leaves the timer open.
-    Raises OSError where the kernel gives no timer.
-    """
+    """Call `on_beat` in every period until `ended` is set; missed beats are told in its arguments."""
     heartbeat = Heartbeat(period_ns)
 
     def woken() -> None:
@@ -53,13 +46,7 @@ async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
 
 
 async def lateness(realtime: RealTime, rate_hz: int, seconds: float) -> Lateness:
-    """Measure for `seconds` how late a bare timer of `rate_hz` beats: return each beat's lateness, us.
-
-    `seconds` are counted in beats, missed ones too; WARM_UP_BEATS are left out, and come before them. Returns also how
-    many beats were missed, which have no lateness, and what scheduling of `realtime` the kernel refused; empty where it
-    granted all. Asks the kernel for that scheduling. The thread keeps what it was granted, and the process its frozen
-    garbage. Raises OSError as `beat`.
-    """
+    """Measure for `seconds` how late a bare timer of `rate_hz` beats: return each beat's lateness, us."""
     not_granted = prepare(realtime)
     late_us: list[float] = []
     missed = -WARM_UP_BEATS

@@ -37,13 +37,7 @@ class CoreCost(NamedTuple):
 
 
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
-    """Run `core` for `seconds` of virtual time on a pulse; return the calls of `step` and of `plan`, one each a tick.
-
-    `config` is the core's, which is not checked. The device is the simulated PLANT, armed before the `seconds`; the
-    pulse is that of SWING_SHARE. The calls act on the stages of a second loop, armed in the same way. So make each
-    once, in their order, a tick's plan before its step. `core` itself does not change. Less than half a period gives no
-    calls. Raises RuntimeError or RefusedError if a device does not arm, DomainError as `ClosedLoop.tick`.
-    """
+    """Run `core` for `seconds` of virtual time on a pulse; return the calls of `step` and of `plan`, one each a tick."""
     period_s = 1.0 / config.rates.control_hz
     # stages change in place, so the calls are repeated on those of another loop, which has come as far
     loop, again = _armed(config, core), _armed(config, core)
@@ -65,23 +59,14 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
 
 
 def _armed(config: Config, core: Core) -> ClosedLoop:
-    """Return a new loop of `core` on the simulated PLANT, armed: homed and enabled, without a setpoint.
-
-    `core` does not change, and its loops share nothing that does. `config` is the core's, which is not checked. Raises
-    RuntimeError or RefusedError where it does not arm.
-    """
+    """Return a new loop of `core` on the simulated PLANT, armed: homed and enabled, without a setpoint."""
     loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
     loop.arm()
     return loop
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
-    """Repeat one plan and one step a beat until all are done, and return the processor time of each, us.
-
-    There are as many plans as steps, in the order of `calls`, which is not checked; none give empty lists. What they
-    return is dropped. The caller has asked for the thread's scheduling. No call may raise: the event loop would only
-    log the error, and the same beat be repeated for ever. Freezes the garbage as `beat` does. Raises OSError as `beat`.
-    """
+    """Repeat one plan and one step a beat until all are done, and return the processor time of each, us."""
     found = CoreCost([], [])
     ended = asyncio.Event()
 

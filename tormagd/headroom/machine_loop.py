@@ -48,10 +48,7 @@ def work() -> tuple[float, float, int]:
 
 
 def machine_us(repetitions: int = REPETITIONS) -> float:
-    """Return the median processor time of one round of `work`, us, of this thread, after one that does not count.
-
-    There are `repetitions` rounds, 1 at least: 0 raises StatisticsError, a ValueError.
-    """
+    """Return the median processor time of one round of `work`, us, of this thread, after one that does not count."""
     work()
     taken_ns = []
     for _ in range(repetitions):

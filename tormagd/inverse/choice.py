@@ -31,12 +31,7 @@ BESIDE_PLANS = ("thesis",)
 def named(
     solver: str, step_mT: float | None = None, neighbours: int | None = None, reason: str = "named by the scene"
 ) -> Choice:
-    """Return the choice of a search by its name; None stands for its usual grid step, mT, or number of neighbours.
-
-    `solver` is one of RUNTIME_SOLVERS. A setting that the search lacks is 0 in the choice; `reason` goes in as it is.
-    Raises `DomainError` for an unknown name, and for a setting given that the search does not have. The value of a
-    setting is not checked here, but by `build`; a fraction of a neighbour is cut off.
-    """
+    """Return the choice of a search by its name; None stands for its usual grid step, mT, or number of neighbours."""
     require_that(solver in _USUAL, "solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
     settings = []
     for key, given, usual in zip(("step_mT", "neighbours"), (step_mT, neighbours), _USUAL[solver], strict=True):
@@ -46,16 +41,7 @@ def named(
 
 
 def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel, *, rises: bool) -> FieldSolver:
-    """Build the chosen search over a range of fields, mT, and return it.
-
-    `rises`: every curve of the model rises over the whole range, which the caller has found out. "newton" is a
-    RisingSearch, "nearest" and "torch" are a NearestFieldSearch, "thesis" is RowByRow with the model's mean error as
-    epsilon. `choice` is one that `named` returned: a name of no search is built as "thesis". "torch" and "thesis"
-    import torch, and hold it to one thread, for the whole process. They ask `model`; the others ask the curve that they
-    are given. Raises `DomainError` where the settings do not fit, the range does not rise, and where torch is needed
-    and not installed. It is raised, too, for "newton" without `rises`, and for "thesis" where the model states no mean
-    error.
-    """
+    """Build the chosen search over a range of fields, mT, and return it."""
     if choice.solver == "newton":
         require_that(rises, "solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")
         return RisingSearch(field_range_mT)
@@ -73,10 +59,7 @@ def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel
 
 
 def mean_error_N(model: ForceModel) -> float:
-    """Return the mean absolute error of the model's force in its training's validation, N.
-
-    Raises `DomainError` where the model file states none.
-    """
+    """Return the mean absolute error of the model's force in its training's validation, N."""
     name, metrics = "validation_mae_N", model.metadata.metrics
     require_that(name in metrics, name, "missing in the model's metrics", "a model that states its mean error")
     return metrics[name]

@@ -17,12 +17,7 @@ Batch = Callable[[ForceCurve], Floats]
 
 
 def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[np.float64]:
-    """Return fields from least to greatest, mT, evenly spaced by `step_mT` or a little less, both ends included.
-
-    `field_range_mT` is the least and the greatest field. Raises `DomainError` unless both are finite and the least is
-    below the greatest. Also for a step that is NaN, not above 0, greater than the range, or makes more than
-    MAX_GRID_POINTS.
-    """
+    """Return fields from least to greatest, mT, evenly spaced by `step_mT` or a little less, both ends included."""
     low, high = field_range_mT
     require_number("field_range_mT", low)
     require_number("field_range_mT", high)
@@ -37,21 +32,7 @@ def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[n
 
 
 class NearestFieldSearch:
-    """Nearest-neighbour search of the field (section 4.2.6 of the thesis), vectorised and continuous.
-
-    The force is evaluated at every field of a grid at once. Candidates are the `neighbours` points of the grid that are
-    nearest in force. Where predicted and asked force cross beside a candidate, the root takes its place, by linear
-    interpolation: the answer is not bound to the grid. Without a crossing, candidates count that are as near as the
-    best within rounding, and so does the point nearest the last field. That is so on plateaus, at touching points and
-    at the ends of reach.
-
-    The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where the force
-    rises with the field there is one root, and one neighbour finds it. Where it also falls there are several, each on a
-    branch of its own. With too few neighbours all candidates may then lie on another branch than the last field's.
-
-    `fields_mT` is an even grid, as `field_grid` makes it. `batch` gives the forces on the grid; None: the curve does.
-    Raises `DomainError` unless `neighbours` is 1 to the number of grid points.
-    """
+    """Nearest-neighbour search of the field (section 4.2.6 of the thesis), vectorised and continuous."""
 
     def __init__(self, fields_mT: NDArray[np.float64], neighbours: int = 8, batch: Batch | None = None) -> None:
         self._fields_mT, self._batch = fields_mT, batch
@@ -61,13 +42,7 @@ class NearestFieldSearch:
         self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`; of several the one nearest `last_field_mT`, or the least where that is None.
-
-        A force out of reach gets the field of the grid that comes nearest; `reach` says so. A last field may lie out of
-        range; the answer does not. The predicted force is the curve's there, also where a `batch` searched.
-        `iterations` is 2. Keeps nothing from call to call. Raises `DomainError` for numbers that are not finite or too
-        large.
-        """
+        """Return the field for `force_N`; of several the one nearest `last_field_mT`, or the least where that is None."""
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
         forces_N = curve.forces_N(self._fields_mT) if self._batch is None else self._batch(curve)
         candidates, reach = self._candidates(forces_N - force_N, near, tie_N(curve))
@@ -75,12 +50,7 @@ class NearestFieldSearch:
         return answer(curve, field_mT, force_N, curve.force_N(field_mT), 2, reach)
 
     def _candidates(self, excess_N: Floats, near_mT: float, same_N: float) -> tuple[NDArray[np.float64], Reach]:
-        """Return the fields that fit equally well, mT, and whether the force asked is in reach.
-
-        `excess_N` is the predicted less the asked force at each grid point. Forces within `same_N` of each other are
-        equal. Roots between grid points are among the fields; the grid point nearest `near_mT` is, where it fits as
-        well. The fields come in no order, and may repeat; there is one at least.
-        """
+        """Return the fields that fit equally well, mT, and whether the force asked is in reach."""
         fields = self._fields_mT
         below = excess_N < 0
         crosses = below[1:] != below[:-1]

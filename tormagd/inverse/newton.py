@@ -19,13 +19,7 @@ MAX_EVALUATIONS: Final = 60
 
 @final
 class RisingSearch:
-    """Newton's method from the last field, or else from the least, in a bracket that begins as the whole range.
-
-    A rising force has one root at most. A step to or past an end of the range evaluates the force at that end, once.
-    Any other step out of the bracket is replaced by a bisection, and so is one of over half the step before. The answer
-    is the root to `ACCURACY_MT`, or the nearer end for a force out of reach; after `MAX_EVALUATIONS` it is where the
-    search stands. Raises `DomainError` unless the range is finite and rises.
-    """
+    """Newton's method from the last field, or else from the least, in a bracket that begins as the whole range."""
 
     def __init__(self, field_range_mT: tuple[float, float]) -> None:
         low_mT, high_mT = field_range_mT
@@ -37,15 +31,7 @@ class RisingSearch:
         self._high_mT = high_mT
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`. The search begins at `last_field_mT`, or at the least field where it is None.
-
-        The field is the root to ACCURACY_MT, and the predicted force is the curve's there. A last field out of range
-        counts as the end that it lies beyond. A force out of reach gets the nearer end of the range; `reach` says so.
-        `iterations` is 1 to a little over MAX_EVALUATIONS. Where these do not suffice, the field where the search
-        stands is the answer, and `reach` is INSIDE. Keeps nothing from call to call. A curve that falls somewhere is
-        not noticed: any of its roots, or an end, may be the answer. Raises `DomainError` for numbers that are not
-        finite or too large.
-        """
+        """Return the field for `force_N`."""
         low, high = self._low_mT, self._high_mT
         span = high - low
         field = checked_near_mT(force_N, last_field_mT, low)

@@ -17,12 +17,7 @@ torch.set_num_threads(1)  # a second thread costs more than it saves at these si
 
 
 def batch(model: ForceModel, fields_mT: Floats) -> Batch:
-    """Return a function from a curve to the forces of `model`, N, at all `fields_mT` (n), in one pass in torch.
-
-    The forces (n) are in the order of the fields, in an array of their own for each call. Of the curve it takes
-    displacement, rate and share of iron only, unchecked: they are not held within what the model knows. The weights and
-    fields are copied: later changes do not count. Two threads must not call it at once.
-    """
+    """Return a function from a curve to the forces of `model`, N, at all `fields_mT` (n), in one pass in torch."""
     network, rows = to_network(model), torch.zeros((len(fields_mT), len(FEATURES)), dtype=torch.float64)
     rows[:, FIELD] = torch.from_numpy(fields_mT)
     others = torch.tensor([column for column in range(len(FEATURES)) if column != FIELD])
@@ -38,11 +33,7 @@ def batch(model: ForceModel, fields_mT: Floats) -> Batch:
 
 
 def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
-    """Return a function from a curve and one field, mT, to the force of `model`, N: a pass in torch for one row.
-
-    Of the curve it takes displacement, rate and share of iron only. Nothing is checked, or held within what the model
-    knows: NaN gives NaN. The weights are copied: later changes of the model do not count.
-    """
+    """Return a function from a curve and one field, mT, to the force of `model`, N: a pass in torch for one row."""
     network = to_network(model)
 
     def force_N(curve: ForceCurve, field_mT: float) -> float:
@@ -54,13 +45,7 @@ def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
 
 
 class RowByRow:
-    """The thesis's search: one field of a grid after the other from the least, until |F - NN| <= epsilon.
-
-    `fields_mT` (n >= 1) rise, which is not checked. `predict_N` evaluates a row: `row` of a model, as the thesis did
-    it, or the curve's own `force_N`. Where no row is within `epsilon_N`, the nearest is the answer. The search knows no
-    continuity: the last field is checked, not used. Raises `DomainError` unless `epsilon_N` is a finite number, 0 or
-    more.
-    """
+    """The thesis's search: one field of a grid after the other from the least, until |F - NN| <= epsilon."""
 
     def __init__(self, fields_mT: Floats, epsilon_N: float, predict_N: Callable[[ForceCurve, float], float]) -> None:
         require_number("epsilon_N", epsilon_N)
@@ -69,13 +54,7 @@ class RowByRow:
         self._epsilon_N, self._predict_N = epsilon_N, predict_N
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest.
-
-        Of the rows up to there, the nearest in force is the answer; of two alike, the first. `reach` is INSIDE where a
-        row is within epsilon, or rows lie on both sides. It is BELOW where all rows give more than `force_N`, ABOVE
-        where none does. `iterations` counts the rows evaluated. `last_field_mT` may be None; it is checked and not
-        used. Raises `DomainError` for numbers that are not finite or too large.
-        """
+        """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest."""
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0
         for field_mT in self._fields_mT:

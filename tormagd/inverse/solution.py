@@ -18,11 +18,7 @@ class Reach(StrEnum):
 
 @final
 class FieldSolution(Value):
-    """The field for a force, and the force that the model predicts there.
-
-    `confidence` is 0..1 (see `ForceCurve.confidence`). `iterations` counts the evaluations of the curve, one after the
-    other; a pass over a whole grid of fields is one.
-    """
+    """The field for a force, and the force that the model predicts there."""
 
     def __init__(
         self, field_mT: float, predicted_force_N: float, confidence: float, iterations: int, reach: Reach
@@ -36,10 +32,7 @@ class FieldSolution(Value):
 
 @final
 class Question(Value):
-    """A question to a search in a process of its own: at which field does the brake give `force_N`?
-
-    Asked at `time_s`, for a handle at this displacement and rate; of several fields the one nearest `last_field_mT`.
-    """
+    """A question to a search in a process of its own: at which field does the brake give `force_N`?"""
 
     def __init__(
         self, time_s: float, displacement_mm: float, rate_mm_s: float, force_N: float, last_field_mT: float
@@ -68,20 +61,11 @@ class FieldSolver(Protocol):
     """A search for the field at which the brake gives `force_N`."""
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`; of several, the one nearest `last_field_mT`, or the least where that is None.
-
-        A force out of reach gets the field that comes nearest; `reach` says so. Raises `DomainError` naming an argument
-        that is not finite, or too large.
-        """
+        """Return the field for `force_N`; of several, the one nearest `last_field_mT`, or the least where that is None."""
 
 
 def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float) -> float:
-    """Check the arguments of a search; return the field that its answer should be near, mT.
-
-    That is the last field, or `least_mT`, the opener gap, where it is None. It is not held within the search's range.
-    Raises `DomainError` naming `last_field_mT`, for either field, or `force_N` where it is not finite, or beyond
-    LARGEST.
-    """
+    """Check the arguments of a search; return the field that its answer should be near, mT."""
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):
         require_number("last_field_mT", near_mT)
@@ -90,20 +74,13 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
 
 
 def tie_N(curve: ForceCurve) -> float:
-    """Return the difference of force, N, up to which two forces of `curve` count as equal: its rounding error.
-
-    It is the same for all fields of the curve.
-    """
+    """Return the difference of force, N, up to which two forces of `curve` count as equal: its rounding error."""
     return TIE * curve.magnitude_N
 
 
 def answer(
     curve: ForceCurve, field_mT: float, force_N: float, predicted_N: float, iterations: int, reach: Reach
 ) -> FieldSolution:
-    """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence.
-
-    The confidence is the curve's at `field_mT`, 0..1, less the further the two forces are apart. `iterations` and
-    `reach` go in as they are. Nothing is checked, and the curve's force is not evaluated.
-    """
+    """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence."""
     trust = curve.confidence(field_mT, force_N - predicted_N)
     return FieldSolution(field_mT, predicted_N, trust, iterations, reach)

@@ -14,12 +14,7 @@ class LabError(ValueError):
 
 def not_installed(module: str) -> str:
     """Return the sentence `PACKAGE is not installed: COMMAND`, for the module `module`; whether it is missing is not
-    checked.
-
-    PACKAGE is pip's name, by PACKAGE_OF where it differs. COMMAND installs tormagd's extra `lab`. For a packaged
-    tormagd it installs that package alone, in the version that tormagd needs, into the folder of tormagd. Raises
-    PackageNotFoundError for a packaged tormagd without its metadata.
-    """
+    checked."""
     package = PACKAGE_OF.get(module, module)
     library = Path(__file__).resolve().parents[2]
     if library.name == "tormagd" and not (library / "pyproject.toml").exists():  # a folder of its own, as packaged

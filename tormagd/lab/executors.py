@@ -17,10 +17,7 @@ ResultT = TypeVar("ResultT")
 
 
 def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> None:
-    """Add the options `--workers`, 1..1024, and `--dask ADDRESS` to `parser`; without the latter `dask` is None.
-
-    `workers` is the default, and not checked. `needed` says in the help what a cluster's workers must have installed.
-    """
+    """Add the options `--workers`, 1..1024, and `--dask ADDRESS` to `parser`; without the latter `dask` is None."""
     parser.add_argument("--workers", type=WORKERS, default=workers, help="processes on this machine (%(default)s)")
     parser.add_argument(
         "--dask", metavar="ADDRESS", help=f"scheduler of a Dask cluster instead; its workers need {needed}"
@@ -30,12 +27,7 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 @contextmanager
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
     """Give the executor that `options.workers` and `options.dask` ask for, as a context: processes here, or a Dask
-    cluster.
-
-    `dask` None: so many new processes of this machine, which inherit nothing of this one. The end of the context waits
-    for all runs, and ends the processes, or lets the cluster go. Raises OSError where no scheduler answers at `dask`,
-    LabError for one that is no address, and ModuleNotFoundError where Dask is not installed.
-    """
+    cluster."""
     if options.dask is None:
         # a fork of this process would inherit the locks of libraries' threads, but not the threads
         with ProcessPoolExecutor(options.workers, get_context("forkserver")) as here:
@@ -56,12 +48,7 @@ def finished(
     executor: Executor, function: Callable[[ItemT], ResultT], items: Iterable[ItemT], unit: str
 ) -> Iterator[tuple[ItemT, "Future[ResultT]"]]:
     """Run `function` on every item; yield each item with its done future, in order of completion, beside a progress
-    bar.
-
-    All items are handed to `executor` at the first step. An error of a run stays in its future: `result()` raises it,
-    and the other runs go on. A process here that dies fails all runs that are left. A caller that stops iterating
-    cancels the runs that have not begun. The bar counts `unit`, on stderr, and only on a terminal.
-    """
+    bar."""
     pending = {executor.submit(function, item): item for item in items}
     try:
         for future in tqdm(as_completed(pending), total=len(pending), unit=unit, disable=None):

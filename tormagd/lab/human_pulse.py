@@ -22,11 +22,7 @@ EDGE_S = 0.5
 
 def measured_pulse() -> Array:
     """Return heartpy's recording (n, some 25 s) as shipped, at SOURCE_HZ, in the light sensor's own unit, which is no
-    force.
-
-    The file is read anew each time. Raises ModuleNotFoundError where heartpy is not installed, OSError where its file
-    is missing, ValueError for a cell that is no number.
-    """
+    force."""
     # found, not imported: heartpy's import fails beside a current setuptools
     package = importlib.util.find_spec("heartpy")
     if package is None or package.origin is None:
@@ -36,13 +32,7 @@ def measured_pulse() -> Array:
 
 def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int) -> tuple[Array, Array]:
     """Return times, s, and forces, N (both n), of the pulse scaled to `least_N`..`most_N`, which this part just
-    reaches.
-
-    It is low-passed without lag, and lasts `duration_s` at `rate_hz`. Times begin at 0, EDGE_S into the recording.
-    Forces are not checked: with `most_N` the smaller the pulse is upside down. Raises ValueError where the recording,
-    less EDGE_S at both ends, is shorter than `duration_s`, and for no sample at all. Raises ModuleNotFoundError and
-    OSError as `measured_pulse`.
-    """
+    reaches."""
     raw = measured_pulse()
     smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=SOURCE_HZ, output="sos"), raw)
     # both ends of a filtered signal carry the filter's guesses
@@ -57,20 +47,12 @@ def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int
 
 def scaled(values: Array, least: float, most: float) -> Array:
     """Return `values` (n) mapped linearly so that they range from `least` to `most`; with `most` the smaller they are
-    mirrored.
-
-    The given array stays. Values that are all equal are not refused: they give NaN, with NumPy's RuntimeWarning. A NaN
-    among them makes all NaN. Raises ValueError where there are none.
-    """
+    mirrored."""
     found: Array = least + (values - values.min()) / np.ptp(values) * (most - least)
     return found
 
 
 def recorded(folder: str) -> list[Path]:
-    """Return the CSV files of `folder`, sorted by name, within the folder of measured data that TORMAG_DATA names.
-
-    The result is empty where this variable of the environment is not set, or there is no such folder. Nothing is
-    opened.
-    """
+    """Return the CSV files of `folder`, sorted by name, within the folder of measured data that TORMAG_DATA names."""
     data = os.environ.get("TORMAG_DATA")
     return sorted((Path(data) / folder).glob("*.csv")) if data else []

@@ -18,10 +18,7 @@ from tormagd.simulation.plant import Plant
 
 
 def put_gap(plant: Plant, gap_mm: float) -> None:
-    """Move both carriages of `plant` at once, each by half the way, to the gap `gap_mm`; screws and encoders follow.
-
-    `gap_mm` is not checked, and no stop holds the carriages. Speeds and currents stay as they are.
-    """
+    """Move both carriages of `plant` at once, each by half the way, to the gap `gap_mm`; screws and encoders follow."""
     before_mm, lead_mm_rad = plant.gap_mm, plant.parameters.screw.lead_mm / math.tau
     for axis in (plant.left, plant.right):
         # the screw turns with the carriage, so the encoder sees it
@@ -31,10 +28,7 @@ def put_gap(plant: Plant, gap_mm: float) -> None:
 
 @final
 class IdealCarriages(Actuator):
-    """Actuator that moves the gap of one simulated device directly; the device's motors rest.
-
-    Holds the scene's gaps, the core's top speed, and `reference`: where the gap was put, and how fast it went there.
-    """
+    """Actuator that moves the gap of one simulated device directly; the device's motors rest."""
 
     def __init__(self, core: Core, plant: Plant) -> None:
         super().__init__()
@@ -62,12 +56,7 @@ class IdealCarriages(Actuator):
         is_over: bool,
     ) -> Drive:
         """Put the gap of the simulated device where `plan` wants it at `now_s`, set `reference` to it, and return
-        duties of 0.
-
-        The gap goes no further than the top speed reaches in `dt_s`, above 0, which is not checked. Where that falls
-        short, the result has the limit RATE. `plan` None holds the gap, within the scene's. While `is_over`, a force
-        over the ceiling, it opens, with or without a plan. `measurement` and `measured` play no part.
-        """
+        duties of 0."""
         before_mm = self._plant.gap_mm
         wanted_mm = self._open_mm if is_over else min(max(before_mm, self._closed_mm), self._open_mm)
         if plan is not None and not is_over:

@@ -62,13 +62,7 @@ MIN_GAIN = 0.1
 
 
 class Drive(NamedTuple):
-    """Drive of the gap, as accelerations of the gap, mm/s^2; opening is positive.
-
-    Full voltage gives `stall_mm_s2` at rest and `per_s` less for each mm/s; the current limit allows `most_mm_s2`.
-    Against it stand the gearbox's friction `gear_mm_s2`, a share `mesh_loss` of all beyond that, and the nut's load.
-    The load is the magnets' pull, `pull_mm_s2_N` for each newton, and the guides' drag; `screw_friction` of it is
-    friction besides. All friction brakes too.
-    """
+    """Drive of the gap, as accelerations of the gap, mm/s^2; opening is positive."""
 
     stall_mm_s2: float
     per_s: float
@@ -82,22 +76,17 @@ class Drive(NamedTuple):
 
     def highest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
         """Return the largest speed `dt_s` after this gap and speed, mm/s: of opening at full voltage, against the
-        magnets' pull. `dt_s` is at most 1 / per_s."""
+        magnets' pull."""
         return self._sped_up(self.pull_mm_s2_N * self.pull_N.at(gap_mm), speed_mm_s, dt_s)
 
     def lowest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
         """Return the smallest speed `dt_s` after this gap and speed, mm/s: of closing at full voltage, with the
-        magnets' pull. `dt_s` is at most 1 / per_s."""
+        magnets' pull."""
         return -self._sped_up(-self.pull_mm_s2_N * self.pull_N.at(gap_mm), -speed_mm_s, dt_s)
 
     def _sped_up(self, pull_mm_s2: float, speed_mm_s: float, dt_s: float) -> float:
         """Return the speed of the gap, mm/s, `dt_s` after `speed_mm_s`, at full voltage to open against the pull
-        `pull_mm_s2`.
-
-        It is the largest that can be reached; opening is positive, the pull too where it closes. A gap that closes
-        brakes, and may turn round within the step. It stands, at 0, where friction is more than what is left over.
-        `dt_s` is above 0 and at most 1 / `per_s`; that is not checked.
-        """
+        `pull_mm_s2`."""
         if speed_mm_s < 0.0:
             braking = self._acceleration(pull_mm_s2, speed_mm_s, -1.0)
             if speed_mm_s + braking * dt_s <= 0.0:
@@ -110,12 +99,7 @@ class Drive(NamedTuple):
 
     def _acceleration(self, pull_mm_s2: float, speed_mm_s: float, direction: float) -> float:
         """Return the gap's acceleration, mm/s^2, at `speed_mm_s` and the full voltage that opens, within the current
-        limit.
-
-        `pull_mm_s2` is the magnets' pull alone, below 0 where it helps. Friction and the guides' drag are added here,
-        against `direction`: 1 where the gap opens or would open, else -1. At rest a result against `direction` means
-        that the gap stands.
-        """
+        limit."""
         driving = min(self.stall_mm_s2 - self.per_s * speed_mm_s, self.most_mm_s2)
         nut = pull_mm_s2 + direction * self.drag_mm_s2
         friction = self.gear_mm_s2 + self.screw_friction * abs(nut)
@@ -124,11 +108,7 @@ class Drive(NamedTuple):
 
 
 class Lag(NamedTuple):
-    """Law of remanence: what the moment of the field lacks while it rises, and has too much while it falls.
-
-    The lag goes to -`branch_Tm`, T m, while the moment rises, and to `branch_Tm` while it falls. A change by `turn_Tm`,
-    above 0, takes it most of the way. Time has no part in it.
-    """
+    """Law of remanence: what the moment of the field lacks while it rises, and has too much while it falls."""
 
     branch_Tm: float
     turn_Tm: float
@@ -139,11 +119,7 @@ class Lag(NamedTuple):
         return branch_Tm + (lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm)
 
     def along_Tm(self, moments_Tm: Array, lag_Tm: float, before_Tm: float) -> Array:
-        """Return the lag (n), T m, at each of `moments_Tm` (n), T m, in order.
-
-        Before the first the moment was `before_Tm`, and lagged `lag_Tm`. Where the moment stays, so does the lag. NaN
-        is not refused, and makes all that follows NaN.
-        """
+        """Return the lag (n), T m, at each of `moments_Tm` (n), T m, in order."""
         found = []
         for moment_Tm in moments_Tm.tolist():
             if moment_Tm != before_Tm:
@@ -160,16 +136,7 @@ def lag_of(plant: PlantParameters) -> Lag:
 
 
 class Brake(NamedTuple):
-    """Force of the gap while the handle slides.
-
-    A gap gives a moment of the field (`moment_Tm` over `gap_mm`, from closed to open), which lags while it changes.
-    Moment and lag together, the strength, give the force of the fresh, cool insert (`fresh_N` over `strength_Tm`), part
-    of which relaxes. `sliding_N` makes the felt force of a kinetic level, N, and the handle's speed, mm/s. `rested_mm`
-    is the gap at which the insert rested before.
-
-    For the second plant a field in T stands for the moment, one exponential for creep, and an exponential lag for play.
-    There a bound is near, but not exact.
-    """
+    """Force of the gap while the handle slides."""
 
     gap_mm: Array
     moment_Tm: Array
@@ -181,10 +148,7 @@ class Brake(NamedTuple):
     sliding_N: Callable[[float, float], float]
 
     def fresh_at_N(self, moment_Tm: float, lag_Tm: float = 0.0) -> float:
-        """Return the force, N, of the fresh insert at a moment with its lag, T m.
-
-        Beyond `strength_Tm` it is the force at the nearer end.
-        """
+        """Return the force, N, of the fresh insert at a moment with its lag, T m."""
         return float(np.interp(moment_Tm + lag_Tm, self.strength_Tm, self.fresh_N))
 
     def open_N(self, hand_mm_s: float) -> float:
@@ -204,11 +168,7 @@ class Brake(NamedTuple):
 
     def moment_for_Tm(self, strength_Tm: float, moment_Tm: float, lag_Tm: float) -> float:
         """Return the moment, T m, that together with its lag makes `strength_Tm`, coming from `moment_Tm` with the lag
-        `lag_Tm`.
-
-        It is found by NEWTON_STEPS steps of Newton's method along the branch of the hysteresis. Whether they settled is
-        not checked, and the moment may lie beyond the device's.
-        """
+        `lag_Tm`."""
         wanted_Tm = moment_Tm
         for _ in range(NEWTON_STEPS):
             change_Tm = wanted_Tm - moment_Tm
@@ -221,10 +181,7 @@ class Brake(NamedTuple):
 
 
 def friction_of(plant: PlantParameters) -> Friction:
-    """Return the friction between roller and insert of a plant, as the simulated device has it.
-
-    A plant with [pad] or [second] has the numbers too, though its own friction is another.
-    """
+    """Return the friction between roller and insert of a plant, as the simulated device has it."""
     return Friction(
         presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
         viscous_N_s_mm=plant.friction.viscous_N_s_mm,
@@ -234,10 +191,7 @@ def friction_of(plant: PlantParameters) -> Friction:
 
 
 def drive_of(plant: PlantParameters) -> Drive:
-    """Return the drive of a device, both carriages together; the guides' drag is the mean of both.
-
-    Raises DomainError for gaps that are too large beside the magnets.
-    """
+    """Return the drive of a device, both carriages together; the guides' drag is the mean of both."""
     motor, gear, screw = plant.motor, plant.gear, plant.screw
     lead_m_rad = screw.lead_mm * 1e-3 / math.tau
     coupling_Nm_A = gear.ratio * motor.back_emf_V_s_rad
@@ -259,11 +213,7 @@ def drive_of(plant: PlantParameters) -> Drive:
 
 def brake_of(plant: PlantParameters) -> Brake:
     """Return the brake of a device between the plant's stops, in steps of GRID_MM at most; of a second plant an
-    approximation.
-
-    A plant with a pad is not refused: the result is of the insert that its file states beside. Raises `DomainError` for
-    a moment outside the force law's domain.
-    """
+    approximation."""
     assumed = plant.assumed
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
@@ -287,10 +237,7 @@ def brake_of(plant: PlantParameters) -> Brake:
 
 
 def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameters) -> Brake:
-    """Return the brake of the second plant over the gaps `gap_mm` (n, rising), mm; an approximation, see `Brake`.
-
-    `second` is the plant's own table of that name. What is called a moment, T m, is here the field at the shaft, T.
-    """
+    """Return the brake of the second plant over the gaps `gap_mm` (n, rising), mm; an approximation, see `Brake`."""
     field_T = np.array([1e-3 * shaft_field_mT(gap, plant, second.concentration) for gap in gap_mm.tolist()])
     shares_T = [1e-3 * share * half_mT for share, half_mT in zip(second.play_shares, second.play_mT, strict=True)]
     branch_T = sum(shares_T, 0.0)
@@ -310,10 +257,7 @@ def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameter
 
 
 class Asked(NamedTuple):
-    """A force in even steps, clipped to what can be asked, and the field strength that gives it.
-
-    `scale`, `offset_N` and `relaxed_N` turn the fresh insert's force into the rendered one.
-    """
+    """A force in even steps, clipped to what can be asked, and the field strength that gives it."""
 
     force_N: Array
     strength_Tm: Array
@@ -322,12 +266,7 @@ class Asked(NamedTuple):
     offset_N: float
 
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
-        """Return the rendered force (n), N, for the gaps `gap_mm` (n) in the steps of this force.
-
-        `brake` has to be the one of `asked_of`. Before the first step the gap was open, and lagged as one that was
-        opened. What has relaxed is that of the force asked, not of these gaps. A gap beyond the brake's counts as its
-        nearer end. Raises ValueError for another number of gaps.
-        """
+        """Return the rendered force (n), N, for the gaps `gap_mm` (n) in the steps of this force."""
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)
         return self.scale * (fresh_N - self.relaxed_N) + self.offset_N
@@ -343,11 +282,7 @@ class Bound(NamedTuple):
 
     def figures(self, start_s: float = -math.inf) -> Json:
         """Return `sd_N`, the asked force's standard deviation, and the RMS errors `no_delay_rms_N` and
-        `foresight_rms_N`.
-
-        All are floats, N, over the times from `start_s` on, which counts as `time_s`. They are NaN, with NumPy's
-        RuntimeWarning, where there are none.
-        """
+        `foresight_rms_N`."""
         inside = self.time_s >= start_s
         asked_N = self.asked_N[inside]
         return {
@@ -366,12 +301,7 @@ def bound(
     step_s: float = STEP_S,
 ) -> Bound:
     """Return the bound for forces (n), N, at times (n), s, linear in between, or with `is_held` each held until the
-    next.
-
-    Times have to rise, which is not checked. Forces are clipped to the device's range and MAX_N. The handle slides at
-    TURNED_MM_S. `step_s` is the step of the result, whose first time is the first of `time_s`. Raises `DomainError` for
-    under 2 or over MAX_STEPS steps, and for a force that is NaN. Raises as `brake_of` and `foresight_mm`.
-    """
+    next."""
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MAX_STEPS:
         raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MAX_STEPS} steps of {step_s:g} s")
@@ -388,12 +318,7 @@ def bound(
 
 def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, step_s: float) -> Asked:
     """Return the force (n), N, clipped to the device's range and `most_N`, with the relaxation while exactly that is
-    rendered.
-
-    The steps are `step_s` long, and the handle moves at `hand_mm_s` all the time. Before the first step the insert
-    rested at `brake.rested_mm`. Neither `step_s` nor `hand_mm_s` is checked. Raises `DomainError` for a force that is
-    NaN.
-    """
+    rendered."""
     offset_N, scale = brake.felt(hand_mm_s)
     # a gap that has been opened brakes a little more than one that was never closed
     least_N = brake.fresh_at_N(float(brake.moment_Tm[-1]), brake.lag.branch_Tm)
@@ -417,12 +342,7 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
 
 def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
     """Return the gap (n), mm, at the end of each step of `step_s`, of carriages that follow `asked` without delay or
-    foresight.
-
-    They begin at rest at the gap of the first force, so that the first gap is exact. At each step they know the force
-    at its end. Where they are late they approach as fast as they can and still brake in time. `asked` is of `brake`,
-    and has one step at least, else IndexError.
-    """
+    foresight."""
     gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
     moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.lag.branch_Tm
 
@@ -458,14 +378,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
 
 def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
     """Return the gap (n), mm, over the steps with the least RMS error of force that the drive allows; the whole force
-    is known.
-
-    At what gap and speed it begins is free. Steps are `step_s` long; `asked` is of `brake`, and has three steps at
-    least. Each round linearises about the last round's gap, and solves a quadratic programme in gaps and lags.
-    Convexity is not proven, so the optimum is tested against an exhaustive search (`tests/lab/test_bound.py`). Raises
-    RuntimeError where the rounds do not settle, or Clarabel finds no solution; ModuleNotFoundError where Clarabel is
-    not installed.
-    """
+    is known."""
     steps = len(asked.force_N)
     slope_Tm_mm = np.gradient(brake.moment_Tm, brake.gap_mm)
     slope_N_Tm = asked.scale * np.gradient(brake.fresh_N, brake.strength_Tm)
@@ -517,13 +430,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Found:
     """Return how closely ideal carriages can render the forces in the file `options.force`, on the plant
-    `options.plant`.
-
-    `options.insert` names the insert in it. The figures, N: `sd_N`, the standard deviation of the force asked for,
-    clipped; the RMS errors `no_delay_rms_N` and `foresight_rms_N`; the plant's `least_N` and `most_N`. Raises
-    DomainError, ForceFileError and PlantError for what is refused, LabError where no optimum was found. Raises
-    ModuleNotFoundError where Clarabel is not installed.
-    """
+    `options.plant`."""
     table = read_forces(options.force)
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
     plant = with_insert(plant, options.insert)
@@ -540,11 +447,7 @@ def _reached(
     limit_mm_s: Callable[[float, float, float], float], gap_mm: Array, speeds_mm_s: Array, step_s: float
 ) -> tuple[Array, Array]:
     """Return the speed limit at the end of each step but the first, mm/s, and its slope over the speed before (n - 2
-    each).
-
-    `limit_mm_s` gives the limit, as `Drive.highest_mm_s` does, for gap, speed and time. `gap_mm` (n) has three gaps at
-    least, `speeds_mm_s` (n - 1) are those between them. The slope is that of a secant, SECANT_MM_S to either side.
-    """
+    each)."""
     found = []
     for gap, speed in zip(gap_mm[1:-1].tolist(), speeds_mm_s[:-1].tolist(), strict=True):
         more, less = limit_mm_s(gap, speed + SECANT_MM_S, step_s), limit_mm_s(gap, speed - SECANT_MM_S, step_s)
@@ -554,12 +457,7 @@ def _reached(
 
 
 def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tuple[sparse.spmatrix, sparse.spmatrix]:
-    """Return the lag's law, linearised, as two matrices (n x n): one for the changes of gaps, one for those of lags.
-
-    The products of the matrices with these changes sum to 0 in every step. The law is linearised about `moment_Tm` and
-    `lag_Tm` (n each), T m. `turned` (n) is the moment's slope over the gap, T m/mm, over the unit of a lag's change, T
-    m. The first lag has no change.
-    """
+    """Return the lag's law, linearised, as two matrices (n x n): one for the changes of gaps, one for those of lags."""
     steps = len(moment_Tm)
     change_Tm = np.diff(moment_Tm)
     kept = np.exp(-np.abs(change_Tm) / brake.lag.turn_Tm)
@@ -575,12 +473,7 @@ def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tu
 def _least_squares(
     matrix: sparse.spmatrix, error: Array, nothing: sparse.spmatrix, limits: list[tuple[sparse.spmatrix, Array]]
 ) -> Array:
-    """Return the x (p) with the least |matrix x + error|, subject to `nothing` x = 0 and the limits.
-
-    `matrix` is n x p, `error` n, `nothing` m x p. Each limit is a matrix and its bounds: its product with the first
-    elements of x is at most these. A solution that Clarabel calls nearly solved counts. Raises RuntimeError where it
-    finds none, ModuleNotFoundError where Clarabel is not installed.
-    """
+    """Return the x (p) with the least |matrix x + error|, subject to `nothing` x = 0 and the limits."""
     unit = float(np.abs(matrix).max())
     below = sparse.vstack([limit for limit, _ in limits], format="csc")
     below.resize(below.shape[0], matrix.shape[1])

@@ -58,10 +58,7 @@ COMMANDS = {
 
 
 def whole(least: int, most: int) -> Callable[[str], int]:
-    """Return a type for argparse: it reads a whole number from `least` to `most`, as `int` does.
-
-    It raises ArgumentTypeError, which names the text and the range, for anything else.
-    """
+    """Return a type for argparse: it reads a whole number from `least` to `most`, as `int` does."""
 
     def number(text: str) -> int:
         try:
@@ -76,8 +73,7 @@ def whole(least: int, most: int) -> Callable[[str], int]:
 
 
 def within(least: float, most: float, unit: str) -> Callable[[str], float]:
-    """Return the type of a finite number in this range, of this unit. It raises ArgumentTypeError for any other
-    text."""
+    """Return the type of a finite number in this range, of this unit."""
     return Within(least, most, f" {unit}").__call__
 
 
@@ -88,13 +84,7 @@ GAP_SPEED = within(1e-6, 1e4, "mm/s")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that the first argument names and return its exit code, as `run` with the other arguments.
-
-    None takes the arguments of the process. Without arguments, and for `-h` or `--help`, the commands are listed on
-    stdout, and the code is 0. So is the version for `--version`. For an unknown name they are listed on stderr, with
-    what may have been meant; the code is 2. Makes stdout and stderr take any text, for the whole process. Raises as
-    `run`, such as SystemExit for wrong usage of the command.
-    """
+    """Run the command that the first argument names and return its exit code, as `run` with the other arguments."""
     write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)
     name = given[0] if given else "--help"
@@ -109,13 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
-    """Run the command `name`, a key of COMMANDS, print what it found on stdout and return its exit code.
-
-    REFUSALS, an OSError and a missing package become one sentence on stderr and exit code 2. Wrong usage is told on
-    stderr, and raises SystemExit with code 2, `--help` with 0. An answer that stdout does not take makes the code
-    NOT_TOLD, where it would be 0. What else a command raises is raised, another ValueError and a missing module of
-    tormagd too.
-    """
+    """Run the command `name`, a key of COMMANDS, print what it found on stdout and return its exit code."""
     try:
         module = import_module(f"tormagd.lab.{COMMANDS[name][0]}")
         parser = argparse.ArgumentParser(

@@ -16,11 +16,7 @@ KEY = "Figures"
 
 
 def stamp(figures: object) -> dict[str, str | None]:
-    """Return the metadata of a PNG drawn from `figures`, for matplotlib's `savefig`: their SHA-256 digest, under KEY.
-
-    `figures` are plain data, and keys of dicts in any order. `Software` is None, which leaves matplotlib's version out:
-    the same figures make the same file. Raises TypeError for what msgspec cannot encode.
-    """
+    """Return the metadata of a PNG drawn from `figures`, for matplotlib's `savefig`: their SHA-256 digest, under KEY."""
     return {KEY: hashlib.sha256(msgspec.json.encode(figures, order="sorted")).hexdigest(), "Software": None}
 
 
@@ -31,12 +27,7 @@ def figures_of(page: str) -> list[str]:
 
 
 def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Figure", Any]:
-    """Return a new matplotlib figure of `size`, width and height in inches, and its axes.
-
-    `grid`, rows and columns, and `options` go to `Figure.subplots`; without a grid it is one cell. The axes are one
-    object for one cell, else an array, of one dimension for one row or column. Nothing is shown, and pyplot does not
-    keep the figure. Raises ModuleNotFoundError without matplotlib.
-    """
+    """Return a new matplotlib figure of `size`, width and height in inches, and its axes."""
     from matplotlib.figure import Figure  # not every installation draws
 
     figure = Figure(figsize=size, layout="constrained")
@@ -53,12 +44,7 @@ def draw_beside(
     title: str,
     finer: float = 1.0,
 ) -> None:
-    """Draw `measured` and `explained` (n) over the time (n), s, and their difference times `finer`, as a picture.
-
-    `labels` are of the explained curve, of the quantity and of the difference, with their units. A file at `path` is
-    replaced. Raises OSError, ModuleNotFoundError without matplotlib, and ValueError for an ending that matplotlib does
-    not know.
-    """
+    """Draw `measured` and `explained` (n) over the time (n), s, and their difference times `finer`, as a picture."""
     figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
     above.plot(time_s, measured, color="#222222", linewidth=0.8, label="measured")
     above.plot(time_s, explained, color="#d1495b", linewidth=0.8, label=labels[0])
@@ -71,12 +57,7 @@ def draw_beside(
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
-    """Write a page, `sections` of Markdown with an empty line between, to `path`, and its pictures into `folder`.
-
-    `pictures` are figures by name, without the ending `.png`. `folder` is made where missing, that of `path` is not.
-    Files of these names are replaced; pictures of earlier names stay. Pictures are stamped with the rows of the page's
-    tables, and written before the page. Raises OSError.
-    """
+    """Write a page, `sections` of Markdown with an empty line between, to `path`, and its pictures into `folder`."""
     page = "\n".join(section.rstrip() + "\n" for section in sections)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():
@@ -85,10 +66,7 @@ def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapp
 
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table in Markdown, with a line end behind each row; without rows its head and rule alone.
-
-    `rows` are texts, one for each of `columns`, which is not checked. Cells are not escaped: `|` begins another cell.
-    """
+    """Return a table in Markdown, with a line end behind each row; without rows its head and rule alone."""
     head = list(columns)
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

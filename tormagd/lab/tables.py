@@ -26,17 +26,7 @@ def read_columns(
     allowed: Mapping[str, tuple[float, float]] | None = None,
     is_exact: bool = False,
 ) -> dict[str, Array]:
-    """Return the columns `names` of a CSV file, and those of `optional` that it has, by name, in this order.
-
-    All have one value for each row. The header is the first row with all `names`, in any order. Rows before it (many
-    testing machines write a preamble), other columns and empty rows are skipped. With `is_exact` the first two, and
-    rows of another length, are refused. `allowed` gives least and most of some columns; None, or a column that is not
-    in it: any finite number.
-
-    Raises `LabError` for a file that cannot be read, is not regular or over MAX_TABLE_BYTES, is not UTF-8 or no CSV.
-    Also for a missing header, a column that stands twice, no rows, or over MAX_ROWS. Also for a cell that is missing,
-    no finite number or out of bounds. The message names the file, and the line, from 1, where one is wrong.
-    """
+    """Return the columns `names` of a CSV file, and those of `optional` that it has, by name, in this order."""
     try:
         require_regular(path, MAX_TABLE_BYTES)
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -60,11 +50,7 @@ def _columns(
     allowed: Mapping[str, tuple[float, float]],
     is_exact: bool,
 ) -> dict[str, Array]:
-    """Find the header in `rows`, pairs of line number, from 1, and cells, and return the columns below it by name.
-
-    `rows` is used up. The other arguments, and the LabError that is raised, are those of `read_columns`; `path` is only
-    named in it. What reading `rows` raises is raised.
-    """
+    """Find the header in `rows`, pairs of line number, from 1, and cells, and return the columns below it by name."""
     header: list[str] = []
     for _, header in rows:
         if is_exact or set(names) <= set(header):
@@ -93,10 +79,7 @@ def _columns(
 
 
 def _number(where: str, text: str, bounds: tuple[float, float] | None) -> float:
-    """Return `text` as a finite number from the least to the most of `bounds`, these included; None: any.
-
-    Raises LabError, which begins with `where`, for all else: empty text, NaN, digits with underscores.
-    """
+    """Return `text` as a finite number from the least to the most of `bounds`, these included; None: any."""
     try:
         # digits grouped as 1_000 are Python's idea, not CSV's
         number = math.nan if "_" in text else float(text)

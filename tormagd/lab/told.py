@@ -5,12 +5,7 @@ from typing import Any
 
 
 def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
-    """Yield the lines of text that tell a person what `--json` prints of `result`.
-
-    A figure, or a record of plain figures, is one line: its name to 40 columns, then its value as `shown`. A record
-    that holds records or lists is taken apart, and its figures are named by all their names. A list of records becomes
-    its name and a `table`. `path` names what holds these figures; empty for the whole result.
-    """
+    """Yield the lines of text that tell a person what `--json` prints of `result`."""
     for key, value in result.items():
         name = f"{path} {key}".strip()
         if isinstance(value, Mapping) and any(isinstance(inner, Mapping | list) for inner in value.values()):
@@ -23,12 +18,7 @@ def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the lines of a table: one with the names of all columns, then one for each of `rows`.
-
-    Columns are aligned to the right, two spaces apart, and stand in the order in which names come up. A row without one
-    has an empty cell. A figure of a nested record is named by both names, as `outer inner`. Lists are left out. Without
-    rows there is one empty line.
-    """
+    """Yield the lines of a table: one with the names of all columns, then one for each of `rows`."""
     flat = [dict(_figures(row)) for row in rows]
     names = list(dict.fromkeys(name for row in flat for name in row))
     cells = [names, *([shown(row.get(name, "")) for name in names] for row in flat)]
@@ -38,10 +28,7 @@ def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of each figure in `row`, in order; lists are left out.
-
-    A figure of a nested record, at any depth, is named `outer inner`. None is a figure.
-    """
+    """Yield name and value of each figure in `row`, in order; lists are left out."""
     for key, value in row.items():
         if isinstance(value, Mapping):
             yield from ((f"{key} {name}", inner) for name, inner in _figures(value))
@@ -50,11 +37,7 @@ def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def shown(value: Any) -> str:
-    """Return a figure as text: a float to four digits, all else as `str` has it, None too.
-
-    A list's elements stand side by side after commas, floats with all their digits. A record's figures stand after
-    their names.
-    """
+    """Return a figure as text: a float to four digits, all else as `str` has it, None too."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {shown(inner)}" for name, inner in value.items())
     if isinstance(value, float):

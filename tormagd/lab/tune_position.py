@@ -27,12 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the stiffest robust gains for the motor of `options.config`, as the fields of Tuning.
-
-    `options.config` None: the default configuration. A person gets them as a table [position], with the margins as a
-    comment; nothing is written. The progress is shown on stderr. Raises LabError where no gains are robust, ConfigError
-    for a configuration that is refused.
-    """
+    """Return the stiffest robust gains for the motor of `options.config`, as the fields of Tuning."""
     grid = list(itertools.product(DERIVATIVE_TIMES_S, FILTER_TIMES_S, INTEGRAL_TIMES_S))
     best = stiffest(tunings(load_config(options.config), tqdm(grid, desc="gains", disable=None)))
     if best is None:

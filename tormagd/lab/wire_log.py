@@ -41,12 +41,7 @@ MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 
 
 class WireLog:
-    """Log of both directions of one serial line, as a file that CAN tools read; to be closed.
-
-    A file that is there is replaced. A frame is stamped with the time its last byte passed. Bytes that are no frame, or
-    name a function without a CAN identifier, are counted in `damaged` and not logged. Raises ValueError for a file type
-    that python-can does not know, and OSError where the file cannot be made.
-    """
+    """Log of both directions of one serial line, as a file that CAN tools read; to be closed."""
 
     def __init__(self, path: Path) -> None:
         if path.suffix.lower() == ".db":  # python-can would add to it
@@ -58,7 +53,6 @@ class WireLog:
 
     @property
     def damaged(self) -> int:
-        """Number of stretches of bytes that could not be logged."""
         return self._nameless + sum(decoder.statistics.corrupt for decoder in self._decoders.values())
 
     def close(self) -> None:
@@ -66,12 +60,7 @@ class WireLog:
         self._log.stop()
 
     def add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
-        """Log the frames that `data` completes, each stamped with `time_s`, s by the caller's clock.
-
-        `is_rx`: bytes of the device, else of the host. An incomplete frame waits for the next call of its direction.
-        The logged frames are counted in `frames`, all else in `damaged`. Raises OSError where the file cannot be
-        written.
-        """
+        """Log the frames that `data` completes, each stamped with `time_s`, s by the caller's clock."""
         for frame in self._decoders[is_rx].feed(data):
             if not 1 <= frame.function <= 0x7F:
                 self._nameless += 1
@@ -88,16 +77,11 @@ class WireLog:
             self.frames += 1
 
     def read(self, now_s: float, raw: Any) -> None:
-        """Log what a connection read from the device: bytes of a serial line. Raises AttributeError for a bus's frames,
-        and as `add`."""
+        """Log what a connection read from the device: bytes of a serial line."""
         self.add(now_s, raw, is_rx=True)
 
     def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
-        """Log what a connection wrote to the device, frames of a serial line as bytes; an empty list logs nothing.
-
-        `unsent`, the count of frames that did not go out, is not used. Raises TypeError for a bus's frames, and OSError
-        as `add`.
-        """
+        """Log what a connection wrote to the device, frames of a serial line as bytes; an empty list logs nothing."""
         self.add(now_s, b"".join(raw), is_rx=False)
 
     def connected(self, memory: Any) -> None:
@@ -105,12 +89,7 @@ class WireLog:
 
 
 def virtual_session(seconds: float, log: WireLog) -> None:
-    """Run a session of the virtual device, sample 1, and log its frames in `log`, which is left open.
-
-    The host connects, homes, enables and follows a swinging force for `seconds` of virtual time, which count from
-    enabling on. All of that is logged, stamped with seconds since the start. Raises RuntimeError if the device does not
-    arm, and OSError as `WireLog.add`.
-    """
+    """Run a session of the virtual device, sample 1, and log its frames in `log`, which is left open."""
     config = load_config(None)
     core = build_core(config)
     loop = ClosedLoop(
@@ -127,13 +106,7 @@ def virtual_session(seconds: float, log: WireLog) -> None:
 
 
 def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
-    """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames in `log`.
-
-    `announce` is called once, with the pseudo-terminal's path. `stopped` is asked at least every POLL_MS. Frames are
-    stamped with seconds since 1970. Bytes that either side does not fetch are lost, but logged. `port` and `log` are
-    left open. Raises OSError when the port goes away, where no pseudo-terminal can be made, and where the log cannot be
-    written.
-    """
+    """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames in `log`."""
     with contextlib.closing(Pty()) as line:
         announce(line.address)
         poll = select.poll()
@@ -154,11 +127,7 @@ def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stop
 
 
 def viewer_formats() -> list[str]:
-    """Return a line `ID:FORMAT:DIVISOR...` for each message, as `python -m can.viewer -d FILE` reads them.
-
-    The identifiers are hexadecimal, those of node NODE. FORMAT is that of `struct`. A value on the wire over its
-    DIVISOR is in the signal's unit; 1 stands for whole numbers and for what protects a message.
-    """
+    """Return a line `ID:FORMAT:DIVISOR...` for each message, as `python -m can.viewer -d FILE` reads them."""
     lines = []
     for layout in LAYOUTS:
         divisors = [repr(1.0 / signal.scale) if signal.type is float else "1" for signal in layout.signals]
@@ -168,10 +137,7 @@ def viewer_formats() -> list[str]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab wire-log`: a way, `virtual`, `tap` or `viewer`, and its own.
-
-    That the ending of the file is known is checked by `run`.
-    """
+    """Add the options of `tormag-lab wire-log`: a way, `virtual`, `tap` or `viewer`, and its own."""
     ways = parser.add_subparsers(dest="way", required=True)
     virtual = ways.add_parser("virtual", help="log a session in virtual time")
     tapped = ways.add_parser("tap", help="log what passes between the daemon and a serial device")
@@ -184,12 +150,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Log to `options.file` by the way `virtual` or `tap`, or return the lines of `viewer_formats` by `viewer`.
-
-    `tap` prints where the daemon finds the line, and ends by SIGINT or SIGTERM. A log gives `file`, and the numbers
-    `frames`, logged, and `damaged`. A file that is there is replaced. Raises LabError for a file type that is not
-    known, OSError for a file or port that cannot be used, and RuntimeError as `virtual_session`.
-    """
+    """Log to `options.file` by the way `virtual` or `tap`, or return the lines of `viewer_formats` by `viewer`."""
     if options.way == "viewer":
         formats = viewer_formats()
         return Found(formats, formats)

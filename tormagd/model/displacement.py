@@ -22,11 +22,7 @@ class Turn(Value):
         self.furthest_mm: Final = furthest_mm
 
     def moved_to(self, position_mm: float) -> "Turn":
-        """Return the state after the handle moved to `position_mm`; this one stays.
-
-        Going on, the handle has a new furthest place. Back by more than TURN_MM, it has turned where it had been
-        furthest, and goes the other way. Otherwise, and for NaN, nothing changes, and this very state is returned.
-        """
+        """Return the state after the handle moved to `position_mm`; this one stays."""
         beyond_mm = position_mm - self.furthest_mm
         if beyond_mm * self.direction >= 0.0:
             return self if beyond_mm == 0.0 else Turn(self.direction, self.turned_mm, position_mm)

@@ -27,10 +27,7 @@ class Element(StrEnum):
 
 
 class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Affine map between physical values and the network's -1..1: scaled = (value - offset) * gain.
-
-    A feature that never varied in training has gain 0: the network knows nothing about it and does not depend on it.
-    """
+    """Affine map between physical values and the network's -1..1: scaled = (value - offset) * gain."""
 
     input_offset: tuple[float, float, float, float]
     input_gain: tuple[float, float, float, float]
@@ -38,10 +35,7 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     output_gain: float
 
     def scaled(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return `features` (n x 4) on the network's scale (n x 4): from -1 to 1 within the ranges of training.
-
-        Outside these it goes on beyond. A feature that never varied becomes 0. Nothing is checked.
-        """
+        """Return `features` (n x 4) on the network's scale (n x 4): from -1 to 1 within the ranges of training."""
         scaled: NDArray[np.float64] = (features - np.array(self.input_offset)) * np.array(self.input_gain)
         return scaled
 
@@ -54,11 +48,7 @@ def require_number(name: str, value: float) -> None:
 
 
 def feature_rows(features: ArrayLike) -> NDArray[np.float64]:
-    """Return `features` as an array of float64 (n x 4, in the order of `FEATURES`); no rows at all (0 x 4) are as good.
-
-    Raises `DomainError` for another shape, and for a number that is not finite or beyond `LARGEST`; it names row, from
-    0, and feature. Raises ValueError or TypeError for what is no array of numbers.
-    """
+    """Return `features` as an array of float64 (n x 4, in the order of `FEATURES`); no rows at all (0 x 4) are as good."""
     rows = np.asarray(features, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != len(FEATURES):
         raise DomainError("features", f"an array of shape {rows.shape}", f"n x 4 in the order {', '.join(FEATURES)}")

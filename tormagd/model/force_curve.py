@@ -58,10 +58,7 @@ class ForceCurve(Protocol):
 
 
 def within(value: float, ends: tuple[float, float]) -> float:
-    """Return `value`, held within the two `ends`, the least first: so a model is asked only where it was trained.
-
-    NaN stays NaN.
-    """
+    """Return `value`, held within the two `ends`, the least first: so a model is asked only where it was trained."""
     return min(max(value, ends[0]), ends[1])
 
 
@@ -78,20 +75,14 @@ class Known:
 
     def excess(self, place: int, value: float) -> float:
         """Return how far feature number `place` of `FEATURES`, from 0, lies outside its range, as a share of it; 0
-        inside, and for NaN.
-
-        For a feature that never varied, as a share of its magnitude, of 1 unit at least.
-        """
+        inside, and for NaN."""
         outside = max(self.lows[place] - value, value - self.highs[place])
         return outside / self.scales[place] if outside > 0.0 else 0.0
 
 
 @final
 class Network:
-    """The 4-h-1 sigmoid network in physical units, as lists: F = constant + output . sigmoid(weight x + bias).
-
-    `weight` (h x 4, columns in the order of `FEATURES`), `bias` (h) and `output` (h) are finite.
-    """
+    """The 4-h-1 sigmoid network in physical units, as lists: F = constant + output . sigmoid(weight x + bias)."""
 
     def __init__(
         self,
@@ -120,11 +111,8 @@ class Network:
         self.known: Final = known
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
-        """Return the force curve at a state of the handle, in mm, mm/s and percent of iron by volume.
-
-        A state outside the range of training is not refused: `confidence` tells. Raises `DomainError` naming a number
-        that is not finite, or beyond `LARGEST`.
-        """
+        """Return the force curve at a state of the handle, in mm, mm/s and percent of iron by volume. Raises
+        `DomainError` naming a number that is not finite, or beyond `LARGEST`."""
         # written out because it stands before every prediction of the control loop
         if not (
             -_LARGEST <= displacement_mm <= _LARGEST
@@ -142,10 +130,7 @@ class Network:
 
 @final
 class NetworkCurve:
-    """The `ForceCurve` of a network at one state of the handle, made by `Network.curve`.
-
-    Holds the network and each hidden unit's share of that state. Fields are not checked.
-    """
+    """The `ForceCurve` of a network at one state of the handle, made by `Network.curve`."""
 
     def __init__(
         self, network: Network, shift: list[float], displacement_mm: float, rate_mm_s: float, cip_percent: float
@@ -162,10 +147,7 @@ class NetworkCurve:
         return self._network.magnitude_N
 
     def force_N(self, field_mT: float) -> float:
-        """Return the force, N, at one field, mT.
-
-        NaN is not refused, and does not give NaN but the network's constant: check the field before.
-        """
+        """Return the force, N, at one field, mT."""
         network, total_N = self._network, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -174,10 +156,7 @@ class NetworkCurve:
         return total_N + network.constant_N
 
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """Return the force, N, and its slope dF/dB, N/mT, at one field, mT.
-
-        As with `force_N`, NaN is not refused: it gives the network's constant, and a slope of 0.
-        """
+        """Return the force, N, and its slope dF/dB, N/mT, at one field, mT."""
         network, total_N, slope = self._network, 0.0, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -200,12 +179,7 @@ class NetworkCurve:
         return forces
 
     def confidence(self, field_mT: float, error_N: float) -> float:
-        """Return the trust exp(-4 e - 20 r), 0..1, in a field whose force misses the force asked by `error_N`.
-
-        e sums over the features how far each lies outside its training range, as a share of that range. r is the error
-        as a share of the force span seen in training; its sign does not matter. A field of NaN counts as inside, an
-        error of NaN gives NaN.
-        """
+        """Return the trust exp(-4 e - 20 r), 0..1, in a field whose force misses the force asked by `error_N`."""
         known = self._network.known
         excess = (
             known.excess(0, self.displacement_mm)

@@ -18,13 +18,7 @@ LONGEST_S = 1e5
 
 
 class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Relaxation and field lag of one element; the defaults are an element that remembers nothing.
-
-    `fractions` g_i and `times_s` tau_i of relaxation, the shortest time first; `field_fractions` are those of the force
-    that the field adds, where they differ. The field's lag h is at most `lag_mT`, reached over changes of `turn_mT`.
-    Raises `DomainError` for numbers out of range, more than 8 terms, times that do not rise, and a lag over a quarter
-    of `turn_mT`.
-    """
+    """Relaxation and field lag of one element; the defaults are an element that remembers nothing."""
 
     fractions: tuple[float, ...] = ()
     times_s: tuple[float, ...] = ()
@@ -49,7 +43,6 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def free(self) -> PronySeries:
-        """The relaxation of the force without field."""
         return PronySeries(self.fractions, self.times_s)
 
     @property

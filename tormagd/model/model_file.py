@@ -54,14 +54,7 @@ class ModelFileError(ValueError):
 
 
 class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a force model is and where it came from.
-
-    `insert` names the insert that the data were measured on. Of several inserts, it is what their names begin with,
-    and `boxes` holds the ranges of each. `ranges` holds the least and the greatest value seen in training for each
-    feature and for `force_N`. `metrics` are the trainer's figures. `created` is given, never read from a clock.
-    `memory` is the part of the force that the network leaves out. Raises `DomainError` for anything that could not be
-    saved and loaded again.
-    """
+    """What a force model is and where it came from."""
 
     element: Element
     insert: str
@@ -105,10 +98,7 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 def _require_ranges(key: str, ranges: Ranges) -> None:
-    """Raise `DomainError` naming `key` unless each feature and `force_N` has a finite range.
-
-    The ranges of the force and of the field may not be empty, and no field is below 0 mT.
-    """
+    """Raise `DomainError` naming `key` unless each feature and `force_N` has a finite range."""
     require_that(set(ranges) == set(UNITS), key, sorted(ranges), f"one range for each of {', '.join(UNITS)}")
     for name, (low, high) in ranges.items():
         is_range = -LARGEST <= low <= high <= LARGEST
@@ -132,12 +122,7 @@ class PhysicalLayers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """Force of an insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network.
-
-    The weights act on scaled values (`metadata.scaling`): hidden_weight (h x 4), hidden_bias (h), output_weight (h).
-    `physical` is the same network with the scaling folded in. Weights are copied, and the copies cannot be written.
-    Raises `DomainError` when metadata and weights do not fit together, or a number is not finite.
-    """
+    """Force of an insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network."""
 
     metadata: ModelMetadata
     hidden_weight: Array
@@ -158,7 +143,7 @@ class ForceModel:
         object.__setattr__(self, "network", Network(*self.physical, known))
 
     def _fold(self) -> PhysicalLayers:
-        """Return the network with the scaling folded in. Raises `DomainError` where a folded number is not finite."""
+        """Return the network with the scaling folded in."""
         scaling = self.metadata.scaling
         gain, offset = np.array(scaling.input_gain), np.array(scaling.input_offset)
         weight = self.hidden_weight * gain
@@ -173,12 +158,10 @@ class ForceModel:
 
     @property
     def feature_ranges(self) -> tuple[tuple[float, float], ...]:
-        """Least and greatest value of each feature seen in training, in the order of `FEATURES`."""
         return tuple(self.metadata.ranges[name] for name in FEATURES)
 
     @property
     def field_range_mT(self) -> tuple[float, float]:
-        """Least and greatest field seen in training, mT."""
         return self.metadata.ranges["field_mT"]
 
     @property
@@ -189,16 +172,10 @@ class ForceModel:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of metadata and weights, 64 hexadecimal digits: it identifies the model."""
         return _checksum(_header(self.metadata), _tensors(self))
 
     def of(self, insert: str) -> "ForceModel":
-        """Return the model of one of its several inserts: the ranges are that insert's alone; the weights are the same.
-
-        The field's lag and turn in `memory` are scaled by the insert's greatest field over that of all inserts. Returns
-        this model itself where it holds no ranges for `insert`. Raises DomainError where the scaled lag makes no
-        `Memory`.
-        """
+        """Return the model of one of its several inserts: the ranges are that insert's alone; the weights are the same."""
         whole, memory = self.metadata, self.metadata.memory
         ranges = (whole.boxes or {}).get(insert)
         if ranges is None:
@@ -209,19 +186,11 @@ class ForceModel:
         return replace(self, metadata=own)
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
-        """Return the force over the field at one state of the handle, as `Network.curve`.
-
-        Raises `DomainError` naming an input that is not finite, or beyond `LARGEST`.
-        """
+        """Return the force over the field at one state of the handle, as `Network.curve`."""
         return self.network.curve(displacement_mm, rate_mm_s, cip_percent)
 
     def predict(self, features: ArrayLike) -> Array:
-        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`); a single point is 1 x 4.
-
-        No rows give no forces. Nothing is clamped: outside the ranges of training it extrapolates. Raises `DomainError`
-        for another shape, and for a number that is not finite, or beyond `LARGEST`. Raises ValueError or TypeError for
-        what is no array of numbers.
-        """
+        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`); a single point is 1 x 4."""
         rows = feature_rows(features)
         weight, bias, output, constant = self.physical
         # sigmoid(z) = (1 + tanh(z/2)) / 2: one operation fewer than exp, and it cannot overflow
@@ -229,18 +198,12 @@ class ForceModel:
         return np.asarray(forces_N, dtype=np.float64)
 
     def predict_one(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Return the force, N, at one point, by the curve that plans use.
-
-        Raises `DomainError` naming an input that is not finite, or beyond `LARGEST`.
-        """
+        """Return the force, N, at one point, by the curve that plans use."""
         require_number("field_mT", field_mT)
         return self.curve(displacement_mm, rate_mm_s, cip_percent).force_N(field_mT)
 
     def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
-        """Return the slope of the force over the field, dF/dB, N/mT (n), at `features` (n x 4, order of `FEATURES`).
-
-        Raises as `predict`.
-        """
+        """Return the slope of the force over the field, dF/dB, N/mT (n), at `features` (n x 4, order of `FEATURES`)."""
         rows = feature_rows(features)
         weight, bias, output, _ = self.physical
         # the sigmoid's slope without 1 - tanh^2, which is 0 by rounding where a unit is saturated
@@ -249,11 +212,7 @@ class ForceModel:
 
 
 def save_model(path: Path | str, model: ForceModel) -> None:
-    """Write `model` to `path`; equal models give equal bytes. Readers see the old file or the whole new one.
-
-    An earlier file is replaced. Raises OSError, also where the folder is missing or `path` is one; an earlier file is
-    then as it was.
-    """
+    """Write `model` to `path`; equal models give equal bytes."""
     tensors = _tensors(model)
     header = _header(model.metadata)
     header["checksum"] = _checksum(header, tensors)
@@ -262,14 +221,7 @@ def save_model(path: Path | str, model: ForceModel) -> None:
 
 
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
-    """Read a model file for `element` and `insert`; None accepts any insert.
-
-    Of a model of several inserts, return that of `insert`; with None the whole.
-
-    Raises `ModelFileError`, with the path, when the file cannot be read, is truncated or altered, or belongs to another
-    element or insert. Raises it, too, for anything but a finite 4-h-1 network in the features and units of this
-    program.
-    """
+    """Read a model file for `element` and `insert`; None accepts any insert."""
     source = Path(path)
     try:
         model = _decode(read_bounded(source, MAX_FILE_BYTES)).of(insert or "")
@@ -290,11 +242,7 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
 
 
 def _decode(data: bytes) -> ForceModel:
-    """Return the model in a file's bytes.
-
-    Raises ModelFileError for another format, checksum or set of tensors, DomainError for values that make no model, and
-    the errors of safetensors and msgspec. Raises RecursionError for a header that is nested without end.
-    """
+    """Return the model in a file's bytes."""
     # the library proves that the header is whole and that the tensors lie inside the file
     tensors = {name: _tensor(name, content) for name, content in safetensors.deserialize(data)}  # type: ignore[no-untyped-call]
     header = _json_header(data).get("__metadata__", {})
@@ -318,17 +266,14 @@ def _decode(data: bytes) -> ForceModel:
 
 
 def _tensor(name: str, content: dict[str, Any]) -> Array:
-    """Return a tensor as an array. Raises ModelFileError unless its numbers are float64."""
+    """Return a tensor as an array."""
     if content["dtype"] not in ("F64", "float64"):
         raise ModelFileError(f"tensor {name} is {content['dtype']}; needed is F64")
     return np.frombuffer(content["data"], dtype="<f8").reshape(content["shape"])
 
 
 def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return `value` as a read-only float64 copy of `shape`; `name` is what an error calls it.
-
-    Raises `DomainError` for numbers that are not floating-point, not finite or beyond `LARGEST`, and for another shape.
-    """
+    """Return `value` as a read-only float64 copy of `shape`; `name` is what an error calls it."""
     source = np.asarray(value)
     require_that(source.dtype.kind == "f", name, source.dtype, "floating-point numbers")
     array = source.astype(np.float64)
@@ -341,7 +286,6 @@ def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _tensors(model: ForceModel) -> dict[str, Array]:
-    """Return the weights of a model as its file's tensors, by their names; `output_bias` is an array of one."""
     return {
         "hidden_weight": model.hidden_weight,
         "hidden_bias": model.hidden_bias,
@@ -357,10 +301,7 @@ def _header(metadata: ModelMetadata) -> dict[str, str]:
 
 
 def _checksum(header: dict[str, str], tensors: dict[str, Array]) -> str:
-    """Return the SHA-256 of header and tensors, as hexadecimal digits; their order does not matter.
-
-    The header is without its own field `checksum`, else another sum comes out.
-    """
+    """Return the SHA-256 of header and tensors, as hexadecimal digits; their order does not matter."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]

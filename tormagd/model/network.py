@@ -11,12 +11,7 @@ from tormagd.physics.errors import require_that
 
 
 class ForceNetwork(nn.Module):
-    """4-h-1 network from physical features (n x 4, order of `FEATURES`) to force in N (n).
-
-    `seed` decides the initial weights (Nguyen & Widrow 1990: hidden units spread over the input range). Train in
-    float64; `network.to(torch.float32)` gives the single-precision copy for use.
-    Raises `DomainError` when `hidden` is not 1 to 4096.
-    """
+    """4-h-1 network from physical features (n x 4, order of `FEATURES`) to force in N (n)."""
 
     input_offset: Tensor
     input_gain: Tensor
@@ -59,18 +54,12 @@ class ForceNetwork(nn.Module):
         return hidden @ self.output_weight + self.output_bias
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return force in N (n) for features (n x 4), which are not checked: NaN gives NaN.
-
-        Raises RuntimeError where torch cannot take their shape or precision.
-        """
+        """Return force in N (n) for features (n x 4), which are not checked: NaN gives NaN."""
         return self.forward_scaled(self.scale_inputs(features)) / self.output_gain + self.output_offset
 
 
 def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
-    """Copy the weights of `network` into a model, to be saved and used; its scaling has to be that of `metadata`.
-
-    That is not checked. Raises `DomainError` when `metadata` does not fit the weights, or a weight is not finite.
-    """
+    """Copy the weights of `network` into a model, to be saved and used; its scaling has to be that of `metadata`."""
     return ForceModel(
         metadata=metadata,
         hidden_weight=network.hidden_weight.detach().double().numpy(),
@@ -81,10 +70,7 @@ def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
 
 
 def to_network(model: ForceModel) -> ForceNetwork:
-    """Return a float64 network with the weights of `model`, for further training or as a reference.
-
-    The model's metadata are not in it but for the scaling, its weights are copied.
-    """
+    """Return a float64 network with the weights of `model`, for further training or as a reference."""
     network = ForceNetwork(model.metadata.scaling, model.metadata.hidden)
     with torch.no_grad():
         network.hidden_weight.copy_(torch.tensor(model.hidden_weight))

@@ -9,12 +9,7 @@ from tormagd.model.model_file import ForceModel
 def falling_at(
     model: ForceModel, fields_mT: tuple[float, float], displacement_mm: float, points: int = 33
 ) -> float | None:
-    """Return the least rate of the handle, mm/s, at which the model's force somewhere does not rise with the field.
-
-    Looks at `points` rates over those seen in training, and as many fields between the two `fields_mT`. Displacement
-    and the share of iron, the least, are fixed. None where the force rises at all of these; between them nothing is
-    looked at. Raises DomainError for a displacement or field that is not finite.
-    """
+    """Return the least rate of the handle, mm/s, at which the model's force somewhere does not rise with the field."""
     _, (slowest, fastest), _, (cip_percent, _) = model.feature_ranges
     fields = np.linspace(*fields_mT, points)
     for rate_mm_s in np.linspace(slowest, fastest, points).tolist():

@@ -12,11 +12,7 @@ _FOLDER, _ENDING = resources.files(__package__) / "models", ".safetensors"
 
 def model_path(name_or_path: str, beside: Path, insert: str = "") -> Path:
     """Return the path of a model file: a shipped one by its name, else a path relative to `beside`; a shipped name goes
-    first.
-
-    AUTO stands for the shipped model of `insert`, or of all inserts of its matrix. The file is not opened. Raises
-    ConfigError, naming the shipped models, where there is no such file.
-    """
+    first."""
     if name_or_path == AUTO:
         own = f"torque_{insert.lower().replace('-', '_')}"
         name_or_path = own if own in shipped(_FOLDER, _ENDING) else own.rpartition("_")[0]

@@ -8,21 +8,6 @@ Divided by its scales, the thesis's force law (Eq. 29..34) depends on one load a
     phi   force over 2 pi t R_i^2 mu_d G0 / R_w
 
 it reads
-
-    eps = r - p,  p = 1 - A y,  r = sqrt(p^2 + 2 B y)                                        (Eq. 29)
-    phi = (lambda1^-4 - 1) / lambda1 + 4 (1 + w) y / lambda1^3                               (Eq. 33, 34)
-
-As printed, the elastic and the magnetic terms cancel to rounding while the load goes to 0. Here both terms of phi are
-positive, and r - p is taken as 2 B y / (r + p) where p > 0. Solved for the load, Eq. 29 is
-
-    y = eps (2 + eps) / (2 (B + A eps))
-
-which rises with eps, so phi rises strictly with y and has one inverse.
-
-In Gamma_1 and Gamma_2 the thesis multiplies pure numbers by t, a length: t counts there as a bare number of metres, the
-*body-force weight*. That is dimensionally odd, and it is what gives the published forces.
-
-Formulas are written once and serve floats (through `math`, for the control loop) and arrays (through numpy).
 """
 
 import math
@@ -47,19 +32,12 @@ _SCALAR = SimpleNamespace(
 
 
 def functions(value: Any) -> SimpleNamespace | ModuleType:
-    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for anything else.
-
-    Both have `sqrt`, `log`, `log1p`, `expm1`, `where` and `all`; for a float there are only these. For a float they
-    raise ValueError where numpy's give NaN or infinity.
-    """
+    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for anything else."""
     return _SCALAR if isinstance(value, float | int) else np
 
 
 class BrakeCurve(NamedTuple):
-    """The brake curve of one wall ratio and body-force weight: w (`wall`), A (`a`) and B (`b`) of Eq. 29 to 34.
-
-    Arguments and results are dimensionless and unchecked: a float gives a float, an array one of its shape and type.
-    """
+    """The brake curve of one wall ratio and body-force weight: w (`wall`), A (`a`) and B (`b`) of Eq. 29 to 34."""
 
     wall: float
     a: float
@@ -71,12 +49,7 @@ class BrakeCurve(NamedTuple):
         return cls(wall, 1.0 - 0.5 * wall * body_force, wall * (1.0 + 1.5 * body_force))
 
     def compression(self, load: Real) -> Real:
-        """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq. 29).
-
-        It may be over MAX_COMPRESSION, and over 1, where the model does not hold: keep the load within `load` of
-        MAX_COMPRESSION. A load under 0 or of NaN is not refused, and its result means nothing; a float may raise
-        ValueError.
-        """
+        """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq."""
         fn = functions(load)
         p = 1.0 - self.a * load
         larger = fn.sqrt(p * p + 2.0 * self.b * load) + abs(p)
@@ -90,11 +63,7 @@ class BrakeCurve(NamedTuple):
         return load
 
     def force(self, compression: Real, load: Real) -> Real:
-        """Return the force phi (Eq. 33, 34) from a load and the compression, below 1, that this load gives.
-
-        That both belong together is not checked. A float compression of 1 or more raises ValueError, an array gives
-        infinity or NaN.
-        """
+        """Return the force phi (Eq."""
         fn = functions(load)
         stretch = 1.0 - compression
         elastic: Real = fn.expm1(-4.0 * fn.log1p(-compression))

@@ -11,10 +11,7 @@ Real = TypeVar("Real", float, FloatArray)
 
 
 class DomainError(ValueError):
-    """A value outside the range in which a model holds. The text names the variable, the value and what is allowed.
-
-    The three are kept as `variable`, `value` and `allowed`.
-    """
+    """A value outside the range in which a model holds. The text names the variable, the value and what is allowed."""
 
     def __init__(self, variable: str, value: object, allowed: str) -> None:
         super().__init__(f"{variable} = {value} is not allowed: {allowed}")
@@ -34,11 +31,7 @@ def require_that(condition: bool, variable: str, value: object, allowed: str) ->
 
 
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:
-    """Raise `DomainError`, naming `variable`, unless `value` or every element of it is in [low, high]; NaN never is.
-
-    Of an array the error names the first element outside; an empty array passes. It is raised, too, for a value that is
-    no float, int or array of float32 or float64. NumPy's whole numbers are none of these.
-    """
+    """Raise `DomainError`, naming `variable`, unless `value` or every element of it is in [low, high]; NaN never is."""
     if isinstance(value, float | int):
         if low <= value <= high:
             return

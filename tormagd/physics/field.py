@@ -15,10 +15,7 @@ REFERENCE_PERMEABILITY = 4.0
 """Relative permeability at which both field laws were fitted: b = (mu_r / 4) a / R."""
 
 PAD_RADIUS_M = 8.55e-3
-"""Radius R at which a / R is taken for the mean field in a tactile pad between the magnets.
-
-By the power law it gives 365 mT at the least gap, the greatest field that the thesis states. That the pad's field falls
-over the gap as the law does is an assumption."""
+"""Radius R at which a / R is taken for the mean field in a tactile pad between the magnets."""
 
 _TM_PER_MT_MM = 1e-6
 _EQ7_C1, _EQ7_C2, _EQ7_P = 1.206, 1256.0, 1.867
@@ -27,50 +24,32 @@ _EQ7_MIN_MM, _EQ7_MAX_MM = 45.0, 95.0
 
 @dataclass(frozen=True, slots=True)
 class ThesisFieldLaw:
-    """The field law of the thesis's Eq. 7: a = c1 (95 - gap)^p + c2, in mT mm, on 45..95 mm. A `FieldLaw`.
-
-    The printed equation carries no unit; mT mm gives the measured field ("up to 800 mT"). It must not be stretched
-    beyond 95 mm: a larger s_max in Eq. 7 raises the field at *every* gap.
-
-    At 95 mm the slope is zero, so the inverse loses half of its digits there. Its methods raise `DomainError` for a gap
-    outside 45..95 mm, or a moment that none of these gaps gives.
-    """
+    """The field law of the thesis's Eq. 7: a = c1 (95 - gap)^p + c2, in mT mm, on 45..95 mm. A `FieldLaw`."""
 
     gap_range_mm: ClassVar[tuple[float, float]] = (_EQ7_MIN_MM, _EQ7_MAX_MM)
     "Smallest and largest gap for which the law holds, mm."
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
-        """Return the radial moment at a gap, T m. Raises `DomainError` for a gap outside 45..95 mm, and for NaN."""
+        """Return the radial moment at a gap, T m."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return _TM_PER_MT_MM * (_EQ7_C1 * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P) + _EQ7_C2)
 
     def gap_mm(self, radial_moment_Tm: Real) -> Real:
-        """Return the gap that gives a radial moment, mm: the inverse of `radial_moment_Tm`.
-
-        Raises `DomainError` for a moment, T m, that no gap of 45..95 mm gives, and for NaN.
-        """
+        """Return the gap that gives a radial moment, mm: the inverse of `radial_moment_Tm`."""
         _require_moment(radial_moment_Tm, self)
         # abs(): the weakest moment itself, times 1e6, may round to just under c2
         excess = abs(radial_moment_Tm / _TM_PER_MT_MM - _EQ7_C2)
         return _EQ7_MAX_MM - _power(excess / _EQ7_C1, 1.0 / _EQ7_P)
 
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
-        """Return the slope of the radial moment at a gap, T m / mm, negative, and 0 at 95 mm.
-
-        Raises `DomainError` for a gap outside 45..95 mm, and for NaN.
-        """
+        """Return the slope of the radial moment at a gap, T m / mm, negative, and 0 at 95 mm."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return -_TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class PowerFieldLaw:
-    """The power law of the thesis's appendix: a = coefficient * gap^exponent, T m with the gap in mm. A `FieldLaw`.
-
-    It agrees with Eq. 7 within about 10% on 45..95 mm, and serves beyond. Its methods take gaps from 1 mm, under which
-    the pole at zero takes over, to 10 m. They raise `DomainError` for others, and for moments that none of them gives.
-    Raises `DomainError` unless 1e-6 <= coefficient <= 1e3 and -6 <= exponent <= -0.1.
-    """
+    """The power law of the thesis's appendix: a = coefficient * gap^exponent, T m with the gap in mm. A `FieldLaw`."""
 
     gap_range_mm: ClassVar[tuple[float, float]] = (1.0, 1e4)
     coefficient: float = 0.44
@@ -81,39 +60,27 @@ class PowerFieldLaw:
         require("exponent", self.exponent, -6.0, -0.1)
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
-        """Return the radial moment at a gap, T m. Raises `DomainError` for a gap outside 1 mm to 10 m, and for NaN."""
+        """Return the radial moment at a gap, T m."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * _power(gap_mm, self.exponent)
 
     def gap_mm(self, radial_moment_Tm: Real) -> Real:
-        """Return the gap that gives a radial moment, mm. Raises `DomainError` for a moment that no gap of 1 mm to 10 m
-        gives."""
+        """Return the gap that gives a radial moment, mm."""
         _require_moment(radial_moment_Tm, self)
         return _power(radial_moment_Tm / self.coefficient, 1.0 / self.exponent)
 
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
-        """Return the slope of the radial moment at a gap, T m / mm, negative.
-
-        Raises `DomainError` for a gap outside 1 mm to 10 m, and for NaN.
-        """
+        """Return the slope of the radial moment at a gap, T m / mm, negative."""
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * self.exponent * _power(gap_mm, self.exponent - 1.0)
 
 
 FieldLaw: TypeAlias = ThesisFieldLaw | PowerFieldLaw
-"""A strictly falling map from gap (mm) to radial moment (T m), with its inverse and slope.
-
-Every method takes a float or an array and returns the same kind and shape. It raises `DomainError` for a gap outside
-`gap_range_mm`, or a radial moment that no gap in that range gives.
-"""
+"""A strictly falling map from gap (mm) to radial moment (T m), with its inverse and slope."""
 
 
 def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_m: float) -> Real:
-    """Return the radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq. 6 with Eq. 8's permeability).
-
-    `radial_moment_Tm` is a float or an array, whose shape and type the result keeps. Raises `DomainError` unless 0 <= a
-    <= 1e6 T m, 1 <= mu_r <= 1000 and 10 um <= R <= 1 m; NaN never is.
-    """
+    """Return the radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq."""
     require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e6)
     require("relative_permeability", relative_permeability, 1.0, 1e3)
     require("radius_m", radius_m, 1e-5, 1.0)

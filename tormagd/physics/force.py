@@ -8,10 +8,6 @@ curve under it, and why it is written so, is in `tormagd.physics.brake_curve`:
 
 The radial moment a (`radial_moment_Tm`) is that of `tormagd.physics.field`, without mu_r / 4. F rises strictly with a,
 so the inverse is unique; `tormagd.lab.design.force_law` has it. The model is used for a stretch lambda1 >= 0.05 only.
-
-Every function takes a float and returns one, about ten times faster than for an array. Or it takes an array of float32
-or float64, whose shape and type the result keeps. All raise `DomainError` for NaN and for values outside the stated
-domain.
 """
 
 import math
@@ -28,10 +24,7 @@ MU0_H_M = 4e-7 * math.pi
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Elastomer cylinder around its shaft, and the roller, all in m.
-
-    Raises `DomainError` unless every length is 10 um .. 1 m and inner_radius_m < outer_radius_m.
-    """
+    """Elastomer cylinder around its shaft, and the roller, all in m."""
 
     inner_radius_m: float
     outer_radius_m: float
@@ -55,10 +48,7 @@ TORMAG = Geometry(inner_radius_m=0.004, outer_radius_m=0.011, thickness_m=0.020,
 
 @dataclass(frozen=True, slots=True)
 class Elastomer:
-    """Shear modulus G0 (Pa), relative permeability mu_r and kinetic friction coefficient mu_d of one insert.
-
-    Raises `DomainError` unless 1 Pa <= G0 <= 1 GPa, 1 <= mu_r <= 1000 and 0.001 <= mu_d <= 10.
-    """
+    """Shear modulus G0 (Pa), relative permeability mu_r and kinetic friction coefficient mu_d of one insert."""
 
     shear_modulus_Pa: float
     relative_permeability: float
@@ -71,30 +61,19 @@ class Elastomer:
 
 
 def max_radial_moment_Tm(elastomer: Elastomer, geometry: Geometry) -> float:
-    """Return the largest admissible radial moment, T m: it compresses the elastomer to lambda1 = 0.05.
-
-    `brake_force_N` refuses more, `Reduced.force` does not.
-    """
+    """Return the largest admissible radial moment, T m: it compresses the elastomer to lambda1 = 0.05."""
     return reduced(elastomer, geometry).max_moment_Tm
 
 
 def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34), 0 without field.
-
-    A float gives a float, an array one of its shape and type. Raises `DomainError` unless the radial moment is from 0
-    to `max_radial_moment_Tm`; NaN never is.
-    """
+    """Return the kinetic friction force at the roller, N, >= 0 (Eq."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return law.force(radial_moment_Tm)
 
 
 class Reduced(NamedTuple):
-    """The force law of one elastomer in one geometry: the dimensionless curve and the two scales that give it units.
-
-    `load_root_per_Tm` times a radial moment, squared, is the load. `force_scale_N` is the force where the curve gives
-    1. `max_moment_Tm` compresses to lambda1 = 0.05. Nothing is checked here.
-    """
+    """The force law of one elastomer in one geometry: the dimensionless curve and the two scales that give it units."""
 
     curve: BrakeCurve
     load_root_per_Tm: float
@@ -107,18 +86,14 @@ class Reduced(NamedTuple):
         return root * root
 
     def force(self, moment_Tm: Real) -> Real:
-        """Return the friction force at the roller, N, at a radial moment of 0 to `max_moment_Tm`, T m.
-
-        A float gives a float, an array one of its shape and type. Nothing is checked: above that the force means
-        nothing, and a float may raise ValueError.
-        """
+        """Return the friction force at the roller, N, at a radial moment of 0 to `max_moment_Tm`, T m."""
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
 
 
 @lru_cache(maxsize=64)
 def reduced(elastomer: Elastomer, geometry: Geometry) -> Reduced:
-    """Return the force law of one elastomer in one geometry. The last 64 are kept, not computed again."""
+    """Return the force law of one elastomer in one geometry."""
     g0, mu_r = elastomer.shear_modulus_Pa, elastomer.relative_permeability
     inner, outer, thickness = geometry.inner_radius_m, geometry.outer_radius_m, geometry.thickness_m
     curve = BrakeCurve.of(wall=(outer - inner) / inner, body_force=thickness * (mu_r - 1.0))

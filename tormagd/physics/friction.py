@@ -17,13 +17,7 @@ from firmware_protocol.value import Value
 
 @final
 class Friction(Value):
-    """Friction at the roller, apart from its kinetic level, which the field sets. Nothing is checked here.
-
-    presliding_stiffness_N_mm  sigma0: stiffness before break-away, > 0
-    viscous_N_s_mm             sigma2: viscous coefficient, >= 0
-    static_ratio               break-away over kinetic level, >= 1
-    stribeck_speed_mm_s        v_s: speed at which the level has fallen most of the way to kinetic, > 0
-    """
+    """Friction at the roller, apart from its kinetic level, which the field sets. Nothing is checked here."""
 
     def __init__(
         self,
@@ -38,22 +32,12 @@ class Friction(Value):
         self.stribeck_speed_mm_s: Final = stribeck_speed_mm_s
 
     def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
-        """Return the steady level g(v) of the dry part at a speed, N; the speed's sign does not matter.
-
-        `kinetic_N` >= 0 is the level of a fast handle; at rest it is `static_ratio` times that. Nothing is checked.
-        """
+        """Return the steady level g(v) of the dry part at a speed, N; the speed's sign does not matter."""
         ratio = speed_mm_s / self.stribeck_speed_mm_s
         return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))
 
     def advance(self, deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> tuple[float, float]:
-        """Return force, N, and deflection, mm, at the end of a step of `dt_s` at constant speed and kinetic level.
-
-        The caller keeps the deflection, 0 at first. Exact in the deflection for any `dt_s` >= 0. A deflection above
-        what the level now carries (the field fell) slips back to that level first, so the dry force never exceeds
-        `level_N`. Passive: the deflection moves with the speed, so the returned force times the step's displacement is
-        at least the exact work. The hand gets back sigma0 / 2 times the deflection squared at most. At a level of 0 the
-        deflection is 0, and the force viscous alone. Nothing is checked: NaN stays in the deflection.
-        """
+        """Return force, N, and deflection, mm, at the end of a step of `dt_s` at constant speed and kinetic level."""
         viscous_N = self.viscous_N_s_mm * speed_mm_s
         reach_mm = self.level_N(speed_mm_s, kinetic_N) / self.presliding_stiffness_N_mm
         if reach_mm == 0.0:

@@ -25,19 +25,13 @@ _Force = Annotated[float, Meta(ge=0.0, le=1e3)]
 
 
 def relative_permeability(cip_fraction: float) -> float:
-    """Return the relative permeability mu_r at a CIP volume fraction (Eq. 5).
-
-    Raises `DomainError` for a fraction outside 0.10..0.40.
-    """
+    """Return the relative permeability mu_r at a CIP volume fraction (Eq."""
     require("cip_fraction", cip_fraction, 0.10, 0.40)
     return 2.0 + 2.0 * (cip_fraction - 0.10) / 0.30
 
 
 class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
-    """The force at a gap of 45 mm less that at 95 mm, N: mean and deviation as measured, and the thesis's estimate.
-
-    `estimate_N` is None for inserts that are not the thesis's.
-    """
+    """The force at a gap of 45 mm less that at 95 mm, N: mean and deviation as measured, and the thesis's estimate."""
 
     measured_N: Annotated[float, Meta(ge=1e-6, le=1e3)]
     deviation_N: _Force
@@ -45,7 +39,7 @@ class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def thesis_estimate_N(self) -> float:
-        """The thesis's estimate of the force range, N. Raises `DomainError` where there is none."""
+        """The thesis's estimate of the force range, N."""
         if self.estimate_N is None:
             raise DomainError("estimate_N", None, "stated for the thesis's inserts only")
         return self.estimate_N
@@ -61,12 +55,7 @@ class Matrix(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Insert(Struct, frozen=True, forbid_unknown_fields=True):
-    """One fabricated insert. Fractions are of volume; the shear modulus is without field.
-
-    None for friction stands for the matrix's, for permeability for that of Eq. 5; `measured` is None where the force
-    range has not been measured. Bounds are checked where the registry is read, not where one is made; whether the
-    fractions leave room for the matrix is not.
-    """
+    """One fabricated insert. Fractions are of volume; the shear modulus is without field."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
     shore_hardness: _Hardness
@@ -80,11 +69,7 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def elastomer(self) -> Elastomer:
-        """Shear modulus, permeability and friction of the insert, for `brake_force_N`.
-
-        What the insert does not state comes from Eq. 5 and from its matrix. Raises `DomainError` outside Eq. 5's range
-        and `Elastomer`'s, and where the friction is needed from a matrix that is not in `MATRICES`.
-        """
+        """Shear modulus, permeability and friction of the insert, for `brake_force_N`."""
         mu_r, friction = self.relative_permeability, self.friction_coefficient
         return Elastomer(
             self.shear_modulus_Pa,
@@ -94,8 +79,7 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def matrix(self) -> Matrix:
-        """The silicone of the insert's hardness. Raises `DomainError` where none of `MATRICES`, the registry's, has
-        it."""
+        """The silicone of the insert's hardness."""
         known = ", ".join(map(str, MATRICES))
         allowed = f"one of a [[matrix]], {known}; or state friction_coefficient"
         require_that(self.shore_hardness in MATRICES, f"{self.name}: shore_hardness", self.shore_hardness, allowed)
@@ -103,23 +87,18 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def shear_modulus_Pa(self) -> float:
-        """Shear modulus G0 without field, Pa."""
         return self.shear_modulus_kPa * 1e3
 
     @property
     def force_range(self) -> MeasuredForceRange:
-        """The measured force range. Raises `DomainError` for an insert that has not been measured."""
+        """The measured force range."""
         if self.measured is None:
             raise DomainError("insert", repr(self.name), "one whose force range has been measured")
         return self.measured
 
     @property
     def masses_g(self) -> dict[str, float]:
-        """Mass of each content in 100 cc, g: `matrix`, `cip`, `slacker`, `thinner`.
-
-        The matrix fills what the others leave; its mass is negative where they leave nothing. Raises `DomainError`
-        where the insert's matrix is not in `MATRICES`.
-        """
+        """Mass of each content in 100 cc, g: `matrix`, `cip`, `slacker`, `thinner`."""
         matrix_fraction = 1.0 - self.cip_fraction - self.slacker_fraction - self.thinner_fraction
         return {
             "matrix": 100.0 * matrix_fraction * self.matrix.density_g_cc,
@@ -140,9 +119,6 @@ INSERTS = {item.name: item for item in _FILE.insert}
 
 
 def insert(name: str) -> Insert:
-    """Return an insert of the registry by its name, such as "MRE-50-40"; capitals count.
-
-    Raises `DomainError` listing the names if there is none.
-    """
+    """Return an insert of the registry by its name, such as "MRE-50-40"; capitals count."""
     require_that(name in INSERTS, "insert", repr(name), "one of " + ", ".join(INSERTS))
     return INSERTS[name]

@@ -22,10 +22,7 @@ MAX_STEP_S: Final = 1e9
 
 @final
 class PronyStep(Value):
-    """The exact update of a `PronySeries` over one length of step, for a driving force that is linear in the step.
-
-    `decays` are exp(-dt / tau_i), `gains` their means over the step.
-    """
+    """The exact update of a `PronySeries` over one length of step, for a driving force that is linear in the step."""
 
     __match_args__ = ("fractions", "decays", "gains")
 
@@ -39,12 +36,7 @@ class PronyStep(Value):
         self.gains: Final = gains
 
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
-        """Return the force, N, and the state at the end of a step, from the state at its beginning.
-
-        `driving_N` is the driving force at the end. The force may be below 0; the given state stays as it is. Raises
-        `DomainError` if `driving_N` is not finite or beyond MAX_FORCE_N, or if the state is not of as many branches as
-        the series. The state's forces are not checked: NaN stays.
-        """
+        """Return the force, N, and the state at the end of a step, from the state at its beginning."""
         if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
             require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         if len(state) != len(self.fractions) + 1:
@@ -59,19 +51,13 @@ class PronyStep(Value):
         return force_N, tuple(following)
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
-        """Return the step, of equal length, of a series with equal times and other fractions; this one stays.
-
-        There are as many `fractions` as before, with a sum below 1: neither is checked here.
-        """
+        """Return the step, of equal length, of a series with equal times and other fractions; this one stays."""
         return PronyStep(fractions, self.decays, self.gains)
 
 
 @final
 class PronySeries(Value):
-    """Relaxing fractions g_i (0..1, sum < 1), each with its time constant tau_i, 1e-6..1e9 s.
-
-    Raises `DomainError` for others.
-    """
+    """Relaxing fractions g_i (0..1, sum < 1), each with its time constant tau_i, 1e-6..1e9 s."""
 
     def __init__(self, fractions: tuple[float, ...], times_s: tuple[float, ...]) -> None:
         paired = f"one time for each of the {len(fractions)} fractions"
@@ -85,19 +71,12 @@ class PronySeries(Value):
         self.times_s: Final = times_s
 
     def relaxed(self, driving_N: float) -> PronyState:
-        """Return the state after an endless rest at a driving force: that force, and 0 N in every branch.
-
-        At 0 N it is that of an element that was never loaded. Raises `DomainError` if `driving_N` is not finite or
-        beyond MAX_FORCE_N.
-        """
+        """Return the state after an endless rest at a driving force: that force, and 0 N in every branch."""
         require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         return (driving_N, *[0.0 for _ in self.fractions])
 
     def discretise(self, dt_s: float) -> PronyStep:
-        """Return the update for steps of `dt_s`; 0 is a jump of the driving force. Keep it where the step is constant.
-
-        Raises `DomainError` unless 0 <= dt_s <= MAX_STEP_S, and so for NaN.
-        """
+        """Return the update for steps of `dt_s`; 0 is a jump of the driving force."""
         if not 0.0 <= dt_s <= MAX_STEP_S:  # spares every plan the call of `require`
             require("dt_s", dt_s, 0.0, MAX_STEP_S)
         ratios = [dt_s / time_s for time_s in self.times_s]

@@ -34,27 +34,18 @@ MAX_ENTRIES = 1_000_000
 
 
 class BlackBoxFile(msgspec.Struct, frozen=True):
-    """One black box as read: its header, and the entries of all parts in their order, as plain data.
-
-    A tick's entry is a list that begins with an integer. Any other entry is a word, or a list that begins with one.
-    """
+    """One black box as read: its header, and the entries of all parts in their order, as plain data."""
 
     header: dict[str, str]
     entries: list[Any]
     is_complete: bool = True
     "False for a file that was cut short: entries up to the cut are there."
     odd: str = ""
-    """The first message of `/ticks` or `/frames` that `/core` does not give, or why an entry of `/core` gives none.
-
-    Empty where there is neither."""
+    """The first message of `/ticks` or `/frames` that `/core` does not give, or why an entry of `/core` gives none."""
 
 
 class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Bytes between daemon and device: one CAN frame, one read of a serial port, or one frame written to it.
-
-    `monotonic_s` is on the clock of the ticks' `monotonic_s`. `data` is hexadecimal. `identifier` is None on a serial
-    port.
-    """
+    """Bytes between daemon and device: one CAN frame, one read of a serial port, or one frame written to it."""
 
     monotonic_s: float
     direction: str
@@ -64,12 +55,7 @@ class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def frames_in(entry: Any) -> list[Frame]:
-    """Return the frames in one entry of a black box, in their order; empty for an entry of another kind.
-
-    An entry of READ or WROTE is a list: name, time in s on the monotonic clock, and what passed; more is ignored. What
-    passed is bytes, or a list of bytes or of pairs, identifier and bytes. Time and identifier are not checked. Raises
-    ValueError or TypeError for an entry of READ or WROTE of another form.
-    """
+    """Return the frames in one entry of a black box, in their order; empty for an entry of another kind."""
     if not isinstance(entry, list) or not entry or entry[0] not in (READ, WROTE):
         return []
     direction, time_s, raw, *_ = entry
@@ -90,26 +76,16 @@ class Shown(NamedTuple):
 
 
 class Derived:
-    """Derives the messages of `/ticks` and `/frames` from the parts of `/core`.
-
-    Goes on from part to part: ticks and frames are numbered, and one offset times all frames.
-    """
+    """Derives the messages of `/ticks` and `/frames` from the parts of `/core`."""
 
     def __init__(self, columns: str) -> None:
-        """Begin; `columns` names the values of a tick, a list in JSON. Raises msgspec.MsgspecError for anything
-        else."""
+        """Begin; `columns` names the values of a tick, a list in JSON."""
         self._columns = msgspec.json.decode(columns, type=tuple[str, ...])
         self._ticks = self._frames = 0
         self._offset_ns: int | None = None
-        "From the monotonic clock to ns since 1970; None while unknown."
 
     def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
-        """Yield the messages derived from one part's entries, in their order: one a tick, one a frame.
-
-        `offset_ns` takes the monotonic clock to ns since 1970. The first one given times all frames, so that they stay
-        in order; while it is None, frames count from 0 of the monotonic clock. Raises ValueError where a tick and the
-        columns differ in length. Raises that, TypeError or OverflowError for a malformed READ or WROTE.
-        """
+        """Yield the messages derived from one part's entries, in their order: one a tick, one a frame."""
         if self._offset_ns is None:
             self._offset_ns = offset_ns
         for entry in entries:
@@ -124,13 +100,7 @@ class Derived:
 
 
 def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> None:
-    """Write a new black box of these parts, whole or not at all.
-
-    `header` needs `columns`: the names of a tick's values, a list in JSON; nothing else in it is checked. `key` seals
-    the file; an empty one seals it without a key. The folder has to exist. Raises FileExistsError where `path` exists,
-    and OSError. Raises KeyError without `columns`, msgspec.MsgspecError for what does not decode, and what
-    `Derived.of` raises for odd entries.
-    """
+    """Write a new black box of these parts, whole or not at all."""
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
     derived = Derived(header["columns"])
@@ -155,12 +125,7 @@ def is_tick(entry: Any) -> bool:
 
 
 def read_black_box(path: Path) -> BlackBoxFile:
-    """Read the black box in `path`; one that was cut short is returned as far as it reads, with `is_complete` False.
-
-    The first message of `/ticks` or `/frames` that differs from `/core` is named in `odd`, and raises nothing. Neither
-    the seal nor what the entries and the header say is checked. Raises RecordingError where the file is not readable,
-    not MCAP, damaged, beyond a bound, or no black box.
-    """
+    """Read the black box in `path`; one that was cut short is returned as far as it reads, with `is_complete` False."""
     found = _Reading(path)
     with opened(path) as file:
         is_complete = scan(file, str(path), found.take, found.message)
@@ -175,11 +140,7 @@ NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC} or no h
 
 
 class _Reading:
-    """A black box while it is read: each message of `/ticks` and `/frames` is compared with what `/core` gives.
-
-    `header` and `entries` are what was read so far, `odd` names the first message that differs. Derived messages wait
-    for the file's own.
-    """
+    """A black box while it is read: each message of `/ticks` and `/frames` is compared with what `/core` gives."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -190,15 +151,10 @@ class _Reading:
         self._derived: Derived | None = None
         self._expected: dict[str, deque[Shown]] = {TICKS_TOPIC: deque(), FRAMES_TOPIC: deque()}
         self._late_ns = {TICKS_TOPIC: 0}
-        "By topic, the first message's time less the derived one's; frames are derived without an offset."
         self._size = self._parts = 0
 
     def take(self, record: Record) -> None:
-        """Take a record that is no message: note a channel's topic, add to the header; others are passed over.
-
-        A channel keeps the first topic told of it, a name in the header its last value. Raises ValueError where `/core`
-        is not msgpack, and as `Record.read` for damage.
-        """
+        """Take a record that is no message: note a channel's topic, add to the header; others are passed over."""
         if record.opcode == Opcode.CHANNEL:
             channel = record.read(Channel)
             if channel.topic == CORE_TOPIC and channel.message_encoding != "msgpack":
@@ -210,11 +166,7 @@ class _Reading:
                 self.header.update(known.metadata)
 
     def message(self, sent: Sent) -> None:
-        """Keep the entries in a message of `/core`, or compare one of `/ticks` or `/frames` with them, or pass it over.
-
-        The first that differs is noted in `odd`, after which nothing more is compared. Raises RecordingError where
-        `take` was given no header before, and UNREADABLE (ValueError among them) for a damaged part.
-        """
+        """Keep the entries in a message of `/core`, or compare one of `/ticks` or `/frames` with them, or pass it over."""
         if not self.header:
             raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read
         topic = self._topics.get(sent.channel, "")
@@ -224,11 +176,7 @@ class _Reading:
             self._compare(topic, sent)
 
     def _part(self, sent: Sent) -> None:
-        """Add a part's entries to `entries`, and expect the messages derived from them in the file.
-
-        An entry from which none can be derived is noted in `odd`, and raises nothing. Raises ValueError beyond a bound
-        on bytes, parts or entries, and msgspec.MsgspecError for a part, or the header's columns, that do not decode.
-        """
+        """Add a part's entries to `entries`, and expect the messages derived from them in the file."""
         self._size, self._parts = self._size + len(sent.data), self._parts + 1
         if self._size > MAX_BYTES or self._parts > MAX_PARTS:
             raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
@@ -245,11 +193,7 @@ class _Reading:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
 
     def _compare(self, topic: str, sent: Sent) -> None:
-        """Compare the file's next message of `topic` with the next derived one, and note in `odd` where they differ.
-
-        Number and bytes have to be the same, a tick's time too. Frames' times may differ by what the first frame's do,
-        within MAX_OFF_NS. A message for which none is derived differs.
-        """
+        """Compare the file's next message of `topic` with the next derived one, and note in `odd` where they differ."""
         if self._expected[topic]:
             expected = self._expected[topic].popleft()
             late_ns = sent.t_ns - expected.t_ns

@@ -48,11 +48,7 @@ class Segment(NamedTuple):
 
 
 def segment_of(path: Path) -> Segment | None:
-    """Describe the recording in `path` by its name and size; None where its size cannot be asked, as of no file.
-
-    Nothing of the file is read; a link counts with its own size. `began_s` is None, and the segment not marked, where
-    the name is not that of a segment.
-    """
+    """Describe the recording in `path` by its name and size; None where its size cannot be asked, as of no file."""
     named = _NAME.fullmatch(path.name)
     began_s = None
     with contextlib.suppress(ValueError):  # such as the 13th month
@@ -65,11 +61,7 @@ def segment_of(path: Path) -> Segment | None:
 
 
 def mark(path: Path) -> Path:
-    """Rename a segment so that pruning keeps it, and return its new path; one that is marked already stays as it is.
-
-    One that somebody else has just marked counts as renamed. Raises ValueError where the file is not named as a
-    segment, and OSError where it is not there or cannot be renamed.
-    """
+    """Rename a segment so that pruning keeps it, and return its new path; one that is marked already stays as it is."""
     named = _NAME.fullmatch(path.name)
     require(named is not None, "the name", path.name, "that of a segment, as tormagctl record DIR gives it")
     if named is None or named[3]:
@@ -85,28 +77,18 @@ def mark(path: Path) -> Path:
 
 
 class RecordingFolder:
-    """Recordings in the folder `path` within `budget`; `clock` is in seconds since 1970.
-
-    Every method may raise OSError, also where there is no folder. None makes it.
-    """
+    """Recordings in the folder `path` within `budget`; `clock` is in seconds since 1970."""
 
     def __init__(self, path: Path, budget: Budget, clock: Callable[[], float] = time.time) -> None:
         self.path, self.budget, self._clock = path, budget, clock
 
     def segments(self) -> list[Segment]:
-        """List the folder's recordings by age, the oldest first; those whose name says no time come before all.
-
-        Every `*.mcap` in it counts, black boxes too, those in its folders do not. Empty where there is no folder.
-        """
+        """List the folder's recordings by age, the oldest first; those whose name says no time come before all."""
         found = [each for path in self.path.glob("*.mcap") if (each := segment_of(path)) is not None]
         return sorted(found, key=lambda each: (each.began_s or 0.0, each.path.name))
 
     def new(self) -> Path:
-        """Prune until a whole segment has room, and return the path for a new one, named by the present time.
-
-        Creates no file, and does not ask whether there is one of that name. Raises OSError with ENOSPC where even
-        pruning leaves no room.
-        """
+        """Prune until a whole segment has room, and return the path for a new one, named by the present time."""
         reason = self.make_room(self.budget.segment_bytes + END_BYTES)
         if reason:
             raise OSError(errno.ENOSPC, reason)
@@ -118,11 +100,7 @@ class RecordingFolder:
         return size >= self.budget.segment_bytes or lasted_s >= self.budget.segment_s
 
     def room(self, needed_bytes: int) -> str:
-        """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty where there is.
-
-        Short means: of `needed_bytes` and the budget's `free_bytes`. The budget's own size counts only then. A recorder
-        asks this while it writes.
-        """
+        """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty where there is."""
         if shutil.disk_usage(self.path).free >= self.budget.free_bytes + needed_bytes:
             return ""
         return self.make_room(needed_bytes)
@@ -134,11 +112,7 @@ class RecordingFolder:
         return f"No space left on device: {over}, and nothing unmarked is left to take away" if over else ""
 
     def prune(self, coming_bytes: int = 0) -> list[Segment]:
-        """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return those deleted.
-
-        Keeps what is marked, is being written, has no time in its name, or is a link, even where that leaves no room. A
-        segment that somebody else deleted meanwhile counts as deleted.
-        """
+        """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return those deleted."""
         left, gone = self.segments(), []
         for segment in list(left):
             is_old = segment.began_s is not None and self._clock() - segment.began_s > self.budget.most_s
@@ -148,12 +122,7 @@ class RecordingFolder:
         return gone
 
     def mark_around(self, segment: Path) -> Path:
-        """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return its new path.
-
-        One that is marked stays as it is; it may still be written. Raises ValueError where `segment` is not named as
-        one, or is marked now but not in this folder. Raises OSError where it cannot be renamed. A failure to mark the
-        one before is passed over.
-        """
+        """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return its new path."""
         marked = mark(segment)
         known = self.segments()
         place = [each.path for each in known].index(marked)
@@ -175,11 +144,7 @@ class RecordingFolder:
         return ""
 
     def _delete(self, segment: Segment) -> bool:
-        """Delete a segment and return True, also where it is gone already.
-
-        False where it is marked, has no time in its name, is a link, or is being written. Raises OSError where it
-        cannot be opened or deleted.
-        """
+        """Delete a segment and return True, also where it is gone already."""
         if segment.is_marked or segment.began_s is None or segment.path.is_symlink():
             return False
         with contextlib.suppress(FileNotFoundError), segment.path.open("rb") as file:

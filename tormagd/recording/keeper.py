@@ -22,8 +22,7 @@ from tormagd.output import write_line
 
 KEPT_S = 30.0
 MAX_BYTES = 48_000_000
-"""The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB. At higher
-rates or with previews the ring reaches less far back."""
+"""The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB."""
 MAX_FILES = 20
 "The oldest file is deleted when there are more."
 MAX_PACKET = 4_000_000
@@ -37,10 +36,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 class Ring:
     """The newest parts of a black box: none over `kept_s` older than the last, at most `most_bytes`, and always the
-    last.
-
-    `bytes` is the size of their entries.
-    """
+    last."""
 
     def __init__(self, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
         self._kept_s, self._most_bytes = kept_s, most_bytes
@@ -61,11 +57,7 @@ class Ring:
 
 
 class Keeper:
-    """Keeps the black box of the daemon at the other end of the socket `its`, and writes it to files.
-
-    Messages are those of `tormagd.keeping`, one a packet. Holds a ring of the newest parts and the daemon's last Begin:
-    folder, header, key. A file is due from its Write until it is written. At most one thread writes.
-    """
+    """Keeps the black box of the daemon at the other end of the socket `its`, and writes it to files."""
 
     def __init__(self, its: socket.socket) -> None:
         self._socket = its
@@ -75,12 +67,7 @@ class Keeper:
         self._writing: threading.Thread | None = None
 
     def run(self) -> None:
-        """Keep and write black boxes until the daemon ends, then write all that is still due, and return.
-
-        Files are written one at a time, in a thread of their own, and answered by a Written each. Those still due when
-        the daemon begins anew or ends are written at once, in this thread. A daemon that goes without End leaves a file
-        named DAEMON-DIED, where parts are kept. Raises msgspec.MsgspecError for a packet that does not decode.
-        """
+        """Keep and write black boxes until the daemon ends, then write all that is still due, and return."""
         while self._hear():
             if self._writing is not None and self._writing.is_alive():
                 continue  # one at a time
@@ -93,10 +80,7 @@ class Keeper:
         self._write_due()
 
     def _write_due(self) -> None:
-        """Write all black boxes that are still due, without waiting for what should have come into them.
-
-        Waits for the one that is being written. Failures are logged and answered; afterwards none is due.
-        """
+        """Write all black boxes that are still due, without waiting for what should have come into them."""
         if self._writing is not None:
             self._writing.join()
         for _, write in self._due:
@@ -104,12 +88,7 @@ class Keeper:
         self._due.clear()
 
     def _hear(self) -> bool:
-        """Wait for one packet from the daemon and take it; return whether the daemon goes on.
-
-        While files are due it waits LOOK_S at most; where nothing came, that is True. False after End, and where the
-        socket was closed or failed. Without End, and where parts are kept, a file named DAEMON-DIED becomes due then.
-        Raises msgspec.MsgspecError for a packet that does not decode.
-        """
+        """Wait for one packet from the daemon and take it; return whether the daemon goes on."""
         ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
         if not ready:
             return True
@@ -127,11 +106,7 @@ class Keeper:
         return not isinstance(said, End)
 
     def _take(self, said: Said) -> None:
-        """Take what the daemon said: keep a Part, begin anew for a Begin, or make the file of a Write due.
-
-        Begin first writes all that is due, then forgets every part. A Write is refused, by a Written that says so,
-        while MAX_DUE files are due. End changes nothing.
-        """
+        """Take what the daemon said: keep a Part, begin anew for a Begin, or make the file of a Write due."""
         match said:
             case Part():
                 self._ring.put(said)
@@ -144,11 +119,7 @@ class Keeper:
                 self._answer(Written(said.name, f"{said.name}: {MAX_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
-        """Write one black box of `parts`, delete the oldest files beyond MAX_FILES, and answer the daemon.
-
-        Makes the folder where there is none. A failure raises nothing, and goes to stderr and into the answer. It may
-        be: no parts, a file that exists, a full disk, an old file that stays. Lowers this thread's priority for good.
-        """
+        """Write one black box of `parts`, delete the oldest files beyond MAX_FILES, and answer the daemon."""
         from tormagd.recording.black_box import write_black_box
 
         with contextlib.suppress(OSError):
@@ -168,17 +139,12 @@ class Keeper:
         self._answer(Written(write.name, refusal))
 
     def _answer(self, answer: Written) -> None:
-        """Send an answer without waiting; a daemon that does not read is passed over."""
         with contextlib.suppress(OSError):  # there may be nobody any more
             self._socket.send(msgspec.msgpack.encode(answer), socket.MSG_DONTWAIT)
 
 
 def _key(file: str) -> bytes:
-    """Read the seals' key from `file`, without surrounding white space; empty for an empty name.
-
-    A file that cannot be read, or is no key, also gives an empty key, with a warning on stderr. It raises nothing: a
-    black box is worth more than its seal.
-    """
+    """Read the seals' key from `file`, without surrounding white space; empty for an empty name."""
     from tormagd.recording.seal import read_key
 
     try:

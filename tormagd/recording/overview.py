@@ -78,10 +78,7 @@ class Glance(TypedDict, total=False):
 
 
 class Curves(msgspec.Struct, frozen=True):
-    """Least and greatest value of each quantity in every stretch that has a message, as bytes.
-
-    `stretches` are their numbers (int64); `low` and `high`, by quantity, are float32 with NaN where no value is known.
-    """
+    """Least and greatest value of each quantity in every stretch that has a message, as bytes."""
 
     stretches: bytes
     low: dict[str, bytes]
@@ -126,7 +123,6 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the first message to the latest, s."""
         return (self.end_ns - self.start_ns) * 1e-9
 
     def require_messages(self) -> None:
@@ -135,11 +131,7 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("the recording has no messages: was the daemon running?")
 
     def series(self, name: str) -> Series | None:
-        """Return the quantity `name`, one of QUANTITIES, from the ticks or else from the snapshots.
-
-        Only stretches with a message are in it; NaN stands where such a stretch has no known value. None where neither
-        has a known value, and for another name.
-        """
+        """Return the quantity `name`, one of QUANTITIES, from the ticks or else from the snapshots."""
         for curves in (self.of_ticks, self.of_snapshots):
             if name in curves.low:
                 low, high = _numbers(curves.low[name]), _numbers(curves.high[name])
@@ -149,11 +141,7 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
-        """Return, by code of this kind, the spans in which the code was present: from and to, seconds since the start.
-
-        `kind` is one of KINDS; empty for another. Spans are in the order of time; those of a code that came and went
-        often may be joined.
-        """
+        """Return, by code of this kind, the spans in which the code was present: from and to, seconds since the start."""
         known = self.codes.get(kind, {})
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
@@ -163,11 +151,7 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def unpacked(data: bytes) -> Overview:
-    """Decode an overview that `Overview.packed` made.
-
-    Types, lengths, and the form of codes are checked; what the numbers say, such as the order of spans, is not. Raises
-    ValueError for anything else, or beyond a bound.
-    """
+    """Decode an overview that `Overview.packed` made."""
     if len(data) > MAX_BYTES:
         raise ValueError(f"an overview of {len(data)} bytes: allowed is {MAX_BYTES}")
     try:
@@ -185,11 +169,7 @@ def unpacked(data: bytes) -> Overview:
 
 
 class OverviewBuilder:
-    """Builds an overview message by message, in bounded memory.
-
-    Holds, for ticks and for snapshots apart, curves, spans of codes, following and a count; for both a histogram of
-    lateness and marks.
-    """
+    """Builds an overview message by message, in bounded memory."""
 
     def __init__(self) -> None:
         self._start_ns: int | None = None
@@ -202,11 +182,7 @@ class OverviewBuilder:
         self._marks: list[Mark] = []
 
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
-        """Add one message, a control tick or a snapshot, in the order of writing; `t_ns` is since 1970.
-
-        `message` has fields of Glance; others are ignored, and a missing one is not known. `lateness_us`, us, goes into
-        the histogram. A mark counts once, not one set before the recording began, and MAX_MARKS at most.
-        """
+        """Add one message, a control tick or a snapshot, in the order of writing; `t_ns` is since 1970."""
         if self._start_ns is None:
             self._start_ns = self._end_ns = t_ns
         since_ns = t_ns - self._start_ns
@@ -225,11 +201,7 @@ class OverviewBuilder:
             self._marks.append(mark)
 
     def made(self) -> Overview:
-        """Return the overview of what was added; all times are 0 where nothing was.
-
-        Codes are the ticks', and of a kind that no tick tells the snapshots'. Following is the ticks', or the
-        snapshots' where no tick counts. Ends every open span: add nothing afterwards.
-        """
+        """Return the overview of what was added; all times are 0 where nothing was."""
         width_ns = max(each.width_ns for each in self._stretches.values())
         for each in self._stretches.values():
             each.widen(width_ns)
@@ -252,12 +224,7 @@ class OverviewBuilder:
 
 
 def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """Return the QUANTITIES of a tick or a snapshot in their order; None for what is missing or no number.
-
-    NaN stays. A missing `gap_mm` is the sum of `left_mm` and `right_mm`. A missing `gap_setpoint_mm` is
-    `reference_gap_mm`. `duty`, left and right, goes before `left_duty` and `right_duty`; that it is a pair is not
-    checked.
-    """
+    """Return the QUANTITIES of a tick or a snapshot in their order; None for what is missing or no number."""
     get = message.get
     gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
     if gap_mm is None and left_mm is not None and right_mm is not None:
@@ -277,15 +244,11 @@ def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
 
 
 def _number(value: object) -> float | None:
-    """Return a float or an integer as it is, None for anything else, a boolean among them."""
     return value if value.__class__ is float or value.__class__ is int else None
 
 
 def codes_in(told: object) -> tuple[str, ...]:
-    """Return the codes in a field's value, a text, or a list or tuple of texts; empty for anything else, such as None.
-
-    Characters that no code has become "?", a code that is too long is cut to 64 characters, and an empty one is "?".
-    """
+    """Return the codes in a field's value, a text, or a list or tuple of texts; empty for anything else, such as None."""
     words = (told,) if isinstance(told, str) else told if isinstance(told, tuple | list) else ()
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 
@@ -300,11 +263,7 @@ class _Followed(Following):
     _number = 0
 
     def add(self, since_ns: int, asked_N: float | None, measured_N: float | None, message: Mapping[str, Any]) -> None:
-        """Look at a message where the next look is due, one in each PERIOD_S; pass it over where none is.
-
-        State, limits, place and rate of the handle are taken from `message`; None or missing is not known. Over
-        BREAK_NS after the last look, or where time ran back, the way to the first force begins anew.
-        """
+        """Look at a message where the next look is due, one in each PERIOD_S; pass it over where none is."""
         number = since_ns // _LOOK_NS
         if number == self._number:
             return
@@ -326,12 +285,7 @@ class _Stretches:
         self._high = [array("f") for _ in QUANTITIES]
 
     def add(self, since_ns: int, values: Iterable[float | None]) -> None:
-        """Add one value of each of QUANTITIES, in their order, to the stretch of `since_ns`.
-
-        `since_ns` counts from the recording's start. Where time ran back, the values go to the last stretch. None and
-        NaN are passed over. A stretch beyond MAX_STRETCHES makes all of them twice as wide. Raises ValueError for
-        another number of values.
-        """
+        """Add one value of each of QUANTITIES, in their order, to the stretch of `since_ns`."""
         number = since_ns // self.width_ns
         # a clock that was set back does not set the curve back
         if not self._numbers or number > self._numbers[-1]:
@@ -351,10 +305,7 @@ class _Stretches:
                     high[-1] = value
 
     def widen(self, width_ns: int) -> None:
-        """Merge stretches to the width `width_ns`, and keep it for those to come.
-
-        It has to be a multiple of the present width, which is not checked.
-        """
+        """Merge stretches to the width `width_ns`, and keep it for those to come."""
         ratio, self.width_ns = width_ns // self.width_ns, width_ns
         if ratio == 1 or not self._numbers:
             return
@@ -377,10 +328,7 @@ class _Stretches:
 
 
 def _joined(spans: list[list[int]]) -> list[list[int]]:
-    """Return the spans with those joined that have the smaller gaps between them, about half; the last stays alone.
-
-    `spans` are from and to, in the order of time. Raises IndexError for fewer than three. The lists in it are changed.
-    """
+    """Return the spans with those joined that have the smaller gaps between them, about half; the last stays alone."""
     gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
     near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
     for span, gap_ns in zip(spans[1:-1], gaps, strict=True):
@@ -399,10 +347,7 @@ class _Held:
         self.ns = 0
 
     def hold(self, from_ns: int, to_ns: int) -> None:
-        """Add a span, or extend the last one where it reaches `from_ns`; beyond MAX_SPANS the nearest are joined.
-
-        Both count from the recording's start. `ns` grows by what was not covered yet.
-        """
+        """Add a span, or extend the last one where it reaches `from_ns`; beyond MAX_SPANS the nearest are joined."""
         if self.spans and from_ns <= self.spans[-1][1] <= to_ns:
             self.ns += to_ns - self.spans[-1][1]
             self.spans[-1][1] = to_ns
@@ -414,10 +359,7 @@ class _Held:
 
 
 class _Codes:
-    """The codes of one kind of message, and when each was present.
-
-    Holds spans and total time of each code, the last message's codes and time, and the usual step between messages.
-    """
+    """The codes of one kind of message, and when each was present."""
 
     def __init__(self) -> None:
         self._known: dict[str, dict[str, _Held]] = {kind: {} for kind in KINDS}
@@ -425,11 +367,7 @@ class _Codes:
         self._now_ns = self._step_ns = 0
 
     def add(self, since_ns: int, message: Mapping[str, Any]) -> None:
-        """Hold the last message's codes up to this one, or, over a break, for one usual step; then take this one's.
-
-        `since_ns` counts from the recording's start. The codes are those in the fields KINDS of `message`; one that is
-        missing has none. Where time ran back, the last message's codes held for no time.
-        """
+        """Hold the last message's codes up to this one, or, over a break, for one usual step; then take this one's."""
         passed_ns = since_ns - self._now_ns
         if 0 < passed_ns <= BREAK_NS:
             self._step_ns = passed_ns
@@ -447,10 +385,7 @@ class _Codes:
             held.hold(self._now_ns, self._now_ns + for_ns)
 
     def made(self) -> dict[str, dict[str, Codes]]:
-        """Hold the last message's codes for one usual step, forget them, and return all spans by kind and code.
-
-        Every one of KINDS is there, empty where it had no code; codes are in the order in which they appeared.
-        """
+        """Hold the last message's codes for one usual step, forget them, and return all spans by kind and code."""
         self._hold(self._step_ns)
         self._now = []
         return {

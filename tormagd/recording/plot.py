@@ -48,12 +48,7 @@ Spans = dict[str, list[tuple[float, float]]]
 
 
 def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
-    """Draw a recording as four panels over one time axis: force, gap, duty, and lanes for state, limits and faults.
-
-    The headline has `title`, the faults, how well the force was followed, and the `notes`. A panel without a value says
-    so. Faults are shaded red; marks stand in the force's panel, cut to 40 characters. Nothing is shown or written.
-    Raises ValueError for a recording without messages.
-    """
+    """Draw a recording as four panels over one time axis: force, gap, duty, and lanes for state, limits and faults."""
     overview.require_messages()
     states, limits, faults = (overview.spans_s(kind) for kind in ("operating_state", "limits", "faults"))
     lanes = bool(states) + len(limits) + max(1, len(faults))
@@ -99,12 +94,7 @@ def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
 
 
 def _place(high_in: float, lines: int, longest: int) -> dict[str, float]:
-    """Return where the four panels are in a figure of WIDE_IN by `high_in`, inches, by matplotlib's names.
-
-    They are under a headline of `lines`, right of names of `longest` characters. `left`, `right`, `top` and `bottom`
-    are shares of the figure, from its left and its lower edge. `hspace` is the distance between panels, as a share of a
-    panel's mean height.
-    """
+    """Return where the four panels are in a figure of WIDE_IN by `high_in`, inches, by matplotlib's names."""
     left_in, top_in, bottom_in, between_in = max(0.9, 0.25 + 0.078 * longest), 0.45 + 0.24 * lines, 0.6, 0.34
     panel_in = (high_in - top_in - bottom_in - 3.0 * between_in) / 4.0
     return {
@@ -117,19 +107,14 @@ def _place(high_in: float, lines: int, longest: int) -> dict[str, float]:
 
 
 def picture(drawn: Figure, form: str) -> bytes:
-    """Return the figure as the bytes of an image file of this form, such as "png". Raises ValueError for an unknown
-    form."""
+    """Return the figure as the bytes of an image file of this form, such as "png"."""
     made = io.BytesIO()
     drawn.savefig(made, format=form, dpi=110)
     return made.getvalue()
 
 
 def save_plot(drawn: Figure, path: Path) -> None:
-    """Write the figure to `path`, in place of a file that is there, whole or not at all.
-
-    The folder has to exist. Raises ValueError for a suffix other than FORMATS in any case, before anything is written,
-    and OSError.
-    """
+    """Write the figure to `path`, in place of a file that is there, whole or not at all."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
     data = picture(drawn, path.suffix[1:].lower())
@@ -139,11 +124,7 @@ def save_plot(drawn: Figure, path: Path) -> None:
 
 
 def _headline(overview: Overview, title: str, notes: Sequence[str]) -> str:
-    """Return the headline: `title` with the faults' codes, or "no fault", on the first line.
-
-    Then comes a line for how well the force was followed, unless that is not known, and each note, in lines of 100
-    characters.
-    """
+    """Return the headline: `title` with the faults' codes, or "no fault", on the first line."""
     names = ", ".join(overview.spans_s("faults"))
     how = in_words(overview.following)
     followed = [f"followed {how} (sensor noise included)"] if how else []
@@ -153,11 +134,7 @@ def _headline(overview: Overview, title: str, notes: Sequence[str]) -> str:
 
 
 def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:
-    """Draw a quantity as one line from each stretch's least value to its greatest and on to the next; nothing for None.
-
-    The line is broken over more than BREAK_S or two usual steps without a message. `label` is for the legend, `style`
-    is matplotlib's, `width` in points.
-    """
+    """Draw a quantity as one line from each stretch's least value to its greatest and on to the next; nothing for None."""
     if data is None:
         return
     # from the least to the greatest of each stretch, and on to the next
@@ -175,10 +152,7 @@ def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, 
 
 
 def _dress(axes: Axes, label: str, quantity: str) -> None:
-    """Style a panel with `label` at its y axis, and give it a legend above.
-
-    Call it once the lines are drawn: a panel without lines says in its middle that no `quantity` was recorded.
-    """
+    """Style a panel with `label` at its y axis, and give it a legend above."""
     axes.set_ylabel(label)
     axes.grid(axis="both", color="#e6e6e6", linewidth=0.7)
     axes.set_axisbelow(True)
@@ -190,12 +164,7 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
 
 
 def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults: Spans) -> None:
-    """Draw one lane for the operating state and one for each limit and fault, below each other, and name them.
-
-    `states`, `limits` and `faults` are the overview's spans by code. A limit's name has its share of the time, %.
-    Without faults one empty lane says so; without states there is no lane of them. The longest span of each state bears
-    its name.
-    """
+    """Draw one lane for the operating state and one for each limit and fault, below each other, and name them."""
     held_s = {name: codes.held_ns * 1e-9 for name, codes in overview.codes["limits"].items()}
     shares = {name: 100.0 * held_s[name] / max(overview.duration_s, 1e-3) for name in limits}
     rows: list[tuple[str, list[tuple[str, Spans, str]]]] = [
@@ -224,10 +193,6 @@ def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults:
 
 
 def _name_spans(axes: Axes, name: str, spans: list[tuple[float, float]], row: int) -> None:
-    """Write the state's `name` into the longest of its `spans`, in the lane `row`, from 0 on.
-
-    What does not fit the panel is clipped. Raises ValueError for no spans.
-    """
     start, end = max(spans, key=lambda span: span[1] - span[0])
     axes.annotate(
         name,

@@ -36,10 +36,7 @@ class RecordingError(ValueError):
 
 
 class Seen(NamedTuple):
-    """A control tick or a snapshot: its time in ns since 1970, which of the two, and the fields that were wanted.
-
-    A field without a known value is absent from `message`.
-    """
+    """A control tick or a snapshot: its time in ns since 1970, which of the two, and the fields that were wanted."""
 
     t_ns: int
     is_tick: bool
@@ -48,11 +45,7 @@ class Seen(NamedTuple):
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open the file in `path` for reading, as a context.
-
-    Raises RecordingError where it is not readable or no regular file. An OSError within the context becomes a
-    RecordingError, too.
-    """
+    """Open the file in `path` for reading, as a context."""
     try:
         require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file:
@@ -63,10 +56,7 @@ def opened(path: Path) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def readable(name: str) -> Iterator[None]:
-    """Turn any of UNREADABLE raised within this context into a RecordingError that calls the file `name`.
-
-    A RecordingError stays as it is; OSError and all others pass through.
-    """
+    """Turn any of UNREADABLE raised within this context into a RecordingError that calls the file `name`."""
     try:
         yield
     except RecordingError:
@@ -76,13 +66,7 @@ def readable(name: str) -> Iterator[None]:
 
 
 def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Callable[[Sent], None]) -> bool:
-    """Read an MCAP file from its beginning: each message goes to `message`, any other record, also a chunk, to `take`.
-
-    `file` has to stand at byte 0, and is left where reading ended. Returns whether the file ends as it should; False
-    for one cut short. `take` gets END last, which is no MCAP record, where it does. Raises OSError, and RecordingError,
-    naming the file `name`: not MCAP, empty, damaged, or refused by a callback that raises UNREADABLE (ValueError among
-    them).
-    """
+    """Read an MCAP file from its beginning: each message goes to `message`, any other record, also a chunk, to `take`."""
     last = -1
     with readable(name):
         for record in contents(file, message):
@@ -102,10 +86,7 @@ class Place(NamedTuple):
 
 
 class Contents:
-    """Collects what a file's records tell: topics, metadata, and places of chunks, in the file's order.
-
-    `metadata` are tormagd's own, texts by name. `take` raises UNREADABLE for damage.
-    """
+    """Collects what a file's records tell: topics, metadata, and places of chunks, in the file's order."""
 
     def __init__(self) -> None:
         self._topics: dict[int, str] = {}
@@ -117,11 +98,7 @@ class Contents:
         "False where the recorder was killed or the disk was full: messages up to then are there."
 
     def take(self, record: Record) -> None:
-        """Note what a record that is no message tells: a channel's topic, tormagd's metadata, or a chunk's place.
-
-        Of metadata the last value of a name counts, of a channel its last topic. Chunks beyond MAX_INDEX and all other
-        records are passed over.
-        """
+        """Note what a record that is no message tells: a channel's topic, tormagd's metadata, or a chunk's place."""
         if record.opcode == Opcode.CHANNEL:
             channel = record.read(Channel)
             self._topics[channel.id] = channel.topic
@@ -135,12 +112,7 @@ class Contents:
             self.places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
 
     def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Sent], None]:
-        """Return a function of one Sent, which hands each tick and snapshot to `each`, decoded as the type `wanted`.
-
-        `wanted` is any type that msgspec decodes from JSON; fields that it leaves out are ignored. Messages of topics
-        that `take` was not told of before are passed over. The function raises UNREADABLE for damage, and what `each`
-        raises.
-        """
+        """Return a function of one Sent, which hands each tick and snapshot to `each`, decoded as the type `wanted`."""
         decoder = msgspec.json.Decoder(wanted)
 
         def message(sent: Sent) -> None:
@@ -158,11 +130,7 @@ class Contents:
             )
 
     def described(self, name: str, kind: Any) -> Any:
-        """Return the metadata value `name`, which is JSON, decoded as the type `kind` by msgspec.
-
-        None where it is absent, no JSON, or of another type. A text that the recorder wrote as it is, without quotes,
-        gives None too: take it from `metadata`.
-        """
+        """Return the metadata value `name`, which is JSON, decoded as the type `kind` by msgspec."""
         try:
             return msgspec.json.decode(self.metadata[name], type=kind)
         except (KeyError, msgspec.MsgspecError, RecursionError):
@@ -170,14 +138,7 @@ class Contents:
 
 
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Read the recording in an open `file` at byte 0, which errors call `name`: each tick and snapshot goes to `each`.
-
-    `wanted` is the type to decode messages as. Returns metadata, chunk places, and whether it is complete; one cut
-    short is read as far as it goes. The file stays open, and its seals are not checked. Raises RecordingError: not
-    MCAP, damaged, or without ticks and snapshots; and OSError. Ticks and snapshots before the damage have then gone to
-    `each`. What `each` raises ends the reading; one of UNREADABLE, such as ValueError, becomes a RecordingError as if
-    the file were damaged.
-    """
+    """Read the recording in an open `file` at byte 0, which errors call `name`: each tick and snapshot goes to `each`."""
     found = Contents()
     is_whole = scan(file, name, found.take, found.reading(wanted, each))
     found.require(name)
@@ -186,21 +147,13 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
 
 
 def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Read the recording in `path`: each tick and snapshot, decoded as the type `wanted`, goes to `each`.
-
-    Returns and raises as `read_open`, but a file that cannot be opened or read is a RecordingError, too. So is an
-    OSError of `each`: it looks like one of this file.
-    """
+    """Read the recording in `path`: each tick and snapshot, decoded as the type `wanted`, goes to `each`."""
     with opened(path) as file:
         return read_open(file, str(path), wanted, each)
 
 
 class RecordingFile:
-    """A recording on the disk, of any length: its `overview`, `metadata`, `is_complete`, and any seconds of it.
-
-    The overview is its recorder's where its seals, checked with `key`, are whole; else it is made from all messages.
-    Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd.
-    """
+    """A recording on the disk, of any length: its `overview`, `metadata`, `is_complete`, and any seconds of it."""
 
     def __init__(self, path: Path, key: bytes = b"") -> None:
         self.path = path
@@ -223,12 +176,7 @@ class RecordingFile:
 
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, both included, in the file's order, decoded as
-        `wanted`.
-
-        Times are ns since 1970; empty where nothing is in between. Only chunks are read: messages outside of one are
-        not found. Raises RecordingError where the file can no longer be read, is damaged there, or has over MAX_SEEN
-        messages in this time.
-        """
+        `wanted`."""
         found: list[Seen] = []
 
         def keep(seen: Seen) -> None:
@@ -247,11 +195,7 @@ class RecordingFile:
 
 
 def summary_of(path: Path) -> tuple[Contents, Overview] | None:
-    """Read contents and overview from the end of the file in `path`, without its messages.
-
-    Its seals are not checked. None for a cut file, or one without an overview. Raises RecordingError: not readable,
-    damaged, or without ticks and snapshots.
-    """
+    """Read contents and overview from the end of the file in `path`, without its messages."""
     with opened(path) as file, readable(str(path)):
         found = _from_summary(file)
         if found is not None:
@@ -260,11 +204,7 @@ def summary_of(path: Path) -> tuple[Contents, Overview] | None:
 
 
 def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
-    """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview.
-
-    Messages are not read, and nothing says whose they are: `Contents.require` does. Raises OSError, and any of
-    UNREADABLE for damage, which `readable` makes a RecordingError.
-    """
+    """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview."""
     at = file.seek(0, 2) - TAIL_BYTES
     file.seek(max(0, at))
     if at < 0 or not file.read().endswith(MAGIC):
@@ -295,10 +235,7 @@ def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
 
 
 def _at(file: BinaryIO, at: int, opcode: Opcode) -> Record:
-    """Read the record at byte `at`, and leave `file` behind it.
-
-    Raises ValueError where it is cut, too long, or of another kind than `opcode`.
-    """
+    """Read the record at byte `at`, and leave `file` behind it."""
     file.seek(at)
     record = record_at(file, at)
     if record is None or record.opcode != opcode:

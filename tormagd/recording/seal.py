@@ -33,11 +33,7 @@ _BODY = struct.Struct(f"<B{DIGEST_BYTES}s")
 
 
 def read_key(file: str) -> bytes:
-    """Read the sealing key from the file named `file`, without surrounding white space; empty for an empty name.
-
-    Raises OSError where it cannot be read, is no regular file, or has over 2 * MAX_KEY bytes. Raises ValueError where
-    the key is not of MIN_KEY..MAX_KEY bytes, as of an empty file.
-    """
+    """Read the sealing key from the file named `file`, without surrounding white space; empty for an empty name."""
     if not file:
         return b""
     key = read_bounded(Path(file), 2 * MAX_KEY).strip()
@@ -47,10 +43,7 @@ def read_key(file: str) -> bytes:
 
 
 def hasher(key: bytes) -> "hashlib.blake2b":
-    """Return a new BLAKE2b hash of DIGEST_BYTES with this key; an empty key means none.
-
-    Raises ValueError for a key of over 64 bytes.
-    """
+    """Return a new BLAKE2b hash of DIGEST_BYTES with this key; an empty key means none."""
     return hashlib.blake2b(key=key, digest_size=DIGEST_BYTES)
 
 
@@ -65,10 +58,7 @@ class SealingFile:
         "Digest of the newest seal, hexadecimal; empty before the first."
 
     def write(self, data: bytes) -> None:
-        """Write `data` behind what was written, and digest it; while `finish` holds the file's end back, keep it.
-
-        Raises OSError.
-        """
+        """Write `data` behind what was written, and digest it; while `finish` holds the file's end back, keep it."""
         if self._held is None:
             self._file.write(data)
             self._hash.update(data)
@@ -80,14 +70,11 @@ class SealingFile:
         return self._file.tell() + len(self._held or b"")
 
     def flush(self) -> None:
-        """Hand all buffered bytes to the operating system. Raises OSError."""
+        """Hand all buffered bytes to the operating system."""
         self._file.flush()
 
     def seal(self, *, is_last: bool = False) -> bytes:
-        """Write a seal of all bytes before it, keep its digest in `digest`, and return the whole record's bytes.
-
-        `is_last` says that it is the file's last; what follows is not refused. Raises OSError.
-        """
+        """Write a seal of all bytes before it, keep its digest in `digest`, and return the whole record's bytes."""
         digest = _digest(self._hash, is_last)
         body = _BODY.pack(is_last, digest)
         record = Record(SEAL, 0, body).head + body
@@ -96,11 +83,7 @@ class SealingFile:
         return record
 
     def finish(self, mcap: Writer) -> None:
-        """Finish the file that `mcap` writes here: summary, last seal, then a footer whose CRC covers both.
-
-        `mcap` has to write to this object, once; it writes nothing afterwards. The file is flushed and stays open.
-        Raises OSError.
-        """
+        """Finish the file that `mcap` writes here: summary, last seal, then a footer whose CRC covers both."""
         mcap.flush()  # type: ignore[no-untyped-call]
         self._held = bytearray()
         mcap.finish()  # type: ignore[no-untyped-call]
@@ -134,10 +117,6 @@ class Verdict(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Return False for an altered file, one whose key is not here, or one sealed without the configured key.
-
-        True for any other, also without seals where no key is configured.
-        """
         return self.state not in (State.ALTERED, State.OTHER_KEY, State.NO_KEY)
 
     def text(self) -> str:
@@ -146,13 +125,7 @@ class Verdict(NamedTuple):
 
 
 def verified(path: Path, key: bytes = b"") -> Verdict:
-    """Check the seals of the file in `path`, all of which is read, and return the verdict.
-
-    Damage is a verdict, too: ALTERED, also for what is no MCAP. A file cut short is UNFINISHED. Keyed seals need their
-    `key`; with a wrong one the state is ALTERED. With an empty one it is OTHER_KEY as long as every record can be read,
-    even where bytes were altered. With a `key`, a file without seals is NO_KEY, and so is an intact one whose seals
-    have no key. Raises OSError.
-    """
+    """Check the seals of the file in `path`, all of which is read, and return the verdict."""
     with path.open("rb") as file:
         found = _Check(key)
         try:
@@ -166,11 +139,7 @@ def verified(path: Path, key: bytes = b"") -> Verdict:
 
 
 class _Check:
-    """Checks one file's seals, record by record.
-
-    Holds the hash of all bytes so far, what the file says of its seals, and the last seal. Also the summary's place and
-    CRC, and the first oddity.
-    """
+    """Checks one file's seals, record by record."""
 
     def __init__(self, key: bytes) -> None:
         self._key = key
@@ -181,14 +150,9 @@ class _Check:
         self._summary_at = self._offsets_at = self._crc = 0
         self._is_last = self._is_over = False
         self._odd = ""
-        "The first thing that is not as it was sealed."
 
     def take(self, record: Record) -> None:
-        """Check the next record in the file's order, and note what is not as it was sealed.
-
-        Give it every record of `records`, END too. What is wrong with a seal, a footer, or behind the last seal is
-        noted, not raised. Raises McapError, ValueError or struct.error for metadata or a footer that cannot be parsed.
-        """
+        """Check the next record in the file's order, and note what is not as it was sealed."""
         if record.opcode == END:
             self._is_over = True
         elif record.opcode == SEAL:
@@ -200,11 +164,7 @@ class _Check:
         self._digest(record)
 
     def _digest(self, record: Record) -> None:
-        """Add a record to the hash, or while there is none, to the bytes that the hash will begin with.
-
-        Those are given up once a record is neither header nor metadata: such a file is not sealed. A record of the
-        summary is added to its CRC, too, and its place is kept. Raises as `Record.read` for metadata.
-        """
+        """Add a record to the hash, or while there is none, to the bytes that the hash will begin with."""
         if self._hash is not None:
             self._hash.update(record.head)  # apart: a chunk is a megabyte, and joining would copy it
             self._hash.update(record.body)
@@ -222,11 +182,7 @@ class _Check:
             self._summary_at = record.at + HEAD.size + len(record.body)
 
     def _begin(self, record: Record) -> None:
-        """Begin the hash with all bytes so far, where this metadata record says that the file is sealed.
-
-        Nothing happens for other metadata. Keeps by what it is sealed, and what it follows; a kind of seal that tormagd
-        does not write is noted. Raises as `Record.read`.
-        """
+        """Begin the hash with all bytes so far, where this metadata record says that the file is sealed."""
         known = record.read(Metadata)
         if known.name == SEALED:
             self._by, self._follows = known.metadata.get("by", "?"), known.metadata.get("follows", "")
@@ -236,10 +192,7 @@ class _Check:
             self._hash.update(self._head)
 
     def _compare(self, record: Record) -> None:
-        """Compare a seal with the digest of the bytes before it, and keep it as the newest.
-
-        A mismatch is noted. So is a seal after the last, of a wrong size, or in a file that does not say it is sealed.
-        """
+        """Compare a seal with the digest of the bytes before it, and keep it as the newest."""
         self._seals += 1
         if self._hash is None or len(record.body) != _BODY.size:
             self._note("a seal where none can be", record.at)
@@ -251,10 +204,7 @@ class _Check:
         self._sealed_to = record.at + HEAD.size + len(record.body)
 
     def _end(self, record: Record) -> None:
-        """Compare a footer with the summary before it, and note one whose offsets, CRC or size do not fit.
-
-        Raises McapError or struct.error for one that is too short.
-        """
+        """Compare a footer with the summary before it, and note one whose offsets, CRC or size do not fit."""
         footer = Footer.read(ReadDataStream(BytesIO(record.body)))
         own = zlib.crc32((record.head + record.body)[: _FOOTER_BYTES - 4], self._crc)
         told = (footer.summary_start, footer.summary_offset_start, footer.summary_crc)
@@ -262,21 +212,13 @@ class _Check:
             self._note("its footer does not fit what it ends", record.at)
 
     def _note(self, what: str, at: int) -> None:
-        """Keep the first oddity; later ones are passed over."""
         self._odd = self._odd or f"{what} (byte {at})"
 
     def broken(self, why: str) -> Verdict:
-        """Return the verdict where a record cannot be read: altered, for the first oddity noted or else `why`."""
         return Verdict(State.ALTERED, self._odd or why, self._follows, self._last)
 
     def verdict(self, size: int, *, ends: bool) -> Verdict:
-        """Return the verdict on a file of `size` bytes; `ends` says whether its last bytes are MCAP's closing magic.
-
-        Call it once, after the last record. The first that holds: UNSEALED for a file without a word of seals, but
-        NO_KEY where a key is configured. OTHER_KEY for keyed seals without the key. ALTERED for an oddity, or an end
-        that the seals do not explain. NO_KEY for plain seals where a key is configured; UNFINISHED for a file cut
-        short; else WHOLE.
-        """
+        """Return the verdict on a file of `size` bytes; `ends` says whether its last bytes are MCAP's closing magic."""
         if not self._by and not self._seals and (self._is_over or not self._head):
             why = "nothing says whether it was changed: an older tormagd, or another program, wrote it"
             return Verdict(State.NO_KEY if self._key else State.UNSEALED, why)
@@ -298,7 +240,7 @@ class _Check:
 
 
 def _digest(known: "hashlib.blake2b", is_last: bool) -> bytes:
-    """Return the digest of all bytes so far, and of whether the seal is the last. Leaves the hash as it is."""
+    """Return the digest of all bytes so far, and of whether the seal is the last."""
     here = known.copy()
     here.update(b"\1" if is_last else b"\0")
     return here.digest()

@@ -42,11 +42,10 @@ class Record(NamedTuple):
 
     @property
     def head(self) -> bytes:
-        """Return the head of nine bytes before the body: kind and length."""
         return HEAD.pack(self.opcode, len(self.body))
 
     def read(self, kind: Any) -> Any:
-        """Parse the body as the type `kind` of `mcap.records`. Raises McapError, ValueError, struct.error."""
+        """Parse the body as the type `kind` of `mcap.records`."""
         return kind.read(ReadDataStream(BytesIO(self.body)))
 
 
@@ -60,12 +59,7 @@ class Sent(NamedTuple):
 
 
 def contents(file: BinaryIO, message: Callable[[Sent], None]) -> Iterator[Record]:
-    """Read an MCAP file: call `message` with each message, and yield every other record in order, also those in chunks.
-
-    A chunk itself is yielded before its records. END comes last, unless the file is cut short. `file` stands at byte 0.
-    Raises OSError, and ValueError, McapError, ZstdError, struct.error where the file is damaged or beyond the bounds.
-    What `message` raises passes through.
-    """
+    """Read an MCAP file: call `message` with each message, and yield every other record in order, also those in chunks."""
     unpacker = Unpacker()
     for record in records(file):
         if record.opcode == Opcode.CHUNK:
@@ -78,11 +72,7 @@ def contents(file: BinaryIO, message: Callable[[Sent], None]) -> Iterator[Record
 
 
 def records(file: BinaryIO) -> Iterator[Record]:
-    """Yield the records of an MCAP file from its beginning; the last is END, which a file cut short does not have.
-
-    Chunks are not unpacked, and an empty file, or one cut within its first eight bytes, has none. `file` stands at byte
-    0. Raises OSError, and ValueError where the file is no MCAP, or beyond the bounds.
-    """
+    """Yield the records of an MCAP file from its beginning; the last is END, which a file cut short does not have."""
     head = file.read(len(MAGIC))
     if not MAGIC.startswith(head):
         raise ValueError("it does not begin as MCAP does")
@@ -91,11 +81,7 @@ def records(file: BinaryIO) -> Iterator[Record]:
 
 
 def following(file: BinaryIO, at: int) -> Iterator[Record]:
-    """Yield the records from byte `at` on, where `file` already stands, up to the footer; then END.
-
-    `at` is not checked. A file cut short gives no END, and raises nothing. Raises OSError, and ValueError: an unknown
-    kind, a size or a count beyond the bounds, or anything but the closing magic behind the footer.
-    """
+    """Yield the records from byte `at` on, where `file` already stands, up to the footer; then END."""
     texts = 0
     while (record := record_at(file, at)) is not None:
         texts += record.opcode in _TEXTS
@@ -113,11 +99,7 @@ def following(file: BinaryIO, at: int) -> Iterator[Record]:
 
 
 def record_at(file: BinaryIO, at: int) -> Record | None:
-    """Read the record at the file's present place, which is byte `at`; None where the file ends there or within it.
-
-    Leaves `file` behind the record. Its body is not parsed. Raises OSError, and ValueError for an unknown kind, or a
-    length beyond the bound.
-    """
+    """Read the record at the file's present place, which is byte `at`; None where the file ends there or within it."""
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:
         return None
@@ -132,20 +114,13 @@ def record_at(file: BinaryIO, at: int) -> Record | None:
 
 
 class Unpacker:
-    """Unpacks the chunks of one file, with one bound on all of them together.
-
-    Holds what chunks took so far, packed and unpacked, and the count of schemas, channels and metadata.
-    """
+    """Unpacks the chunks of one file, with one bound on all of them together."""
 
     def __init__(self) -> None:
         self._packed = self._unpacked = self._texts = 0
 
     def records(self, chunk: Record, message: Callable[[Sent], None]) -> Iterator[Record]:
-        """Unpack a chunk, a record as it was read: call `message` with each message, yield the others in order.
-
-        Those are schemas, channels and metadata; their `at` is the chunk's. Other kinds are passed over. Raises
-        ValueError, McapError, ZstdError, struct.error for damage or beyond the bounds.
-        """
+        """Unpack a chunk, a record as it was read: call `message` with each message, yield the others in order."""
         known: Chunk = chunk.read(Chunk)
         self._packed += len(chunk.body)
         self._unpacked += known.uncompressed_size
@@ -174,11 +149,7 @@ def _sent(data: bytes, at: int, length: int) -> Sent:
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Unpack a chunk's data, with zstd or not at all, and return them.
-
-    A checksum of 0 is not compared. Raises ValueError: too large, another compression, a wrong size or checksum. Raises
-    ZstdError for damage.
-    """
+    """Unpack a chunk's data, with zstd or not at all, and return them."""
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes: allowed is {MAX_CHUNK_BYTES}")

@@ -12,10 +12,7 @@ Tick = tuple[int, dict[str, Any]]
 
 
 class Thinning:
-    """Keeps one tick of `every`, and all within AROUND_S of a fault or a mark. With 1 all are kept and none waits.
-
-    Holds the ticks that wait, the last tick's faults, and until when all are kept.
-    """
+    """Keeps one tick of `every`, and all within AROUND_S of a fault or a mark. With 1 all are kept and none waits."""
 
     def __init__(self, every: int) -> None:
         self.every = every
@@ -25,20 +22,11 @@ class Thinning:
         self._faults: Any = ()
 
     def happened(self, t_ns: int) -> None:
-        """Keep all ticks from AROUND_S before to AROUND_S after `t_ns`, ns since 1970.
-
-        Those that wait are returned by the next `take`. Nothing is kept that `take` has already thinned out.
-        """
+        """Keep all ticks from AROUND_S before to AROUND_S after `t_ns`, ns since 1970."""
         self._full_to_ns = max(self._full_to_ns, t_ns + AROUND_NS)
 
     def take(self, tick: Tick) -> list[Tick]:
-        """Add a tick, and return the ticks to be written now, in their order; often none.
-
-        A tick waits for AROUND_S. Then one of `every` is returned, and the others are dropped. After the last tick
-        `rest` gives those that still wait. A new set of `faults` in the message, or a mark noted by `happened`, keeps
-        all around it: all that wait are then returned. A message without `faults` has none. That times rise is not
-        checked.
-        """
+        """Add a tick, and return the ticks to be written now, in their order; often none."""
         if self.every == 1:
             return [tick]
         t_ns, message = tick
@@ -55,11 +43,7 @@ class Thinning:
         return given
 
     def rest(self, every: int) -> list[Tick]:
-        """Return one of `every` of the ticks that wait, in their order, and forget them all; 1 returns all.
-
-        Counting goes on from the ticks before: the first that is returned need not be the first that waits. Call it
-        once more after the last tick.
-        """
+        """Return one of `every` of the ticks that wait, in their order, and forget them all; 1 returns all."""
         given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
         self._waiting.clear()
         return given

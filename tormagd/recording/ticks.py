@@ -20,10 +20,7 @@ Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 
 
 class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
-    """Control ticks as rows of one value per column. The first column is `t_ns`, CLOCK_REALTIME; None is not known.
-
-    Raises ValueError for another version, repeated or missing columns, a row of another length, or a time out of range.
-    """
+    """Control ticks as rows of one value per column. The first column is `t_ns`, CLOCK_REALTIME; None is not known."""
 
     v: int
     columns: tuple[str, ...]
@@ -48,12 +45,7 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
 def listening(
     context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
 ) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket to `address`, for telemetry or ticks whose messages begin with `topic`, and return it.
-
-    An empty topic takes all. QUEUE messages may wait; later ones are dropped, and one over MAX_BATCH_BYTES ends the
-    connection. `keys` None means an open endpoint. It waits for nobody: an endpoint may come later. The caller closes
-    the socket. Raises SettingError for an address that ZeroMQ cannot use.
-    """
+    """Connect a new SUB socket to `address`, for telemetry or ticks whose messages begin with `topic`, and return it."""
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
@@ -66,11 +58,7 @@ _DECODER = msgspec.msgpack.Decoder(TickBatch)
 
 
 def decode_ticks(data: bytes) -> TickBatch:
-    """Decode a batch of ticks from msgpack, and check it as TickBatch does.
-
-    Values are not checked against their columns, but for the time. Raises MessageError for anything else, and over
-    MAX_BATCH_BYTES.
-    """
+    """Decode a batch of ticks from msgpack, and check it as TickBatch does."""
     if len(data) > MAX_BATCH_BYTES:
         raise MessageError(f"tick batch of {len(data)} bytes: allowed is {MAX_BATCH_BYTES}")
     try:

@@ -49,10 +49,7 @@ INDEX_SHARE = 64
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
-    """Say in a sentence why the disk of `path` has no room for `needed_bytes` and MIN_FREE_BYTES; empty where it has.
-
-    Writes nothing. The file need not exist, its folder must. Raises OSError.
-    """
+    """Say in a sentence why the disk of `path` has no room for `needed_bytes` and MIN_FREE_BYTES; empty where it has."""
     free, least = shutil.disk_usage(path.parent).free, MIN_FREE_BYTES + needed_bytes
     if free >= least:
         return ""
@@ -60,17 +57,7 @@ def disk_room(path: Path, needed_bytes: int) -> str:
 
 
 class RecordingWriter:
-    """Writes an MCAP recording, or in a folder several one after the other, until `close`; also a context manager.
-
-    `place` is a file, or a folder, whose budget says when a new file begins and what makes room for it. A new mark
-    renames its segment in a folder, and a recent one before, so that pruning keeps them. `key` seals the file, and of
-    `every` ticks one is written where nothing happens. Public counters tell what came: `telemetry_lost` counts missing
-    `seq`, `ticks_lost` missing tick numbers.
-
-    Raises FileExistsError rather than overwrite a recording, and OSError where the file cannot be made or written.
-    Without room the file is ended in order first. Where the disk fails without warning, the file reads up to its last
-    whole chunk.
-    """
+    """Writes an MCAP recording, or in a folder several one after the other, until `close`; also a context manager."""
 
     def __init__(
         self,
@@ -92,11 +79,7 @@ class RecordingWriter:
         self._begin(place.new() if isinstance(place, RecordingFolder) else place, "")
 
     def _begin(self, path: Path, follows: str) -> None:
-        """Open a new file in `path`, lock it against pruning, and write its head and metadata.
-
-        `follows` is the digest that ends the segment before, hexadecimal; empty for the first. The file before stays
-        open if it was. Raises FileExistsError, OSError.
-        """
+        """Open a new file in `path`, lock it against pruning, and write its head and metadata."""
         self.path = path
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks
@@ -107,15 +90,10 @@ class RecordingWriter:
         self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
         self._tick_channels: dict[bool, int] = {}
         self._begin_ns = self._chunk_ns = 0
-        "When the first message of this file was, and that of its present chunk, ns since 1970; 0 before the first."
 
     def _rotate(self, folder: RecordingFolder) -> None:
         """End the file and go on in a new one, which names the old one's last seal, where size or length are over the
-        budget.
-
-        Ticks that wait go into the new one. Where there is no room for it, the file ends in order, and says why. Raises
-        OSError then, and FileExistsError. Where no file is due nothing happens.
-        """
+        budget."""
         if not folder.is_due(self._sealing.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
             return
         try:
@@ -132,17 +110,12 @@ class RecordingWriter:
         raise OSError(errno.ENOSPC, reason)
 
     def describe(self, metadata: dict[str, str]) -> None:
-        """Write metadata, now and into every later file in the folder. The later value of a name counts. Raises
-        OSError."""
+        """Write metadata, now and into every later file in the folder."""
         self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Write one snapshot, without values that are not known, and count missing `seq`.
-
-        A `seq` that starts over (a restarted daemon) is not a loss. A new mark keeps all ticks around it. In a folder
-        it also renames its segment, unless it is older than the segment; `path` is then the new name. Raises OSError.
-        """
+        """Write one snapshot, without values that are not known, and count missing `seq`."""
         if self._last_seq is not None and message.seq > self._last_seq + 1:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
@@ -158,11 +131,7 @@ class RecordingWriter:
             self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message, thinned, and count missing numbers in NUMBER_COLUMN, which may be absent.
-
-        A number that starts over (a restarted daemon) is not a loss. Ticks may wait to be thinned until later calls.
-        Then it goes on in a new file where one is due. Raises OSError, FileExistsError among it.
-        """
+        """Write each row as one message, thinned, and count missing numbers in NUMBER_COLUMN, which may be absent."""
         number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
         for row in batch.rows:
             t_ns = row[0]
@@ -179,11 +148,7 @@ class RecordingWriter:
             self._rotate(self._folder)
 
     def close(self) -> None:
-        """Write waiting ticks, overview, index and last seal, and close the file; do nothing where it is closed.
-
-        Without this call the file reads up to its last whole chunk. Raises OSError where something could not be
-        written; the file may then be cut short.
-        """
+        """Write waiting ticks, overview, index and last seal, and close the file; do nothing where it is closed."""
         if not self._file.closed:
             self._write(self._thinning.rest(self._thinning.every))
             self._end()
@@ -220,11 +185,7 @@ class RecordingWriter:
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
         """Write a message of JSON in `data`; first begin a new chunk where `t_ns` is over CHUNK_NS from its chunk's
-        first.
-
-        Then the chunk before is written, sealed and flushed. Where there is no room for the index, the file is ended in
-        order instead, and the message is not in it. Raises OSError, also where the file was ended.
-        """
+        first."""
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             index_bytes = self._sealing.tell() // INDEX_SHARE
@@ -241,12 +202,7 @@ class RecordingWriter:
 def sealed_mcap(
     file: BinaryIO, key: bytes, sealed: Mapping[str, str], about: dict[str, str]
 ) -> tuple[SealingFile, Writer]:
-    """Begin an MCAP file that is to be sealed, with `key` unless it is empty, and write its first metadata.
-
-    `sealed` are values of the record that says so, `about` those of the record of what is recorded. Returns what seals
-    the file and the writer of its messages; end it by `SealingFile.finish`. Raises OSError, and ValueError for a key of
-    over 64 bytes.
-    """
+    """Begin an MCAP file that is to be sealed, with `key` unless it is empty, and write its first metadata."""
     sealing = SealingFile(file, key)
     mcap = Writer(sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
     mcap.start(profile="", library=f"tormagd {__version__}")
@@ -256,30 +212,19 @@ def sealed_mcap(
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
-    """Register `schema` and a channel of JSON messages under `topic` in the file that `mcap` writes.
-
-    Returns the channel's id. Each call makes another schema and channel, also for the same topic. The schema needs a
-    `title`, which is its name in the file: else KeyError is raised.
-    """
+    """Register `schema` and a channel of JSON messages under `topic` in the file that `mcap` writes."""
     schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=msgspec.json.encode(schema))
     return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the JSON schema of a message type without `$ref`, `anyOf` and tuples, which viewers do not read.
-
-    A value that may be null has the schema of its other type; a tuple is an array of its first type. Bounds, defaults
-    and what is required are left out. The `title` is the type's name behind "tormagd.".
-    """
+    """Return the JSON schema of a message type without `$ref`, `anyOf` and tuples, which viewers do not read."""
     (schema,), definitions = msgspec.json.schema_components([message], ref_template="{name}")
     return {"title": f"tormagd.{message.__name__}", **_plain(schema, definitions)}
 
 
 def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
-    """Return a schema without references and alternatives: the first option that is not null, a tuple's first type.
-
-    `definitions` are the schemas that references name. Raises KeyError for a schema without a type, as of any value.
-    """
+    """Return a schema without references and alternatives: the first option that is not null, a tuple's first type."""
     if "$ref" in schema:
         return _plain(definitions[schema["$ref"]], definitions)
     if "anyOf" in schema:
@@ -296,10 +241,7 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
 
 
 def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Value]:
-    """Return a tick's row as a message: its values by column, without those that are None, NaN or infinite.
-
-    Values within a tuple are not looked at. Raises ValueError where row and columns differ in length.
-    """
+    """Return a tick's row as a message: its values by column, without those that are None, NaN or infinite."""
     # as _known, without a call for each of some sixty values, a thousand times a second
     return {
         name: value
@@ -309,10 +251,7 @@ def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Valu
 
 
 def _tick_schema() -> dict[str, Any]:
-    """Return the JSON schema of a tick message, an object with the columns of this version's daemon.
-
-    An integer is a number: viewers make no difference. No column is required, and others are allowed.
-    """
+    """Return the JSON schema of a tick message, an object with the columns of this version's daemon."""
     (schema,), definitions = msgspec.json.schema_components([TickRecord], ref_template="{name}")
     items = map(_plain, definitions[schema["$ref"]]["prefixItems"], repeat(definitions))
     columns = dict(zip(TickRecord.__struct_fields__, items, strict=True))
@@ -328,11 +267,7 @@ OTHER_SCHEMA = {"title": "tormagd.OtherTick", "type": "object"}
 
 
 def _known(value: Any) -> Any:
-    """Return plain data without what is not known; None where `value` itself is not.
-
-    Not known are None, NaN, infinity, and a list or tuple with one of these in it. A dict loses such entries, at any
-    depth, and may be left empty.
-    """
+    """Return plain data without what is not known; None where `value` itself is not."""
     if isinstance(value, dict):
         return {name: known for name, inner in value.items() if (known := _known(inner)) is not None}
     if isinstance(value, list | tuple):

@@ -23,13 +23,7 @@ from tormagd_client.endpoints import ConfigError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Replay the file that the arguments name, print one JSON object, and return the exit code.
-
-    None takes the arguments of the process. 0 is done, also where the replay differs: the object's `rerun` says where.
-    1 is a stdout that cannot be written. 2 is a file or a setting that cannot be used: one line on stderr says why.
-    Wrong usage raises SystemExit(2). With `--set` or `--fault` the simulated device takes the real one's place, and the
-    object has what `_rehearsed` returns in place of `rerun`.
-    """
+    """Replay the file that the arguments name, print one JSON object, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tormagd.replay", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("file", type=Path)
     parser.add_argument("--from", dest="from_s", type=float, default=0.0)
@@ -70,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _key(configured: Config | None) -> bytes:
-    """Return the configured key of seals, empty without one. Raises ReplayError for one that is no key, OSError."""
+    """Return the configured key of seals, empty without one."""
     try:
         return read_key("" if configured is None else configured.recordings.key)
     except ValueError as error:
@@ -78,13 +72,7 @@ def _key(configured: Config | None) -> bytes:
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
-    """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it.
-
-    `options` are those of `main`. Returns its `plant`, `faults` and `settings`, and what happened. That is `recorded`,
-    what the file has, and `simulated` and `instead`, what the two runs met, both with the faults. Each is a dict with
-    the fields of `Happened`; `instead` is None without settings. Raises ReplayError for a setting, plant or fault that
-    cannot be used, and as `script`, `rebuilt` and `rehearse`.
-    """
+    """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it."""
     todo = script(known.columns, box.entries)
     config = changed(known.config, options.settings)
     simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)

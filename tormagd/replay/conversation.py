@@ -28,10 +28,7 @@ KNOWN = kinds(
 
 
 class Found(NamedTuple):
-    """The first difference: its field, the recorded and the replayed value, and the frame it belongs to.
-
-    `frame` is None where the difference is not about frames.
-    """
+    """The first difference: its field, the recorded and the replayed value, and the frame it belongs to."""
 
     field: str
     recorded: Any
@@ -41,37 +38,25 @@ class Found(NamedTuple):
 
 def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
     """Return the first difference between two plain values, its field behind `where` and a point; None where they agree
-    to the bit.
-
-    `frame` is the frame of what is returned. Plain is what `exact.plain` gives: anything else raises TypeError.
-    """
+    to the bit."""
     found = first_difference(recorded, replayed)
     return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
 
 
 class Conversation:
-    """The recorded conversation with the device run again: a `Connection`, and the backend that gives it what was read.
-
-    What the connection writes is kept for comparison, and goes nowhere. Without a snapshot, or while no port was open,
-    there is no connection: reading and comparing then do nothing.
-    """
+    """The recorded conversation with the device run again: a `Connection`, and the backend that gives it what was read."""
 
     def __init__(self, frame: int) -> None:
         self._connection: Connection | None = None
         self.stream: Stream = FrameStream()
         self._unread: Sequence[Any] = ()
-        "What to read next: one piece of bytes, or frames of a bus."
         self._written: list[Sent] = []
         self.frame = frame
         "Number of the newest frame in the file, from 1; set by the caller."
         self.frames = 0
 
     def begin(self, memory: Any) -> None:
-        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; by none for None.
-
-        Its stream is a serial port's or a CAN node's, as `memory` says. Raises InexactError, EncodeError, TypeError or
-        LookupError for a memory that no connection writes: then there is no connection.
-        """
+        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; by none for None."""
         self._connection = None
         if memory is not None:
             told = memory["stream"]
@@ -83,30 +68,17 @@ class Conversation:
             self._connection = connection
 
     def compare_memory(self, recorded: Any) -> Found | None:
-        """Return where the connection's memory differs from the `recorded` one, with the newest frame's number.
-
-        None where it does not differ, or no port was open. Changes nothing.
-        """
+        """Return where the connection's memory differs from the `recorded` one, with the newest frame's number."""
         own = self._connection
         return None if own is None else differing("state.connection", recorded, own.memory(), self.frame)
 
     def compare(self, recorded: Measurement | None) -> Found | None:
-        """Return where the connection's newest measurement differs from the one that the recorded step was given.
-
-        `recorded` None is a step without a measurement. The result has the newest frame's number. None where nothing
-        differs, or no port was open. Changes nothing.
-        """
+        """Return where the connection's newest measurement differs from the one that the recorded step was given."""
         own = self._connection
         return None if own is None else differing("measurement", plain(recorded), plain(own.measurement), self.frame)
 
     def read(self, entry: Any) -> None:
-        """Feed the connection a READ entry, and add its frames to `frames`.
-
-        `entry` is the name, the time, s on the monotonic clock, and what was read. That is bytes, which count as one
-        frame, or a list of a bus's frames. Without a connection nothing happens, and the entry is not looked at. Where
-        another host drives the node, the connection is lost, as it was then. Raises ValueError, TypeError or
-        msgspec.ValidationError for a malformed entry.
-        """
+        """Feed the connection a READ entry, and add its frames to `frames`."""
         if self._connection is not None:
             _, now_s, raw = entry
             self._unread = pieces = raw if isinstance(raw, list) else [raw]
@@ -114,13 +86,7 @@ class Conversation:
             self.frames += len(pieces)
 
     def wrote(self, entry: Any, output: Duty) -> Found | None:
-        """Send a step's `output` again, and return the first frame that differs from those of the WROTE entry.
-
-        `entry` is the name, the time, s, the list of frames, and how many messages the wire had not taken so far.
-        `frame` has to be the number of the last of these frames. None where none differs, which adds them to `frames`,
-        or where no port was open. A frame that only one side has is "nothing" on the other. Raises ValueError or
-        TypeError for an entry of another form, EncodeError for an output that does not fit the wire.
-        """
+        """Send a step's `output` again, and return the first frame that differs from those of the WROTE entry."""
         if self._connection is None:
             return None
         _, now_s, recorded, unsent = entry
@@ -136,15 +102,10 @@ class Conversation:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Return the link's counters since the port was opened."""
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Decode what `read` was given last, and return the messages; empty where that was done before.
-
-        Raises BackendError where another host drives the CAN node, and msgspec.ValidationError or TypeError for what is
-        no frame.
-        """
+        """Decode what `read` was given last, and return the messages; empty where that was done before."""
         pieces, self._unread = self._unread, ()
         if isinstance(self.stream, FrameStream):
             return [message for piece in pieces for message in self.stream.unpack(piece)]
@@ -162,10 +123,7 @@ class Conversation:
 
 
 def _shown(frame: Any) -> str:
-    """Return a frame as text: bytes in hexadecimal, behind the identifier and "#" on a bus; "nothing" for None.
-
-    Raises TypeError or ValueError for what is neither bytes nor identifier and bytes.
-    """
+    """Return a frame as text: bytes in hexadecimal, behind the identifier and "#" on a bus; "nothing" for None."""
     if frame is None:
         return "nothing"
     if isinstance(frame, bytes):

@@ -39,11 +39,7 @@ class Recorded(NamedTuple):
 
 
 def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
-    """Check a black box's header and return its contents; its model will be looked for where it was, then in `beside`.
-
-    No file is opened, and the entries are not looked at. Raises ReplayError: a value is missing, of another format,
-    damaged (by the hash beside it), or a refused configuration or scene.
-    """
+    """Check a black box's header and return its contents; its model will be looked for where it was, then in `beside`."""
     header = box.header
     missing = [name for name in NEEDED if name not in header]
     if missing:
@@ -71,12 +67,7 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
 
 
 def rebuilt(known: Recorded, config: Config | None = None) -> Core:
-    """Build the recorded core, with `config` in place of the recorded configuration unless that is None.
-
-    Its stages are as at a daemon's start: `rerun` gives them the recorded state. The scene is the recorded one, not the
-    file that `config` names. Raises ReplayError where no model with the recorded hash is found in `model_folders`, or
-    the core cannot be built.
-    """
+    """Build the recorded core, with `config` in place of the recorded configuration unless that is None."""
     found = ""
     for folder in known.model_folders:
         try:
@@ -92,12 +83,7 @@ def rebuilt(known: Recorded, config: Config | None = None) -> Core:
 
 def differences(known: Recorded, configured: Config | None) -> list[str]:
     """List what differs from when the file was written, a line each, in this order: build, platform, scene,
-    configuration.
-
-    Each line begins with one of these words and a colon; empty where nothing differs. `configured` is this machine's
-    configuration. With None it is not compared, and the recorded one names the scene. The scene's file is read again;
-    one that cannot be read is told as a difference. Raises nothing for it.
-    """
+    configuration."""
     found = []
     here, there = sources_hash(), known.header["sources_sha256"]
     if here != there:
@@ -126,11 +112,7 @@ def _compare(found: list[str], what: str, there: str, data: bytes) -> None:
 
 
 def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
-    """Return the header's value `name`, a JSON object, once its hash is compared with the value `NAME_sha256`.
-
-    What the object says is not checked. Raises ReplayError where the hash differs, or it is no object; KeyError where
-    one of the two is missing.
-    """
+    """Return the header's value `name`, a JSON object, once its hash is compared with the value `NAME_sha256`."""
     told = hashlib.sha256(header[name].encode()).hexdigest()
     if told != header[f"{name}_sha256"]:
         raise ReplayError(f"{name}: its hash is {told[:SHOWN]}, beside it stands {header[f'{name}_sha256'][:SHOWN]!r}")
@@ -139,7 +121,7 @@ def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
 
 
 def _json(header: dict[str, str], name: str, kind: Any) -> Any:
-    """Decode a header's JSON value as `kind`. Raises ReplayError where it is none."""
+    """Decode a header's JSON value as `kind`."""
     try:
         return msgspec.json.decode(header[name], type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:

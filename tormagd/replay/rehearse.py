@@ -28,8 +28,7 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import TickRecord
 
 HOMED_S, CONNECTED_S = 8.0, 0.5
-"""When the file's first tick is, in virtual time. By HOMED_S the device is homed, and renders the first setpoint as
-the recorded one did. By CONNECTED_S it is only connected, for a recorded device that was not homed."""
+"""When the file's first tick is, in virtual time."""
 PATIENCE_S = 0.5
 "How long a refused command is given again: the simulated device may come to rest later than the real one."
 SEED = 1
@@ -37,21 +36,14 @@ DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
 
 
 class Happened(msgspec.Struct, frozen=True):
-    """What a run met: faults by when each was first latched, limits by how long each held.
-
-    Both in s, faults from the file's first tick. `refused` names the commands that the core refused, and why.
-    """
+    """What a run met: faults by when each was first latched, limits by how long each held."""
 
     faults: dict[str, float]
     limits: dict[str, float]
     refused: list[str]
 
     def note(self, at_s: float, faults: Iterable[str], held: Iterable[str], for_s: float) -> None:
-        """Add one tick at `at_s`: its faults, and the limits in `held` for another `for_s` seconds.
-
-        Changes the two dicts in place: faults in s to a millisecond, limits to a microsecond. A fault keeps its first
-        time; a limit that stands twice in `held` counts once.
-        """
+        """Add one tick at `at_s`: its faults, and the limits in `held` for another `for_s` seconds."""
         for fault in faults:
             self.faults.setdefault(str(fault), round(at_s, 3))
         for limit in dict.fromkeys(map(str, held)):
@@ -59,10 +51,7 @@ class Happened(msgspec.Struct, frozen=True):
 
 
 class Script(NamedTuple):
-    """What a black box's core was asked to do; times are in seconds from its first tick.
-
-    `setpoints` has one entry for each plan; None is a plan without a setpoint.
-    """
+    """What a black box's core was asked to do; times are in seconds from its first tick."""
 
     lasts_s: float
     is_homed: bool
@@ -75,17 +64,11 @@ class Script(NamedTuple):
 
     @property
     def begins_s(self) -> float:
-        """Return when the file's first tick is in virtual time, s."""
         return HOMED_S if self.is_homed else CONNECTED_S
 
 
 def changed(config: Config, settings: Sequence[str]) -> Config:
-    """Return a copy of the configuration with `KEY=VALUE` settings, as in limits.skew_fault_mm=2.
-
-    A value is TOML; one that is no TOML is taken as text. Of two settings of one key the later counts; without settings
-    the configuration is checked all the same. Raises ReplayError for an unknown key, a setting without "=", a value
-    that the configuration refuses, and TOML beyond what can be read.
-    """
+    """Return a copy of the configuration with `KEY=VALUE` settings, as in limits.skew_fault_mm=2."""
     tables: dict[str, Any] = msgspec.to_builtins(config)
     for setting in settings:
         key, equals, text = setting.partition("=")
@@ -110,12 +93,7 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
 
 
 def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
-    """Return what is to be done again: the setpoints, taken commands and handle positions of a black box's entries.
-
-    `columns` names the values of a tick. Times are s from the first tick, also those of a setpoint. Commands that the
-    core refused, and all other entries, are left out. Raises ReplayError where one of these entries is malformed, or no
-    tick is there. Raises ValueError where `columns` lacks a field of TickRecord.
-    """
+    """Return what is to be done again: the setpoints, taken commands and handle positions of a black box's entries."""
     records = ticks_of(columns, entries)
     ticks = list(records.values())
     first_s = ticks[0].monotonic_s
@@ -146,13 +124,7 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
 
 
 def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Sequence[str]) -> Happened:
-    """Run the script in the closed loop against the simulated device, and return what it met.
-
-    That is faults, limits and refused commands. `core` has to be built of `config`, and gives a new stepper and
-    planner. `plant` names the simulated device. `faults` are its faults, as in encoder_jump@12.5, s from the file's
-    first tick; empty for none. A device that was homed is homed first, one that was driven is armed, at its first
-    setpoint. Raises ReplayError: an unknown plant or fault, or a device that cannot be armed, or not in time.
-    """
+    """Run the script in the closed loop against the simulated device, and return what it met."""
     try:
         delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in map(parse_fault, faults)]
         hand = RecordedHand(tuple(time_s + todo.begins_s for time_s in todo.hand.times_s), todo.hand.positions_mm)
@@ -177,12 +149,7 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
 
 
 def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
-    """Run `loop`, which stands at the script's begin, to the script's end, and return what was met.
-
-    Commands and setpoints are given at their times. A refused command is given again for PATIENCE_S, and those behind
-    it wait; then it is noted in `refused`. Faults count in s from the begin; limits only while ENABLED or PAUSED, by
-    `period_s` a tick.
-    """
+    """Run `loop`, which stands at the script's begin, to the script's end, and return what was met."""
     happened = Happened({}, {}, [])
     setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))
     newest: TimedSetpoint | None = None
@@ -207,11 +174,7 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
 
 
 def _recorded(ticks: list[TickRecord]) -> Happened:
-    """Return the faults and limits that the recorded ticks show; `refused` is empty.
-
-    Times count from the first tick, of which there has to be one. A tick's limits held since the tick before, in every
-    operating state.
-    """
+    """Return the faults and limits that the recorded ticks show; `refused` is empty."""
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
     for before, tick in pairwise([ticks[0], *ticks]):
         happened.note(tick.monotonic_s - first_s, tick.faults, tick.limits, tick.monotonic_s - before.monotonic_s)
@@ -224,10 +187,7 @@ def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:
 
 def _hand(ticks: list[TickRecord]) -> RecordedHand:
     """Return the handle's positions, mm, as its encoder measured them, at the times of the Sense, s from the first
-    tick.
-
-    Of positions with one time the first counts. Where no tick has one, the handle stays at 0 mm.
-    """
+    tick."""
     places: dict[float, float] = {}
     for tick in ticks:
         if tick.sensed_s is not None and tick.device_handle_mm is not None:

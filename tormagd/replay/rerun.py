@@ -59,21 +59,13 @@ QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s"
 
 
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
-    """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a plan without one.
-
-    `entry` is the name, the time, and None or a setpoint's fields in the order of TimedSetpoint, whose ranges are not
-    checked. Raises InexactError or msgspec.ValidationError for an entry of another form.
-    """
+    """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a plan without one."""
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
     return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
 
 
 class Difference(msgspec.Struct, frozen=True):
-    """Where a replay first differs. `tick` counts from 1, `time_s` from the file's first tick.
-
-    `frame` counts from 1, too: the frame written otherwise, or after which a measurement or a memory differs. None
-    where the difference is not about frames.
-    """
+    """Where a replay first differs. `tick` counts from 1, `time_s` from the file's first tick."""
 
     tick: int
     time_s: float
@@ -84,11 +76,7 @@ class Difference(msgspec.Struct, frozen=True):
 
 
 class Rerun(msgspec.Struct, frozen=True):
-    """What a replay gave: `ticks` that agree to the bit, from `from_s` to `to_s` after the file's first tick.
-
-    `snapshots` of the whole state were compared, too. At each of `gaps` something is missing, and the replay went on
-    from the next snapshot. `frames` went through the same link. `difference` is None where none was found.
-    """
+    """What a replay gave: `ticks` that agree to the bit, from `from_s` to `to_s` after the file's first tick."""
 
     ticks: int
     from_s: float
@@ -100,12 +88,7 @@ class Rerun(msgspec.Struct, frozen=True):
 
 
 def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
-    """Return the tick records of a black box by the index of their entry, from 0, in the file's order.
-
-    Other entries are passed over, and so are columns that TickRecord lacks. Raises ReplayError where a tick does not
-    fit `columns` or its types, or no tick is there. Raises ValueError where `columns` lacks a field of TickRecord,
-    which `rebuild.recorded` refuses before.
-    """
+    """Return the tick records of a black box by the index of their entry, from 0, in the file's order."""
     own = TickRecord.__struct_fields__
     order = None if columns == own else [columns.index(name) for name in own]
     records: dict[int, TickRecord] = {}
@@ -124,12 +107,7 @@ def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickReco
 
 
 def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: float = 0.0) -> Rerun:
-    """Run `core` over the entries, up to the first difference or the last tick, and return what came of it.
-
-    `from_s` counts from the first tick. Begins at the newest snapshot (the whole state, one of two a second) not after
-    it, else at the first. A difference is returned, not raised. Raises ReplayError: `from_s` outside the file, a
-    malformed tick, no snapshot with a tick after it, or values that the core does not take.
-    """
+    """Run `core` over the entries, up to the first difference or the last tick, and return what came of it."""
     records = ticks_of(columns, entries)
     places = list(records)
     first_s = records[places[0]].monotonic_s
@@ -166,11 +144,7 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
 
 
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
-    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first with a tick.
-
-    `until_s` is on the monotonic clock. `records` are the ticks by their index in `entries`. Raises ReplayError where
-    no snapshot has a tick after it.
-    """
+    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first with a tick."""
     found: int | None = None
     waiting: int | None = None
     for place, entry in enumerate(entries):
@@ -186,20 +160,14 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 
 
 class _Running:
-    """Core and conversation while they are replayed, entry by entry.
-
-    The states are step, plan and connection: known from a snapshot on, until something is missing in the file. Holds
-    the newest step's measurement and output, a plan's failure, and counts of snapshots that were compared and of gaps.
-    """
+    """Core and conversation while they are replayed, entry by entry."""
 
     def __init__(self, core: Core, frame: int) -> None:
         self.conversation = Conversation(frame)
         self._of_frames: Found | None = None
-        "First difference in frames since the last tick; a difference in the tick's record comes first."
         self._stepper, self._planner = core.stepper(), core.planner()
         self._used = self._planner.planned
         self._failure: Exception | None = None
-        "Error of the newest plan; None once an AFRESH entry shows that the recorded plan failed, too."
         self._output: Duty | None = None
         self._measurement: Measurement | None = None
         self.is_known = False
@@ -207,12 +175,7 @@ class _Running:
         self.snapshots = self.gaps = 0
 
     def take(self, entry: Any, record: TickRecord) -> Found | None:
-        """Take one entry that is no tick, and return the first thing that differs; None where nothing does.
-
-        `record` is the next tick's, which holds the inputs of a step. Until the first snapshot, and after a MISSING
-        entry until the next, all but frames is passed over. Raises any of UNTAKEN for an entry of another form, or
-        values that the core refuses; the states are then not to be used.
-        """
+        """Take one entry that is no tick, and return the first thing that differs; None where nothing does."""
         name = name_of(entry)
         self.conversation.frame += len(frames_in(entry))
         if name == journal.STATE:
@@ -230,12 +193,7 @@ class _Running:
         return None
 
     def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
-        """Do what one entry tells: step, plan, learning, command or fault; return a difference only for a command.
-
-        That is a command which was taken and is refused here, or the other way round. `record` holds a step's inputs. A
-        difference in measurement or frames is kept for `compare`. So is the error of a plan that fails, unless an
-        AFRESH entry follows. Raises ValueError for an unknown entry, and any other of UNTAKEN.
-        """
+        """Do what one entry tells: step, plan, learning, command or fault; return a difference only for a command."""
         match name:
             case journal.STEP:
                 self._measurement = measurement_of(record)
@@ -284,12 +242,7 @@ class _Running:
         return None
 
     def compare(self, record: TickRecord) -> Found | None:
-        """Return the first column that differs from the recorded tick, or else what its frames show.
-
-        The clock's column, `t_ns`, is not compared; the loop's timing is taken from the record. None where nothing
-        differs, or the states are not known. A failed plan that the record does not have counts first. Raises
-        ValueError for a tick before any step.
-        """
+        """Return the first column that differs from the recorded tick, or else what its frames show."""
         if not self.is_known:
             return None
         if self._output is None:
@@ -306,12 +259,7 @@ class _Running:
 
     def _begin(self, entry: Any) -> Found | None:
         """Compare the states with a snapshot where they are known, then take the snapshot's; return the first
-        difference.
-
-        `entry` is the name, step, plan and connection, which are compared in this order; None where none differs. A
-        snapshot that is only taken is not counted. Afterwards the states are known, and a failed plan is forgotten.
-        Raises InexactError, TypeError or LookupError for a snapshot that does not fit.
-        """
+        difference."""
         differs, connection = None, entry[3]
         if self.is_known:
             self.snapshots += 1
@@ -326,11 +274,7 @@ class _Running:
 
 
 def measurement_of(record: TickRecord) -> Measurement | None:
-    """Return the measurement that a tick's step was given; None where the record's `measurement`, its number, is None.
-
-    Ranges are not checked. Raises ValueError where there is a number and another part is missing, KeyError for an
-    unknown mode, switch or device fault.
-    """
+    """Return the measurement that a tick's step was given; None where the record's `measurement`, its number, is None."""
     if record.measurement is None:
         return None
     numbers = {name: getattr(record, column) for name, column in MEASURED.items()}
@@ -348,10 +292,7 @@ def measurement_of(record: TickRecord) -> Measurement | None:
 
 
 def name_of(entry: Any) -> str:
-    """Return a black box entry's name, a word by itself or at the head of a list; empty for a tick and anything else.
-
-    Whether there is an entry of that name is not checked.
-    """
+    """Return a black box entry's name, a word by itself or at the head of a list; empty for a tick and anything else."""
     if isinstance(entry, str):
         return entry
     if isinstance(entry, list) and entry and isinstance(entry[0], str):
@@ -360,6 +301,5 @@ def name_of(entry: Any) -> str:
 
 
 def _short(thing: object) -> str:
-    """Return a value's text, cut to 200 characters."""
     text = str(thing) if isinstance(thing, Exception | str) else repr(thing)
     return text if len(text) <= 200 else f"{text[:197]}..."

@@ -22,7 +22,7 @@ class Position(StrEnum):
 
     KEPT = "kept"
     LOST_HERE = "lost"
-    "An encoder's counts are wrong. The device does not know, and goes on calling itself homed."
+    "An encoder's counts are wrong."
     LOST_THERE = "given up by the device"
     "A device that has latched, or was reset, does not call itself homed."
 
@@ -34,27 +34,18 @@ class Explanation(NamedTuple):
     remedy: str
     reaction: Reaction = Reaction.HELD
     safe_ms: float = 100.0
-    "The longest time from when the cause shows to when the reaction begins. 50 ms of it are the device's timeout."
+    "The longest time from when the cause shows to when the reaction begins."
     shows: str = "at once"
     "When the cause shows: many faults hide from a device at rest."
     position: Position = Position.KEPT
 
     @property
     def clears(self) -> str:
-        """The commands that clear a fault with this explanation and allow `enable` again, in words.
-
-        That is "clear-fault", or "clear-fault, then home". A limit needs neither: for one this means nothing.
-        """
         return "clear-fault" if self.position is Position.KEPT else "clear-fault, then home"
 
 
 class Fault(StrEnum):
-    """Why the gap was opened. A fault is latched until `clear-fault`.
-
-    Faults that show together are named in this order, causes before consequences. First comes what somebody did and
-    what stopped the loop, then a motor that goes the wrong way, then the device's own faults. Then come readings that
-    are not believed, and last what is concluded from readings.
-    """
+    """Why the gap was opened. A fault is latched until `clear-fault`."""
 
     STOPPED = "STOPPED"
     HOST_STALL = "HOST_STALL"
@@ -592,9 +583,6 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
-    """Return the faults for the firmware's fault bits, in the order of the bits; empty for none.
-
-    `is_host_stall` says that the daemon itself had sent no Drive: then the device's command timeout becomes HOST_STALL.
-    """
+    """Return the faults for the firmware's fault bits, in the order of the bits; empty for none."""
     names = _BY_DEVICE_FAULT | ({DeviceFault.COMMAND_TIMEOUT: Fault.HOST_STALL} if is_host_stall else {})
     return tuple(fault for bit, fault in names.items() if bit in bits)

@@ -65,20 +65,7 @@ class RefusedError(Exception):
 
 @final
 class Conditions(Value):
-    """The conditions on which a command is taken or refused.
-
-    connected         the device runs and is measured
-    fresh             its State, Sense and Status are recent
-    homed             the positions of its carriages are known
-    busy              it homes or opens, or was asked to; or its calibration is not in force yet
-    device_latched    it holds a fault of its own
-    sensor_doubted    the force sensor is not believed
-    remedy            what to do about `cause`; empty where there is no advice
-    round_trip_s      the usual time from a Drive to its State
-    clock_drift       by which share the device's clock runs fast
-    apart_mm          how far the carriages are apart
-    most_*            the bounds above which `enable` is refused
-    """
+    """The conditions on which a command is taken or refused."""
 
     def __init__(
         self,
@@ -116,11 +103,7 @@ class Conditions(Value):
 
 @final
 class SafetyState(Value):
-    """Operating state, latched faults, and the newest request to the device.
-
-    `clearing_until_s`: until then the device may still report a fault that was cleared. `needs_homing`: a fault took
-    the positions away; the device's HOMED does not count until the device has dropped it, as it does when it homes.
-    """
+    """Operating state, latched faults, and the newest request to the device."""
 
     def __init__(
         self,
@@ -140,7 +123,6 @@ class SafetyState(Value):
 
     @property
     def is_driven(self) -> bool:
-        """Tell whether the device is driven: it follows the plan (ENABLED) or holds its gap (PAUSED)."""
         return self.operating_state is OperatingState.ENABLED or self.operating_state is OperatingState.PAUSED
 
     def ask(self, request: DeviceRequest) -> "SafetyState":
@@ -174,7 +156,7 @@ class Transition(NamedTuple):
     guards: tuple[Guard, ...] = ()
     "In the order in which they are asked; the first that does not hold is told."
     request: DeviceRequest = DeviceRequest.NONE
-    "What the device is asked for. CLEAR is asked only of a device that has latched a fault."
+    "What the device is asked for."
 
 
 class Refusal(NamedTuple):
@@ -221,10 +203,7 @@ def _apart(state: SafetyState, present: Conditions) -> str:
 
 
 def _slow(state: SafetyState, present: Conditions) -> str:
-    """Return what is wrong with the round trip to the device, in ms; empty where it is at most `most_round_trip_s`.
-
-    A NaN is wrong. `state` is not looked at.
-    """
+    """Return what is wrong with the round trip to the device, in ms; empty where it is at most `most_round_trip_s`."""
     if present.round_trip_s <= present.most_round_trip_s:
         return ""
     return (
@@ -340,12 +319,7 @@ _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
 
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
-    """Return `state` in FAULT with `faults` latched and the device asked to open; `state` itself where none is new.
-
-    New faults stand behind those latched before, and among themselves in the order of `Fault`: causes before their
-    consequences. `faults` may be in any order, and empty, but name none twice: that is not checked. A new fault in
-    FAULT asks the device again, under a new number. Faults of LOST_POSITION set `needs_homing`.
-    """
+    """Return `state` in FAULT with `faults` latched and the device asked to open; `state` itself where none is new."""
     if not faults:  # as nearly always, a thousand times a second
         return state
     new = [fault for fault in faults if fault not in state.faults]
@@ -362,26 +336,12 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
 
 
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
-    """Return `state` after the device said whether it is homed: a device that is not homed ends `needs_homing`.
-
-    Such a device has begun to home or was reset, so that its next HOMED is of a new origin. Nothing else changes: in
-    any other case it is `state` itself. `is_homed` has to be what the device itself says.
-    """
+    """Return `state` after the device said whether it is homed: a device that is not homed ends `needs_homing`."""
     return state if is_homed or not state.needs_homing else state.replaced(needs_homing=False)
 
 
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
-    """Return the state after the operator's command `name` at the host's time `now_s`; `state` itself stays as it was.
-
-    The new state may hold a new request to the device. `stop` latches the fault STOPPED, is never refused and needs no
-    device. `clear-fault` drops all faults, and asks for CLEAR only a device that has latched one. That device may go on
-    reporting its fault for CLEARING_S; `enable` ends this time.
-
-    Raises RefusedError for an unknown command, for one that the table refuses in this state, and for the first guard
-    that does not hold. Where the table refuses, a device that is not connected is told instead of the table's reason.
-    `use-scene` in DISABLED is taken without a device; the caller changes the scene. `clear-fault` in ENABLED and PAUSED
-    changes nothing.
-    """
+    """Return the state after the operator's command `name` at the host's time `now_s`; `state` itself stays as it was."""
     if name not in COMMANDS:
         raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
     event = Event(name)
@@ -407,11 +367,7 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 
 
 def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
-    """Raise RefusedError where `guard` does not hold in `state` under `conditions`; else do nothing.
-
-    The error has the guard's `code`, what is wrong with its figures as message, and the guard's remedy as hint. With
-    CONNECTED, the remedy of `conditions`, unless empty, replaces the guard's.
-    """
+    """Raise RefusedError where `guard` does not hold in `state` under `conditions`; else do nothing."""
     message = guard.refuses(state, conditions)
     if message:
         is_told_better = guard is CONNECTED and conditions.remedy
@@ -419,12 +375,7 @@ def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
 
 
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
-    """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED, `resume` in PAUSED.
-
-    Elsewhere `enable` is the last, and `clear-fault` the first in FAULT. `home` is among them where the device is not
-    `is_homed`, or a fault took the positions away. Guards are not asked: the commands are taken only once the causes of
-    the faults have gone.
-    """
+    """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED, `resume` in PAUSED."""
     if state.operating_state is ENABLED:
         return ()
     if state.operating_state is PAUSED:
@@ -437,21 +388,12 @@ def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
 
 
 def reason(name: str, source: OperatingState) -> str:
-    """Return the log's line for a command that was taken in the state `source`, as in "FAULT to DISABLED: why".
-
-    `name` is the value of an `Event`, as in "clear-fault". Empty where the table refuses the command there; whether
-    guards held is not asked. Raises ValueError for an unknown command.
-    """
+    """Return the log's line for a command that was taken in the state `source`, as in "FAULT to DISABLED: why"."""
     row = TRANSITIONS[Event(name), source]
     return f"{source} to {row.target}: {row.reason}" if isinstance(row, Transition) else ""
 
 
 def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -> SafetyState:
-    """Return `state` in the operating state `target`, with a new `request` to the device unless `request` is NONE.
-
-    Every change of the operating state is made here. Neither the table nor a guard is asked: the caller does. With NONE
-    the last request and its number stay.
-    """
     after = state.replaced(operating_state=target)
     return after if request is DeviceRequest.NONE else after.ask(request)
 

@@ -14,17 +14,11 @@ class OperatingPoint(Struct, frozen=True):
     search: str
 
     def __str__(self) -> str:
-        """Say rates and search, for a person."""
         return f"{self.control_hz} / {self.inference_hz} Hz, {self.search}"
 
 
 class Share(Struct, frozen=True):
-    """The processor time of a daemon that serves a scene in one way, live on the simulated device.
-
-    daemon             the share of wall time that all its processes take
-    tick_us            what a control tick takes, with the plan that it may make; median
-    plan_us            what a plan takes; median
-    """
+    """The processor time of a daemon that serves a scene in one way, live on the simulated device."""
 
     way: OperatingPoint
     daemon: float
@@ -33,7 +27,6 @@ class Share(Struct, frozen=True):
 
     @property
     def ticks_us_s(self) -> float:
-        """The processor time of the control ticks of one second, us."""
         return self.way.control_hz * self.tick_us
 
 
@@ -45,17 +38,11 @@ class Tried(Struct, frozen=True):
 
     @property
     def worst_N(self) -> float:
-        """The greatest RMS error of the three samples, N."""
         return max(self.rms_N)
 
 
 class WorstDevice(Struct, frozen=True):
-    """The worst device of a group in one situation.
-
-    group      `deciding` or `judging`: the devices that a way was chosen on, or those that it was judged on
-    rms_N      the RMS error of the force in the chosen way
-    usual_N    the RMS error in the usual way
-    """
+    """The worst device of a group in one situation."""
 
     group: str
     device: str
@@ -66,13 +53,7 @@ class WorstDevice(Struct, frozen=True):
 
 
 class MeasuredScene(Struct, frozen=True):
-    """What was measured of one scene.
-
-    fingerprint   the scene's, which changes with what the scene asks for
-    chosen        the way that was chosen
-    tried         every way that was tried, the usual one first
-    judged        how the chosen way did on other devices
-    """
+    """What was measured of one scene."""
 
     name: str
     fingerprint: str
@@ -83,17 +64,14 @@ class MeasuredScene(Struct, frozen=True):
 
     @property
     def usual(self) -> Tried:
-        """The scene served in the usual way: 1000 Hz of control and 500 of plans."""
         return self.tried[0]
 
     @property
     def is_met(self) -> bool:
-        """Whether the usual way keeps to the tolerance on the three samples."""
         return self.usual.worst_N <= self.tolerance_N
 
     def of(self, way: OperatingPoint) -> Tried:
-        """Return what was found of `way`: the same rates and the same search. Raises StopIteration where it was not
-        tried."""
+        """Return what was found of `way`: the same rates and the same search."""
         return next(each for each in self.tried if each.way == way)
 
 
@@ -132,10 +110,6 @@ def measured() -> Measurements:
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
-    """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`.
-
-    It is TOLERATED of `tolerance_N`, N, or WORSE of it more than `usual_N`, whichever is greater. Where the usual way
-    keeps the tolerance, the other has to.
-    """
+    """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`."""
     most_N = max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)
     return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N

@@ -34,20 +34,18 @@ class Force(Strict, frozen=True):
     "What the task would like as its lowest force; below the device's F_min it gets F_min, and the limit F_MIN shows."
     most_N: Annotated[float, Meta(gt=0.0, le=1_000.0)]
     resolution_N: Annotated[float, Meta(gt=0.0, le=100.0)]
-    "The smallest difference of force that matters. A device that cannot make or measure it is refused."
+    "The smallest difference of force that matters."
     tolerance_rms_N: Annotated[float, Meta(gt=0.0, le=100.0)]
     least_variance_accounted_for: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     release_N_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.0
     "How fast the force is let go when its publisher is gone, and how fast it goes to another publisher's."
     most_release_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 20.0
-    "How fast it may be lost at most, whatever fails. A device that opens faster than that is refused."
+    "How fast it may be lost at most, whatever fails."
     standby_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
-    """Where the brake waits while less is asked: nearer to the forces that come, and felt as drag. At most F_min and
-    0.3 N."""
+    """Where the brake waits while less is asked: nearer to the forces that come, and felt as drag."""
 
     @property
     def waiting_N(self) -> float:
-        """The least force, N, that is asked of the device while somebody sends setpoints."""
         return self.least_N if self.standby_N is UNSET else max(self.least_N, self.standby_N)
 
 
@@ -59,11 +57,7 @@ class Bandwidth(Strict, frozen=True):
 
 
 class Signal(Strict, frozen=True):
-    """The force that the task asks for over time: a recording, or `force`'s range up and down.
-
-    Of the range, as much is asked as the device gives. A device whose carriages are too slow for the signal is refused.
-    Raises ValueError unless either `file` or `bandwidth_hz` is given, and for what shapes flanks beside `file`.
-    """
+    """The force that the task asks for over time: a recording, or `force`'s range up and down."""
 
     file: str = ""
     "A CSV with the columns t_s,force_N, relative to the scene file; forces between its rows are on a smooth curve."
@@ -112,29 +106,11 @@ class Budget(Strict, frozen=True):
     core_share: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
     "Of one processor's time, for steps and plans."
     delay_ms: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
-    """How old setpoints may be when they are followed (`SOURCE_LATE`), and the budget of the whole way. Where it is not
-    given, any age is allowed, and the way's budget is 400 ms."""
+    """How old setpoints may be when they are followed (`SOURCE_LATE`), and the budget of the whole way."""
 
 
 class Terms(Strict, frozen=True):
-    """The parts of the controller's model. A part that is left out is not computed.
-
-    `rate`        the handle's rate and displacement are inputs of the learned model. Without it the force over the gap
-                  is one table, that of a handle at the thesis's 42 mm/s, and there is no search
-    `creep`       the friction of a creeping handle beside that of a sliding one, static and Stribeck's, is learned
-    `scale`       the device's force over the model's is learned: friction, modulus, field
-    `offset`      the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds
-                  back, beyond what its model expects
-    `memory`      from where the gap has been, the model follows how much force the elastomer has relaxed away. It
-                  follows how far the element's field lags behind the gap's, too
-    `forecast`    setpoints are carried along their slope to now and ahead, and a force that repeats itself is foreseen
-    `motor`       how late the carriages are is learned and made up for, and the duty that the reference takes is fed
-                  forward. It takes that for its speed, its acceleration, the dry friction of gearbox and screw, and the
-                  magnets' pull. The pull limits the opening speed as well
-
-    A pad has no `creep`. What safety rests on is no term: the ceiling, the judgement of the sensor, the force law
-    beside the search.
-    """
+    """The parts of the controller's model. A part that is left out is not computed."""
 
     rate: bool = True
     creep: bool = True
@@ -148,14 +124,10 @@ class Terms(Strict, frozen=True):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The names of the terms that are left out."""
         return tuple(name for name in TERMS if not getattr(self, name))
 
     def without(self, *names: str) -> "Terms":
-        """Return these terms with `names` left out, too; without names the same.
-
-        Raises ValueError for a name that is no term, and so for `learning`.
-        """
+        """Return these terms with `names` left out, too; without names the same."""
         for name in names:
             if name not in TERMS:
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
@@ -171,8 +143,7 @@ class Insert(Strict, frozen=True):
 
     name: str
     model: str
-    """A safetensors file (relative to the scene file), or the name of a shipped model. "auto" is the shipped one of
-    this insert, or that of all inserts of its matrix."""
+    """A safetensors file (relative to the scene file), or the name of a shipped model."""
     gap_closed_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 45.0
     gap_open_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 95.0
     inner_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 4.0
@@ -184,16 +155,13 @@ class Insert(Strict, frozen=True):
 
 
 class Solver(Strict, frozen=True):
-    """The field search. "auto": none where the rate is no term, else Newton's method, the cheapest and most exact.
-
-    Raises ValueError for settings beside "auto".
-    """
+    """The field search. "auto": none where the rate is no term, else Newton's method, the cheapest and most exact."""
 
     name: str = AUTO
     step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET
-    "Of the grid over the field. Only beside a named search."
+    "Of the grid over the field."
     neighbours: Annotated[int, Meta(ge=1, le=64)] | UnsetType = UNSET
-    'Points of the grid that compete for the answer of the search "nearest". Only beside a named search.'
+    'Points of the grid that compete for the answer of the search "nearest".'
 
     def __post_init__(self) -> None:
         for key in ("step_mT", "neighbours"):
@@ -248,11 +216,7 @@ class Scene(Strict, frozen=True):
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
 
     def _require_no_brake(self) -> None:
-        """Raise ValueError where a tactile scene states what only a brake has.
-
-        That is a radius or thickness other than the default, a `force.standby_N`, or a `[handle]` other than the
-        default.
-        """
+        """Raise ValueError where a tactile scene states what only a brake has."""
         usual = Insert(self.insert.name, self.insert.model)
         for key in ("inner_radius_mm", "outer_radius_mm", "thickness_mm", "roller_radius_mm"):
             value = getattr(self.insert, key)
@@ -265,16 +229,11 @@ class Scene(Strict, frozen=True):
 
     @property
     def roller_radius_mm(self) -> float | None:
-        """The lever, mm: a newton at the roller is so many mNm at the handle's shaft. None for a pad."""
         return self.insert.roller_radius_mm if self.element == "torque" else None
 
     @property
     def fingerprint(self) -> str:
-        """The hash, 16 hex digits, of what the scene asks for; equal scenes have equal ones in every process.
-
-        The scene's name, description and budget, and how it is served (terms, rates, search), do not count. Of its
-        files only the names do, not folders and contents.
-        """
+        """The hash, 16 hex digits, of what the scene asks for; equal scenes have equal ones in every process."""
         signal, insert = self.signal, self.insert
         task = msgspec.structs.replace(
             self,
@@ -296,18 +255,10 @@ def shipped_scenes() -> tuple[str, ...]:
 
 
 def scene_path(name_or_path: str) -> Path:
-    """Return the path of the shipped scene with this name, or of the file at this path, from the working directory on.
-
-    A shipped name goes first; the file is not opened. Raises ConfigError naming the shipped scenes where there is
-    neither.
-    """
+    """Return the path of the shipped scene with this name, or of the file at this path, from the working directory on."""
     return named("scene", name_or_path, _SHIPPED, ENDING)
 
 
 def load_scene(name_or_path: str) -> Scene:
-    """Read and check a shipped scene, by its name, or the scene in a file; a shipped name goes first.
-
-    Model, insert and signal that it names are neither looked for nor read. Raises ConfigError naming file, key, value
-    and what is allowed, also for a file that cannot be read or is no TOML.
-    """
+    """Read and check a shipped scene, by its name, or the scene in a file; a shipped name goes first."""
     return convert(scene_path(name_or_path), Scene)

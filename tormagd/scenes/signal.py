@@ -15,11 +15,7 @@ Array = npt.NDArray[np.float64]
 
 
 def recorded(path: Path) -> tuple[Array, Array]:
-    """Read a file of forces, and return its times from the first row on, s, and forces, N (n each, 2 at least).
-
-    Times rise. Displacement and rate in it are passed over. Raises ConfigError naming `signal.file`, for a file that
-    cannot be read or is no table of forces.
-    """
+    """Read a file of forces, and return its times from the first row on, s, and forces, N (n each, 2 at least)."""
     try:
         table = read_forces(path)
     except ForceFileError as error:
@@ -31,14 +27,7 @@ def recorded(path: Path) -> tuple[Array, Array]:
 def asked(
     signal: Signal, beside: Path, range_N: tuple[float, float], longest_s: float, rate_hz: int
 ) -> tuple[Array, Array]:
-    """Return times, s from 0 on, and forces, N (n each), that `signal` asks for.
-
-    There are `rate_hz` of them a second, and at least two. A recording, `signal.file` in the folder `beside`, is
-    interpolated by a smooth curve to its end, and held within `range_N`, least and greatest. Without a file the force
-    goes through the range up and down once, in steps of `step_N` at most. Each step is half a cosine, and is held for
-    `hold_s`. Both end after `longest_s` at the latest; infinite: at their own end. Raises ConfigError for a file that
-    is not as allowed.
-    """
+    """Return times, s from 0 on, and forces, N (n each), that `signal` asks for."""
     low_N, high_N = range_N
     if signal.file:
         known_s, known_N = recorded(beside / signal.file)
@@ -59,11 +48,7 @@ def asked(
 
 
 def _through(time_s: Array, known_s: Array, known_N: Array) -> Array:
-    """Return the forces (n) at `time_s` on cubic Hermite curves through the rows `known_s`, `known_N`.
-
-    Slopes are from a row's neighbours: a corner at every row would shake the carriages. `time_s` must lie within the
-    rows.
-    """
+    """Return the forces (n) at `time_s` on cubic Hermite curves through the rows `known_s`, `known_N`."""
     slope = np.gradient(known_N, known_s)
     after = np.clip(np.searchsorted(known_s, time_s, side="right"), 1, len(known_s) - 1)
     start = after - 1

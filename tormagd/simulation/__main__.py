@@ -38,13 +38,7 @@ FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come.
-
-    `arguments` None: those of the process. Writes the CSV file of `--truth` while it runs, and closes the door and that
-    file at the end. Says on stderr how often it fell behind real time. Returns 0, or 1 where stdout cannot be written
-    or an emulated processor ends. Raises SystemExit(2) for usage, or for a plant, hand, fault, firmware or door that
-    cannot be used. While it runs, OSError for a full disk and can.CanError for a bus that has gone pass through.
-    """
+    """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come."""
     command = parser()
     options = command.parse_args(arguments)
     ask_for_slices()  # a real device has a processor of its own
@@ -74,13 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
-    """Build the device that the options ask for, open its door, and return both; `resources` closes the door.
-
-    `options` are those of `parser`. The device is not closed: an emulator ends with the last reference to it. Without
-    `--hand` it is `steady`, or `pressing` at a pad. A CAN door without a path gets a temporary folder, which
-    `resources` removes. Raises PlantError, HandError or FaultError for those words, DomainError for a plant outside the
-    force law. Raises BuildError for a firmware that cannot be built, OSError for a door that cannot be opened.
-    """
+    """Build the device that the options ask for, open its door, and return both; `resources` closes the door."""
     boot = FIRMWARES[options.firmware]
     plant = load_plant(options.plant)
     hand = parse_hand(options.hand or ("steady" if plant.pad is None else "pressing"))
@@ -105,11 +93,7 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the argument parser of `python -m tormagd.simulation`; the reference of commands is made from it, too.
-
-    It refuses rates and node numbers out of range. Plant, hand, faults and door are words or paths, and are looked at
-    by `main`.
-    """
+    """Return the argument parser of `python -m tormagd.simulation`; the reference of commands is made from it, too."""
     made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
     doors = made.add_mutually_exclusive_group(required=True)
     doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal, its path printed first")
@@ -157,10 +141,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _rate(least: int, most: int, text: str) -> int:
-    """Return the command-line word `text` as a whole number.
-
-    Raises ArgumentTypeError outside `least`..`most`, ValueError for no whole number.
-    """
+    """Return the command-line word `text` as a whole number."""
     rate = int(text)
     if not least <= rate <= most:
         raise argparse.ArgumentTypeError(f"{rate}: allowed are {least} to {most}")

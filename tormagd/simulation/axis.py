@@ -21,13 +21,7 @@ MAX_STEP_SHARE: Final = 0.25
 
 @final
 class Axis:
-    """State and laws of one carriage with its drive.
-
-    `position_m` is the carriage's distance from the centre plane, `angle_rad` the screw's angle since power-on, opening
-    positive. `contact_N` is the force with which the nut pushes the carriage outward. `drag_N` of the guide,
-    `backlash_m` and both frictions may be changed at any time. Raises PlantError for a plant whose motion is too fast
-    for steps of `dt_s`.
-    """
+    """State and laws of one carriage with its drive."""
 
     def __init__(
         self, plant: PlantParameters, drag_N: float, start_mm: float, attraction_N: float, dt_s: float
@@ -72,17 +66,10 @@ class Axis:
 
     @property
     def back_emf_V(self) -> float:
-        """Voltage of the turning motor at its terminals without a current."""
         return self._coupling_Nm_A * self.speed_rad_s
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
-        """Advance the drive and its carriage by one time step, `dt_s`.
-
-        Sets angle, speed, current, place and `contact_N`. `voltage_V` is the mean voltage at the motor, positive to
-        open; the supply is no bound here. None is an open bridge, in which no current flows. `attraction_N` is the
-        magnets' pull, positive towards closed. The current is held within its limit, the carriage between its stops;
-        friction may hold either. Nothing is checked: NaN stays in the state.
-        """
+        """Advance the drive and its carriage by one time step, `dt_s`."""
         # four times a simulated millisecond: hence local names
         coupling_Nm_A = self._coupling_Nm_A
         before_rad_s, contact_N = self.speed_rad_s, self.contact_N
@@ -160,11 +147,7 @@ class Axis:
             self.contact_N = 0.0
 
     def shaft_after(self, age_s: float, voltage_V: float | None) -> tuple[float, float]:
-        """Return the screw's (angle_rad, current_A) at `age_s` after the last step, without changing the state.
-
-        `age_s` is from 0 to under one step; this is not checked. `voltage_V` is the mean voltage since that step, None
-        for an open bridge, whose current is 0. The speed counts as constant; the current is held within its limit.
-        """
+        """Return the screw's (angle_rad, current_A) at `age_s` after the last step, without changing the state."""
         speed_rad_s = self.speed_rad_s
         angle_rad = self.angle_rad + age_s * speed_rad_s
         if voltage_V is None:

@@ -20,7 +20,7 @@ class BusDoor:
     """The device as a node of a CAN bus that others run. The bus must have a descriptor to wait for."""
 
     def __init__(self, device: CanDevice, spec: str) -> None:
-        """Open the bus of `spec`, INTERFACE:CHANNEL. Raises OSError saying why it cannot be opened."""
+        """Open the bus of `spec`, INTERFACE:CHANNEL."""
         interface, _, channel = spec.partition(":")
         try:
             self._bus = can.Bus(interface=interface, channel=channel, ignore_config=True, **OPTIONS.get(interface, {}))
@@ -36,13 +36,7 @@ class BusDoor:
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
         """Hand the device what waits on the bus, if the bus is `readable`, and send what the device has sent by
-        `now_s`.
-
-        `now_s` is seconds from power-on; `readable` counts as a yes or no. It takes FRAMES_AT_ONCE frames at most, and
-        the rest waits. Ignored are frames that are no classical data frames of 11 bits, and those with a function that
-        only a device sends. Raises can.CanError when the bus goes away, or does not take a frame at once. Raises
-        ValueError for a time before the last.
-        """
+        `now_s`."""
         if readable:
             for _ in range(FRAMES_AT_ONCE):
                 frame = self._bus.recv(0)
@@ -61,6 +55,5 @@ class BusDoor:
         self._bus.shutdown()
 
     def _take(self, now_s: float, frame: CanFrame) -> None:
-        """Give the device a frame; its own messages, as UDP multicast returns them, and too long ones are dropped."""
         if frame.identifier >> 4 not in OWN_FUNCTIONS and len(frame.data) <= MAX_DATA:
             self._device.receive(now_s, frame)

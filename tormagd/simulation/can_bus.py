@@ -34,13 +34,9 @@ class SimulatorBus(can.BusABC):
     """A host's CAN controller on the simulated bus. Classical frames with 11-bit identifiers only."""
 
     def __init__(self, channel: str, can_filters: Any = None, **settings: object) -> None:
-        """Connect to the simulator that serves `channel`. Raises can.CanInitializationError if none does.
-
-        The bit rate is the simulator's; `settings` go to python-can.
-        """
+        """Connect to the simulator that serves `channel`."""
         self.channel_info = f"tormagsim {channel}"
         self._name = "".join(Path(channel).name.split())
-        """Channel in received frames. A log's fields are separated by spaces, so the name has none."""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -54,11 +50,7 @@ class SimulatorBus(can.BusABC):
     @staticmethod
     def _detect_available_configs() -> list[AutoDetectedConfig]:
         """Return the channels of running simulators that were given no path of their own, sorted; python-can asks for
-        them.
-
-        Each is a dict with `interface`, "tormagsim", and `channel`, the socket's path. Empty where none runs. Raises
-        OSError where /proc/net/unix cannot be read, as outside Linux.
-        """
+        them."""
         listening = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace").split()
         found = sorted(str(path) for path in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/can"))
         return [{"interface": "tormagsim", "channel": path} for path in found if path in listening]
@@ -68,12 +60,7 @@ class SimulatorBus(can.BusABC):
         return self._socket.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a classical data frame, waiting up to `timeout` seconds for room; None waits for ever, 0 not at all.
-
-        Raises can.CanOperationError for any other frame, for no room in time, and where the simulator has gone. An
-        identifier over 11 bits is not refused, but cut to its lowest 11. That the frame was sent says nothing of
-        whether a node heard it.
-        """
+        """Send a classical data frame, waiting up to `timeout` seconds for room; None waits for ever, 0 not at all."""
         if msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd or len(msg.data) > MAX_DATA:
             raise can.CanOperationError(f"{msg}: allowed are classical data frames of 11-bit identifiers")
         packet = to_socket(CanFrame(msg.arbitration_id & MAX_IDENTIFIER, bytes(msg.data)))
@@ -87,12 +74,7 @@ class SimulatorBus(can.BusABC):
             raise can.CanOperationError("the simulator has gone", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        """Return the next frame, and False: python-can has still to filter it. After `timeout` seconds the frame is
-        None.
-
-        A `timeout` of None waits for ever, 0 not at all. A packet with ERROR_FLAG becomes an error frame. Raises
-        can.CanOperationError where the simulator has gone, or sent what is no frame.
-        """
+        """Return the next frame, and False: python-can has still to filter it."""
         try:
             if timeout != 0:
                 select.select([self._socket], [], [], timeout)

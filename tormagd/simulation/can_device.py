@@ -45,16 +45,7 @@ class CanLine(Protocol):
 
 
 class CanDevice:
-    """One device and the bus it is on: the frames that wait, the one under way, and those that are not fetched yet.
-
-        receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
-        transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
-        advance(now_s)                only lets time pass
-
-    Times are seconds from power-on. A time before the last, over all three, raises ValueError, as does one that is not
-    finite. The bus carries `bitrate` bits a second. The device answers at the address `node`, 0 to 15: neither is
-    checked.
-    """
+    """One device and the bus it is on: the frames that wait, the one under way, and those that are not fetched yet."""
 
     def __init__(self, messages: MessageDevice, bitrate: int = DEFAULT_BITRATE, node: int = DEFAULT_NODE) -> None:
         self.messages = messages
@@ -66,55 +57,37 @@ class CanDevice:
         self._order = 0
         self._waiting: list[tuple[int, int, Delivery]] = []
         self._flight: Delivery | None = None
-        "What is on the bus now."
         self._free_s = 0.0
-        "When the bus is free, again."
         self._now_s = 0.0
         self._delivered: list[Delivery] = []
 
     @property
     def truth(self) -> Truth:
-        """The plant's true state at the time of the last call."""
         return self.messages.truth
 
     @property
     def next_event_s(self) -> float:
         """Return when something happens next, s from power-on: a frame ends or may start, or an event inside the
-        device.
-
-        Never before the last time given, and at the latest the firmware's next tick.
-        """
+        device."""
         event_s = self.messages.next_event_s
         is_used = self._flight is not None or self._waiting
         return min(event_s, max(self._free_s, self._now_s)) if is_used else event_s
 
     def receive(self, now_s: float, frame: CanFrame, host: int = 1) -> None:
         """Let time pass until `now_s` and queue the frame that `host` sends then; in a full queue it is lost, and
-        counted in `lost`.
-
-        `host` is any number from 1, the sender of the later `Delivery`. The frame is not checked: one for no node goes
-        over the bus, too. Raises ValueError for a time before the last, or not finite.
-        """
+        counted in `lost`."""
         self.advance(now_s)
         self._queue(Delivery(host, frame))
 
     def transmit(self, now_s: float) -> list[Delivery]:
         """Let time pass until `now_s` and return the frames whose last bit has gone by since the last call, in that
-        order.
-
-        The hosts' own are among them; DEVICE is the device's number. Each is returned once. Raises ValueError for a
-        time before the last, or not finite.
-        """
+        order."""
         self.advance(now_s)
         delivered, self._delivered = self._delivered, []
         return delivered
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`: frames end and start on the bus.
-
-        Frames that end, the hosts' too, are kept for `transmit`. What the device sends into a full queue counts in
-        `lost`. Raises ValueError for a time before the last, or not finite.
-        """
+        """Let time pass until `now_s`: frames end and start on the bus."""
         if not self._now_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._now_s} on")
         while (event_s := self.next_event_s) <= now_s:
@@ -144,16 +117,11 @@ class CanDevice:
         heappush(self._waiting, (delivery.frame.identifier, self._order, delivery))
 
     def _start_frame(self, time_s: float) -> None:
-        """Put the waiting frame of the lowest identifier on the bus, which is used until `_free_s`. One has to be
-        waiting."""
         _, _, self._flight = heappop(self._waiting)
         self._free_s = time_s + frame_bits(self._flight.frame) * self._bit_s
 
     def _end_frame(self, delivery: Delivery) -> None:
-        """Free the bus, and put its frame among the delivered.
-
-        The device receives it too, if a host sent it to the device's node. An error frame reaches no device.
-        """
+        """Free the bus, and put its frame among the delivered."""
         self._flight = None
         self._delivered.append(delivery)
         sender, frame = delivery

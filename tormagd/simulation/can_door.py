@@ -18,7 +18,7 @@ class CanDoor:
     """Simulated CAN bus with a device and up to MAX_HOSTS hosts, which come and go as they like."""
 
     def __init__(self, device: CanDevice, path: Path) -> None:
-        """Serve at `path`, replacing what a killed simulator left there. Raises OSError."""
+        """Serve at `path`, replacing what a killed simulator left there."""
         self._device = device
         self._path = path
         self._hosts: dict[int, socket.socket] = {}
@@ -39,12 +39,7 @@ class CanDoor:
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
         """Admit hosts, take their frames, and hand on every frame that has gone by until `now_s`, seconds from
-        power-on.
-
-        `readable` are those of `descriptors` on which something waits; any other is taken for a host that connects. A
-        frame goes to all hosts but its sender. A host that has left, or sent what is no frame, is disconnected. One
-        that does not read loses frames. Raises ValueError for a time before the last.
-        """
+        power-on."""
         for descriptor in readable:
             if descriptor in self._hosts:
                 self._take(now_s, descriptor)
@@ -56,18 +51,14 @@ class CanDoor:
                 self._hand(descriptor, packet)
 
     def close(self) -> None:
-        """Disconnect all hosts and remove the socket from its folder. A second call changes nothing."""
+        """Disconnect all hosts and remove the socket from its folder."""
         for descriptor in list(self._hosts):
             self._dismiss(descriptor)
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
     def _welcome(self) -> None:
-        """Admit the host that connects; one above MAX_HOSTS is disconnected at once. Without one waiting it does
-        nothing.
-
-        Raises OSError where the process may open no more files.
-        """
+        """Admit the host that connects; one above MAX_HOSTS is disconnected at once."""
         with contextlib.suppress(BlockingIOError):  # a host that came has gone again
             host, _ = self._listener.accept()
             if len(self._hosts) >= MAX_HOSTS:
@@ -81,11 +72,7 @@ class CanDoor:
 
     def _take(self, now_s: float, descriptor: int) -> None:
         """Hand the device at most FRAMES_AT_ONCE frames of the host at `descriptor`, with the time `now_s`; the rest
-        waits.
-
-        A host that has left, or sent what is no frame, is disconnected. Raises ValueError for a time before the last,
-        and KeyError where no host has this descriptor.
-        """
+        waits."""
         for _ in range(FRAMES_AT_ONCE):
             try:
                 packet = self._hosts[descriptor].recv(SOCKET_FRAME.size + 1)
@@ -100,8 +87,7 @@ class CanDoor:
             self._device.receive(now_s, frame, descriptor)
 
     def _hand(self, descriptor: int, packet: bytes) -> None:
-        """Send a packet to the host at `descriptor`. One that does not read loses the packet; one that has gone is
-        disconnected."""
+        """Send a packet to the host at `descriptor`."""
         try:
             self._hosts[descriptor].send(packet)
         except BlockingIOError:
@@ -111,10 +97,7 @@ class CanDoor:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove the socket at `path` if nobody listens there; leave it where somebody does, and do nothing without one.
-
-    Raises OSError where that cannot be found out, as for a file that is no socket, or where it cannot be removed.
-    """
+    """Remove the socket at `path` if nobody listens there; leave it where somebody does, and do nothing without one."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
         try:
             probe.connect(str(path))

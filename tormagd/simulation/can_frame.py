@@ -27,11 +27,7 @@ class CanFrame(NamedTuple):
 
 
 def frame_bits(frame: CanFrame) -> int:
-    """Return how many bit times the frame takes, with its stuff bits and the pause of 3 behind it (ISO 11898-1).
-
-    The frame has to be a classical one of 11 bits and at most 8 bytes: others are not refused, and their result means
-    nothing. An error frame raises OverflowError.
-    """
+    """Return how many bit times the frame takes, with its stuff bits and the pause of 3 behind it (ISO 11898-1)."""
     # start of frame, identifier, then RTR, IDE and r0, which are 0 in a classical data frame, and the length
     head = (frame.identifier << 7 | len(frame.data)).to_bytes(3, "big")
     crc = 0
@@ -48,19 +44,12 @@ def frame_bits(frame: CanFrame) -> int:
 
 
 def to_socket(frame: CanFrame) -> bytes:
-    """Return the frame as one packet of the simulator's socket.
-
-    Data of more than MAX_DATA bytes are cut, not refused; `from_socket` then takes the packet for none.
-    """
+    """Return the frame as one packet of the simulator's socket."""
     return SOCKET_FRAME.pack(frame.identifier, len(frame.data), frame.data)
 
 
 def from_socket(packet: bytes) -> CanFrame | None:
-    """Return the frame in a packet of the simulator's socket, None where the packet holds no valid one.
-
-    Valid has the length of SOCKET_FRAME, an identifier of 11 bits and at most 8 bytes of data. An error frame is valid,
-    and has ERROR_FLAG in its identifier. An empty packet, the socket's end, gives None.
-    """
+    """Return the frame in a packet of the simulator's socket, None where the packet holds no valid one."""
     if len(packet) != SOCKET_FRAME.size:
         return None
     identifier, length, data = SOCKET_FRAME.unpack(packet)
@@ -80,10 +69,7 @@ _CRC_TABLE = [_crc_of(byte) for byte in range(256)]
 
 
 def _after(run: int, byte: int) -> tuple[int, int]:
-    """Return the stuff bits in a byte that follows a run of equal bits, and the run that it leaves.
-
-    A run counts zeros, negative ones: from -4 to 4. The byte's highest bit comes first.
-    """
+    """Return the stuff bits in a byte that follows a run of equal bits, and the run that it leaves."""
     stuffed = 0
     for place in range(7, -1, -1):
         one = -1 if byte >> place & 1 else 1

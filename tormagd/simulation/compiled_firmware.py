@@ -78,11 +78,7 @@ class View(ctypes.Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    """Return the library, loaded once for this process, with its functions' types declared.
-
-    Compiles the C sources where that has not been done. Raises BuildError where they cannot be built, or their
-    structures are laid out otherwise than ctypes does it.
-    """
+    """Return the library, loaded once for this process, with its functions' types declared."""
     library = load_library()
     pointer, time_s, payload = ctypes.c_void_p, ctypes.c_double, ctypes.c_char_p
     sensors = ctypes.POINTER(CSensors)
@@ -111,10 +107,7 @@ def _sizes(library: ctypes.CDLL) -> list[int]:
 
 
 class CompiledFirmware:
-    """One device's firmware in C from its boot on, as `Firmware`: the same calls, times and results.
-
-    Raises BuildError where the C sources cannot be built. Two of them share nothing that changes.
-    """
+    """One device's firmware in C from its boot on, as `Firmware`: the same calls, times and results."""
 
     def __init__(self, plant: PlantParameters) -> None:
         library = _library()
@@ -123,14 +116,9 @@ class CompiledFirmware:
         library.tormag_device_init(self._device, ctypes.byref(parameters_of(plant)))
         self._output: Output = OFF
         self._known: View | None = None
-        """What can be read of the device; None once something has happened to it."""
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host at `time_s`, s since boot, and return what to answer, as `Firmware.receive`.
-
-        Messages of a device are ignored: NONE. That times do not fall is not checked. Raises EncodeError for a message
-        that has no form on the wire, DecodeError for one that the C codec refuses.
-        """
+        """Act on one message of the host at `time_s`, s since boot, and return what to answer, as `Firmware.receive`."""
         payload, self._known = encode(message), None
         answer: int = _library().tormag_bridge_receive(
             self._device, time_s, FUNCTION[type(message)], payload, len(payload), seen(sensors)
@@ -140,29 +128,20 @@ class CompiledFirmware:
         return ANSWERS[answer]
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick at `time_s`, as `Firmware.tick`: return a Status every twentieth time, None otherwise.
-
-        Motions and watches have gone on even where it raises EncodeError, as `status`.
-        """
+        """Run one 1 kHz tick at `time_s`, as `Firmware.tick`: return a Status every twentieth time, None otherwise."""
         payload, self._known = ctypes.create_string_buffer(MAX_PAYLOAD), None
         length: int = _library().tormag_bridge_tick(self._device, time_s, seen(sensors), payload)
         _require_sent(length, sensors)
         return _decoded(Status, payload.raw) if length else None
 
     def status(self, sensors: Sensors) -> Status:
-        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any).
-
-        Nothing changes. Raises EncodeError for a supply or temperature that has no step on the wire.
-        """
+        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any)."""
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
         _require_sent(_library().tormag_bridge_status(self._device, seen(sensors), payload), sensors)
         return _decoded(Status, payload.raw)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return State and Sense of that moment, as `Firmware.measurement`: each call counts State's counter up.
-
-        Raises EncodeError for a current or force that has no step on the wire.
-        """
+        """Return State and Sense of that moment, as `Firmware.measurement`: each call counts State's counter up."""
         payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
         result: int = _library().tormag_bridge_measurement(self._device, time_s, seen(sensors), payloads)
         _require_sent(result, sensors)
@@ -176,17 +155,14 @@ class CompiledFirmware:
 
     @property
     def mode(self) -> DeviceMode:
-        """Operating mode."""
         return DeviceMode(self._view().mode)
 
     @property
     def faults(self) -> DeviceFault:
-        """Latched faults."""
         return DeviceFault(self._view().faults)
 
     @property
     def homed(self) -> bool:
-        """Whether the zero of the encoders is valid."""
         return bool(self._view().homed)
 
     @property
@@ -206,11 +182,7 @@ class CompiledFirmware:
 
 
 def parameters_of(plant: PlantParameters) -> CParameters:
-    """Return what the firmware of a plant's device is given at its boot, as the C structure.
-
-    The mm of an encoder's count come from screw lead and roller radius, the stall current from `assumed.overcurrent_A`.
-    The serial number is SERIAL_NUMBER for every plant. Nothing is checked here.
-    """
+    """Return what the firmware of a plant's device is given at its boot, as the C structure."""
     return CParameters(
         lead_mm=plant.screw.lead_mm,
         stall_A=plant.assumed.overcurrent_A,
@@ -223,10 +195,7 @@ def parameters_of(plant: PlantParameters) -> CParameters:
 
 
 def seen(sensors: Sensors) -> CSensors:
-    """Return `sensors` as the firmware's structure. Counts beyond 32 bits run over, as the firmware's own do.
-
-    Numbers are not checked: NaN is passed on.
-    """
+    """Return `sensors` as the firmware's structure."""
     return CSensors(
         sensors.left_counts,
         sensors.right_counts,
@@ -241,7 +210,6 @@ def seen(sensors: Sensors) -> CSensors:
 
 
 def _require_sent(result: int, sensors: Sensors) -> None:
-    """Raise EncodeError if the C function's result is negative: a value has no step on the wire."""
     if result < 0:
         raise EncodeError(f"{sensors}: a value has no step on the wire")
 

@@ -5,10 +5,7 @@ from typing import final
 
 @final
 class Curve:
-    """A function as a table: its values at equal distances from `start` to `end`, linear between them.
-
-    There are two `values` at least, and `end` is over `start`; neither is checked.
-    """
+    """A function as a table: its values at equal distances from `start` to `end`, linear between them."""
 
     def __init__(self, values: list[float], start: float, end: float) -> None:
         self._start = start
@@ -17,10 +14,7 @@ class Curve:
         self._values = values
 
     def at(self, x: float) -> float:
-        """Return the value at `x`; beyond both ends the outermost pieces go on in their direction.
-
-        Raises ValueError for NaN, OverflowError for an infinite `x`.
-        """
+        """Return the value at `x`; beyond both ends the outermost pieces go on in their direction."""
         place = (x - self._start) * self._per_unit
         index = int(place)
         if index < 0:

@@ -83,12 +83,7 @@ class Packet(Value):
 
 @final
 class MessageDevice:
-    """The simulated device at the level of messages: payloads in, payloads out, whatever carries them.
-
-    `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`, from which its user
-    takes. Times are the host's, seconds from power-on. Faults strike at the firmware's first tick from their times on;
-    those that last act until `mend`. It holds the `plant` and the `firmware`, a new one after each reset.
-    """
+    """The simulated device at the level of messages: payloads in, payloads out, whatever carries them."""
 
     def __init__(
         self,
@@ -116,7 +111,6 @@ class MessageDevice:
         self._closed_m = parameters.assumed.closed_mm * 1e-3
         self._inbox: deque[Packet] = deque()
         self._struck: set[str] = set()
-        """Names of the faults in STANDING that act now."""
         self._output: Output = OFF
         self._stuck_left: int | None = None
         self._stuck_handle: int | None = None
@@ -131,27 +125,17 @@ class MessageDevice:
 
     @property
     def truth(self) -> Truth:
-        """The plant's true state at the time of the last `advance`."""
         return self.plant.truth
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
-        """Queue a payload that arrives at `time_s`; the device hears it when `advance` gets there.
-
-        `function` is the message's number on the wire, or BYTES for bytes of a serial line. What is no message is not
-        refused here: it is counted in `undecodable` on arrival. Raises ValueError for a time before those already
-        queued or the last `advance`, or one that is not finite.
-        """
+        """Queue a payload that arrives at `time_s`; the device hears it when `advance` gets there."""
         latest_s = self._inbox[-1].time_s if self._inbox else self._time_s
         if not latest_s <= time_s < math.inf:
             raise ValueError(f"time_s = {time_s}: allowed is from {latest_s} on")
         self._inbox.append(Packet(time_s, function, payload))
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`: messages arrive, faults strike, the firmware ticks and answers into `outbox`.
-
-        Raises ValueError for a time before the last one, or not finite. What an emulated firmware raises passes
-        through, as does EncodeError for a value that the wire cannot say.
-        """
+        """Let time pass until `now_s`: messages arrive, faults strike, the firmware ticks and answers into `outbox`."""
         if not self._time_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._time_s} on")
         while (event_s := self.next_event_s) <= now_s:
@@ -169,10 +153,7 @@ class MessageDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next, s from power-on: a message arrives, an answer leaves, or the firmware ticks.
-
-        Never before the time of the last `advance`.
-        """
+        """When something happens next, s from power-on: a message arrives, an answer leaves, or the firmware ticks."""
         event_s = self._tick_due_s
         if self._inbox:
             event_s = min(event_s, self._inbox[0].time_s)
@@ -186,11 +167,7 @@ class MessageDevice:
             self._time_s = time_s
 
     def _drive_bridges(self) -> None:
-        """Put the firmware's present output at the motors, in steps of the PWM, as supply and faults let it.
-
-        Both bridges are open where the output is not enabled, or without supply. The output is remembered: `advance`
-        calls this for another one.
-        """
+        """Put the firmware's present output at the motors, in steps of the PWM, as supply and faults let it."""
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
@@ -211,11 +188,7 @@ class MessageDevice:
         return (time_s - self._boot_s) * self._rate
 
     def _tick(self, time_s: float) -> None:
-        """Begin the faults that are due, then let the firmware tick, and send its Status if one is due.
-
-        Counts the tick, and sets when the next one is due. A frozen firmware does not tick; it is reset once its
-        watchdog's time is over.
-        """
+        """Begin the faults that are due, then let the firmware tick, and send its Status if one is due."""
         self._ticks += 1
         while self._faults and self._faults[0].at_s <= time_s:
             self._strike(time_s, self._faults.popleft())
@@ -230,11 +203,7 @@ class MessageDevice:
             self._send(time_s, status)
 
     def _deliver(self, time_s: float, packet: Packet) -> None:
-        """Give the firmware a `packet` that arrives at `time_s`, and queue its answer with the device's jitter.
-
-        The commands_vanish and answers_half faults and a hanging firmware may drop the packet. One that is no message
-        is dropped and counted in `undecodable`.
-        """
+        """Give the firmware a `packet` that arrives at `time_s`, and queue its answer with the device's jitter."""
         if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
         if "answers_half" in self._struck and _is_drive(packet):
@@ -249,10 +218,7 @@ class MessageDevice:
             self._answers.append((answer_s, answer))
 
     def _hear(self, device_s: float, packet: Packet) -> Answer:
-        """Give the firmware a packet's bytes or message, and return what it answers, at `device_s` of its own clock.
-
-        NO_ANSWER, and one more in `undecodable`, for what is no message.
-        """
+        """Give the firmware a packet's bytes or message, and return what it answers, at `device_s` of its own clock."""
         if packet.function == BYTES and isinstance(self.firmware, EmulatedFirmware):
             return self.firmware.hear(device_s, packet.payload, self._sensors())
         try:
@@ -263,10 +229,7 @@ class MessageDevice:
         return self.firmware.receive(device_s, message, self._sensors())
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
-        """Send what `answer` stands for into `outbox`: Identity, or State and Sense as they are at `time_s`.
-
-        The fault other_schema puts another schema's hash into the Identity.
-        """
+        """Send what `answer` stands for into `outbox`: Identity, or State and Sense as they are at `time_s`."""
         if answer is IDENTITY:
             known = self.firmware.identity()
             if "other_schema" in self._struck:
@@ -279,10 +242,7 @@ class MessageDevice:
 
     def _send(self, time_s: float, message: Message) -> None:
         """Put a message into `outbox` at `time_s`, unless a fault silences its kind; a fault may spoil the CRC of a
-        State.
-
-        Raises EncodeError for a value that the wire cannot say.
-        """
+        State."""
         function, payload = FUNCTION[type(message)], encode(message)
         if SILENCES.get(function) in self._struck:
             return
@@ -291,11 +251,7 @@ class MessageDevice:
         self.outbox.append(Packet(time_s, function, payload))
 
     def _sensors(self) -> Sensors:
-        """Return what the electronics measure now, faults included.
-
-        Encoders are in counts, the carriages' from the firmware's last boot, the handle's from power-on. End switches
-        follow the carriages' true places. Force is the sensor's reading, N, the temperature the element's, Celsius.
-        """
+        """Return what the electronics measure now, faults included."""
         plant, struck = self.plant, self._struck
         left_m, right_m = plant.left.position_m, plant.right.position_m
         switches = 0
@@ -325,14 +281,9 @@ class MessageDevice:
         return math.floor(self.plant.handle_mm * self._handle_counts_per_mm)
 
     def _reset(self, time_s: float) -> None:
-        """Boot the firmware, again or for the first time: mode, zero, clock and pending answers are lost.
-
-        The carriages' encoders count from here, the handle's goes on. Faults of the device, and messages on their way
-        to it, stay.
-        """
+        """Boot the firmware, again or for the first time: mode, zero, clock and pending answers are lost."""
         self.firmware: Firmware | CompiledFirmware | EmulatedFirmware = self._boot(self.parameters)
         self._answers: deque[tuple[float, Answer]] = deque()
-        """Answers that are due, with their times."""
         (left_rad, _), (right_rad, _) = self.plant.shafts
         self._left_boot_counts, self._right_boot_counts = self._encoders(left_rad, right_rad)
         self._boot_s = time_s
@@ -349,21 +300,14 @@ class MessageDevice:
         )
 
     def _count_on(self, stuck_left: int | None, left_count_sign: int) -> None:
-        """Let the left encoder go on from its present count, without a leap.
-
-        It stays at `stuck_left`, or with None counts on: with `left_count_sign` 1 the right way, with -1 backwards.
-        """
+        """Let the left encoder go on from its present count, without a leap."""
         (left_rad, _), (right_rad, _) = self.plant.shafts
         left_counts, _ = self._encoders(left_rad, right_rad)
         self._stuck_left, self._left_count_sign = stuck_left, left_count_sign
         self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
 
     def mend(self) -> None:
-        """End all faults that act on the device now, at the time of the last `advance`.
-
-        What came of them stays: a firmware that was reset, counts that an encoder gained or missed, what was latched. A
-        hanging firmware hangs until its reset, and faults that are not due yet still come.
-        """
+        """End all faults that act on the device now, at the time of the last `advance`."""
         plant, parameters, time_s = self.plant, self.parameters, self._time_s
         if "worn_gearbox" in self._struck:
             plant.wear(1.0 / WEAR)
@@ -380,11 +324,7 @@ class MessageDevice:
         self._drive_bridges()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
-        """Begin `fault` at `time_s`: what it does is in `faults.KNOWN`, its size in percent, if it has one, in `fault`.
-
-        What acts on the bridges is put at the motors at once. Sizes multiply with those of earlier faults, but for
-        `opening`. Raises ValueError for a name whose effect is not defined here.
-        """
+        """Begin `fault` at `time_s`: what it does is in `faults.KNOWN`, its size in percent, if it has one, in `fault`."""
         if fault.name in STANDING:
             self._struck.add(fault.name)
         match fault.name:
@@ -456,16 +396,7 @@ class SerialDevice(Protocol):
 
 @final
 class VirtualDevice:
-    """The device behind a serial line: bytes in, bytes out, both paced to the baud rate.
-
-        receive(now_s, data)   the host hands bytes to its port; they arrive one by one from then on
-        transmit(now_s)        lets time pass until then, and gives the bytes whose last bit has left the line by then
-        advance(now_s)         only lets time pass
-
-    Times are the host's, seconds from power-on. A time before the last, over all three, raises ValueError, as does one
-    that is not finite. Damaged frames are dropped, and counted in `statistics`; a firmware that reads frames itself
-    gets them all.
-    """
+    """The device behind a serial line: bytes in, bytes out, both paced to the baud rate."""
 
     def __init__(
         self,
@@ -483,25 +414,18 @@ class VirtualDevice:
         self._receiver_free_s = 0.0
         self._sequence = 0
         self._line: deque[tuple[float, bytes]] = deque()
-        """What is still to leave of each frame, and when its first bit does."""
         self._sender_free_s = 0.0
 
     @property
     def truth(self) -> Truth:
-        """The plant's true state at the time of the last call."""
         return self.messages.truth
 
     @property
     def statistics(self) -> FramingStatistics:
-        """What the device's frame decoder has counted."""
         return self._decoder.statistics
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """Let time pass until `now_s` and take the bytes `data` that the host writes then; they arrive one by one.
-
-        What would make more than MAX_BACKLOG_BYTES wait is lost, and not told. Raises ValueError for a time before the
-        last, or not finite.
-        """
+        """Let time pass until `now_s` and take the bytes `data` that the host writes then; they arrive one by one."""
         self.messages.advance(now_s)
         start_s = max(now_s, self._receiver_free_s)
         room = MAX_BACKLOG_BYTES - math.ceil((start_s - now_s) / self._byte_s)
@@ -518,10 +442,7 @@ class VirtualDevice:
 
     def advance(self, now_s: float) -> None:
         """Let time pass until `now_s`, and queue what the device sends on the line, in frames with the next sequence
-        numbers.
-
-        Raises ValueError for a time before the last, or not finite.
-        """
+        numbers."""
         self.messages.advance(now_s)
         outbox = self.messages.outbox
         while outbox:
@@ -534,10 +455,7 @@ class VirtualDevice:
 
     def transmit(self, now_s: float) -> bytes:
         """Let time pass until `now_s` and return the bytes that have left the line since the last call; a frame may
-        come in parts.
-
-        Empty where none has. Raises ValueError for a time before the last, or not finite.
-        """
+        come in parts."""
         self.advance(now_s)
         out: list[bytes] = []
         line, byte_s = self._line, self._byte_s
@@ -556,11 +474,7 @@ class VirtualDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next, s from power-on: a frame of the device ends on the line, or an event inside it.
-
-        At the latest it is the firmware's next tick. A frame that has ended counts until `transmit` gives it, so the
-        time may be before the last one given.
-        """
+        """When something happens next, s from power-on: a frame of the device ends on the line, or an event inside it."""
         event_s = self.messages.next_event_s
         if self._line:
             start_s, data = self._line[0]
@@ -569,14 +483,12 @@ class VirtualDevice:
 
 
 def _is_drive(packet: Packet) -> bool:
-    """Return whether a packet is a Drive, whole or damaged."""
     # behind the first byte of COBS, a frame's next one is its function
     return (packet.payload[1:2] if packet.function == BYTES else bytes((packet.function,))) == DRIVE
 
 
 def _stretches(data: bytes) -> list[bytes]:
-    """Return `data` cut behind each delimiter: a frame has arrived when its delimiter has. What follows the last stands
-    alone."""
+    """Return `data` cut behind each delimiter: a frame has arrived when its delimiter has."""
     if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
         return [data]
     *ended, rest = data.split(DELIMITER)

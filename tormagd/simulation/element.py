@@ -16,13 +16,7 @@ from tormagd.simulation.warmth import Warmth
 
 @final
 class TorqueElement:
-    """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristle deflection, temperature.
-
-    Advances in equal steps of `dt_s`. `force_N` is the friction at the roller surface, as a torque sensor feels it.
-    Positive resists positive motion. Just after a reversal the bristles still point the old way. `kinetic_N`, never
-    negative, is the kinetic friction now. Raises tormagd.physics.errors.DomainError when the parameters leave the force
-    law's domain somewhere in the stroke.
-    """
+    """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristle deflection, temperature."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         self._dt_s = dt_s
@@ -49,26 +43,17 @@ class TorqueElement:
 
     @property
     def temperature_C(self) -> float:
-        """Temperature of the elastomer."""
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
         """Advance by one step that ends at `time_s` and at gap `gap_mm`, with the handle at the mean speed
-        `speed_mm_s`.
-
-        It is `prepare` and `slide`.
-        """
+        `speed_mm_s`."""
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
         """Begin a step that ends at `time_s`, s from power-on, and at `gap_mm`: advance all but the bristles, and set
-        `kinetic_N`.
-
-        That is field, relaxation and temperature; none depends on the handle. Call it once a step of `dt_s`, before
-        `slide`: neither is checked. A gap beyond the stops is not refused. Raises ValueError for a gap of NaN,
-        OverflowError for an infinite one.
-        """
+        `kinetic_N`."""
         moment_Tm = self._field.advance(gap_mm)
         driving_N = self._force.at(moment_Tm) * self._warmth.advance(time_s)
         relaxed_N, self._memory = self._relax.advance(self._memory, driving_N)
@@ -77,18 +62,12 @@ class TorqueElement:
 
     def resisting_N(self, speed_mm_s: float) -> float:
         """Return the friction, N, that the step begun by `prepare` would end with at the mean handle speed
-        `speed_mm_s`.
-
-        The state stays: several speeds may be tried before `slide`. NaN gives NaN.
-        """
+        `speed_mm_s`."""
         return self._friction.advance(self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
         """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`: set `force_N` and the
-        bristles.
-
-        A speed of NaN is not refused, and stays in the bristles.
-        """
+        bristles."""
         self.force_N, self._deflection_mm = self._friction.advance(
             self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s
         )

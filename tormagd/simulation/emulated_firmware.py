@@ -62,12 +62,7 @@ class _PinsOut(ctypes.Structure):
 
 
 class EmulatedFirmware:
-    """One device's firmware on its processor from its boot on, as `Firmware`, with times in seconds since that boot.
-
-    `output` is what its bridges do; the same object until it changes. `close` ends the emulator, as does the end of
-    this process. Raises BuildError without compiler or emulator. Where the emulator ends by itself, every method that
-    lets the firmware run raises EmulationError.
-    """
+    """One device's firmware on its processor from its boot on, as `Firmware`, with times in seconds since that boot."""
 
     def __init__(self, plant: PlantParameters) -> None:
         program, emulator = build(Target.MPS2), debian_tool("qemu-system-arm")
@@ -97,23 +92,14 @@ class EmulatedFirmware:
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         """Let a message of the host arrive at `time_s`, in a frame of its own with the next sequence number; return
-        what was answered.
-
-        As `hear` otherwise. Raises EncodeError for a value that does not fit the wire, and EmulationError.
-        """
+        what was answered."""
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         return self.hear(time_s, frame, sensors)
 
     def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
         """Let bytes of the link arrive at `time_s` of its clock, one whole frame at most, and return what was answered
-        to them.
-
-        `time_s` is not before the last, which is not checked; the firmware sees `sensors` then. Without bytes it does
-        not run, and NONE is returned; NONE also stands for a damaged frame. A State and Sense that it answers wait for
-        `measurement`, an Identity for `identity`. Raises EmulationError, and AssertionError where more than one frame
-        has been answered.
-        """
+        to them."""
         answer = Answer.NONE
         for start in range(0, len(data), MAX_BYTES):
             messages = self._wake(time_s, sensors, data[start : start + MAX_BYTES])
@@ -123,59 +109,44 @@ class EmulatedFirmware:
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
         """Let it sleep until its tick at `time_s`, as `Firmware.tick`, and return a Status every twentieth time, None
-        otherwise.
-
-        `time_s` is not before the last, which is not checked. Raises EmulationError.
-        """
+        otherwise."""
         self._answer(self._wake(time_s, sensors))
         status, self._status = self._status, None
         return status
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return the oldest State and Sense that it has sent and nobody has taken, and forget them.
-
-        They are of the moment of the `hear` or `receive` that answered MEASUREMENT; `time_s` and `sensors` given here
-        do not count. Raises IndexError where none waits.
-        """
+        """Return the oldest State and Sense that it has sent and nobody has taken, and forget them."""
         return self._measured.popleft()
 
     def identity(self) -> Identity:
-        """Return what it has answered to the last Hello, again and again. Raises RuntimeError before any."""
+        """Return what it has answered to the last Hello, again and again."""
         if self._identity is None:
             raise RuntimeError("the firmware has sent no Identity yet: allowed is to ask after a Hello")
         return self._identity
 
     @property
     def mode(self) -> DeviceMode:
-        """Operating mode."""
         return DeviceMode(self._pins.view.mode)
 
     @property
     def faults(self) -> DeviceFault:
-        """Latched faults."""
         return DeviceFault(self._pins.view.faults)
 
     @property
     def homed(self) -> bool:
-        """Whether the zero of the encoders is valid."""
         return bool(self._pins.view.homed)
 
     @property
     def statistics(self) -> FramingStatistics:
-        """What was seen of the frames that the firmware has sent."""
         return self._decoder.statistics
 
     @property
     def instructions(self) -> int:
-        """How many the last wake took, to INSTRUCTIONS_PER_CYCLE."""
         return INSTRUCTIONS_PER_CYCLE * int(self._pins.busy)
 
     def _answer(self, messages: list[Message]) -> Answer:
         """Keep what the firmware has sent in one wake for `measurement`, `identity` and `tick`, and return what answer
-        it is.
-
-        Raises AssertionError for messages that no device sends in this order.
-        """
+        it is."""
         answer = Answer.NONE
         match messages:
             case [State() as state, Sense() as sense, *rest]:
@@ -192,11 +163,7 @@ class EmulatedFirmware:
 
     def _wake(self, time_s: float, sensors: Sensors, data: bytes = b"") -> list[Message]:
         """Let it sleep until `time_s` on its clock, then act on its sensors and on at most MAX_BYTES of the link's
-        `data`.
-
-        Returns the messages that it sends. Updates `output` and what can be read of it. Raises EmulationError;
-        AssertionError where what it sends is no frame.
-        """
+        `data`."""
         cycles = round(time_s * CYCLES_PER_S)
         record = _PinsIn(seen(sensors), cycles - self._cycles, len(data))
         self._pins = pins = self._told(bytes(record), data)
@@ -209,10 +176,7 @@ class EmulatedFirmware:
         return [decode(frame.function, frame.payload) for frame in frames]
 
     def _told(self, record: bytes, data: bytes = b"") -> _PinsOut:
-        """Put `data` on the link, tell the firmware a record of its pins, and return what it says when it waits again.
-
-        Raises EmulationError with the emulator's last words where it has ended; it is killed then.
-        """
+        """Put `data` on the link, tell the firmware a record of its pins, and return what it says when it waits again."""
         to, of = _pipes(self._process)
         said = b""
         with contextlib.suppress(OSError):
@@ -235,11 +199,7 @@ def _pipes(process: "subprocess.Popen[bytes]") -> tuple[IO[bytes], IO[bytes]]:
 
 
 def _end(process: "subprocess.Popen[bytes]", link: socket.socket, errors: IO[bytes]) -> int | None:
-    """End the emulation, as `EmulatedFirmware.close`: without its pins the firmware counts its stack and stops.
-
-    Closes pipes, link and error file; an emulator that goes on for END_S more is killed. Returns how many bytes of the
-    stack were ever used, None where the firmware did not say.
-    """
+    """End the emulation, as `EmulatedFirmware.close`: without its pins the firmware counts its stack and stops."""
     to, of = _pipes(process)
     to.close()
     used = of.read(4)

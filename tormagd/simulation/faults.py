@@ -55,12 +55,7 @@ class Fault(NamedTuple):
 
 def parse_fault(spec: str) -> Fault:
     """Return the fault that the command-line word `spec` stands for: `NAME[=PERCENT%][@SECONDS]`; without a time from 0
-    s on.
-
-    Its `percent` is the number as given, 0 for a fault without a size. Raises FaultError for another form, an unknown
-    name, a size at a fault that takes none, or none at one that does. It is raised, too, for a time or a size out of
-    range. The message says what is allowed.
-    """
+    s on."""
     match = _FORM.fullmatch(spec)
     name = match["name"] if match else spec
     if match is None or name not in KNOWN:

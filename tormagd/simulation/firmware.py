@@ -117,11 +117,7 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 @final
 class Firmware:
     """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall; this is
-    not checked.
-
-    `mode`, latched `faults`, `homed` and the bridges' `output` are its state, besides the motion under way and the
-    counters of what it accepted last. `output` is the same object until it changes.
-    """
+    not checked."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm
@@ -153,13 +149,7 @@ class Firmware:
     # -- messages ------------------------------------------------------------------------------------------------
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host at `time_s` and return what to answer; a message of a device is ignored.
-
-        A Hello is answered by IDENTITY, a Drive with a new counter by MEASUREMENT; all else gives NONE, no answer. A
-        Hello's nonce counts as the one accepted last. A Hello with another schema or protocol version latches
-        SCHEMA_MISMATCH, which opens the gap unless the drives are off. A command with the nonce accepted last is
-        ignored.
-        """
+        """Act on one message of the host at `time_s` and return what to answer; a message of a device is ignored."""
         if isinstance(message, Drive):
             return self._drive(time_s, message, sensors)
         if isinstance(message, Hello):
@@ -176,12 +166,7 @@ class Firmware:
         return NO_ANSWER
 
     def _drive(self, time_s: float, drive: Drive, sensors: Sensors) -> Answer:
-        """Act on a Drive; one with a new counter is answered in every mode, so that a host can always measure.
-
-        MEASUREMENT is that answer, NO_ANSWER the one to a counter that came last. In RUN its duties become the output.
-        RUN is entered only from IDLE: homed, of a matching schema, without a fault. Where anything but OFF ended the
-        last run, an OFF must come first. An OFF in RUN opens the gap.
-        """
+        """Act on a Drive; one with a new counter is answered in every mode, so that a host can always measure."""
         if drive.counter == self._drive_counter:
             return NO_ANSWER
         self._drive_counter = drive.counter
@@ -200,12 +185,7 @@ class Firmware:
         return MEASUREMENT
 
     def _obey(self, time_s: float, command: Retract | Home | Clear, sensors: Sensors) -> bool:
-        """Carry out `command` unless the mode forbids it, and return whether it was accepted.
-
-        Status acknowledges only an accepted command. Retract begins to open, or goes on; it is refused in LATCHED. Home
-        begins a homing, unhomed; it is refused outside IDLE. Clear drops all faults and leads to IDLE. It is refused
-        while motors are on, a lasting cause is still there, or the schema does not match.
-        """
+        """Carry out `command` unless the mode forbids it, and return whether it was accepted."""
         if isinstance(command, Retract):
             if self.mode is LATCHED:
                 return False
@@ -237,10 +217,7 @@ class Firmware:
     # -- time ----------------------------------------------------------------------------------------------------
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick at `time_s`, s since boot: the motion under way and the watches, which may latch faults.
-
-        Returns a Status every twentieth time, None otherwise. Updates `mode`, `homed` and `output`.
-        """
+        """Run one 1 kHz tick at `time_s`, s since boot: the motion under way and the watches, which may latch faults."""
         if self.mode is RUN:
             self._tick_run(time_s, sensors)
         elif self._motors_on:
@@ -251,11 +228,7 @@ class Firmware:
         return None if self._ticks % STATUS_TICKS else self.status(sensors)
 
     def _tick_run(self, time_s: float, sensors: Sensors) -> None:
-        """Watch a run: any fault is latched, ends it and opens the gap.
-
-        That is SUPPLY, TEMPERATURE, OVERCURRENT, COMMAND_TIMEOUT, END_STOP or SKEW. Without one, an opening duty at an
-        open switch is taken away from `output`.
-        """
+        """Watch a run: any fault is latched, ends it and opens the gap."""
         left_mm, right_mm = self._positions_mm(sensors)
         fault = self._causes(time_s, sensors)
         if time_s - self._drive_s > COMMAND_TIMEOUT_S:
@@ -270,12 +243,7 @@ class Firmware:
         self.output = self._bounded(self.output, sensors)
 
     def _tick_motion(self, time_s: float, sensors: Sensors) -> None:
-        """Advance homing or retraction by one tick, and set `output`; at its end take the zeros over and rest.
-
-        SUPPLY, TEMPERATURE and OVERCURRENT end a homing and open the gap, as its failure does. A reversed motor or
-        encoder is latched at once as HOMING_FAILED, drives off. A retraction goes on while it latches
-        UNCOMMANDED_MOTION or RETRACT_FAILED.
-        """
+        """Advance homing or retraction by one tick, and set `output`; at its end take the zeros over and rest."""
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
         homing = isinstance(motion, HomingMotion)
@@ -309,10 +277,7 @@ class Firmware:
         self._rest(time_s, LATCHED if self.faults else IDLE)
 
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
-        """Watch the resting device, and latch what shows: UNCOMMANDED_MOTION, or SUPPLY and TEMPERATURE where new.
-
-        Motion by itself also opens the gap. After the others the drives stay off, and the device is no longer homed.
-        """
+        """Watch the resting device, and latch what shows: UNCOMMANDED_MOTION, or SUPPLY and TEMPERATURE where new."""
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)
             return
@@ -323,10 +288,7 @@ class Firmware:
     @staticmethod
     def _bounded(output: Output, sensors: Sensors) -> Output:
         """Return `output` without an opening duty for a carriage at its open switch, which must not run on into the
-        stop.
-
-        `output` itself where no switch is closed.
-        """
+        stop."""
         if not sensors.switches:
             return output
         return Output(
@@ -338,11 +300,7 @@ class Firmware:
     # -- transitions ---------------------------------------------------------------------------------------------
 
     def _fail(self, time_s: float, fault: DeviceFault, sensors: Sensors) -> None:
-        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves.
-
-        A device whose drives stay off is LATCHED at once, and no longer homed. One that opens already goes on, and is
-        LATCHED at its end.
-        """
+        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves."""
         self.faults |= fault
         if not self._motors_on and DeviceFault.UNCOMMANDED_MOTION not in fault:
             self._rest(time_s, LATCHED)
@@ -350,10 +308,7 @@ class Firmware:
             self._retract(time_s, sensors)
 
     def _retract(self, time_s: float, sensors: Sensors) -> None:
-        """Begin to open the gap. After RUN the host must send OFF before it can enter RUN again.
-
-        A homed device opens at its opening speed, slower towards the end; another at its homing speed.
-        """
+        """Begin to open the gap."""
         if self.mode is RUN:
             self._may_run = False
         self.mode = RETRACTING
@@ -369,10 +324,7 @@ class Firmware:
         )
 
     def _rest(self, time_s: float, mode: DeviceMode) -> None:
-        """Open the bridges, end the motion, and enter `mode`; LATCHED also makes the device unhomed.
-
-        The watch on motion by itself begins anew.
-        """
+        """Open the bridges, end the motion, and enter `mode`; LATCHED also makes the device unhomed."""
         self.mode = mode
         self.output = OFF
         self._motion = None
@@ -388,10 +340,7 @@ class Firmware:
     # -- watches -------------------------------------------------------------------------------------------------
 
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
-        """Return the faults whose cause is there now, whatever the device does: SUPPLY and TEMPERATURE.
-
-        The supply has to be MIN_SUPPLY_V to MAX_SUPPLY_V, the temperature at most MAX_TEMPERATURE_C.
-        """
+        """Return the faults whose cause is there now, whatever the device does: SUPPLY and TEMPERATURE."""
         causes = NO_FAULT
         if not MIN_SUPPLY_V <= sensors.supply_V <= MAX_SUPPLY_V:
             causes |= DeviceFault.SUPPLY
@@ -401,10 +350,7 @@ class Firmware:
 
     def _causes(self, time_s: float, sensors: Sensors) -> DeviceFault:
         """Return the lasting causes, and OVERCURRENT once a motor's current has been at its level for over
-        OVERCURRENT_S.
-
-        Updates when each motor was last under that level.
-        """
+        OVERCURRENT_S."""
         if abs(sensors.left_current_A) < self._overcurrent_A:
             self._left_calm_s = time_s
         if abs(sensors.right_current_A) < self._overcurrent_A:
@@ -414,16 +360,11 @@ class Firmware:
         return causes | DeviceFault.OVERCURRENT if time_s - calm_s > OVERCURRENT_S else causes
 
     def _calm(self, time_s: float) -> None:
-        """Restart the overcurrent watch of both motors."""
         self._left_calm_s = time_s
         self._right_calm_s = time_s
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
-        """Return how far a carriage, the further of the two, has moved from where it rested, mm, whichever way.
-
-        While opening only the way back from its most open place counts. 0 within COASTING_S of the last transition.
-        Updates the place that this way is measured from.
-        """
+        """Return how far a carriage, the further of the two, has moved from where it rested, mm, whichever way."""
         if time_s - self._watch_since_s < COASTING_S:
             return 0.0
         left, right = sensors.left_counts, sensors.right_counts
@@ -436,10 +377,6 @@ class Firmware:
         return max(abs(left - left_then), abs(right - right_then)) * self._mm_per_count
 
     def _positions_mm(self, sensors: Sensors) -> tuple[float, float]:
-        """Return the left and the right carriage's place, mm, from its zero; opening is positive, so most are negative.
-
-        The zero is where it was at boot, and after homing where its open switch closed.
-        """
         mm_per_count = self._mm_per_count
         return (
             sensors.left_counts * mm_per_count - self._left_zero_mm,
@@ -447,7 +384,6 @@ class Firmware:
         )
 
     def _carriages(self, sensors: Sensors) -> tuple[Carriage, Carriage]:
-        """Return what the firmware knows of the left and the right carriage: place, open switch, current."""
         left_mm, right_mm = self._positions_mm(sensors)
         return (
             Carriage(left_mm, Switches.LEFT_OPEN in sensors.switches, sensors.left_current_A),
@@ -461,10 +397,7 @@ class Firmware:
         return Identity(SCHEMA_HASH, VERSION[0], VERSION[1], SERIAL_NUMBER)
 
     def status(self, sensors: Sensors) -> Status:
-        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any).
-
-        HOMED is one of the switches. Nothing changes; the wire's ranges are not checked here.
-        """
+        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any)."""
         ends: int = sensors.switches
         return Status(
             mode=self.mode,
@@ -477,11 +410,7 @@ class Firmware:
         )
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return State and Sense of that moment; each call counts State's counter up, from 1 on and modulo 256.
-
-        Carriages are mm from their zeros, the handle mm of the roller's surface. The wire's ranges are not checked
-        here.
-        """
+        """Return State and Sense of that moment; each call counts State's counter up, from 1 on and modulo 256."""
         left_mm, right_mm = self._positions_mm(sensors)
         self._state_counter = (self._state_counter + 1) % 256
         return (

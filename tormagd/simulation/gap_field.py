@@ -24,15 +24,10 @@ class GapField:
 
     @property
     def moment_Tm(self) -> float:
-        """Radial moment at the newest gap, with hysteresis, T m."""
         return self._moment_Tm + self._lag_Tm
 
     def advance(self, gap_mm: float) -> float:
-        """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m.
-
-        The lag depends on the way of the gap, never on time. An unchanged gap changes nothing. A gap beyond the
-        device's stops is not refused: the table's last piece goes on there. Raises ValueError for NaN.
-        """
+        """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m."""
         moment_Tm = self.static.at(gap_mm)
         change_Tm = moment_Tm - self._moment_Tm
         if change_Tm != 0.0:

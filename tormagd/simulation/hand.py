@@ -59,10 +59,7 @@ class ReversingHand(Value):
         self.period_s: Final = period_s
 
     def position_mm(self, time_s: float) -> float:
-        """Return the place of the roller's surface at `time_s`, 0 to REVERSING_TRAVEL_MM, mm.
-
-        `time_s` is not below 0; this is not checked, and other times give places outside.
-        """
+        """Return the place of the roller's surface at `time_s`, 0 to REVERSING_TRAVEL_MM, mm."""
         phase = math.fmod(time_s, self.period_s) / self.period_s
         half, back = (phase, False) if phase < 0.5 else (phase - 0.5, True)
         share = min(half / 0.35, 1.0)
@@ -72,10 +69,7 @@ class ReversingHand(Value):
 
 @final
 class PressingHand(Value):
-    """The dummy finger of the thesis's pulse experiment: it presses `depth_mm` into the pad at 1 mm/s, and stays.
-
-    It touches the pad after 10 s, when the device is homed.
-    """
+    """The dummy finger of the thesis's pulse experiment: it presses `depth_mm` into the pad at 1 mm/s, and stays."""
 
     def __init__(self, depth_mm: float = DEFAULT_DEPTH_MM) -> None:
         self.depth_mm: Final = depth_mm
@@ -94,10 +88,7 @@ class RecordedHand(Value):
         self.positions_mm: Final = positions_mm
 
     def position_mm(self, time_s: float) -> float:
-        """Return the recorded place at `time_s`, mm, linear between the points; the first or the last beyond them.
-
-        NaN gives the last. Raises IndexError where there is no point.
-        """
+        """Return the recorded place at `time_s`, mm, linear between the points; the first or the last beyond them."""
         after = bisect.bisect_right(self.times_s, time_s)
         if after == 0:
             return self.positions_mm[0]
@@ -139,15 +130,7 @@ class Impedance(Value):
 
 @final
 class FeltHand:
-    """Hand that feels: spring and damper draw its mass x towards an intended motion x_i, while the friction f resists.
-
-        m dv/dt = k (x_i - x) + d (dx_i/dt - v) - f(v)
-
-    Each step is solved with its own friction at its mean speed (implicit midpoint). So the energies close, where a late
-    force would drive what it should damp. Where friction falls with speed and several speeds fit, the one found is near
-    the speed before: what sticks goes on to stick. Bristles act with their force at a step's end, which damps their
-    ringing, at 8 N/mm as 0.004 N s/mm would. From `lets_go_s` on the mass is alone.
-    """
+    """Hand that feels: spring and damper draw its mass x towards an intended motion x_i, while the friction f resists."""
 
     def __init__(self, intended: Hand, impedance: Impedance, lets_go_s: float = math.inf) -> None:
         self._intended = intended
@@ -165,11 +148,7 @@ class FeltHand:
         return self._intended.position_mm(time_s)
 
     def moved_mm(self, time_s: float, resisting_N: Callable[[float], float]) -> float:
-        """Advance the hand to `time_s` and return its place then, mm.
-
-        `resisting_N` gives the friction, N, at a mean speed in the step, mm/s. Updates `speed_mm_s` and `force_N`.
-        Raises ValueError for a time not after the last one: a hand that feels has a state, and moves one plant.
-        """
+        """Advance the hand to `time_s` and return its place then, mm."""
         dt_s, speed_mm_s, impedance = time_s - self._time_s, self.speed_mm_s, self._impedance
         if dt_s <= 0.0:
             raise ValueError(f"time_s = {time_s}: allowed is after {self._time_s}, where the hand has been")
@@ -204,25 +183,13 @@ _PUBLISHED: Final = (
 
 def drawn_impedance(seed: int) -> Impedance:
     """Draw a person's hand by `seed`: a finger's, a wrist's or an arm's in turn, evenly in the logarithms of published
-    sizes.
-
-    The same seed gives the same hand. The handle's own mass is not included. Sizes are of the order found for
-
-        a finger tip      Hajian and Howe (J Biomech Eng 119, 1997)
-        a held stylus     Kuchenbecker, Park and Niemeyer (ASME IMECE, 2003)
-        a hand on an arm  Hogan (IEEE ICRA, 1989), Dolan, Friedman and Nagurka (IEEE Trans SMC 23, 1993),
-                          Tsuji, Morasso, Goto and Ito (Biol Cybern 72, 1995)
-    """
+    sizes."""
     draw = random.Random(f"hand {seed}")
     return Impedance(*[low * (high / low) ** draw.random() for low, high in _PUBLISHED[seed % len(_PUBLISHED)]])
 
 
 def _root(function: Callable[[float], float], start: float, slope: float) -> float:
-    """Return a zero of a function that rises far out, to within EXACT_N or as near as ROUNDS rounds come.
-
-    The zero is bracketed from `start` on by growing steps, the first by a line of `slope`; the Illinois method finds
-    it.
-    """
+    """Return a zero of a function that rises far out, to within EXACT_N or as near as ROUNDS rounds come."""
     near, at_near = start, function(start)
     step = -at_near / slope
     far = near + step
@@ -262,11 +229,7 @@ _FELT: dict[str, tuple[float, float, float]] = {
 
 
 def parse_hand(spec: str) -> Hand:
-    """Return the hand that the command-line word `spec`, one of KNOWN, stands for; a size not given takes its default.
-
-    A word that ends with .csv names a recording, which is read. Raises HandError for an unknown word, and for a size
-    that is no number or out of range, with what is allowed. For a recording it raises as `read_recording`.
-    """
+    """Return the hand that the command-line word `spec`, one of KNOWN, stands for; a size not given takes its default."""
     name, _, value = spec.partition("=")
     if name in _SIZED:
         hand, low, high = _SIZED[name]
@@ -279,11 +242,7 @@ def parse_hand(spec: str) -> Hand:
 
 
 def _felt(spec: str, text: str) -> FeltHand:
-    """Return the hand of the word `spec`, felt=KEY=VALUE,..., whose part behind `felt=` is `text`.
-
-    A size that is not given takes its default, so an empty `text` all; of a key given twice the last counts. Raises
-    HandError for an unknown key, and for a size that is no number or out of range.
-    """
+    """Return the hand of the word `spec`, felt=KEY=VALUE,..., whose part behind `felt=` is `text`."""
     sizes = {key: usual for key, (usual, _, _) in _FELT.items()}
     for word in filter(None, text.split(",")):
         key, _, value = word.partition("=")
@@ -296,10 +255,7 @@ def _felt(spec: str, text: str) -> FeltHand:
 
 
 def _number(spec: str, text: str, low: float, high: float) -> float:
-    """Return `text`, a part of the word `spec`, as a number from `low` to `high`.
-
-    Raises HandError, naming `spec` and the range, for another number or for no number.
-    """
+    """Return `text`, a part of the word `spec`, as a number from `low` to `high`."""
     try:
         number = float(text)
     except ValueError:
@@ -310,11 +266,7 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
 
 
 def read_recording(path: Path) -> RecordedHand:
-    """Read a hand's motion from the CSV file at `path`: columns t_s, s, and position_mm, mm, within +-1e6.
-
-    The times have to rise from row to row, in two rows at least. Raises HandError for a file that cannot be read, is no
-    such table or is over 16 MB. The message names the file, and the row where one is wrong.
-    """
+    """Read a hand's motion from the CSV file at `path`: columns t_s, s, and position_mm, mm, within +-1e6."""
     try:
         table = read_table(path, RECORDED)
     except ForceFileError as error:

@@ -58,11 +58,7 @@ class Ramp:
         self._full_speed_mm_s = NO_LOAD_REV_S * lead_mm_rev
 
     def duty(self, position_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Advance the ramp by `dt_s` at the signed `speed_mm_s` and return the duty for the carriage at `position_mm`.
-
-        Opening is positive. The duty is the share of the no-load speed, plus RAMP_GAIN_PER_MM times the ramp's lead,
-        within DUTY_LIMIT. The ramp stays within RAMP_LEAD_MM of the carriage.
-        """
+        """Advance the ramp by `dt_s` at the signed `speed_mm_s` and return the duty for the carriage at `position_mm`."""
         reference_mm = self._reference_mm + speed_mm_s * dt_s
         self._reference_mm = min(max(reference_mm, position_mm - RAMP_LEAD_MM), position_mm + RAMP_LEAD_MM)
         duty = speed_mm_s / self._full_speed_mm_s + RAMP_GAIN_PER_MM * (self._reference_mm - position_mm)
@@ -71,11 +67,7 @@ class Ramp:
 
 @final
 class CarriageOpening:
-    """Motion that brings one carriage to its open switch and brakes it there.
-
-    A carriage that comes no further has failed when its current says why: a stall, or no current at all. Standing still
-    at a travelling current is a dead encoder, and the motion goes on.
-    """
+    """Motion that brings one carriage to its open switch and brakes it there."""
 
     def __init__(self, time_s: float, carriage: Carriage, lead_mm_rev: float, stall_A: float) -> None:
         self._ramp = Ramp(carriage.position_mm, lead_mm_rev)
@@ -87,13 +79,7 @@ class CarriageOpening:
         self.outcome = Outcome.MOVING
 
     def step(self, time_s: float, dt_s: float, carriage: Carriage, speed_mm_s: float) -> None:
-        """Advance by one tick, `dt_s` long and ending at `time_s`, and set `duty` and `outcome`.
-
-        The carriage is driven towards its open switch at `speed_mm_s` at most. MOVING: it is not there, or has not yet
-        been braked there for SETTLE_S. DONE: it has been, with a duty of 0; one that leaves its switch is driven again.
-        FAILED, for good and with a duty of 0: it has come no further for PATIENCE_S, at the current of a stall or at
-        none.
-        """
+        """Advance by one tick, `dt_s` long and ending at `time_s`, and set `duty` and `outcome`."""
         if self.outcome is Outcome.FAILED:
             return
         if carriage.at_open_end:
@@ -118,12 +104,7 @@ class CarriageOpening:
 
 @final
 class Retraction:
-    """Motion that opens the gap: both carriages to their open switches, each as far as it comes.
-
-    With `tapered`, which needs a valid zero, the speed falls towards the open end; otherwise one speed holds
-    throughout. A motion counts as late after the time of the whole stroke, wherever it began: a dead encoder says
-    nothing of what is left. A late one goes on, for it may still arrive.
-    """
+    """Motion that opens the gap: both carriages to their open switches, each as far as it comes."""
 
     def __init__(
         self,
@@ -149,7 +130,6 @@ class Retraction:
 
     @property
     def blocked(self) -> bool:
-        """Whether a carriage has been given up; its screw then springs back from the stall."""
         return Outcome.FAILED in [opening.outcome for opening in self._openings]
 
     def is_late(self, time_s: float) -> bool:
@@ -163,11 +143,7 @@ class Retraction:
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """Advance both carriages by one tick, `dt_s` long and ending at `time_s`, and return the outcome; updates
-        `duties`.
-
-        MOVING while a carriage is on its way, within TIME_LIMIT_S. After that, or when none is on its way: DONE where
-        both are braked at their open switches, else FAILED.
-        """
+        `duties`."""
         for opening, carriage in zip(self._openings, carriages, strict=True):
             opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))
         outcomes = [opening.outcome for opening in self._openings]
@@ -176,11 +152,7 @@ class Retraction:
         return Outcome.DONE if outcomes == [Outcome.DONE, Outcome.DONE] else Outcome.FAILED
 
     def _bounded_mm_s(self, carriage: Carriage) -> float:
-        """Return the speed, mm/s, at which this carriage is to open now; above 0.
-
-        With `tapered` it falls towards the open end, to CREEP_MM_S. Beyond the open end the zero is wrong: the carriage
-        then searches its switch at SEARCH_SHARE of the speed at most.
-        """
+        """Return the speed, mm/s, at which this carriage is to open now; above 0."""
         if not self._tapered:
             return self._speed_mm_s
         # beyond where its switch should have been the zero is wrong, as after an encoder's leap: it searches there
@@ -190,10 +162,7 @@ class Retraction:
 
 @final
 class HomingMotion:
-    """Motion that finds both open switches twice: at speed, then creeping after a back-off, so that the zero repeats.
-
-    `zeros_mm` holds the encoder positions of the two switches once the outcome is DONE.
-    """
+    """Motion that finds both open switches twice: at speed, then creeping after a back-off, so that the zero repeats."""
 
     def __init__(
         self,
@@ -221,12 +190,7 @@ class HomingMotion:
         return left_mm or 0.0, right_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Advance by one tick, `dt_s` long and ending at `time_s`; set `duties` and return the outcome.
-
-        FAILED after the time limit, a failed search or a back-off that takes too long; `duties` may stay as they were.
-        REVERSED once a carriage that went back towards closed has been braked for SETTLE_S. DONE once both switches
-        have been found twice, with `zeros_mm` set; else MOVING.
-        """
+        """Advance by one tick, `dt_s` long and ending at `time_s`; set `duties` and return the outcome."""
         if time_s >= self._deadline_s:
             return Outcome.FAILED
         if self._search is None:
@@ -256,11 +220,7 @@ class HomingMotion:
 
     def _back_off(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """Drive both carriages off their open switches for one tick, `dt_s` long and ending at `time_s`, and set
-        `duties`.
-
-        Once both are BACK_OFF_MM in and off their switches, begins the search that creeps back to them. Returns MOVING,
-        or FAILED once the back-off has lasted over BACK_OFF_LIMIT_S, with the duties as they were.
-        """
+        `duties`."""
         if time_s - self._back_off_since_s > BACK_OFF_LIMIT_S:
             return Outcome.FAILED
         sides = zip(carriages, self._ramps, self._starts_mm, strict=True)
@@ -272,13 +232,10 @@ class HomingMotion:
         return Outcome.MOVING
 
     def _inward_duty(self, carriage: Carriage, ramp: Ramp, start_mm: float, dt_s: float) -> float:
-        """Return the duty that closes this carriage's side, 0 once it is BACK_OFF_MM in and off its switch."""
         clear = carriage.position_mm <= start_mm - BACK_OFF_MM and not carriage.at_open_end
         return 0.0 if clear else ramp.duty(carriage.position_mm, -self._speed_mm_s, dt_s)
 
     def _outward(self, time_s: float, carriages: tuple[Carriage, Carriage], speed_mm_s: float) -> Retraction:
-        """Return a search for both open switches that begins at `time_s`, at `speed_mm_s` throughout. Nothing moves
-        yet."""
         return Retraction(
             time_s,
             carriages,

@@ -43,11 +43,7 @@ class Friction(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Field(Struct, frozen=True, forbid_unknown_fields=True):
-    """Radial moment of the magnets over their gap, with hysteresis in percent of its value at a gap of 45 mm.
-
-    `power` is coefficient * gap_mm**exponent, T m. `thesis` is Eq. 7 up to 95 mm, and goes over smoothly into that
-    power law.
-    """
+    """Radial moment of the magnets over their gap, with hysteresis in percent of its value at a gap of 45 mm."""
 
     law: Literal["power", "thesis"]
     coefficient: Annotated[float, Meta(gt=0.0, le=10.0)]
@@ -56,10 +52,7 @@ class Field(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
-    """Prony terms of an elastomer: each share of a force step dies away with its time constant.
-
-    Raises ValueError where the two differ in length, or the shares sum to 1 or more.
-    """
+    """Prony terms of an elastomer: each share of a force step dies away with its time constant."""
 
     fractions: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
     times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
@@ -98,10 +91,7 @@ class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """The element of the second plant, in the place of the insert; `SecondElement` states the laws of these constants.
-
-    Raises ValueError where shares do not match what they belong to, or have another sum than their law allows.
-    """
+    """The element of the second plant, in the place of the insert; `SecondElement` states the laws of these constants."""
 
     concentration: Annotated[float, Meta(ge=1.0, le=3.0)]
     without_field_N: NotNegative
@@ -199,10 +189,7 @@ class FirmwareTiming(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
-    """What the plant card leaves open. Every default is an assumption, with its reason beside it.
-
-    Raises ValueError where switches, stops, starting places or temperatures contradict each other.
-    """
+    """What the plant card leaves open. Every default is an assumption, with its reason beside it."""
 
     screw_mean_diameter_mm: Positive = 7.0  # an 8 mm trapezoidal screw, thread depth 1 mm
     ambient_C: Annotated[float, Meta(ge=-20.0, le=60.0)] = 25.0  # where the thesis's temperature range begins
@@ -235,10 +222,7 @@ class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """One simulated device, in the units of the plant card.
-
-    Raises ValueError where `assumed.overcurrent_A` is not under the current limit of the electronics.
-    """
+    """One simulated device, in the units of the plant card."""
 
     elastomer: Elastomer
     friction: Friction
@@ -254,9 +238,9 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     firmware: FirmwareTiming
     assumed: Assumed = Assumed()
     pad: PadParameters | None = None
-    "In the place of insert and shaft; `elastomer`, `friction` and `relaxation` are then unused. None: no pad."
+    "In the place of insert and shaft; `elastomer`, `friction` and `relaxation` are then unused."
     second: SecondParameters | None = None
-    "In the place of the insert; `elastomer`, `friction`, `relaxation` and `field` are then unused. None: the insert."
+    "In the place of the insert; `elastomer`, `friction`, `relaxation` and `field` are then unused."
 
     def __post_init__(self) -> None:
         limit_A = self.electronics.current_limit_A
@@ -269,12 +253,10 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def closed_stop_mm(self) -> float:
-        """Face-to-centre distance at which a carriage meets its inner stop."""
         return self.assumed.closed_mm - self.assumed.stop_beyond_mm
 
     @property
     def open_stop_mm(self) -> float:
-        """Face-to-centre distance at which a carriage meets its outer stop."""
         return self.assumed.home_mm + 2.0 * self.assumed.stop_beyond_mm
 
 
@@ -304,13 +286,7 @@ def plant_names() -> tuple[str, ...]:
 
 
 def load_plant(path_or_name: str | Path) -> PlantParameters:
-    """Read a plant by the name of a packaged one (`sample_1`), or from a TOML file; a packaged name goes first.
-
-    A file with `carriages` states only a pad or the second plant's element. All other parts are those of the plant that
-    it names, packaged or a file by its path from the working directory. Raises PlantError for a missing or unreadable
-    file, bad TOML, and unknown or missing keys. Values that are not finite, out of range, or contradict each other
-    raise PlantError, too. Whether its motion and force can be simulated is seen when a `Plant` is made.
-    """
+    """Read a plant by the name of a packaged one (`sample_1`), or from a TOML file; a packaged name goes first."""
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)
     if isinstance(read, PlantParameters):
@@ -320,12 +296,7 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
-    """Return the plant with the insert called `name` in the place of its own; the plant itself for PLANTS_INSERT.
-
-    The elastomer deviates from the registry's `name` by the factors by which the plant's own deviates from
-    PLANTS_INSERT. Relative permeability stays at 1 or above. All else stays, a pad too; the bounds of a plant file are
-    not checked again. Raises `DomainError` for an unknown insert.
-    """
+    """Return the plant with the insert called `name` in the place of its own; the plant itself for PLANTS_INSERT."""
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
     own = plant.elastomer
     fitted = Elastomer(

@@ -29,10 +29,7 @@ VESSEL: Final = Friction(presliding_stiffness_N_mm=2.0, viscous_N_s_mm=0.0, stat
 
 
 class Felt(NamedTuple):
-    """Forces at the tip at one time. `force_N` resists the way in, `friction_N` is the vessel's while the tip slides.
-
-    `contact_mm` is the handle's place where the wall was met last; None before a first contact.
-    """
+    """Forces at the tip at one time. `force_N` resists the way in, `friction_N` is the vessel's while the tip slides."""
 
     tip_mm: float
     force_N: float
@@ -43,12 +40,7 @@ class Felt(NamedTuple):
 
 
 class Patient:
-    """Robot's tip that follows the handle with a first-order lag, in a vessel with an elastic wall, which may beat.
-
-    `wall_mm` counts from the handle's place at the first update, where the tip begins. Over `buckling_N` the catheter
-    buckles: the force grows no more, and the tip stays behind. It keeps the places of robot and tip, the vessel's
-    friction, and where the wall was met. Raises ValueError for sizes that make no sense.
-    """
+    """Robot's tip that follows the handle with a first-order lag, in a vessel with an elastic wall, which may beat."""
 
     def __init__(
         self,
@@ -77,11 +69,7 @@ class Patient:
         self._contact_mm: float | None = None
 
     def update(self, time_s: float, handle_mm: float) -> Felt:
-        """Advance to `time_s`, with the handle at `handle_mm` since the last update, and return what the tip feels.
-
-        The first update puts tip and robot at the handle's place, from where the wall counts. Times must not fall and
-        no number be NaN: neither is checked, and the patient's state is of no use afterwards.
-        """
+        """Advance to `time_s`, with the handle at `handle_mm` since the last update, and return what the tip feels."""
         if math.isnan(self._time_s):
             self._time_s, self._start_mm, self._robot_mm, self._tip_mm = time_s, handle_mm, handle_mm, handle_mm
         dt_s, self._time_s = time_s - self._time_s, time_s
@@ -101,12 +89,7 @@ class Patient:
 
 
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
-    """Return the fields of a setpoint that says what the tip feels, `felt`, in the way of `mode`, one of MODES.
-
-    Forces are in N, and never negative. Mode `force` gives `servo_cf`, the size of the force. The others give wall and
-    friction together as `servo_cf`. Of these `way` adds the friction as `withdraw_cf`. `law` adds the wall as
-    `contact`, once the tip has met it: `handle_mm`, `stiffness_N_mm` and `friction_N`. Any other mode counts as `law`.
-    """
+    """Return the fields of a setpoint that says what the tip feels, `felt`, in the way of `mode`, one of MODES."""
     if mode == FORCE:
         return {"servo_cf": abs(felt.force_N)}
     fields: dict[str, Any] = {"servo_cf": felt.wall_N + felt.friction_N}
@@ -122,11 +105,7 @@ def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
 
 
 class NetworkDelay(Generic[T]):
-    """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage from .. to, seconds.
-
-    `loss` is the share of messages lost in the long run, `burst` the mean number lost in a row. Jitter may let a later
-    message arrive sooner. Raises ValueError for negative times, a loss outside 0..0.5, or bursts under 1.
-    """
+    """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage from .. to, seconds."""
 
     def __init__(
         self,
@@ -150,10 +129,7 @@ class NetworkDelay(Generic[T]):
         self._under_way: list[tuple[float, int, float, T]] = []
 
     def send(self, time_s: float, value: T) -> None:
-        """Send `value` at `time_s`: it arrives after the delay and its jitter. By chance, or in the outage, it is lost.
-
-        Nobody is told of a loss. Times are seconds of any clock. What arrives is kept until `arrived` hands it out.
-        """
+        """Send `value` at `time_s`: it arrives after the delay and its jitter."""
         chance, arrives_s = self._draw.random(), time_s + self._delay_s + self._jitter_s * self._draw.random()
         self._is_losing = chance < (self._goes_on if self._is_losing else self._begins)
         self._sent += 1
@@ -179,13 +155,7 @@ def run(
     clock_s: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints in `mode` `back`.
-
-    `mode` is one of MODES; another is not refused, and counts as `setpoint_of` says. Before a first motion has arrived
-    no setpoint is sent, from then on one every period, for the motion sent last. Returns the number of setpoints that
-    `client` published. A setpoint that arrives after a later one is dropped; its stamp is the time when it was sent.
-    `is_over` is asked with seconds of `clock_s`; `wait` sleeps for seconds. Raises what `client` raises.
-    """
+    """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints in `mode` `back`."""
     began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
     newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0
     while not is_over(now_s := clock_s()):
@@ -221,11 +191,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the simulated patient from the command line and return the exit code.
-
-    `arguments` None: those of the process. 0: setpoints were published; 1: none were, or the daemon was not reached.
-    Usage exits with 2.
-    """
+    """Run the simulated patient from the command line and return the exit code."""
     command = parser()
     options = command.parse_args(arguments)
     try:

@@ -26,11 +26,7 @@ _ROUNDING: Final = 1e-6
 
 @final
 class Truth(Value):
-    """The plant's true state at one time. `force_N` has the sign of the motion that it resists.
-
-    `left_mm` and `right_mm` are the carriages' distances from the centre plane. `kinetic_N` is the friction of a handle
-    that slides now. At a pad, `handle_mm` is the finger's depth in it and `force_N` pushes the finger out.
-    """
+    """The plant's true state at one time. `force_N` has the sign of the motion that it resists."""
 
     def __init__(
         self,
@@ -72,15 +68,7 @@ class Sensor(Protocol):
 
 @final
 class Plant:
-    """The device without its electronics, in fixed substeps of its own time; `Axis` and `TorqueElement` state the laws.
-
-    `advance` takes any time step and keeps the remainder of a substep for the next call. A voltage that changes within
-    a substep acts in it with its mean. A bridge opens at the nearer end of a substep, which moves a carriage at full
-    speed by up to 25 um. Screws and currents can be read within a substep; all other state is that at its beginning. At
-    power-on both bridges are open. `left` and `right` are the carriages, `element` what is between the magnets. `seed`
-    is of the force sensor's noise. Raises HandError for a hand that feels at a pad, and what `Axis` and the element
-    raise.
-    """
+    """The device without its electronics, in fixed substeps of its own time; `Axis` and `TorqueElement` state the laws."""
 
     def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
         assumed = parameters.assumed
@@ -116,12 +104,10 @@ class Plant:
 
     @property
     def time_s(self) -> float:
-        """Time since power-on at the last whole substep, s."""
         return self._substeps * self._substep_s
 
     @property
     def gap_mm(self) -> float:
-        """Distance between the magnets' faces."""
         return (self.left.position_m + self.right.position_m) * 1e3
 
     @property
@@ -158,22 +144,14 @@ class Plant:
         )
 
     def drive(self, left_V: float | None, right_V: float | None) -> None:
-        """Put `left_V` and `right_V` at the motors from now on, positive to open; None opens that motor's bridge.
-
-        They hold until the next call. The supply's voltage is no bound here.
-        """
+        """Put `left_V` and `right_V` at the motors from now on, positive to open; None opens that motor's bridge."""
         share = self._target_s / self._substep_s - self._substeps
         self._left_early_V += _early_V(self.left, share, self._left_V, left_V)
         self._right_early_V += _early_V(self.right, share, self._right_V, right_V)
         self._left_V, self._right_V = left_V, right_V
 
     def advance(self, dt_s: float) -> None:
-        """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each millisecond.
-
-        What is left of a substep waits for the next call. `dt_s` is not below 0; this is not checked, and would turn
-        the plant's clock back. Raises what the element and the hand raise, and ValueError or OverflowError for a time
-        that is not finite.
-        """
+        """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each millisecond."""
         self._target_s = target_s = self._target_s + dt_s
         due = int(target_s / self._substep_s + _ROUNDING)
         if due == self._substeps:
@@ -194,11 +172,7 @@ class Plant:
         self._substeps = due
 
     def _advance_element(self, time_s: float) -> None:
-        """Move the hand to `time_s`, then advance the element and the force sensor by their step.
-
-        Sets `handle_mm` and `handle_mm_s`. A hand that feels moves as the element's friction lets it; another as it is
-        prescribed.
-        """
+        """Move the hand to `time_s`, then advance the element and the force sensor by their step."""
         hand, element, before_mm = self._hand, self.element, self.handle_mm
         if isinstance(element, PressedPad):
             self.handle_mm = hand.position_mm(time_s)
@@ -215,42 +189,28 @@ class Plant:
         self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:
-        """Divide the friction of both gearboxes and screws by `divisor`, each time it is called.
-
-        1 / `divisor` undoes it; one below 1 makes friction greater. Raises ZeroDivisionError for 0, which is the only
-        number refused.
-        """
+        """Divide the friction of both gearboxes and screws by `divisor`, each time it is called."""
         for axis in (self.left, self.right):
             axis.gear_friction_Nm /= divisor
             axis.screw_friction_m /= divisor
 
 
 def _applied_V(axis: Axis, voltage_V: float | None) -> float:
-    """Return the voltage at the motor: at an open bridge (None) its back-EMF, which drives no current."""
     return axis.back_emf_V if voltage_V is None else voltage_V
 
 
 def _early_V(axis: Axis, share: float, before_V: float | None, voltage_V: float | None) -> float:
-    """Return what the voltage before the change adds to the mean over the substep, of which `share` has passed, V.
-
-    `before_V` held until now, `voltage_V` does from now on; None is an open bridge. A bridge opens at the nearer end of
-    the substep: no mean voltage takes the current away at once.
-    """
     share = float(round(share)) if voltage_V is None else share
     return share * (_applied_V(axis, before_V) - _applied_V(axis, voltage_V))
 
 
 def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None:
-    """Return the mean voltage over the substep that has begun; None only where the bridge was open all the time."""
     return None if voltage_V is None and not early_V else _applied_V(axis, voltage_V) + early_V
 
 
 @final
 class SimulatedSensor:
-    """The force sensor: samples at its own rate, adds noise and a drifting offset, saturates, and shows samples late.
-
-    `reading_N` is the newest sample that shows; 0 before the first.
-    """
+    """The force sensor: samples at its own rate, adds noise and a drifting offset, saturates, and shows samples late."""
 
     def __init__(self, plant: PlantParameters, noise: random.Random) -> None:
         sensor = plant.force_sensor
@@ -268,11 +228,7 @@ class SimulatedSensor:
 
     def advance(self, time_s: float, force_N: float) -> None:
         """Bring the sensor to `time_s`, at which the rendered force is `force_N`: sample when due, show what has
-        arrived.
-
-        A call makes one sample at most, so call it once a millisecond; this is not checked. A sample beyond the
-        sensor's range is held at its end. Updates `reading_N`.
-        """
+        arrived."""
         # half an element step of tolerance: a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
             self._samples += 1
@@ -283,10 +239,7 @@ class SimulatedSensor:
             self.reading_N = self._in_flight.popleft()[1]
 
     def _normal(self) -> float:
-        """Return the next standard normal number; two are made at a time and the second is kept (Box and Muller, 1958).
-
-        `random.Random.gauss` may give other numbers in another Python; only those of `random` are promised to stay.
-        """
+        """Return the next standard normal number; two are made at a time and the second is kept (Box and Muller, 1958)."""
         if self._has_spare:
             self._has_spare = False
             return self._spare

@@ -19,11 +19,7 @@ MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
 @final
 class PressedPad:
     """The pad between the magnets, with its state: magnetic branch, conditioned pad, temperature. It starts worked and
-    rested.
-
-    `force_N` pushes the finger out and is never negative: plates only push. Below 6 mm depth the plates meet, and the
-    force rises no further. Raises ValueError for a plant without `pad`.
-    """
+    rested."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         if plant.pad is None:
@@ -36,22 +32,15 @@ class PressedPad:
 
     @property
     def kinetic_N(self) -> float:
-        """`force_N`: at a pad nothing slides."""
         return self.force_N
 
     @property
     def temperature_C(self) -> float:
-        """Temperature of the pad."""
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
         """Advance by one step that ends at `time_s`, s, and at `gap_mm`, with the finger `depth_mm` deep and pressing
-        at `speed_mm_s`.
-
-        Sets `force_N`. Depth and speed are held within 0..6 mm and +-100 mm/s, positive inwards. Raises DomainError for
-        a depth or speed of NaN, and for a gap so small that its field is over 500 mT. Raises ValueError for a gap of
-        NaN.
-        """
+        at `speed_mm_s`."""
         field_mT = MT_PER_TM * self._field.advance(gap_mm)
         depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)
         speed_mm_s = min(max(speed_mm_s, -FASTEST_MM_S), FASTEST_MM_S)

@@ -16,7 +16,7 @@ LATE_S = 2e-3
 """From this lateness on, a wake-up counts as falling behind: two firmware ticks."""
 SLIP_S = 5e-3
 """From this lateness on, the device's time stands still instead, because the process did not run, as no microcontroller
-would. The device must not take its own sleep for the host's silence, of which it survives 50 ms."""
+would."""
 TRUTH_PERIOD_S = 1e-3
 TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C,kinetic_N\n"
 
@@ -63,14 +63,7 @@ class Punctuality(NamedTuple):
 
 
 def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: TextIO | None = None) -> Punctuality:
-    """Run `device` behind `door` in real time until `stopped()`, and return how well real time was kept.
-
-    `stopped` is asked before each wait, which ends with the device's next event or with something from a host. A
-    wake-up more than LATE_S late is counted; more than SLIP_S late makes the device's time stand still for as long.
-    `truth`, unless None, gets TRUTH_HEADER and then a row for each TRUTH_PERIOD_S of the device's time; `t_ns` is
-    CLOCK_REALTIME. It is not flushed, and nothing is closed. Freezes the garbage collector's present objects for the
-    whole process. Raises what `door`, `device` and `truth` raise.
-    """
+    """Run `device` behind `door` in real time until `stopped()`, and return how well real time was kept."""
     # nothing made so far will die: keep the collector from walking it while the device runs
     gc.freeze()
     power_on_s = time.monotonic()
@@ -103,8 +96,6 @@ def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: T
 
 
 def _truth_row(truth: Truth, t_ns: int) -> str:
-    """Return a line of the truth's file, in the order of TRUTH_HEADER, for the state `truth` at CLOCK_REALTIME
-    `t_ns`."""
     return (
         f"{t_ns},{truth.force_N:.5f},{truth.gap_mm:.5f},{truth.left_mm:.5f},{truth.right_mm:.5f},"
         f"{truth.handle_mm:.4f},{truth.handle_mm_s:.3f},{truth.temperature_C:.3f},{truth.kinetic_N:.5f}\n"

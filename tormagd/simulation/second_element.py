@@ -10,9 +10,6 @@ the order that the literature gives; they stand in `plants/second.toml`, with th
     contact      dA/dt = 1 - A |v| / D                  its age, s (Dieterich 1979, Ruina 1983)
                  L = N (1 + a ln(v_c + |v|) + c ln(1 + A / A_c)), and 1 N at v_ref   rubber on steel (Grosch 1963)
     before it slides: springs k_i side by side, each of which slips at its share of L (Iwan 1966)
-
-So the force creeps with the logarithm of time, a large step sooner than a small one. Friction grows with the logarithm
-of the speed, and of the time at rest. What the handle feels after a turn depends on where it turned before.
 """
 
 import math
@@ -27,11 +24,7 @@ RESTED_S: Final = 1000.0
 
 def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) -> float:
     """Return the flux density at the shaft, mT: a block's on its axis, half a gap away, times 2 and times
-    `concentration`.
-
-    Two equal blocks make the 2; `concentration` is what the iron shaft draws in (Furlani 2001). The gap is above 0 mm:
-    0 raises ZeroDivisionError, and less is not refused, as NaN is not.
-    """
+    `concentration`."""
     width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
 
     def angle(from_mm: float) -> float:
@@ -44,20 +37,13 @@ def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) 
 
 def fresh_N(field_mT: float, second: SecondParameters) -> float:
     """Return the kinetic friction, N, of the fresh, cool element in the field `field_mT`, sliding at the reference
-    speed.
-
-    Fresh is without creep. The field's sign does not matter; NaN gives NaN.
-    """
+    speed."""
     saturation = math.tanh(field_mT / second.saturating_mT)
     return second.without_field_N + second.saturated_N * saturation * saturation
 
 
 def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> float:
-    """Return the friction at `speed_mm_s` and contact age `age_s` over that of steady sliding at the reference speed.
-
-    It has no unit, and is 1 at the reference speed and its own age. The sign of the speed does not matter. The age, s,
-    is not below 0; this is not checked.
-    """
+    """Return the friction at `speed_mm_s` and contact age `age_s` over that of steady sliding at the reference speed."""
     reference_mm_s, slow_mm_s = second.reference_mm_s, second.slow_mm_s
     reference_age = second.renewed_mm / reference_mm_s / second.ageing_s
     faster = math.log((slow_mm_s + abs(speed_mm_s)) / (slow_mm_s + reference_mm_s))
@@ -67,13 +53,7 @@ def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> fl
 
 @final
 class SecondElement:
-    """The second plant's element, behind the interface of `TorqueElement`; advances in equal steps of `dt_s`.
-
-    State are the plays, the creeping force, the contact's age and its springs. `force_N` is the friction at the
-    roller's surface, positive against positive motion. `kinetic_N`, never negative, is that at the reference speed. The
-    element is passive: the handle alone stretches its springs, and they slip. Raises ValueError for a plant without
-    `second`.
-    """
+    """The second plant's element, behind the interface of `TorqueElement`; advances in equal steps of `dt_s`."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         if plant.second is None:
@@ -94,7 +74,6 @@ class SecondElement:
 
     @property
     def temperature_C(self) -> float:
-        """Temperature of the elastomer."""
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
@@ -105,11 +84,7 @@ class SecondElement:
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
         """Begin a step that ends at `time_s`, s from power-on, and at `gap_mm`: advance plays, creep, temperature and
-        `kinetic_N`.
-
-        None of these depends on the handle; `slide` ends the step. Call it once a step: this is not checked. Raises
-        ZeroDivisionError for a gap of 0.
-        """
+        `kinetic_N`."""
         second = self._second
         driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self._warmth.advance(time_s)
         self._creeping_N = self._crept_N(self._creeping_N + second.creeping_share * (driving_N - self._fresh_N))
@@ -118,25 +93,16 @@ class SecondElement:
 
     def resisting_N(self, speed_mm_s: float) -> float:
         """Return the friction, N, that the step begun by `prepare` would end with at the mean handle speed
-        `speed_mm_s`.
-
-        The state stays: several speeds may be tried before `slide`.
-        """
+        `speed_mm_s`."""
         return self._slid(speed_mm_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
-        """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`.
-
-        Sets `force_N`, the contact's age and its springs. NaN is not refused, and stays in them.
-        """
+        """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`."""
         self.force_N, self._age_s, self._stretched_mm = self._slid(speed_mm_s)
 
     def _slid(self, speed_mm_s: float) -> tuple[float, float, list[float]]:
         """Return force, N, contact age, s, and each spring's length, mm, at the end of a step at the mean speed
-        `speed_mm_s`.
-
-        The state stays.
-        """
+        `speed_mm_s`."""
         second, dt_s = self._second, self._dt_s
         # exact for a constant speed: what is left of the age, and what the step adds to it
         renewed = abs(speed_mm_s) * dt_s / second.renewed_mm
@@ -153,10 +119,7 @@ class SecondElement:
         return force_N, age_s, springs_mm
 
     def _magnetised_mT(self, gap_mm: float) -> float:
-        """Move the plays to the field at `gap_mm`, and return that field with their hysteresis, mT.
-
-        A gap of 0 raises ZeroDivisionError; less, and NaN, are not refused.
-        """
+        """Move the plays to the field at `gap_mm`, and return that field with their hysteresis, mT."""
         second = self._second
         field_mT = shaft_field_mT(gap_mm, self._plant, second.concentration)
         found_mT = field_mT
@@ -167,10 +130,7 @@ class SecondElement:
         return found_mT
 
     def _crept_N(self, creeping_N: float) -> float:
-        """Return what is left of the creeping force, N, after `dt_s`. Its sign stays, and the state does.
-
-        It is the exact solution: tanh(s / 2 V) falls by exp(-dt / T). The form loses no digits at a large s.
-        """
+        """Return what is left of the creeping force, N, after `dt_s`."""
         scale_N = self._second.creep_scale_N
         large = math.exp(-abs(creeping_N) / scale_N)
         kept, lost = self._kept, self._lost

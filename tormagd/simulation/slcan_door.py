@@ -23,10 +23,7 @@ _FRAME = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
 class SlcanAdapter:
-    """Translator between the serial characters of the Lawicel protocol and CAN frames; no I/O and no clock.
-
-    It keeps whether the channel `is_open`, and a command that is not complete yet.
-    """
+    """Translator between the serial characters of the Lawicel protocol and CAN frames; no I/O and no clock."""
 
     def __init__(self) -> None:
         self.is_open = False
@@ -35,12 +32,7 @@ class SlcanAdapter:
 
     def feed(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
         """Take the host's characters; return the characters to answer, and the frames that the host sends, both in
-        their order.
-
-        An incomplete command waits for the next call, LONGEST_COMMAND and one more characters of it at most. A frame
-        (`t`, 11-bit only) is answered as sent where the channel is open. It is refused where it is not, or where it is
-        damaged, as is any unknown command. Nothing is raised, whatever the characters are.
-        """
+        their order."""
         *commands, rest = (self._pending + data).split(END)
         # too long a command is refused when its end comes: no more of it is kept than shows its length
         self._pending = rest[: LONGEST_COMMAND + 1]
@@ -55,20 +47,11 @@ class SlcanAdapter:
         return answers, frames
 
     def line(self, frame: CanFrame) -> bytes:
-        """Return a received frame as characters for the host, CR included, whether the channel is open or not.
-
-        The frame has an 11-bit identifier and at most 8 bytes; another is not refused, and the host cannot read the
-        line.
-        """
+        """Return a received frame as characters for the host, CR included, whether the channel is open or not."""
         return b"t%03X%d%s\r" % (frame.identifier, len(frame.data), frame.data.hex().upper().encode())
 
     def _answer(self, command: bytes) -> bytes:
-        """Carry out a command that is no frame, given without its CR, and return its answer.
-
-        Only the first letter counts, but for bit rates. `O` opens the channel, `C` closes it. An empty command is
-        accepted, and so are the bit rates `S0` to `S8` while it is closed, without effect. `V`, `N` and `F` are
-        answered by TOLD. Any other is refused, as `O` and bit rates are while it is open.
-        """
+        """Carry out a command that is no frame, given without its CR, and return its answer."""
         match command[:1]:
             case b"":  # hosts send empty lines to end whatever was there before
                 return OK
@@ -92,12 +75,7 @@ class SlcanDoor(Pty):
         self._adapter = SlcanAdapter()
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device the host's frames, and the host the adapter's answers and the device's frames until `now_s`.
-
-        `now_s` is seconds from power-on; the host's characters are read where `readable` is not empty. While the host's
-        channel is closed its frames are refused, and it gets none; what the device sends meanwhile is lost. Raises
-        BlockingIOError where `readable` is not true, and ValueError for a time before the last.
-        """
+        """Hand the device the host's frames, and the host the adapter's answers and the device's frames until `now_s`."""
         out = b""
         if readable:
             out, frames = self._adapter.feed(self.read())
@@ -111,7 +89,7 @@ class SlcanDoor(Pty):
 
 
 def _frame(command: bytes) -> CanFrame | None:
-    """Return the frame in `tiiildd..` (identifier, length and data in hexadecimal), None for any other command."""
+    """Return the frame in `tiiildd..`"""
     match = _FRAME.fullmatch(command)
     if match is None or len(match[3]) != 2 * int(match[2]):
         return None

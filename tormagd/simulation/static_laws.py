@@ -22,11 +22,7 @@ JOIN_MM = 10.0
 
 
 def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
-    """Return the radial moment at each gap (n, mm) by the plant's field law, T m (n), without hysteresis.
-
-    The law of the thesis goes over into the power law within JOIN_MM from 95 mm on, and is its tangent under 45 mm.
-    Raises DomainError for constants or gaps outside the power law's range, and so for NaN.
-    """
+    """Return the radial moment at each gap (n, mm) by the plant's field law, T m (n), without hysteresis."""
     power = PowerFieldLaw(plant.field.coefficient, plant.field.exponent).radial_moment_Tm(gap_mm)
     if plant.field.law == "power":
         return power
@@ -43,36 +39,24 @@ def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
 
 def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
     """Return the attraction between the magnets at a gap, N, >= 0: the closed form in air times the factor for the iron
-    shaft.
-
-    A float gives a float, an array one of its shape. Raises DomainError for a gap outside 0.01 mm to 50 times the
-    magnets' shortest edge, and for magnets as `CuboidMagnet` does.
-    """
+    shaft."""
     return plant.assumed.attraction_factor * attraction_N(gap_mm, _magnet(plant))
 
 
 def moment_over_gap(plant: PlantParameters) -> Curve:
-    """Return `radial_moment_Tm` as a table over every gap that the device can reach, mm to T m. Raises DomainError as
-    that."""
+    """Return `radial_moment_Tm` as a table over every gap that the device can reach, mm to T m."""
     ends_mm = _reached_mm(plant)
     return Curve(radial_moment_Tm(_gaps_mm(*ends_mm), plant).tolist(), *ends_mm)
 
 
 def pull_over_gap(plant: PlantParameters) -> Curve:
-    """Return `pull_of_magnets_N` as a table over every gap that the device can reach, mm to N.
-
-    Raises DomainError as that, for a gap that is too large beside the magnets. The last 8 are kept, not computed again.
-    """
+    """Return `pull_of_magnets_N` as a table over every gap that the device can reach, mm to N."""
     ends_mm = _reached_mm(plant)
     return Curve((plant.assumed.attraction_factor * _attraction_N(_magnet(plant), *ends_mm)).tolist(), *ends_mm)
 
 
 def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: float) -> Curve:
-    """Return the fresh, cool insert's kinetic friction as a table over the radial moment, T m to N.
-
-    The table has MOMENT_POINTS from `weakest_Tm` to `strongest_Tm`. Raises DomainError where these leave the force
-    law's domain, or the plant's elastomer does.
-    """
+    """Return the fresh, cool insert's kinetic friction as a table over the radial moment, T m to N."""
     elastomer = Elastomer(
         shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
         relative_permeability=plant.elastomer.relative_permeability,

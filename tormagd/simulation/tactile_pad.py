@@ -34,11 +34,7 @@ SAMPLES_PER_CYCLE = 175
 
 @final
 class TactilePad:
-    """One pad with its past: conditioning by strain (Mullins effect) and relaxing stress. A new pad is unworked.
-
-    It keeps the greatest depth so far, the present one, and what is left of earlier stress. Displacement is the
-    finger's depth in the pad, rate that of pressing in.
-    """
+    """One pad with its past: conditioning by strain (Mullins effect) and relaxing stress. A new pad is unworked."""
 
     def __init__(self, parameters: PadParameters) -> None:
         self._parameters = parameters
@@ -61,11 +57,7 @@ class TactilePad:
         self._memory, self._field_memory = self._series.relaxed(0.0), self._field_series.relaxed(0.0)
 
     def elastic_parts_N(self, displacement_mm: float, rate_mm_s: float, field_mT: float) -> tuple[float, float]:
-        """Return two forces before relaxation, N: the elastomer's as conditioned now, and what the field adds.
-
-        Their sum is the force of a pad without a past. Raises `DomainError` outside 0..6 mm, +-100 mm/s, 0..500 mT. The
-        state stays.
-        """
+        """Return two forces before relaxation, N: the elastomer's as conditioned now, and what the field adds."""
         require("displacement_mm", displacement_mm, 0.0, DEEPEST_MM)
         require("rate_mm_s", rate_mm_s, -FASTEST_MM_S, FASTEST_MM_S)
         require("field_mT", field_mT, 0.0, STRONGEST_MT)
@@ -87,12 +79,7 @@ class TactilePad:
         return matrix_N, added_kPa * area * gent * (1.0 + pad.field_rate_gain * speed)
 
     def advance(self, dt_s: float, displacement_mm: float, rate_mm_s: float, field_mT: float) -> float:
-        """Advance by `dt_s` and return the force at the step's end, N, never negative.
-
-        The pad is conditioned and relaxes meanwhile. Displacement, rate and field are those at the end; that the rate
-        is the displacement's is not checked. 0 s is a step without time. Raises `DomainError` as `elastic_parts_N`
-        does, or for a `dt_s` below 0; the pad's past may have changed then.
-        """
+        """Advance by `dt_s` and return the force at the step's end, N, never negative."""
         if dt_s != self._dt_s:
             self._step, self._field_step = self._series.discretise(dt_s), self._field_series.discretise(dt_s)
             self._dt_s = dt_s
@@ -108,13 +95,7 @@ class TactilePad:
         return max(relaxed_N + field_N, 0.0)
 
     def run(self, time_s: Array, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
-        """Advance through a program of n samples and return the force at each, N (n).
-
-        Times are s, in a float array as the others. A program from time 0 has its first sample at once; of any other
-        the first step is as long as the second. Raises `DomainError` as `elastic_parts_N` does, and for times that
-        fall. Raises IndexError without samples, or with a single one that is not at time 0. Raises ValueError for
-        columns of different lengths. The pad's past has changed up to there.
-        """
+        """Advance through a program of n samples and return the force at each, N (n)."""
         steps = np.round(np.diff(time_s, prepend=0.0 if time_s[0] == 0.0 else 2 * time_s[0] - time_s[1]), 9)
         columns = zip(steps.tolist(), displacement_mm.tolist(), rate_mm_s.tolist(), field_mT.tolist(), strict=True)
         return np.array([self.advance(*row) for row in columns])
@@ -122,12 +103,7 @@ class TactilePad:
 
 def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     """Return time, displacement, rate and cycle number of one pass of the test rig, each (4 rates * 3 cycles *
-    samples).
-
-    A cycle goes from 0.2 to 4.5 mm and back; on the way back its rate is negative. Units are s, mm and mm/s. Times rise
-    from above 0, and cycles are numbered from 0 through all rates, in the order of RATES_MM_S. `samples_per_cycle` of 0
-    gives empty arrays.
-    """
+    samples)."""
     times, displacements, rates, cycles, start_s = [], [], [], [], 0.0
     stroke_mm = FULL_INDENTATION_MM - TOUCHING_MM
     share = np.arange(1, samples_per_cycle + 1) / samples_per_cycle

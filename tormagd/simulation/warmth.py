@@ -18,11 +18,7 @@ class Warmth:
         self.temperature_C = self._ambient_C
 
     def advance(self, time_s: float) -> float:
-        """Set `temperature_C` to that of `time_s`, s since power-on; return the factor on a cool elastomer's force.
-
-        It is 1 at the ambient temperature, and under 1 where warmth softens. Only the time counts, not how the device
-        works, and it may be any: nothing but the temperature is remembered.
-        """
+        """Set `temperature_C` to that of `time_s`, s since power-on; return the factor on a cool elastomer's force."""
         if self._warming_K > 0.0:
             self.temperature_C = self._ambient_C - self._warming_K * math.expm1(
                 -self._drift_K_s * time_s / self._warming_K

@@ -11,10 +11,6 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    """Load the client and its errors when asked for: a program that reads messages alone need not wait for ZeroMQ.
-
-    Raises AttributeError for any other name.
-    """
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from tormagd_client import blocking, errors

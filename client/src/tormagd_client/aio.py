@@ -39,10 +39,7 @@ from tormagd_client.wire import (
 
 
 class AsyncClient(Connections[zmq.asyncio.Socket]):
-    """Asyncio client of the daemon at `endpoints`: arguments, results and errors of `blocking.Client`.
-
-    An asynchronous context manager. It has no `ask` and `answer`: a task may wait for a `request` while others run.
-    """
+    """Asyncio client of the daemon at `endpoints`: arguments, results and errors of `blocking.Client`."""
 
     _made = zmq.asyncio.Context
 
@@ -70,11 +67,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None
     ) -> tuple[str, ...]:
         """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know.
-
-        `told` hears each command as it is given; all are returned. Where the wait ends before, by `timeout_s`
-        (RefusedError, `timeout`) or by cancelling, the daemon is told to disable. Raises as `request`, and RefusedError
-        where arming failed.
-        """
+        Raises as `request`, and RefusedError where arming failed."""
         until_s, report = asyncio.get_running_loop().time() + timeout_s, ArmReport(given=(), is_over=False)
         await self.request("arm")
         try:
@@ -94,10 +87,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
     async def publish(
         self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any
     ) -> None:
-        """Ask for a force at the roller, with arguments and errors of `blocking.Client.publish`.
-
-        Waits up to `wait_s` until the daemon takes setpoints.
-        """
+        """Ask for a force at the roller, with arguments and errors of `blocking.Client.publish`."""
         setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
         while await setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
             self._is_taken = (await setpoints.recv()).startswith(SUBSCRIBED)
@@ -119,7 +109,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         return self._heard(VERDICT_TOPIC, Verdict)
 
     async def _heard(self, topic: bytes, kind: type[Told]) -> AsyncIterator[Told]:
-        """Subscribe to `topic` and yield its messages without an end. Raises MessageError."""
+        """Subscribe to `topic` and yield its messages without an end."""
         socket = self._socket(zmq.SUB, self._endpoints.telemetry, topic)
         while True:
             yield decode((await socket.recv_multipart())[-1], kind)
@@ -133,8 +123,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         self.close()
 
     async def _result(self, command: str, args: dict[str, Any], wait_s: float) -> dict[str, Any]:
-        """Send a command and return its result, one command at a time. Raises UnreachableError after `wait_s`, and as
-        `answered`."""
+        """Send a command and return its result, one command at a time."""
         async with self._turn:
             control, pending = self._socket(zmq.DEALER, self._endpoints.control), Pending(next(self._ids), command)
             try:

@@ -38,12 +38,7 @@ RETRY_S = 0.1
 
 
 class Client(Connections["zmq.Socket[bytes]"]):
-    """Blocking client of the daemon at `endpoints`: commands, setpoints, telemetry.
-
-    A context manager; sockets open as they are needed. `wait_s` is the longest wait for the daemon. `source` names the
-    publisher. Making one raises SettingError for keys that are no good, a call for an address that ZeroMQ cannot use.
-    Not to be shared between threads.
-    """
+    """Blocking client of the daemon at `endpoints`: commands, setpoints, telemetry."""
 
     _made = zmq.Context
 
@@ -55,10 +50,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return self._result(self.ask(command, **args), self._wait_s)
 
     def ask(self, command: str, **args: Any) -> Pending:
-        """Send `command` without waiting, and return what `answer` takes.
-
-        To a daemon that cannot be reached nothing is sent: no answer comes then.
-        """
+        """Send `command` without waiting, and return what `answer` takes."""
         pending = Pending(next(self._ids), command)
         # a daemon that refused the key is no peer of the socket: sending would block for ever
         with contextlib.suppress(zmq.Again):
@@ -66,11 +58,8 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return pending
 
     def answer(self, pending: Pending, wait_s: float = 0.0) -> dict[str, Any] | None:
-        """Return the result of an asked command; None where no answer comes within `wait_s`.
-
-        Raises RefusedError, InFaultError, and UnreachableError for an answer that is not understood. Late answers to
-        other requests are dropped.
-        """
+        """Return the result of an asked command; None where no answer comes within `wait_s`. Raises RefusedError,
+        InFaultError, and UnreachableError for an answer that is not understood."""
         deadline_s = time.monotonic() + wait_s
         left_s = wait_s
         control = self._socket(zmq.DEALER, self._endpoints.control)
@@ -92,11 +81,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
 
     def arm(self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None) -> tuple[str, ...]:
         """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know.
-
-        `told` hears each command as it is given; all are returned. Where the wait ends before, by `timeout_s`
-        (RefusedError, `timeout`) or an interrupt, the daemon is told to disable. Raises as `request`, and RefusedError
-        where arming failed.
-        """
+        Raises as `request`, and RefusedError where arming failed."""
         until_s, report = time.monotonic() + timeout_s, ArmReport(given=(), is_over=False)
         self.request("arm")
         try:
@@ -114,12 +99,9 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return armed(report)
 
     def publish(self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any) -> None:
-        """Ask for a force at the roller, N, meant at `stamp_ns`, CLOCK_REALTIME; None means now.
-
-        `fields` are those of `messages.Setpoint`; `contact` may be a mapping of its names. Waits until the daemon takes
-        setpoints: the first time, and after the daemon has gone. Raises ValueError naming what is not allowed,
-        TypeError for an unknown field, and UnreachableError where nobody takes setpoints within `wait_s`.
-        """
+        """Ask for a force at the roller, N, meant at `stamp_ns`, CLOCK_REALTIME; None means now. Raises ValueError
+        naming what is not allowed, TypeError for an unknown field, and UnreachableError where nobody takes setpoints
+        within `wait_s`."""
         self.require_taken().send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def require_taken(self) -> "zmq.Socket[bytes]":
@@ -135,10 +117,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
 
     def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
         """Return the telemetry that has arrived since the last call, oldest first; wait up to `wait_s` for the first
-        message.
-
-        Listens from the first call on. Raises MessageError for a message that is not valid.
-        """
+        message. Raises MessageError for a message that is not valid."""
         return self._arrived(TELEMETRY_TOPIC, Telemetry, wait_s)
 
     def motions(self, wait_s: float = 0.0) -> list[Motion]:
@@ -151,8 +130,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return self._arrived(VERDICT_TOPIC, Verdict, wait_s)
 
     def _arrived(self, topic: bytes, kind: type[Told], wait_s: float) -> list[Told]:
-        """Return all messages of `topic` that have arrived, waiting up to `wait_s` for the first. Raises
-        MessageError."""
+        """Return all messages of `topic` that have arrived, waiting up to `wait_s` for the first."""
         socket = self._socket(zmq.SUB, self._endpoints.telemetry, topic)
         arrived: list[Told] = []
         while socket.poll(0 if arrived else round(wait_s * 1e3)):
@@ -168,7 +146,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
         self.close()
 
     def _result(self, pending: Pending, wait_s: float) -> dict[str, Any]:
-        """Return the answer to `pending`. Raises UnreachableError where none comes within `wait_s`, and as `answer`."""
+        """Return the answer to `pending`."""
         result = self.answer(pending, wait_s)
         if result is None:
             raise self._unanswered(wait_s)

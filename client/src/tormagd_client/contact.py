@@ -24,11 +24,7 @@ MAX_SHARE, MAX_MM = 0.2, 0.5
 
 
 class ContactEstimator:
-    """Estimator of one wall, for samples with 20 mN and 0.2 mm of noise, some hundred a second.
-
-    Holds a running mean of place and force, the friction, and the sums of the wall's line. A wall that has moved is
-    learned anew. `friction_N` is learned before the wall.
-    """
+    """Estimator of one wall, for samples with 20 mN and 0.2 mm of noise, some hundred a second."""
 
     def __init__(self) -> None:
         self._mean_mm = self._mean_N = 0.0
@@ -40,10 +36,7 @@ class ContactEstimator:
 
     @property
     def contact(self) -> Contact | None:
-        """Return the wall; None while it is not known well enough: then send forces.
-
-        None is also a wall beyond MAX_PLACE_MM. Stiffness is MAX_STIFFNESS_N_MM at most, friction 0 at least.
-        """
+        """Return the wall; None while it is not known well enough: then send forces."""
         slope_N_mm, place_mm, slope_sd, place_sd_mm, _ = self._line()
         is_known = slope_sd <= MAX_SHARE * slope_N_mm and place_sd_mm <= MAX_MM
         if not (is_known and abs(place_mm) <= MAX_PLACE_MM):
@@ -52,11 +45,8 @@ class ContactEstimator:
         return Contact(handle_mm=place_mm, stiffness_N_mm=stiffness_N_mm, friction_N=max(self.friction_N, 0.0))
 
     def update(self, tip_mm: float, force_N: float, way: float) -> None:
-        """Take one sample. `tip_mm` counts as the handle's place does, and `force_N` resists the way in.
-
-        `way` is above 0 while the tip goes in or is held. On the way out the sample is dropped, because friction
-        differs there. Raises ValueError for a number that is not finite.
-        """
+        """Take one sample. `tip_mm` counts as the handle's place does, and `force_N` resists the way in. Raises
+        ValueError for a number that is not finite."""
         for name, value in (("tip_mm", tip_mm), ("force_N", force_N), ("way", way)):
             if not math.isfinite(value):
                 raise ValueError(f"{name} = {value}: allowed are finite numbers")
@@ -74,14 +64,10 @@ class ContactEstimator:
         """Forget the line of the wall; friction stays."""
         self._weight = self._at_mm = self._at_N = 0.0
         self._mm2 = self._mm_N = self._N2 = 0.0
-        "Weighted means, and sums of squares around these means."
 
     def _take(self, place_mm: float, force_N: float) -> None:
         """Learn from one mean point: friction from the first LEAST and all before the wall, the line from those behind
-        it.
-
-        A point off the line is dropped.
-        """
+        it."""
         if self._is_off(place_mm, force_N):
             return
         if self._free < LEAST or force_N - self.friction_N < TOUCHES_N:
@@ -116,11 +102,7 @@ class ContactEstimator:
         return is_off
 
     def _line(self) -> tuple[float, float, float, float, float]:
-        """Return slope and wall's place, the standard deviations of both, and a point's deviation from the line, N.
-
-        Slope and place are 0 and the deviations infinite while points are too few, or the force does not rise with the
-        place.
-        """
+        """Return slope and wall's place, the standard deviations of both, and a point's deviation from the line, N."""
         if self._weight < LEAST * KEPT**LEAST or self._mm_N <= 0.0:
             return 0.0, 0.0, math.inf, math.inf, math.inf
         slope_N_mm = self._mm_N / self._mm2

@@ -8,10 +8,7 @@ from tormagd_client.printable import printable
 
 
 class ClientError(Exception):
-    """A call that was not carried out: a stable code, what happened, and what to do next.
-
-    `message` and `hint` may be the daemon's own words; as a text the error is printable, on one line.
-    """
+    """A call that was not carried out: a stable code, what happened, and what to do next."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(printable(f"{message}; {hint}" if hint else message))

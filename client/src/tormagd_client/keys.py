@@ -68,11 +68,8 @@ def fingerprint(public: bytes | str) -> str:
 
 
 def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
-    """Make a key pair, both files with mode 0600, and return the paths of its secret and its public file.
-
-    Missing folders are made, with mode 0700. Raises ConfigError where `name` is not allowed, or a file exists or cannot
-    be made. Then neither file was made, and nothing is overwritten.
-    """
+    """Make a key pair, both files with mode 0600, and return the paths of its secret and its public file. Raises
+    ConfigError where `name` is not allowed, or a file exists or cannot be made."""
     if not _NAME.fullmatch(name):
         raise ConfigError(
             f"name = {name[:80]!r}: allowed are 1..64 letters, digits, . _ and -, a letter or digit first"
@@ -110,7 +107,7 @@ def regular(path: Path) -> os.stat_result:
 
 
 def _certificate(path: Path) -> KeyPair | tuple[bytes, None]:
-    """Read the keys in a file, the secret one None where there is none. Raises ConfigError."""
+    """Read the keys in a file, the secret one None where there is none."""
     try:
         public, secret = zmq.auth.load_certificate(path)
     except OSError as error:

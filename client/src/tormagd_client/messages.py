@@ -35,20 +35,12 @@ class MessageError(ValueError):
 
 
 def _require_within(key: str, value: float | None, least: float, most: float) -> None:
-    """Raise ValueError as `require` unless `value` is None or from `least` to `most`.
-
-    The range is put into words only on refusal, as five hundred setpoints a second come.
-    """
     if not (value is None or least <= value <= most):
         require(False, key, value, f"{least:g}..{most:g}")
 
 
 class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on.
-
-    The force is `friction_N` before the wall, and `stiffness_N_mm` more for each mm behind it. Raises ValueError for a
-    field out of range.
-    """
+    """Elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on."""
 
     handle_mm: float
     stiffness_N_mm: float
@@ -62,15 +54,7 @@ class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A force to render, from one publisher. `stamp_ns` is CLOCK_REALTIME at the publisher. Raises ValueError out of
-    range.
-
-    `servo_cf` is the force on a handle that pushes on, `withdraw_cf` on one that withdraws; None: `servo_cf` both ways.
-    With a `contact` the force follows the handle against that wall, and `servo_cf` is not used.
-
-    `displacement_mm` (since the handle turned) and `rate_mm_s` say for which handle motion the force is meant. Without
-    them, and for a brake's handle that slides, the daemon uses the measured motion. `preview_N` holds the forces that
-    follow, `preview_dt_ms` apart. A publisher that starts again raises its `session` and starts `seq` anew.
-    """
+    range."""
 
     v: int
     source: str
@@ -127,10 +111,7 @@ class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True):
-    """The handle's motion, on the topic `motion`: positive pushing on.
-
-    `t_ns` is the time of reading, CLOCK_REALTIME, `device_s` that time by the device's own clock.
-    """
+    """The handle's motion, on the topic `motion`: positive pushing on."""
 
     v: int
     t_ns: int
@@ -159,14 +140,7 @@ class Mark(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
-    """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME.
-
-    `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion. `belief` has the
-    believed values of the device by name. `search_age_ms` is how long ago the search for `field_mT` began, where it
-    runs beside the plans. `handle_mm` and `handle_mm_s` are positive pushing on. `verdict` is the newest
-    setpoint's, `mark` the newest since the start. A
-    value that is not known (no device, no setpoint) is null.
-    """
+    """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME."""
 
     v: int
     t_ns: int
@@ -224,10 +198,7 @@ class ClockReport(msgspec.Struct, frozen=True):
 
 
 class LinkReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device at the other end of the wire, and how well the wire carries; `tormagctl firmware --json`.
-
-    Counters are since the port was last opened, `losses` since the daemon's start. What is not known is null.
-    """
+    """The device at the other end of the wire, and how well the wire carries; `tormagctl firmware --json`."""
 
     state: str
     cause: str
@@ -265,11 +236,7 @@ class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's.
-
-    `delay_us` is from the stamp, by the corrected clock, until the message was read; counters are since its first
-    message. `clock_behind_ms` corrects its stamps; null while it is not known.
-    """
+    """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's."""
 
     state: str
     silent_ms: float
@@ -289,11 +256,7 @@ class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlayoutReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What holding setpoints back until `playout_ms` after their stamps does, of the setpoints that were held.
-
-    `held_us` is the delay that it adds, `jitter_us` the jitter (RFC 3550) that it takes out. Of all `setpoints` since
-    the start, `late` came later than that and were followed at once.
-    """
+    """What holding setpoints back until `playout_ms` after their stamps does, of the setpoints that were held."""
 
     playout_ms: float
     held_us: ExecReport
@@ -303,10 +266,7 @@ class PlayoutReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts of setpoints since the daemon's start; `sources` has each publisher's newest `seq`.
-
-    `playout` is null where no setpoint is held back.
-    """
+    """Counts of setpoints since the daemon's start; `sources` has each publisher's newest `seq`."""
 
     accepted: int
     refused: int
@@ -320,11 +280,7 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WayReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Time of a setpoint from its stamp to the force, against a budget. What is not known yet is null.
-
-    `to_duty_us`: from the stamp, by the corrected clock, until the first duty that follows it. `device_us`: from a
-    Drive to its State, median. `carriages_ms`: how late the carriages are believed to be.
-    """
+    """Time of a setpoint from its stamp to the force, against a budget. What is not known yet is null."""
 
     to_duty_us: ExecReport
     device_us: float | None
@@ -353,11 +309,7 @@ class RateReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Learned correction of the device: its force is `scale` times the model's plus `offset_N`.
-
-    `sensor_zero_N` is what its force sensor reads without a force. `lag_ms` is how late its carriages are; null while
-    that is not learned.
-    """
+    """Learned correction of the device: its force is `scale` times the model's plus `offset_N`."""
 
     scale: float
     scale_sd: float
@@ -369,10 +321,7 @@ class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device's stored profile: whether it is used, its age on the disk (null: none), and why there is none.
-
-    `folder` is where profiles are kept, empty where none are.
-    """
+    """The device's stored profile: whether it is used, its age on the disk (null: none), and why there is none."""
 
     is_used: bool
     age_s: float | None
@@ -405,11 +354,7 @@ class StallReport(msgspec.Struct, frozen=True):
 
 
 class PeerReport(msgspec.Struct, frozen=True):
-    """A peer that was refused, or whose messages were dropped: where, who, why, and how often.
-
-    `address` is a host or a process. `key` is the fingerprint of the shown key with its listed name, empty where none
-    was shown.
-    """
+    """A peer that was refused, or whose messages were dropped: where, who, why, and how often."""
 
     endpoint: str
     address: str
@@ -419,10 +364,7 @@ class PeerReport(msgspec.Struct, frozen=True):
 
 
 class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Connections by endpoint, peers that were refused, and messages that were dropped unread.
-
-    Counts are since the start. Of both kinds the newest or worst are named, the rest are `others`.
-    """
+    """Connections by endpoint, peers that were refused, and messages that were dropped unread."""
 
     connections: dict[str, int] = msgspec.field(default_factory=dict)
     refused: int = 0
@@ -432,10 +374,7 @@ class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
-    """In how many control ticks each output stage has acted since the start, in the order of the stages.
-
-    The gap reference's speed and its acceleration were limited, a number was not finite, a duty was cut.
-    """
+    """In how many control ticks each output stage has acted since the start, in the order of the stages."""
 
     rate: int = 0
     slew: int = 0
@@ -516,10 +455,7 @@ class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Description(msgspec.Struct, frozen=True, kw_only=True):
-    """Answer to the command `describe`: what a recording is of. What is not known is null.
-
-    `configuration_file` is null where the daemon runs on its defaults.
-    """
+    """Answer to the command `describe`: what a recording is of. What is not known is null."""
 
     version: str
     build: str
@@ -534,12 +470,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One control tick: all inputs of the step, and all outputs. Units as in `Telemetry`; times in ns and s.
-
-    A row of the recording endpoint's message, its columns in this order. `device_*` is the device's own word, beside
-    what is concluded. What is not known (no device, no setpoint) is null. `received_s`, `sensed_s` and `reported_s` (of
-    the clock of `monotonic_s`) and `delay_s` are the measurement's: from them a step decides how old it is.
-    """
+    """One control tick: all inputs of the step, and all outputs. Units as in `Telemetry`; times in ns and s."""
 
     t_ns: int
     monotonic_s: float

@@ -161,10 +161,7 @@ def understood(result: dict[str, Any], kind: type[T]) -> T:
 
 
 def arm_report(status: dict[str, Any]) -> ArmReport:
-    """Return how far an `arm` has come, from an answer to `status`. Raises as `understood`.
-
-    A daemon that knows of none was started anew: the report is over then, with an error.
-    """
+    """Return how far an `arm` has come, from an answer to `status`. Raises as `understood`."""
     told = status.get("arm")
     if told is None:
         return ArmReport(given=(), is_over=True, error=Explained("gone", "the daemon was started anew", "arm again"))
@@ -195,8 +192,7 @@ def _printable(value: Any) -> Any:
 
 
 def _contact(fields: Mapping[str, float]) -> Contact:
-    """Return the contact of these fields. Raises ValueError for names that are unknown or missing, and for values out
-    of range."""
+    """Return the contact of these fields."""
     try:
         return Contact(**fields)
     except TypeError as error:
@@ -221,11 +217,9 @@ class Numbering:
         contact: Contact | Mapping[str, float] | None = None,
         **fields: Any,
     ) -> bytes:
-        """Return the next setpoint as bytes; `stamp_ns` is when the force is meant, None for now.
-
-        Other arguments are as in `messages.Setpoint`. Raises ValueError naming what is not allowed; no number is used
-        up then. Raises TypeError for a field that a setpoint does not have.
-        """
+        """Return the next setpoint as bytes; `stamp_ns` is when the force is meant, None for now. Raises ValueError
+        naming what is not allowed; no number is used up then. Raises TypeError for a field that a setpoint does not
+        have."""
         made = Setpoint(
             v=VERSION,
             source=self.source,
@@ -243,11 +237,7 @@ class Numbering:
 
 
 class Connections(Generic[SocketT]):
-    """Base of both clients: the daemon at `endpoints`, and the sockets to it, opened as they are needed.
-
-    `wait_s` is the longest wait for the daemon. `source` names the publisher. Raises SettingError for keys that are no
-    good.
-    """
+    """Base of both clients: the daemon at `endpoints`, and the sockets to it, opened as they are needed."""
 
     _made: ClassVar[Callable[[], Any]]
     "Makes the ZeroMQ context of the sockets."

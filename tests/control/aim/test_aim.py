@@ -59,7 +59,6 @@ def test_without_a_setpoint_the_gap_stays_open(planner, moving, is_there: bool) 
 @pytest.mark.parametrize("rate_mm_s", [0.0, 1.0, 4.9])
 @pytest.mark.parametrize("force_N", [0.6, 1.0, 1.8])
 def test_a_handle_that_rests_does_not_close_the_gap(first, moving, rate_mm_s: float, force_N: float) -> None:
-    """At rest the force is the hand's choice: the gap waits where it is right once the handle moves on."""
     resting = moving(handle=Handle(MOBILISED_MM, rate_mm_s, TURN, 42.0))
     gap_mm = first(force_N, moving()).gap_mm
     assert first(force_N, resting).gap_mm == pytest.approx(gap_mm, abs=0.1)
@@ -100,7 +99,6 @@ def test_what_cannot_be_given_is_said_once(first, moving, force_N: float, limit:
 
 
 def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(planner, planned, first) -> None:
-    """Where the element gives 1.6 times the model's force, 0.7 N are less than the open gap gives."""
     planner.teach(Learned(DeviceFit(scale=1.6)))
     plan = planned(planner, 0.7)
     assert Limit.F_MIN in plan.limits
@@ -120,7 +118,6 @@ def test_the_gap_moves_ahead_along_the_setpoints_slope(core, planner, planned, m
 
 
 def test_a_preview_gives_the_gaps_speed_and_acceleration(core, planner, first, moving) -> None:
-    """Where the force turns round, the speed is none and only the acceleration tells what comes."""
 
     def force_N(time_s: float) -> float:
         return 1.5 + 0.1 * math.cos(2.0 * math.pi * 3.0 * (time_s - 0.2))
@@ -141,7 +138,6 @@ def test_a_preview_gives_the_gaps_speed_and_acceleration(core, planner, first, m
 
 
 def test_the_model_is_never_asked_outside_what_it_was_shown(first) -> None:
-    """A setpoint may be meant for any motion; the model answers for the nearest that it knows, and the plan says so."""
     fast = first(1.0, rate_mm_s=1_000.0)
     assert Limit.MODEL_RANGE in fast.limits
     (replaced,) = fast.outside
@@ -154,7 +150,6 @@ def test_the_model_is_never_asked_outside_what_it_was_shown(first) -> None:
 
 
 def test_where_the_field_lags_and_the_force_relaxes_the_gap_makes_up_for_both(planned, moving) -> None:
-    """Whichever way the force goes, with the memory that the element has."""
     planner = build_core(CONFIG).planner()
     for force_N, begins_mm in ((1.6, 100), (0.9, 150), (1.3, 200)):
         for at_mm in range(begins_mm, begins_mm + 50):
@@ -263,7 +258,6 @@ fits = st.builds(
 
 @given(device=fits, unseen=st.none() | fits, asked_N=st.floats(0.0, 5.0))
 def test_the_most_open_of_the_guards_wins(core, device: DeviceFit, unseen: DeviceFit | None, asked_N: float) -> None:
-    """Whatever is asked and believed, the gap is never closer than any guard allows."""
     belief = Belief(device, device, unseen, 0.0, None, (), 0.0)
     planner = core.planner()
     plan = planner.aim.update(0.1, None, Ask(asked_N, [asked_N] * 7, None, ()), belief, planner.believe.memory, None)
@@ -320,7 +314,6 @@ def test_points_between_which_no_slope_is_are_refused_and_equal_ones_are_not() -
 
 
 def test_a_force_or_gap_that_is_no_number_has_no_place() -> None:
-    """It would be taken for the last point, the closest gap."""
     shown = drawn_portrait(0.4, [0.2] * 8)
     for asked, name in ((shown.gap_mm_at, "value"), (shown.gap_and_slope_at, "value"), (shown.force_N_at, "steps")):
         with pytest.raises(DomainError, match=f"^{name} = nan is not allowed: a number$"):

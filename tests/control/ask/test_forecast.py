@@ -177,7 +177,6 @@ def test_a_pulse_that_suddenly_beats_faster_is_followed() -> None:
 
 
 def test_another_source_is_not_foreseen_from_the_first() -> None:
-    """It takes over within the stream: what was learned loses its trust within a tenth of a second."""
     times_s = times_at("250 Hz", 9.0)
     followed = follow(
         times_s, np.where(times_s < 7.0, pulse_N(times_s), 0.9 + 0.2 * np.sin(2.0 * math.pi * 2.3 * times_s))
@@ -189,7 +188,6 @@ def test_another_source_is_not_foreseen_from_the_first() -> None:
 
 
 def test_after_a_jump_nothing_is_forecast_and_trust_has_to_be_earned_again(learned: Forecast) -> None:
-    """No remembered stretch is like one with a jump in it, and a regression would carry it on."""
     trust, changes_N = learned.trust, learned.changes_N
     for tick in range(1, 8):
         tell(learned, 3.995 + 0.005 * tick, 0.8)
@@ -281,7 +279,6 @@ def by_regression(history: Array, of: tuple[int, ...]) -> tuple[Array, float]:
 def test_a_forecast_is_a_mixture_of_weighted_ridge_regressions(
     seconds: float, rise_missed: float, beat_missed: float
 ) -> None:
-    """By the inverse squares of the mean squares that both missed lately, and are from what they know now."""
     forecast = beaten(seconds)
     forecast.update(forecast.stamp_s + (EVERY + 0.5) * GRID_S, forecast.force_N + 0.004)
     forecast.rise_missed, forecast.beat_missed = rise_missed, beat_missed
@@ -294,7 +291,6 @@ def test_a_forecast_is_a_mixture_of_weighted_ridge_regressions(
 
 
 def test_what_both_embeddings_missed_is_remembered() -> None:
-    """Setpoints come as the grid's points do: what was said four before is compared with what came."""
     times_s = np.arange(600) * GRID_S * (1.0 + 1e-6)
     forces_N = pulse_N(times_s)
     forecast = Forecast()
@@ -316,7 +312,6 @@ def test_what_both_embeddings_missed_is_remembered() -> None:
 
 
 def test_where_one_finds_nothing_alike_the_other_speaks_for_both(learned: Forecast) -> None:
-    """After a jump to a force that is held: before long the short embedding has left it behind, the long one not."""
     spoken = 0
     for tick in range(1, BEAT_DELAYS[-1] + 2):
         tell(learned, 4.0 + tick * GRID_S, 0.8 + 1e-4 * math.sin(tick))
@@ -360,7 +355,6 @@ hostile = st.lists(
 @settings(max_examples=150, deadline=None)
 @given(setpoints=hostile)
 def test_nan_never_travels_and_a_replay_is_exact(setpoints: list[tuple[float, float, float]]) -> None:
-    """Stamps in any order, any distance apart, on top of what was learned."""
     forecast, again = read(), read()
     for step_s, force_N, slope_N_s in setpoints:
         tell(forecast, forecast.stamp_s + step_s, force_N, slope_N_s)

@@ -73,7 +73,6 @@ def stream_of(
     ids=["plain", "preview", "wall", "withdraws"],
 )
 def test_what_is_played_out_later_is_followed_alike_whatever_it_is(form: dict[str, Any]) -> None:
-    """As if it had been meant that much later, but for its age, by which it ends."""
     playout_s = 0.0625
     now, later = governor(), governor()
     for number in range(1, 60):
@@ -134,7 +133,6 @@ def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least() -> Non
 
 
 def test_a_setpoint_that_goes_stale_on_a_slope_is_let_go_from_where_the_force_is() -> None:
-    """It was carried on along its slope; the ramp begins there, not at the setpoint."""
     following, ask = stream_of([1.0 + 0.02 * number for number in range(20)])
     for tick in range(1, 400):
         last_N = ask.path_N[0]
@@ -197,7 +195,6 @@ def test_another_holders_forces_teach_no_slope_and_no_period() -> None:
 def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
     events: list[tuple[int, float, float]],
 ) -> None:
-    """Each holder asks for a constant force; publishers fall silent, come late, and take over from each other."""
     following, now_s = governor(0.0, 2.0), 0.0
     for holder, age_s, elapsed_s in events:
         now_s += elapsed_s
@@ -225,7 +222,6 @@ def test_a_hand_that_draws_back_is_let_go_at_once_after_a_silence_too(holder: in
 def test_after_a_silence_a_publisher_is_followed_from_the_decayed_force_without_a_slope_from_before(
     holder: int,
 ) -> None:
-    """Whether it is the same that comes back or another."""
     following, _ = stream_of([1.0, 1.1, 1.2])
     decayed_N = decide(following, 0.2, TimedSetpoint(1.2, 0.03, VALID_S)).force_N
     ask = decide(following, 0.201, TimedSetpoint(1.5, 0.201, VALID_S, holder=holder))
@@ -248,7 +244,6 @@ def test_from_a_gap_that_was_held_the_force_goes_along_the_ramp(asked_N: float) 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.02])
 def test_a_slope_is_learned_and_carried_ahead(lag_s: float) -> None:
-    """However late the carriages are: a lag is made up for as far as it is known what comes."""
     following, ask = stream_of(RAMP_N)
     assert following.slope_N_s == pytest.approx(1.0, rel=1e-3)
     assert path_N(ask) == pytest.approx(1.39 + AFTER_S, abs=1e-3)
@@ -322,7 +317,6 @@ def swing_N(time_s: float) -> float:
 @pytest.mark.parametrize("seconds", [0.3, 0.5, 0.82])
 @pytest.mark.parametrize("ahead_s", [0.07, 0.4])
 def test_a_preview_is_what_comes(seconds: float, ahead_s: float) -> None:
-    """A swing that no slope foresees; the path goes along it."""
     ask = told(swing_N, seconds, ahead_s=ahead_s)
     assert (path_N(ask), ask.force_N, ask.limits, ask.foresight) == (
         pytest.approx([swing_N(seconds + after_s) for after_s in PATH_S], abs=2e-3),
@@ -338,7 +332,6 @@ def step_N(time_s: float) -> float:
 
 
 def test_what_is_too_fast_is_missed_before_and_after() -> None:
-    """The carriages set out before a step that they know of, and the limit says that they are too slow for it."""
     assert path_N(told(step_N, 0.6)) == pytest.approx(1.2)
     there = told(step_N, 1.0)
     assert (there.force_N, there.limits) == (pytest.approx(1.5, abs=0.1), (Limit.RATE,))
@@ -356,7 +349,6 @@ def test_late_carriages_set_out_sooner() -> None:
 def test_no_path_is_faster_than_the_gap_or_beyond_what_was_asked(
     ahead_N: list[float], spacing_s: float, lag_s: float
 ) -> None:
-    """However the preview leaps, and whatever it says: the path goes on from where the last one was."""
     following = governor(0.0, 1.0)
     for tick in range(1, 6):
         before_N, now_s = following.asked_N, 0.004 * tick
@@ -442,7 +434,6 @@ def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> 
 
 
 def test_of_what_is_foreseen_a_slow_gap_makes_the_best(learned: Governor) -> None:
-    """It turns before the force does, and is asked for no more than it can do."""
     fastest_N_s = GAP_SPEED_MM_S * (PORTRAIT.force_N[-1] - PORTRAIT.force_N[0]) / (95.0 - 45.0)
     follower_N = learned.asked_N
     missed_N, followed_N = [], []
@@ -472,7 +463,6 @@ def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> Non
 
 
 def test_a_silent_stream_is_not_believed_to_go_on(learned: Governor) -> None:
-    """However long its last setpoint is valid."""
     last = TimedSetpoint(beats_N(10.0), 10.0, 60.0)
     assert decide(learned, 10.05, last).foresight > 0.9
     late = decide(learned, 10.2, last)
@@ -487,7 +477,6 @@ def test_what_a_long_preview_says_is_not_foreseen(learned: Governor) -> None:
 
 
 def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> None:
-    """With 40 ms of a pulse known, the gap is sent to what comes in 90."""
     missed: dict[bool, list[float]] = {True: [], False: []}
     for is_foreseen, found in missed.items():
         following = governor(0.0, beats_N(0.0), terms=Terms(forecast=is_foreseen))
@@ -505,7 +494,6 @@ def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> No
 
 
 def test_touches_that_nobody_foresees_are_gone_for() -> None:
-    """Random ones of a newton, each as long as the pause behind it, and half of what the gap would need."""
     random, following, now_s = np.random.default_rng(8), governor(0.0, 0.7), 0.0
     for _ in range(20):
         for force_N in (0.7, random.uniform(1.2, 1.9)):
@@ -528,7 +516,6 @@ events = st.tuples(
 @settings(max_examples=150, deadline=None)
 @given(history=st.lists(events, min_size=1, max_size=30))
 def test_nan_never_travels(history: list[tuple[float | None, list[float], float, float, float]]) -> None:
-    """First setpoints, equal stamps, huge gaps, stamps ahead and behind, in any order."""
     following, now_s = governor(), 0.0
     for force_N, preview, age_s, valid_s, elapsed_s in history:
         now_s += elapsed_s

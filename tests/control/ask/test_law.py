@@ -45,7 +45,6 @@ def following() -> Following:
 
 @pytest.mark.parametrize(("rate_mm_s", "is_slow"), [(3.0, True), (10.0, False), (60.0, False)])
 def test_a_handle_feels_the_wall_where_it_is_and_at_most_a_little_before(following, rate_mm_s, is_slow) -> None:
-    """The gap itself follows 1.4 N/s at most, the wall rises by 0.75, 2.5 and 15."""
     before_N = []
     for place_mm in np.arange(-20.0, 14.0, rate_mm_s * PERIOD_S).tolist():
         ask = following.ask(Travel(place_mm, rate_mm_s), wall=WALL)
@@ -152,7 +151,7 @@ class Pushed:
         self._way, self._sign, self._turn = Way(push_sign), push_sign, Turn(1.0, 0.0, 0.0)
 
     def at(self, place_mm: float, hand_N: float, *, zero_N: float = 0.0, is_sensor_believed: bool = True) -> Travel:
-        """The handle there, while the hand gives this force, positive pushing on. The sensor's zero is known."""
+        """The handle there, while the hand gives this force, positive pushing on."""
         encoder_mm = self._sign * place_mm
         self._turn = self._turn.moved_to(encoder_mm)
         direction = self._turn.direction

@@ -32,7 +32,6 @@ def test_what_the_gap_can_follow_is_followed() -> None:
 
 
 def test_a_step_is_met_in_its_middle() -> None:
-    """As much too soon as too late: the gap is half way where the step is."""
     path = path_mm(60.0, [60.0] * 20 + [64.0] * 20, [1.0] * 40)
     assert (path[19], path[20]) == pytest.approx((62.0 - MAX_MM / 2.0, 62.0 + MAX_MM / 2.0))
     assert (path[:14], path[26:]) == (pytest.approx([60.0] * 14), pytest.approx([64.0] * 14))
@@ -58,7 +57,6 @@ def test_no_more_of_it_is_told_than_is_asked_for() -> None:
 
 @pytest.mark.parametrize(("from_mm", "wanted_N"), [(89.9, (1.01, 1.0)), (50.1, (1.99, 2.0))])
 def test_no_carriages_are_sent_past_the_ends(from_mm: float, wanted_N: tuple[float, float]) -> None:
-    """The lead of a gap that is on its way to an end would."""
     path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEED_MM_S)
     _, sent_mm = path.pursue(from_mm, from_mm, 1.0, [wanted_N[0]] + [wanted_N[1]] * 14, DeviceFit(), 0.0)
     assert sent_mm == (90.0 if from_mm > 70.0 else 50.0)
@@ -68,7 +66,6 @@ def test_no_carriages_are_sent_past_the_ends(from_mm: float, wanted_N: tuple[flo
 @pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: float, is_near: bool, way: float) -> None:
-    """Either way, by the model's force: 40 mm for 1 N of it; 1.5 N are at 70 mm."""
     path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEED_MM_S)
     to_N = 1.5 + way * share * NEAR_S * SPEED_MM_S / 40.0
     assert path.is_near(70.0, device.force_N(to_N), device) is is_near
@@ -84,7 +81,6 @@ GRID = 4
     st.integers(-10, 10),
 )
 def test_no_path_within_the_speed_misses_less(points: list[tuple[float, float, int]], start: int) -> None:
-    """Nor where the points are unevenly far apart."""
     wanted, weights = [60.0 + at for at, _, _ in points], [weight for _, weight, _ in points]
     steps = [step for _, _, step in points]
     grid_mm = MAX_MM / GRID

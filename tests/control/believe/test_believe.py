@@ -33,7 +33,6 @@ def test_the_device_is_learned_from_measured_over_predicted_force(core, hear, mo
 
 
 def test_what_friction_has_not_followed_yet_is_no_weak_device(core, hear, planned, moving) -> None:
-    """A gap that closes at 125 mm/s, and readings of the model's own device, whose bristles bend with the travel."""
     planner, friction = hear(core.planner(), 2.0, moving(sensed_s=0.0)), Friction(BRISTLES_N_MM, 0.0, 1.0, 1.0)
     known, bent_mm = planner.believe.device, 1.0871 / BRISTLES_N_MM
     for step in range(1, 60):
@@ -46,7 +45,6 @@ def test_what_friction_has_not_followed_yet_is_no_weak_device(core, hear, planne
 
 @pytest.mark.parametrize("is_known", [True, False])
 def test_a_force_is_a_pull_only_where_the_sensors_zero_is_known(planner, planned, moving, is_known: bool) -> None:
-    """A hand that rests beside a zero that has drifted is not let go."""
     if not is_known:
         planner.believe.zero.doubt()
     planned(planner, 1.0, moving(force_N=-0.15, **RESTING))
@@ -55,7 +53,6 @@ def test_a_force_is_a_pull_only_where_the_sensors_zero_is_known(planner, planned
 
 @pytest.mark.parametrize("static", [0.95, 1.12])
 def test_a_reading_just_above_a_creep_teaches_the_force_there(planner, hear, moving, static: float) -> None:
-    """At 6 mm/s some of static friction is left: a fit that took the reading for one at speed counted it twice."""
     planner.teach(Learned(slow_factor=static, slow_learned=1.0))
     slow = {"handle": Handle(MOBILISED_MM, 6.0, TURN, 6.0)}
     plan = hear(planner, 8.0, moving(force_N=0.9 * 1.0871, **slow)).planned
@@ -120,7 +117,6 @@ def test_before_it_is_mobilised_only_more_force_than_expected_teaches(
 def test_a_handle_that_has_stopped_teaches_nothing_of_a_gap_that_goes_on(
     planner, hear, planned, moving, goes_on: bool
 ) -> None:
-    """Its rate is filtered, and known for slower only later."""
     devices = []
     hear(planner, 2.0, moving(sensed_s=0.0))
     for number in range(20):
@@ -184,8 +180,6 @@ def test_what_its_zero_is_off_by_is_no_friction_at_a_creep(core, planner, hear, 
 
 
 def test_a_device_that_has_shown_nothing_is_taken_for_a_strong_one(core, hear, planned, moving) -> None:
-    """The gap stays where the strongest believable device would keep to the ceiling; turning the handle shows which it
-    is, and the ceiling moves."""
     new = planned(core.planner(), 2.0, moving(**RESTING))
     assert Limit.CEILING in new.limits
     assert new.gap_mm == new.min_gap_mm
@@ -246,7 +240,6 @@ def swing(core, moving):
 @pytest.mark.long
 @pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.017), (0.0, 0.002), (-0.01, 0.0), (0.06, MAX_LAG_S)])
 def test_a_lag_is_learned_where_what_comes_is_known(swing, late_s: float, learned_s: float) -> None:
-    """And half a plan's period besides: by so much the governor's gap goes before what is previewed."""
     assert swing(late_s, is_known=True).believe.carriages.lag_s == pytest.approx(learned_s, abs=1e-3)
     assert swing(late_s, is_known=True, seconds=1.0, learns=False).believe.carriages.lag_s == 0.0
 

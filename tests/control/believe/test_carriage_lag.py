@@ -27,7 +27,6 @@ def swung(late_s: float, seconds: float, *, off_mm: float = 0.0) -> CarriageLag:
 
 @pytest.mark.parametrize("late_s", [0.0, 0.007, 0.02, 0.045])
 def test_it_comes_to_the_lag_and_stays_there(late_s: float) -> None:
-    """However long it goes on. A lag of first order turns a swing's phase by a little less than a delay does."""
     nearest_s = math.tan(2.0 * math.pi * late_s) / (2.0 * math.pi)
     assert [swung(late_s, seconds).lag_s for seconds in (10.0, 40.0)] == pytest.approx([nearest_s] * 2, abs=1.5e-3)
 

@@ -51,7 +51,6 @@ def test_it_is_lost_until_it_moves() -> None:
 
 
 def test_friction_at_rest_falls_with_the_gap_and_does_not_come_back() -> None:
-    """What a hand leaves of its force when it rests: no more than the open gap held, however it closes again."""
     watch, held_N = HandleWatch(), 2.0
     for reading in range(1, 5_000):
         held_N = min(held_N, swinging(reading * PERIOD_S))
@@ -65,7 +64,6 @@ def test_a_handle_that_moves_is_none_that_is_lost(speed_mm_s: float) -> None:
 
 
 def test_a_hand_that_presses_within_a_count_is_a_resting_one() -> None:
-    """What bends of the stiffest elastomer before its encoder could show it."""
     assert STIFFEST_N_MM * STANDS_MM < RISES_N
 
     def pressing(now_s: float) -> float:
@@ -80,7 +78,6 @@ def test_a_force_that_leaps_while_the_gap_stands_is_the_sensors_own() -> None:
 
 
 def test_what_the_handles_last_motion_leaves_is_not_taken_for_a_rise() -> None:
-    """The rate's filter and the sensor's delay say something of a motion for a while after it."""
 
     def still_moving(now_s: float) -> float:
         return 2.0 - math.exp(-now_s / 0.05)

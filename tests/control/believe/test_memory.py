@@ -68,7 +68,6 @@ def test_it_relaxes_as_its_series_does_of_the_force_of_its_own_field(follow, ele
 
 
 def test_the_open_gap_gives_more_on_the_way_back(follow, element: Element) -> None:
-    """The element's own field lags: what was foreseen at the closed gap is there at the open one."""
     open_mm, curve = max(GAPS_MM), element.nominal.only
     rested, closed = follow(found(open_mm)), follow(found(open_mm), found(NEAR_MM))
     opened = follow(found(open_mm), found(NEAR_MM), found(open_mm))
@@ -77,7 +76,6 @@ def test_the_open_gap_gives_more_on_the_way_back(follow, element: Element) -> No
 
 
 def test_what_the_field_adds_relaxes_by_fractions_of_its_own() -> None:
-    """Of a pad, which nothing had pressed before."""
     pad = build_core(Config(scene="radial_pulse")).element
     memory = Memory(fractions=(0.05, 0.04), times_s=(1.0, 30.0), field_fractions=(0.1, 0.02))
     remembered, pressed = ElementMemory(memory, pad.nominal, pad.field, GAPS_MM), found(NEAR_MM, depth_mm=2.0)
@@ -130,7 +128,6 @@ def test_a_device_that_is_found_homed_has_rested_there(follow, element: Element)
 def test_one_that_has_to_be_homed_has_rested_where_it_was_switched_on(
     follow, element: Element, rested_mm: float
 ) -> None:
-    """Its counts are 0 there, and once more where the switches are; the flag comes later than that."""
     on_its_way = [found(95.0 + opened_mm, is_homed=False) for opened_mm in (0.0, 10.0, 95.0 - rested_mm, 15.5, 0.0)]
     remembered = follow(*on_its_way, found(95.0), memory=element.memory)
     assert remembered.relaxed_N == pytest.approx(follow(found(rested_mm), memory=element.memory).relaxed_N, rel=0.02)

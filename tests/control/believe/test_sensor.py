@@ -87,7 +87,6 @@ def test_a_zero_that_a_reversal_tells_ends_it(known, hear, moving) -> None:
 def test_an_operator_says_whether_device_or_sensor_has_changed(
     known, hear, moving, wrong: str, share: float, limits: tuple[Limit, ...]
 ) -> None:
-    """A device is learned anew; a sensor teaches nothing."""
     hear(known, 1.0, moving(force_N=0.75 * MODEL_N))
     known.confirm(wrong)
     hear(known, 0.5, moving(force_N=0.75 * MODEL_N))
@@ -132,8 +131,6 @@ def test_what_has_changed_around_the_device_may_explain_a_leap(
 
 @pytest.mark.parametrize("share", [0.7, 1.0, 1.5])
 def test_what_relaxes_is_followed_and_what_goes_on_falling_is_not(planner, hear, moving, share: float) -> None:
-    """A fall by 1% of the device's own force a second is its elastomer's; 12% of that force later it is none any
-    more."""
     own_N, fallen_N = share * MODEL_N, 0.0
     hear(planner, 2.0, moving(force_N=own_N))
     for _ in range(100):
@@ -145,7 +142,6 @@ def test_what_relaxes_is_followed_and_what_goes_on_falling_is_not(planner, hear,
 
 
 def test_a_drift_is_not_hidden_by_a_force_that_steps(core, known, hear, moving) -> None:
-    """10 mN/s down, while the force steps every two seconds: each step explains some of it, and takes it back."""
     levels = (moving(), MODEL_N), (moving(**CLOSER), core.portrait.force_N_at(70.0))
     drifted_N = 0.0
     while not known.believe.sensor.is_disputed and drifted_N < 1.0:
@@ -176,14 +172,12 @@ def test_readings_that_left_slowly_have_to_agree_for_ten_seconds_and_no_longer(k
 
 
 def test_a_fit_that_swings_is_the_same_device_still(known, hear, moving) -> None:
-    """As with a handle's rate: what is lost is gained again, so no relaxing adds up."""
     for swing in range(12):
         hear(known, 2.5, moving(force_N=MODEL_N + 0.07 * (-1) ** swing))
         assert not known.believe.sensor.is_disputed
 
 
 def test_a_sensor_that_stands_still_is_wrong_only_where_it_should_not(known, hear, moving) -> None:
-    """One whose noise is resolved never does; any other shows another value once the force has moved."""
     assert Limit.SENSOR in hear(known, 2.0 * FROZEN_S, moving(), 0.0).planned.limits
 
 

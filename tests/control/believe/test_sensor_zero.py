@@ -34,8 +34,7 @@ def strokes(
     model_N: tuple[float, float] = (1.5, 1.5),
     rate_mm_s: tuple[float, float] = (42.0, 42.0),
 ) -> tuple[SensorZero, float]:
-    """After strokes to and fro of a handle on a device whose sensor is off by that, with noise; and when. Without
-    `is_tared` the sensor is not taken for tared."""
+    """After strokes to and fro of a handle on a device whose sensor is off by that, with noise; and when."""
     zero = zero or SensorZero()
     if not is_tared:
         zero.doubt()
@@ -101,7 +100,6 @@ def test_before_anything_is_heard_no_time_counts() -> None:
     "turn", [{"rest_s": LONGEST_TURN_S + 0.1}, {"stroke_s": 0.5 * LEVEL_S}, {"off_N": MAX_ZERO_N + 0.1}]
 )
 def test_levels_that_say_nothing_are_not_compared(turn: dict[str, float]) -> None:
-    """Too far apart, too short, or of a sensor that is broken rather than off its zero."""
     zero, _ = strokes(**({"off_N": 0.2, "number": 2, "is_tared": False} | turn))  # type: ignore[arg-type]
     assert zero.zero_N == 0.0
 
@@ -128,7 +126,6 @@ def test_after_another_speed_or_force_or_a_long_rest_less_is_known(changes: dict
 
 
 def test_a_drift_is_followed() -> None:
-    """5 mN a minute for an hour, turning every 10 s."""
     zero, now_s = SensorZero(), 0.0
     for _ in range(180):
         _, now_s = strokes(0.005 / 60.0 * now_s, zero, number=2, stroke_s=1.0, rest_s=9.0, from_s=now_s)

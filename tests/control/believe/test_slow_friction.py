@@ -57,7 +57,6 @@ def test_it_is_learned_within_the_time_that_a_person_takes_to_notice() -> None:
 
 
 def test_of_a_known_device_a_creep_shows_its_static_friction_and_no_more() -> None:
-    """Nothing judges the sensor at a creep: one that reads too little closes the gap by a tenth at most."""
     assert [crept(share, 10.0, fit=KNOWN).factor for share in (0.6, 5.0)] == [MIN_STATIC, MAX_STATIC]
 
 
@@ -137,7 +136,6 @@ def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float
 
 
 def test_a_handle_that_sticks_for_a_moment_does_not_creep() -> None:
-    """The gap stays for it: a fall of the rate is followed over SLOWS_S, a rise at once."""
     slow = SlowFriction(BOUNDS)
     slow.slide(1.0, 20.0)
     slow.slide(1.0 + 0.3 * SLOWS_S, 1.0)

@@ -52,7 +52,6 @@ def test_one_force_is_right_where_it_was_shown_and_uncertain_elsewhere() -> None
 
 
 def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
-    """What relaxes is an offset: a device that is known is not believed to have become another."""
     known = shown([(1.0, 0.7), (2.0, 2.0)], 1.1, 0.0)
     drifted = shown([(1.5, 2.0)], 1.1, -0.1, known)
     assert (drifted.force_N(2.0), drifted.scale) == (pytest.approx(2.1, abs=0.02), pytest.approx(1.1, abs=0.05))
@@ -76,7 +75,6 @@ STRONGEST = 1.53
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
 @pytest.mark.parametrize("scale", [BOUNDS.min_scale, 0.8, 1.0, 1.2, STRONGEST])
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
-    """However little has been shown, and whatever the device: never over, but for the two in a hundred of `SURE`."""
     most_N = 2.5
     model_N = shown(levels, scale, 0.0).surely_within_N(most_N, BOUNDS)
     allowed_N = most_N if levels else most_N * STRONGEST / (1.0 + SURE * SCALE_SD)
@@ -136,7 +134,6 @@ def test_of_so_many_times_the_force_it_is_as_many_times_as_unsure(factor: float)
 
 
 def test_what_is_known_is_forgotten_in_its_time() -> None:
-    """The offset in less, the sooner it adapts; and in two halves of the time as in the whole."""
     known, adapts_in_s = DeviceFit(1.2, 0.05, 0.01, 0.001, 0.002), 0.5
     offset_lasts_s = 2.0 * OFFSET_SD_N**2 * adapts_in_s**2 / ERROR_N2_S
     left = math.exp(-2.0)
@@ -154,7 +151,6 @@ def test_what_is_known_is_forgotten_in_its_time() -> None:
 
 @pytest.mark.parametrize(("learns_scale", "learns_offset"), [(True, False), (False, True)])
 def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns_scale: bool, learns_offset: bool) -> None:
-    """Schmidt's filter against the covariance of any gain, in Joseph's form."""
     fit, terms = DeviceFit(1.1, 0.02, 0.02, 0.001, 0.008), {"adapts_in_s": 0.5, "bounds": BOUNDS}
     found, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=learns_scale, learns_offset=learns_offset, **terms)
     aged, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=False, learns_offset=False, **terms)

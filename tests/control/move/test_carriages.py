@@ -23,7 +23,6 @@ def test_the_duty_pushes_towards_the_planned_gap(running) -> None:
 
 
 def test_skew_pulls_the_carriages_together(make_bench) -> None:
-    """Synchronisation adds its share of the skew to either carriage's own error, towards each other."""
     duties = []
     for synchronisation in (0.0, 1.0):
         bench = make_bench(position={"synchronisation": synchronisation}).enabled()
@@ -46,7 +45,6 @@ def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running
 
 @pytest.mark.parametrize("gap_mm", [-1e9, 0.0, 300.0, 1e9])
 def test_the_reference_stays_in_the_gap_range(make_bench, gap_mm: float) -> None:
-    """Carriages that follow exactly, sooner than any do; the plan asks for a gap that does not exist."""
     bench = make_bench(limits={"no_motion_time_s": 10.0}).enabled()
     for _ in range(3_000):
         bench.step(gap_mm, **bench.there)
@@ -55,7 +53,6 @@ def test_the_reference_stays_in_the_gap_range(make_bench, gap_mm: float) -> None
 
 
 def test_a_least_gap_ends_a_motion_towards_it(running) -> None:
-    """A path that closes at 38 mm/s, well beyond the gap that this device allows."""
     lowest_mm = math.inf
     for tick in range(1, 300):
         running.step(running.plan(80.0 - 0.038 * tick, gap_speed_mm_s=-38.0, min_gap_mm=76.0), **running.there)
@@ -73,7 +70,6 @@ def test_carriages_beyond_the_closed_end_are_driven_back(bench, gap_mm: float) -
 
 
 def test_a_carriage_that_the_firmware_holds_at_its_open_switch_is_not_driven(bench) -> None:
-    """The switch lies 0.2 mm before the end asked for: nothing is learned there, and closing takes no longer."""
     at_end = bench.gap(94.6)
     switches = Switches.HOMED | Switches.LEFT_OPEN | Switches.RIGHT_OPEN
     bench.enabled(**at_end)
@@ -100,7 +96,6 @@ def test_less_supply_takes_more_duty(make_bench) -> None:
 
 
 def test_the_magnets_pull_is_fed_forward_to_open_and_not_to_close(make_bench) -> None:
-    """The carriages follow exactly, so that a duty is what their motion takes."""
     duties: dict[float, list[float]] = {60.0: [], 46.0: []}
     for stated_V in (0.0, 1.5):
         for aim_mm, found in duties.items():

@@ -114,7 +114,6 @@ def test_margins_agree_with_an_independent_computation() -> None:
 
 
 def test_a_loop_that_swings_is_told_by_how_much_its_gain_is_too_high() -> None:
-    """Five times the supply is five times the gain: 14 dB."""
     motor, position = Config().motor, Config().position
     hard = msgspec.structs.replace(motor, supply_V=5.0 * motor.supply_V)
     usual_dB = margins(motor, position, PERIOD_S).gain_margin_dB
@@ -188,7 +187,6 @@ SHORT_INTEGRAL = Position(
     )
 )
 def test_gains_at_their_bounds_are_unstable_only_where_the_margins_say_so(position: Position) -> None:
-    """What build_core accepts is stable, from end to end of what the configuration allows."""
     motor = Config().motor
     found = margins(motor, position, PERIOD_S)
     if found.phase_margin_deg >= MIN_PHASE_MARGIN_DEG and found.gain_margin_dB >= MIN_GAIN_MARGIN_DB:
@@ -224,7 +222,6 @@ def test_gains_that_would_oscillate_and_motors_too_weak_for_the_pull_give_no_cor
 
 @pytest.mark.parametrize("gap_mm", np.linspace(45.0, 95.0, 11))
 def test_the_pull_falls_with_the_gap_as_that_of_two_blocks(gap_mm: float) -> None:
-    """Beside the closed form of Akoun and Yonnet, both over their value at 45 mm."""
     block = CuboidMagnet(0.04, 0.04, 0.02, 1.45)
     motor = Config().motor
     expected = attraction_N(float(gap_mm), block) / attraction_N(45.0, block)
@@ -232,7 +229,6 @@ def test_the_pull_falls_with_the_gap_as_that_of_two_blocks(gap_mm: float) -> Non
 
 
 def test_the_shipped_pull_is_what_the_devices_data_say() -> None:
-    """50 to 80 N through the screw that lifts and the gears, in volts at the stalled motor."""
     motor, screw_efficiency = Config().motor, 0.65
     torque_Nm = np.array([50.0, 80.0]) * motor.screw_lead_mm * 1e-3 / math.tau / screw_efficiency
     volts = torque_Nm / motor.gear_efficiency / motor.gear_ratio / motor.back_emf_V_s * motor.resistance_ohm

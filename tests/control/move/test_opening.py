@@ -92,7 +92,6 @@ def test_a_low_supply_explains_a_lower_speed(opens: Opens) -> None:
 
 
 def test_a_line_that_shows_nothing_for_a_while_hides_no_opening_and_no_standstill(opens: Opens) -> None:
-    """While no State comes nothing is concluded from places; the next one has the whole way in it, or has not."""
     assert opens.look(0.2, -25.0, SPEED_MM_S) is None
     opens.ticks += 700
     assert opens.look(0.1, -11.5, SPEED_MM_S) is None

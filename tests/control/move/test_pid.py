@@ -48,7 +48,6 @@ def updated(stage: Pid, error_mm: float, error_mm_s: float = 0.0, ahead: float =
 def test_unsaturated_p_and_i_are_those_of_simple_pid(
     sequence: list[float], proportional: float, integral_time_s: float
 ) -> None:
-    """simple-pid integrates before it answers and we do after, so its integral is ours one update later."""
     stage = Pid(Position(proportional_per_mm=proportional, integral_time_s=integral_time_s, derivative_time_s=0.0))
     oracle = PID(proportional, proportional / integral_time_s, 0.0, setpoint=0.0, sample_time=None)
     for error in sequence:
@@ -82,7 +81,6 @@ def test_the_duty_never_leaves_its_limit(
 def test_nothing_winds_up_against_a_switch(
     position: Position, integral: float, history: list[tuple[float, float, float]]
 ) -> None:
-    """However it is pushed there, for however long: no duty, no saturation, and closing finds no more to unlearn."""
     stage = begun(position, integral)
     for error, speed, ahead in history * 20:
         assert stage.update(error, speed, ahead, DT_S, True) <= 0.0
@@ -101,7 +99,6 @@ def test_a_carriage_at_its_switch_closes_as_any_other() -> None:
 
 @given(position=positions, back_calculation_s=st.floats(0.01, 0.2), error=st.floats(15.0, 50.0))
 def test_back_calculation_balances_growth(position: Position, back_calculation_s: float, error: float) -> None:
-    """Standing saturation comes to P / Ti + (limit - P - I) / Tt = 0, within the limit."""
     stage = Pid(msgspec.structs.replace(position, back_calculation_s=back_calculation_s))
     updated(stage, error, count=2_000)
     assert stage.is_saturated
@@ -111,7 +108,6 @@ def test_back_calculation_balances_growth(position: Position, back_calculation_s
 
 
 def test_a_jump_of_the_reference_is_no_derivative_kick() -> None:
-    """A target that jumps moves the error, not the speed error: the derivative does not see it."""
     assert updated(begun(), 0.1) == pytest.approx(SHIPPED.proportional_per_mm * 0.1)
     # a carriage that moves exactly as its reference asks for no derivative action
     assert updated(begun(), 0.0, ahead=0.3) == pytest.approx(0.3)
@@ -127,7 +123,6 @@ def test_both_directions_are_alike(error: float, speed: float, integral: float) 
 @settings(max_examples=5, deadline=None)
 @given(position=positions, error=st.floats(0.5, 50.0), dt_s=st.sampled_from([0.01, 0.05, 0.1]))
 def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float, dt_s: float) -> None:
-    """The integral stays within the whole duty, and an error of the other sign turns the duty round in one update."""
     stage = Pid(position)
     for _ in range(round(3_600.0 / dt_s)):
         stage.update(error, 0.0, 0.0, dt_s, False)
@@ -148,7 +143,6 @@ def test_a_carriage_at_rest_on_target_forgets_within_its_integral_time(integral:
 
 
 def test_no_carriage_is_nearer_than_on_target() -> None:
-    """Half a count of the device's encoders, 4480 on a lead of 8 mm, is within it, and a whole one is not."""
     assert 0.5 * 8.0 / 4480.0 < ON_TARGET_MM < 8.0 / 4480.0
 
 

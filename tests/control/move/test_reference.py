@@ -93,7 +93,6 @@ def test_a_step_is_reached_without_overshoot(position: Position, speeds: Speeds,
 
 
 def test_a_step_takes_hardly_longer_than_its_limits_ask() -> None:
-    """1 mm of gap: time-optimal with this acceleration is 2 sqrt(d / a); the last stretch is a little slower."""
     ticks = int(1.3 * 2.0 * math.sqrt(1.0 / MAX_MM_S2) / DT_S)
     *_, reference = followed(70.0, [Reference(69.0)] * ticks)
     assert abs(reference.gap_mm - 69.0) <= 0.1
@@ -139,7 +138,6 @@ def test_either_way_has_its_own_limit() -> None:
 
 
 def test_a_target_that_turns_is_met_where_it_turns() -> None:
-    """A swing that begins off the target: knowing how it turns leaves less overshoot than knowing only its speed."""
     rate, excess_mm = 2.0 * math.pi * 3.0, []
     for is_known in (True, False):
         phases = [rate * tick * DT_S for tick in range(1_000)]
@@ -161,7 +159,6 @@ def test_a_target_that_turns_is_met_where_it_turns() -> None:
 def test_what_is_expected_never_leaves_what_was_asked(
     references: list[tuple[float, float, float]], lag_s: float, filter_s: float
 ) -> None:
-    """A lag with a positive kernel: no overshoot of its own, whatever the periods."""
     expected = Expected()
     expected.begin(references[0][0])
     for gap_mm, speed_mm_s, dt_s in references:

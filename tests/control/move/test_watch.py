@@ -51,7 +51,6 @@ def test_a_stale_measurement(running) -> None:
 
 
 def test_a_measurement_over_a_slow_line(running) -> None:
-    """Each state comes at once after the last, but answers a drive of long ago: a loop around that would swing."""
     running.step(count=5, delay_s=TIMEOUT_S - 1e-3)
     assert not running.faults
     assert running.run_into(Fault.MEASUREMENT_STALE, delay_s=TIMEOUT_S + 1e-3) == 1
@@ -141,7 +140,6 @@ def test_carriages_that_overran_their_open_switches_by_a_little_are_no_fault(ben
 def test_a_switch_that_its_carriage_contradicts_is_a_fault(
     bench, side: str, switch: str, borne_mm: float, wrong_mm: float
 ) -> None:
-    """Counts were lost, the zero is wrong, or the switch is stuck, dead or another's."""
     other_mm = f"{'right' if side == 'LEFT' else 'left'}_mm"
     mm, switches = f"{side.lower()}_mm", Switches.HOMED | (Switches[f"{side}_{switch}"] if switch else Switches(0))
     bench.step(count=50, switches=switches, **{mm: borne_mm, other_mm: -20.0})
@@ -151,7 +149,6 @@ def test_a_switch_that_its_carriage_contradicts_is_a_fault(
 
 
 def test_a_switch_that_is_newer_than_the_position_says_nothing(running) -> None:
-    """Status comes without a State, too: by then the carriage may have come to its switch."""
     last = running.ticks
     running.silent(running.measure(last), 8)
     assert running.stepper.measure.sight.is_blind
@@ -164,7 +161,6 @@ def test_a_switch_that_is_newer_than_the_position_says_nothing(running) -> None:
 
 
 def test_a_gap_that_does_not_follow(make_bench) -> None:
-    """The carriages creep, so that they do move, but by far too little."""
     bench = make_bench(limits={"no_motion_time_s": 10.0}).enabled()
     while bench.watch.straying_s == 0.0:
         bench.step(50.0)
@@ -196,7 +192,6 @@ def test_one_carriage_at_its_switch_excuses_no_other(bench, switch: Switches) ->
 
 
 def test_a_process_that_stood_still_saw_no_carriage_stand_still(running) -> None:
-    """One look before the pause and one after it say nothing of what the carriages did between."""
     running.step(60.0, count=30)
     assert running.watch.still_s > 0.0
     running.ticks += round(CONFIG.limits.no_motion_time_s / PERIOD_S)
@@ -206,7 +201,6 @@ def test_a_process_that_stood_still_saw_no_carriage_stand_still(running) -> None
 
 @pytest.mark.parametrize("target_mm", [60.0, 90.0])
 def test_carriages_that_go_the_other_way_are_named(running, target_mm: float) -> None:
-    """Both, so that nothing skews; what the loop does about it makes it worse."""
     at_mm = -7.5
     while not running.faults:
         output = running.step(target_mm, left_mm=at_mm, right_mm=at_mm)
@@ -236,7 +230,6 @@ def test_too_much_force_opens_and_is_then_a_fault(running, given: tuple[str, ...
 
 
 def test_a_force_that_is_too_much_again_and_again_is_a_fault(running) -> None:
-    """A gap that opens is no longer over; a plan that closes it again is no less wrong for that."""
     for tick in range(240):
         limits = running.step(force_N=3.0 if tick % 120 < 60 else 1.0, **running.there).limits
         if running.faults:

@@ -41,16 +41,7 @@ _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
 
 
 class Element(NamedTuple):
-    """The nominal device: how its element makes force.
-
-    nominal    the force over the field
-    memory     relaxation and the field's hysteresis
-    field      the field over the gap
-    portrait   the force over the gap, without memory
-    search     the search for a field
-    law        the force law that the search's field is held near; None for a pad, of which no law is known
-    is_beside  the search takes longer than a plan has, and runs beside the plans
-    """
+    """The nominal device: how its element makes force."""
 
     nominal: Nominal
     memory: Memory
@@ -63,11 +54,7 @@ class Element(NamedTuple):
 
 @final
 class Aim:
-    """The last stage of planning: turns the force asked for into a field, the field into a gap, both into a plan.
-
-    It keeps the newest plan's number and field, and the newest `question` to a search beside the plans and its
-    `answer`.
-    """
+    """The last stage of planning: turns the force asked for into a field, the field into a gap, both into a plan."""
 
     number: int = 0
     "Number of the newest plan."
@@ -94,13 +81,7 @@ class Aim:
         self._low_confidence: Final = config.limits.low_confidence
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
-        """Begin at `now_s`, and return a plan with the gap open, no setpoint, the limit NO_SETPOINT and this `number`.
-
-        Call it before the first `update`, whose plan has the next number. The plan's force is the portrait's least, its
-        confidence 1, its `predicted_N` None. The element's field there lags `lag_mT` behind the gap's: it becomes
-        `element_mT`, and the newest `answer`, as of `now_s`. A `question` stays. Raises DomainError where the open gap
-        is none of the field law's.
-        """
+        """Begin at `now_s`, and return a plan with the gap open, no setpoint, the limit NO_SETPOINT and this `number`."""
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
@@ -116,17 +97,7 @@ class Aim:
         memory: ElementMemory,
         measured: Measured | None,
     ) -> Plan:
-        """Return the next plan, for the force in `ask` and the device in `belief`.
-
-        The plan's gap is within the scene's, and never less than `least_mm`; where that holds it open, the plan has the
-        limit CEILING. `setpoint` is the one behind `ask`, None without a publisher. The motion that it states counts
-        only while `ask.is_meant`. `measured` is None while the device is silent. `memory` gives the lag of the
-        element's field, and does not change. Updates `number` and `element_mT`, and `question` where a search runs
-        beside the plans.
-
-        Raises DomainError where no gap gives the field, a number is not finite, or the newest answer is older than
-        OLDEST_ANSWER_S. The stage may then be half updated: `begin` anew.
-        """
+        """Return the next plan, for the force in `ask` and the device in `belief`."""
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
@@ -145,22 +116,12 @@ class Aim:
         return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
 
     def answer_to(self, question: Question) -> Answer:
-        """Search the field for `question`, for a search that runs beside the plans, and return the answer.
-
-        The answer has the question's time. Its field is the model's, not yet held near the force law. The motion asked
-        for is held within the model's range. Changes nothing: the answer is not kept, and may be searched for in
-        another process. Raises DomainError for a number that is not finite or too large.
-        """
+        """Search the field for `question`, for a search that runs beside the plans, and return the answer."""
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        """Return the field for the model's force `wanted_N` along `curve`; of several the one nearest `element_mT`.
-
-        Where the search runs beside the plans, note the `question` for it, and return its newest answer, which may be
-        one to an earlier question. Raises DomainError for an answer older than OLDEST_ANSWER_S at `now_s`; the question
-        is noted before. Also raises it where the plans search, for a number that is not finite or too large.
-        """
+        """Return the field for the model's force `wanted_N` along `curve`; of several the one nearest `element_mT`."""
         if not self._is_beside:
             return self._search.solve(curve, wanted_N, self.element_mT)
         self.question = Question(now_s, curve.displacement_mm, curve.rate_mm_s, wanted_N, self.element_mT)
@@ -182,14 +143,7 @@ class Aim:
         limits: tuple[Limit, ...],
         outside: tuple[Outside, ...],
     ) -> Plan:
-        """Return the record of the plan to `gap_mm` at `now_s`, with the gap's motion ahead on the path of `ask`.
-
-        `setpoint` is the one behind `ask`, None without a publisher. `min_mm` is the least gap that is safe, `field_mT`
-        the gap's field that is looked for, with the search's `confidence`. `limits` and `outside` go in as they are.
-        The record's `trim` is the asked force over the model's for a device at speed. Where the model's is not above 0,
-        it is that device's scale. The `stamp_s` is -inf unless the setpoint is followed. Changes nothing. Raises
-        DomainError for NaN in the path.
-        """
+        """Return the record of the plan to `gap_mm` at `now_s`, with the gap's motion ahead on the path of `ask`."""
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
@@ -222,12 +176,7 @@ class Aim:
         is_held: bool,
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
-        """Return what holds the force back, in the order in which it does; empty where nothing does.
-
-        The limits of `ask` and of the belief (`believed`) come first. MODEL_RANGE is added where a quantity is
-        `outside` the model, CEILING where `is_held`, and LOW_CONFIDENCE, F_MIN and F_MAX by the search's `solution`.
-        F_MIN is told only while a publisher asks for a force. F_MIN and F_MAX are not told twice.
-        """
+        """Return what holds the force back, in the order in which it does; empty where nothing does."""
         limits = (*ask.limits, *believed)
         if outside:
             limits = (*limits, Limit.MODEL_RANGE)
@@ -243,13 +192,7 @@ class Aim:
         return limits
 
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
-        """Return the gap's speed, mm/s, and acceleration, mm/s^2, at the beginning of the path `path_N` (7) of forces.
-
-        `path_N` are the device's forces at PATH_S. The motion is that of the parabola nearest in squares to their gaps
-        in the portrait, opening positive. It begins at the first gap. Speed and acceleration are held within what the
-        configuration lets the gap do. A path out of reach stands at the portrait's end, without motion. Raises
-        DomainError for NaN.
-        """
+        """Return the gap's speed, mm/s, and acceleration, mm/s^2, at the beginning of the path `path_N` (7) of forces."""
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
         start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))
         speed, acceleration = 0.0, 0.0

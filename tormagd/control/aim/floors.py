@@ -13,12 +13,7 @@ LAW_SHARE: Final = 0.12
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap allowed, mm, within the portrait's: that of `ceiling_mm` for the believed device.
-
-    `ceiling_N` is the greatest force that the device may surely give, CEILING times the scene's. Until the handle has
-    slid, the real device may be one of which nothing is known, `belief.unseen`. Then the more open gap of both counts.
-    Where `belief.unseen` is None, only the believed device does. Raises DomainError where a fit gives NaN.
-    """
+    """Return the least gap allowed, mm, within the portrait's: that of `ceiling_mm` for the believed device."""
     known_mm = ceiling_mm(portrait, belief.device, ceiling_N, bounds)
     if belief.unseen is None:
         return known_mm
@@ -26,21 +21,12 @@ def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Devic
 
 
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap, mm, at which the device, taken SURE deviations stronger, gives no more than `ceiling_N`.
-
-    SURE is `believe.strength`'s, and `bounds` are what the configuration lets a device be. The gap is held within the
-    portrait's: a device that gives more even at the open gap gets that gap. Raises DomainError where the fit gives NaN.
-    """
+    """Return the least gap, mm, at which the device, taken SURE deviations stronger, gives no more than `ceiling_N`."""
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
-    """Return `field_mT`, held within a share LAW_SHARE of the field that the force law gives for `wanted_N`.
-
-    Fields are in mT. `wanted_N` is the model's force, N. For one that no field of the law gives, the law's nearer end
-    counts. `law` is None where no law is known: the field stays as it is. Raises DomainError for a force of NaN; a
-    field of NaN stays NaN.
-    """
+    """Return `field_mT`, held within a share LAW_SHARE of the field that the force law gives for `wanted_N`."""
     if law is None:
         return field_mT
     law_mT = law.field_mT(wanted_N)

@@ -19,12 +19,7 @@ GRID: Final = 201
 
 @final
 class Portrait:
-    """Force, N, and its slope |dF/dgap|, N/mm, over the gap, mm, at n >= 2 points, for one contact and without memory.
-
-    Along the lists forces rise, and gaps fall evenly, from the open to the closed gap; neither is checked, nor the
-    lengths. A look-up raises DomainError for NaN. Raises DomainError for a force that is not finite, ZeroDivisionError
-    for one point.
-    """
+    """Force, N, and its slope |dF/dgap|, N/mm, over the gap, mm, at n >= 2 points, for one contact and without memory."""
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
@@ -35,49 +30,32 @@ class Portrait:
 
     @property
     def min_N(self) -> float:
-        """F_min: the force that the open gap gives."""
         return self.force_N[0]
 
     @property
     def max_N(self) -> float:
-        """F_max: the force that the closed gap gives."""
         return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
-        """Return |dF/dgap|, N/mm, at the gap that gives `force_N`; at the nearer end of the range where none does.
-
-        Raises DomainError for NaN.
-        """
+        """Return |dF/dgap|, N/mm, at the gap that gives `force_N`; at the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
-        """Return the gap, mm, of `force_N`, as `gap_mm_at`, and |dF/dgap|, N/mm, at the next point of more force.
-
-        The slope is that point's own, not interpolated as by `slope_at_N_mm`; beyond the last point it is the last
-        point's. Raises DomainError for NaN.
-        """
+        """Return the gap, mm, of `force_N`, as `gap_mm_at`, and |dF/dgap|, N/mm, at the next point of more force."""
         after = self._rising_N.after(force_N)
         gap_mm = interpolated_before(after, force_N, self._rising_N, self.gap_mm)
         return gap_mm, self.slope_N_mm[min(after, len(self.slope_N_mm) - 1)]
 
     def gap_mm_at(self, force_N: float) -> float:
-        """Return the gap, mm, that gives `force_N`; the nearer end of the range where none does.
-
-        So the result does not tell whether the force is in reach: `min_N` and `max_N` do. Raises DomainError for NaN.
-        """
+        """Return the gap, mm, that gives `force_N`; the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.gap_mm)
 
     def force_N_at(self, gap_mm: float) -> float:
-        """Return the force, N, at `gap_mm`; outside the range, the force of the nearer end. Raises DomainError for
-        NaN."""
+        """Return the force, N, at `gap_mm`; outside the range, the force of the nearer end."""
         return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
-        """Return the rate of force, N/s, that the speed `gap_speed_mm_s` makes at the gap that gives `force_N`.
-
-        It has the sign of the speed, though a gap that opens loses force: the caller minds the sign. Where no gap gives
-        `force_N`, the slope at the nearer end counts. Raises DomainError for a force of NaN; the speed is not checked.
-        """
+        """Return the rate of force, N/s, that the speed `gap_speed_mm_s` makes at the gap that gives `force_N`."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 
@@ -91,13 +69,7 @@ class PortraitSearch:
         self._field: Final = field
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`: that of the gap which gives it in the portrait.
-
-        `last_field_mT`, None without one, is only checked: a portrait has one gap for a force. A force in reach has
-        confidence 1, and is itself the predicted force: `curve` is not asked. For one out of reach field and predicted
-        force are those of the nearer end, as `reach` tells. Its confidence is the one that `curve` gives there.
-        `iterations` is 1. Raises DomainError for a number that is not finite or too large.
-        """
+        """Return the field for `force_N`: that of the gap which gives it in the portrait."""
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
         field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
@@ -110,33 +82,21 @@ class PortraitSearch:
 
 @final
 class LawOfField:
-    """The magnetoelastic law of the insert (Eq. 29 to 34) over a portrait's gaps, scaled to the portrait's force.
-
-    Search results are held near this law. Force, N, and field, mT (n each), rise along the lists, which is not checked.
-    Raises DomainError for a force that is not finite.
-    """
+    """The magnetoelastic law of the insert (Eq. 29 to 34) over a portrait's gaps, scaled to the portrait's force."""
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
         self._rising_N: Final = Rising(force_N)
         self.fields_mT: Final = fields_mT
 
     def field_mT(self, force_N: float) -> float:
-        """Return the field, mT, that gives `force_N` by the law; the field of the nearer end where none does.
-
-        Raises DomainError for NaN.
-        """
+        """Return the field, mT, that gives `force_N` by the law; the field of the nearer end where none does."""
         return interpolated(force_N, self._rising_N, self.fields_mT)
 
 
 def law_beside(
     shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
 ) -> LawOfField:
-    """Return the force law at the gaps of the portrait `shown`, scaled to the portrait's force.
-
-    `law` is the field law of the insert that `field` and `elastomer` are of, with its `geometry`; that they belong
-    together is not checked. The scale is the median ratio of the portrait's force to the law's. Raises DomainError
-    where the gaps leave the domain of either, and where a scaled force is not finite.
-    """
+    """Return the force law at the gaps of the portrait `shown`, scaled to the portrait's force."""
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
     scaled_N: list[float] = (scale * forces_N).tolist()
@@ -144,12 +104,7 @@ def law_beside(
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
-    """Return the portrait that the model's `curve` predicts, at GRID gaps over `gap_range_mm`, closed to open.
-
-    `gap_range_mm` is the closed and the open gap, mm, in this order; the portrait's lists begin with the open one. The
-    closed gap has to be below the open one, and the force has to rise with the field over them: neither is checked.
-    Raises DomainError where the field law ends, and for a force that is not finite.
-    """
+    """Return the portrait that the model's `curve` predicts, at GRID gaps over `gap_range_mm`, closed to open."""
     gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))

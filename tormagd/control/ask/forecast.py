@@ -30,7 +30,7 @@ MIN_HISTORY: Final = 100
 RISE_DELAYS: Final = (1, 2, 4, 7, 11)
 BEAT_DELAYS: Final = (1, 3, 8, 18, 38)
 """Delays of the two embeddings, in points: a stretch is compared at these points before its end, as changes from the
-end. They reach back to the rise of a pulse, or to what came before it."""
+end."""
 TAPS: Final = 5
 "Number of delays in each embedding."
 STRIDE: Final = 3
@@ -51,8 +51,7 @@ UNLIKE_N: Final = 0.05
 RIDGE: Final = 0.01
 "Share by which the regression's variances are raised: stretches that hardly differ teach no dependence."
 MAX_LEVERAGE: Final = 100.0
-"""Nothing is forecast from a stretch of more leverage, as after a jump. Leverage is 1 plus its squared distance from
-the mean of the stretches most like it, in their standard deviations."""
+"""Nothing is forecast from a stretch of more leverage, as after a jump."""
 LONG_S: Final = 2.0
 SHORT_S: Final = 0.2
 "Skill is earned over the long time, a few beats, and lost over the short."
@@ -64,13 +63,7 @@ _LONGEST: Final = BEAT_DELAYS[-1]
 
 
 def embedding(delays: tuple[int, ...]) -> Array:
-    """Return the places of all stretches in a full history, as negative indices from its end.
-
-    `delays` are TAPS rising whole numbers, at most BEAT_DELAYS' last; they are not checked. The result has the shape
-    (TAPS + 1 + HORIZON, n), whole numbers. A column holds one stretch: the points at `delays` before its end, the
-    nearest first, then its end, then the points that followed. The first column is the newest stretch, after which its
-    own end is repeated. The others end HORIZON points before it or earlier, STRIDE apart.
-    """
+    """Return the places of all stretches in a full history, as negative indices from its end."""
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
     ends = np.arange(-1 - HORIZON, _LONGEST - HISTORY - 1, -STRIDE)
     return np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
@@ -101,12 +94,7 @@ LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
 
 @final
 class Forecast:
-    """Learner of one stream of setpoints, which forecasts how the force goes on.
-
-    Give each setpoint to `update`, and call `foresee` after plans; read `trust` before `forces_N`. It keeps the forces
-    of the last ten seconds on a grid of GRID_S. It also keeps the newest forecast, the guesses that are not judged yet,
-    and the forecast's skill.
-    """
+    """Learner of one stream of setpoints, which forecasts how the force goes on."""
 
     stamp_s: float
     "Stamp of the newest setpoint; -inf before the first."
@@ -136,11 +124,7 @@ class Forecast:
 
     @property
     def trust(self) -> float:
-        """Return how far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast.
-
-        At 1 the forecast alone counts. The trust is the skill score of LONG_S times (1 + the score of SHORT_S), both
-        factors held within 0..1. Above 0 `forces_N` may be called.
-        """
+        """Return how far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast."""
         if not self.changes_N:
             return 0.0
         earned, lost = self.long.score, -self.short.score
@@ -151,14 +135,7 @@ class Forecast:
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     def update(self, stamp_s: float, force_N: float) -> None:
-        """Take one setpoint, judge what was forecast for its time, and remember it on the grid. Makes no forecast.
-
-        `stamp_s` and `force_N` are finite; they are not checked. A stamp less than GRID_S before the newest counts as
-        the newest. A force with the newest stamp replaces the newest force, and adds no point. An older stamp, or a
-        pause of more than MAX_STEP_S, begins anew with this setpoint, as the first does: nothing learned, no skill.
-        Between two setpoints the grid's forces are linear. A forecast stays until the next `foresee`, as far as it
-        reaches.
-        """
+        """Take one setpoint, judge what was forecast for its time, and remember it on the grid."""
         if -GRID_S < stamp_s - self.stamp_s < 0.0:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
         spacing_s = stamp_s - self.stamp_s
@@ -171,13 +148,7 @@ class Forecast:
         self.stamp_s, self.force_N = stamp_s, force_N
 
     def foresee(self, slope_N_s: float) -> bool:
-        """Make a forecast from the newest point of the grid, and return whether one was due.
-
-        A forecast is due after every EVERY points, once the history has MIN_HISTORY points; else nothing changes. It
-        replaces the one before. It is empty where the history has no stretch like the newest; the skill of SHORT_S is
-        then lost. So True does not say that there is a forecast: `trust` does. Its guess for the point JUDGED ahead is
-        noted, with that of the setpoints' slope `slope_N_s`; `update` judges both by what comes.
-        """
+        """Make a forecast from the newest point of the grid, and return whether one was due."""
         if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
             return False
         (rise, rise_unlike), (beat, beat_unlike) = _search(np.frombuffer(self.history))
@@ -197,12 +168,7 @@ class Forecast:
         return True
 
     def forces_N(self, begins_after_s: float, after_s: list[float]) -> list[float]:
-        """Return the forecast forces (n), N, at `begins_after_s` + `after_s` (n), s, after the newest setpoint's stamp.
-
-        The times are >= 0, which is not checked; no times give no forces. At the stamp itself the force is the newest
-        setpoint's. Beyond the forecast's end its last force holds. Nothing is held within what a device gives. Call it
-        only while `trust` is above 0: an empty forecast raises IndexError. Raises DomainError for a time of NaN.
-        """
+        """Return the forecast forces (n), N, at `begins_after_s` + `after_s` (n), s, after the newest setpoint's stamp."""
         changes = self.changes_N
         # the forecast is shifted through the newest setpoint, which may have come after the point it was made from
         since_s = self.stamp_s - self.from_s
@@ -217,13 +183,7 @@ class Forecast:
         self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
 
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
-        """Add `count` >= 1 points to the grid, up to a setpoint later than the newest, and judge the guesses for them.
-
-        Between the newest setpoint and this one, at `stamp_s`, the force is taken as linear. The oldest points beyond
-        HISTORY go. Guesses move on by `count`, those for the new points are judged and gone. The caller keeps the
-        setpoint itself, and has checked that it is later. A forecast that reaches at most one point beyond it is
-        dropped.
-        """
+        """Add `count` >= 1 points to the grid, up to a setpoint later than the newest, and judge the guesses for them."""
         spacing_s = stamp_s - self.stamp_s
         times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]
         shares = [(time_s - self.stamp_s) / spacing_s for time_s in times_s]
@@ -249,11 +209,6 @@ class Forecast:
         self.beat_missed += _LONG_SHARE * (beat_error_N * beat_error_N - self.beat_missed)
 
     def _guess(self, rise: list[float], beat: list[float], changes: list[float], slope_N_s: float) -> Guess:
-        """Return the force at the point JUDGED after the grid's newest, by each embedding, their mixture and the slope.
-
-        `rise`, `beat` and `changes` are changes of force from that newest point, N, with more than JUDGED numbers each.
-        Nothing is kept here.
-        """
         since_s = self.stamp_s - self.time_s
         return Guess(
             _ahead_N(self.force_N, rise, since_s),
@@ -264,26 +219,11 @@ class Forecast:
 
 
 def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
-    """Return the force, N, JUDGED points ahead, along changes from a point `since_s` before the newest force.
-
-    `changes_N` has more than JUDGED numbers, the first 0, a grid step apart. Of the changes, what they say of `since_s`
-    has come already, as steeply as to the first point ahead: it is taken off.
-    """
     return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
 
 
 def _search(history: Array) -> list[tuple[list[float], float]]:
-    """Forecast with each embedding, and return for each the changes of force, N, and a distance, N².
-
-    `history` holds the forces on the grid, MIN_HISTORY to HISTORY of them, the newest last; it is not changed. There
-    are two results, that of RISE_DELAYS first. The changes (1 + HORIZON) go from the newest point of the grid to itself
-    and the next HORIZON points, so the first is 0. The list is empty where every stretch differs from the newest by
-    more than UNLIKE_N, or where its leverage is over MAX_LEVERAGE. The distance is always given. It is
-    that of the stretch most like the newest: the mean square of a point, at least SAME_N's.
-
-    What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
-    from itself, so that the regression's constant is its forecast.
-    """
+    """Forecast with each embedding, and return for each the changes of force, N, and a distance, N²."""
     # both embeddings at once: most of the time goes into the calls, not into their numbers
     changes = history[EMBEDDINGS[:, :, : (len(history) - _LONGEST - 1 - HORIZON) // STRIDE + 2]]
     changes -= changes[:, TAPS : TAPS + 1]
@@ -301,12 +241,7 @@ def _search(history: Array) -> list[tuple[list[float], float]]:
 
 
 def _constants(rows: list[list[float]]) -> list[float]:
-    """Return the regressions' constants (1 + HORIZON), N, by elimination: 0, then one for each point that followed.
-
-    `rows` (TAPS + 1) are weighted sums of products, one row for each regressor, with 1 last; they are not changed.
-    Columns are the regressors, then the HORIZON points that followed. A newest stretch of more leverage than
-    MAX_LEVERAGE gives an empty list.
-    """
+    """Return the regressions' constants (1 + HORIZON), N, by elimination: 0, then one for each point that followed."""
     total = rows[TAPS][TAPS]
     variance = 0.0
     for place in range(TAPS):

@@ -37,8 +37,7 @@ OUTRUN_N: Final = 0.02
 "Where the path misses what is known ahead by more, the carriages are too slow: the limit RATE."
 
 EARLY_N: Final = 0.08
-"""By so much more than is felt there the gap closes before a wall: 0.1 N with what is not known of a device. The least
-RMS error would brake the handle more."""
+"""By so much more than is felt there the gap closes before a wall: 0.1 N with what is not known of a device."""
 
 Bounds = tuple[float, float]
 "The least and the greatest force that the scene allows and the device gives."
@@ -46,12 +45,7 @@ Bounds = tuple[float, float]
 
 @final
 class Governor:
-    """The stage that turns setpoints, of one publisher after another, into the forces to render.
-
-    It keeps what was asked last, the setpoints' slope and forecast, who holds the brake, and the gap's path. It also
-    keeps the ramps to a new publisher and to another wall. In its methods, `dt_s` is the time since the last plan,
-    `force_N` what is asked for now, and `bounds` what scene and device allow. `lag_s` is the lag of the carriages.
-    """
+    """The stage that turns setpoints, of one publisher after another, into the forces to render."""
 
     time_s: float
     "Time of the newest plan."
@@ -70,8 +64,7 @@ class Governor:
     is_passing: bool
     "Whether the force is on the ramp to the forces of its holder."
     sent_mm: float | None
-    """The portrait's gap that the carriages were sent to; None where nothing is known ahead. A gap, not its force: what
-    is known of the device may have changed since."""
+    """The portrait's gap that the carriages were sent to; None where nothing is known ahead."""
     from_mm: float
     "The portrait's gap that the newest plan asked for, where `sent_mm` is not None."
     expected_N: float | None
@@ -87,11 +80,7 @@ class Governor:
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
     ) -> None:
-        """Begin at `now_s` with the gap open and no publisher.
-
-        `force` is the scene's, `gap_speed_mm_s` the gap's top speed. Of `terms`, only whether the forecast is in use
-        counts.
-        """
+        """Begin at `now_s` with the gap open and no publisher."""
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._path: Final = Path(portrait, gap_speed_mm_s)
@@ -117,26 +106,7 @@ class Governor:
         travel: Travel = AT_REST,
         held_N: float | None = None,
     ) -> Ask:
-        """Return the force to render now and those ahead, N, with the limits that hold them back. Advances all state.
-
-        `setpoint` is None without a publisher. `device` is what is known of the device's strength, `travel` the
-        handle's motion. What is known ahead is looked at `lag_s` later, the carriages' lag. `held_N` is the force of a
-        gap that follows no plan; None where it follows plans. A valid setpoint leaves the force at `held_N`, and is
-        reached along a ramp once that is None. A clock that goes back counts as one that stands.
-
-        A setpoint whose age is over `valid_for_s` is too old: the limit STALE. Without one it is NO_SETPOINT. RANGE,
-        STANDBY, F_MIN and F_MAX say what holds a valid one. RATE says that the gap, or a ramp between walls, is behind,
-        and TAKEOVER that a ramp leads to a publisher's forces. The setpoint's own limits are passed on. The result's
-        `is_meant` tells whether a valid setpoint is followed, `asked_N` what it asks for.
-
-        A setpoint that jumps is followed at once, within the scene's and the device's bounds. Three things go at the
-        scene's release rate. Without a valid setpoint, the force decays to the device's least. A new publisher's
-        forces, and the first after none was followed, are reached along a ramp. So is another wall, or none, in the
-        place of a wall.
-
-        Raises DomainError for a number that is not finite or beyond LARGEST, and for a preview without `preview_dt_s` >
-        0. State may then be half advanced: `begin` anew.
-        """
+        """Return the force to render now and those ahead, N, with the limits that hold them back."""
         lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
         dt_s = max(now_s - self.time_s, 0.0)
         self.time_s = now_s
@@ -193,20 +163,11 @@ class Governor:
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def foresee(self) -> bool:
-        """Make a forecast for the next plans, if one is due, and return whether it was. Call between plans.
-
-        Without the term forecast none is due.
-        """
+        """Make a forecast for the next plans, if one is due, and return whether it was."""
         return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def _note_setpoint(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
-        """Update the setpoints' slope, newest force, stamp and holder.
-
-        `allowed_N` is the setpoint's force within what the scene allows, `force_N` the one within the device's reach. A
-        new holder begins a ramp, without slope or forecast. The slope becomes 0 after a pause above MAX_STEP_S, against
-        a wall, or without the term forecast. A stamp that is not newer leaves it. It is filtered, and held to what the
-        gap's speed gives at `force_N`.
-        """
+        """Update the setpoints' slope, newest force, stamp and holder."""
         spacing_s = setpoint.stamp_s - self.stamp_s
         if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
             self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
@@ -220,12 +181,7 @@ class Governor:
         self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
 
     def _blended(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, dt_s: float) -> float:
-        """Return `allowed_N`, or a force on the ramp to it where another wall, or none, has replaced a wall.
-
-        `allowed_N` is what the setpoint asks for, within what the scene allows. The ramp goes at the release rate,
-        besides what the handle's motion changes. A new holder and a handle that withdraws have none. Updates `blend_N`,
-        `law_N`, `law_mm` and `was_pushing`; call it before `_note_setpoint`, whose last holder and force it reads.
-        """
+        """Return `allowed_N`, or a force on the ramp to it where another wall, or none, has replaced a wall."""
         wall, place_mm = setpoint.wall, travel.place_mm
         before_N = self.law_N
         if before_N is None and wall is not None and self.stamp_s != -math.inf and self.was_pushing:
@@ -252,12 +208,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S on the best path for a handle that pushes against `wall` at its present rate.
-
-        The forces are within `bounds`, with what is left of a ramp between walls, `blend_N`, added. The gap closes
-        early by at most EARLY_N over the force at each moment, and passes the wall's place at speed. Updates `sent_mm`
-        and `expected_N`.
-        """
+        """Return the forces (7) at PATH_S on the best path for a handle that pushes against `wall` at its present rate."""
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
         begins_s = lag_s + SPEEDING_UP_S
         wanted_N = [
@@ -272,12 +223,7 @@ class Governor:
         return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
-        """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1.
-
-        `allowed_N` is the setpoint's force within what the scene allows, `stamp_s` its stamp. Without the term forecast
-        nothing is given, and 0 returned. 0 is also returned for a setpoint that was meant to be followed `soon_s` >
-        MAX_STEP_S ago; the forecast gets it all the same.
-        """
+        """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1."""
         if not self._has_forecast:
             return 0.0
         self.forecast.update(stamp_s, allowed_N)
@@ -294,13 +240,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S on the best path for the setpoint's preview.
-
-        They are within `bounds`. Now is `soon_s` after its stamp and playout. With the term forecast and a preview
-        shorter than TIMES_S, the preview's last force goes to the forecast, which goes on from there. The preview's
-        mean slope then becomes `slope_N_s`. Otherwise the forecast forgets. Updates `sent_mm` and `expected_N`. Raises
-        DomainError for a force beyond LARGEST. Call it only for a setpoint with a preview.
-        """
+        """Return the forces (7) at PATH_S on the best path for the setpoint's preview."""
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
             self.slope_N_s = setpoint.preview_slope_N_s
@@ -321,11 +261,7 @@ class Governor:
         lag_s: float,
         most_N: list[Bounds] | None = None,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S, within `bounds`, on the gap's best path for `wanted_N` at TIMES_S.
-
-        `most_N` are upper bounds at PATH_S, in pairs as `Path.pursue` takes them; None: none. `force_N` is where the
-        path begins during a ramp. Updates `sent_mm` and `expected_N`.
-        """
+        """Return the forces (7) at PATH_S, within `bounds`, on the gap's best path for `wanted_N` at TIMES_S."""
         from_mm, sent_mm = self._left_from(force_N, device)
         path_N, self.sent_mm = self._path.pursue(from_mm, sent_mm, dt_s, wanted_N, device, lag_s, most_N)
         # the path sets out sooner by as much as the carriages come later
@@ -347,12 +283,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S along the setpoints' slope, or the forecast, weighted by `foresight`, 0..1.
-
-        Now is `soon_s` after the newest stamp and its playout; the slope carries AHEAD_S at most. Off a ramp, where the
-        gap gets there within NEAR_S, a `foresight` above 0 mixes in the best path for these forces. Updates `sent_mm`
-        and `expected_N`: None where no such path is followed.
-        """
+        """Return the forces (7) at PATH_S along the setpoints' slope, or the forecast, weighted by `foresight`, 0..1."""
         begins_s = soon_s + foresight * lag_s
         times_s = _FORECAST_S if foresight > 0.0 else PATH_S
         slope_N_s = self.slope_N_s
@@ -370,11 +301,7 @@ class Governor:
         return path_N[: len(PATH_S)]
 
     def _left_from(self, force_N: float, device: DeviceFit) -> tuple[float, float]:
-        """Return two of the portrait's gaps, mm: that at the last plan, and that which the carriages were sent to then.
-
-        Where no path was followed, both are those of the force at the last plan. During a ramp to a publisher's forces
-        both are those of `force_N`, what the ramp leads to. Changes nothing.
-        """
+        """Return two of the portrait's gaps, mm: that at the last plan, and that which the carriages were sent to then."""
         # a ramp leads to what is asked, whatever the gap can make of it
         if self.is_passing or self.sent_mm is None:
             gap_mm = self._path.gap_mm(force_N if self.is_passing else self.asked_N, device)
@@ -384,12 +311,7 @@ class Governor:
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
     ) -> tuple[float, tuple[Limit, ...]]:
-        """Return `allowed_N` held to what the device gives, `lowest_N` to `highest_N`, and the limits in force.
-
-        F_MIN or F_MAX tells that the device holds it; both never come. `asked_N` is what the setpoint itself asks for.
-        It adds RANGE where the scene does not allow it, and STANDBY where the scene waits at a greater force. An empty
-        tuple: nothing holds it.
-        """
+        """Return `allowed_N` held to what the device gives, `lowest_N` to `highest_N`, and the limits in force."""
         limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._allowed[1] else (Limit.RANGE,)
         if asked_N < self._allowed[0] and self._least_N < self._allowed[0]:
             limits = (*limits, Limit.STANDBY)
@@ -400,12 +322,7 @@ class Governor:
         return allowed_N, limits
 
     def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
-        """Return a force that falls to `lowest_N` at the release rate, for no valid setpoint, and forget the last one.
-
-        `lowest_N` is the device's least force. The force above it never grows, even where a device is found to be
-        weaker; all forces ahead are that of now. The next setpoint is reached along a ramp. `age_s`, None without a
-        setpoint, and `limits` only go into the result.
-        """
+        """Return a force that falls to `lowest_N` at the release rate, for no valid setpoint, and forget the last one."""
         # where a device turns out weaker, the force above its least does not grow
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
         self.asked_N, self.above_N, self.is_passing = lowest_N + above_N, above_N, True
@@ -421,12 +338,7 @@ class Governor:
 
 
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
-    """Raise DomainError, naming the field, where a number of `setpoint` or its age is not finite or beyond LARGEST.
-
-    None passes. Also raise it for a preview whose `preview_dt_s` is not above 0; without a preview that is not looked
-    at. Each force of a preview is looked at only where their sum is not finite or beyond LARGEST: great forces that
-    cancel out pass.
-    """
+    """Raise DomainError, naming the field, where a number of `setpoint` or its age is not finite or beyond LARGEST."""
     if not (
         -_LARGEST <= age_s <= _LARGEST
         and -_LARGEST <= setpoint.force_N <= _LARGEST
@@ -453,13 +365,7 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
 
 
 def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:
-    """Return the forces of a preview, N, held to `bounds`, at the times TIMES_S from `begins_s` >= 0 after its stamp.
-
-    There are MIN_TIMES or more, as far as the preview goes, or HORIZON_S further with a trusted forecast. Between the
-    setpoint's force and those of its preview they are linear. Past its end, forces go on along its mean slope for
-    AHEAD_S at most, mixed with a trusted forecast. Raises DomainError for a force beyond LARGEST. A setpoint without a
-    preview raises IndexError.
-    """
+    """Return the forces of a preview, N, held to `bounds`, at the times TIMES_S from `begins_s` >= 0 after its stamp."""
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
     ends_s, mean_N_s, trust = setpoint.preview_s, setpoint.preview_slope_N_s, forecast.trust

@@ -31,18 +31,14 @@ CHANGES_PER_S: Final = [1.0 / (after_s - before_s) for before_s, after_s in pair
 SPEEDING_UP_S: Final = 0.025
 "Time constant with which the gap comes to another speed where carriages are in time; sample 1: 20 to 30 ms do as well."
 NEAR_S: Final = 0.18
-"""What the gap gets to in this time is near. On sample 1, with a third of it, a finger's pulse is missed by 39, not 35
-mN."""
+"""What the gap gets to in this time is near."""
 FLATTEST_N_MM: Final = 1e-3
 "Least slope |dF/dgap| of a weight: a force that hardly depends on the gap counts as if it did by this much."
 
 
 @final
 class Path:
-    """Finder of the gap's best path, for one portrait (force over gap) and one top speed of the gap; without state.
-
-    Its methods raise DomainError for NaN.
-    """
+    """Finder of the gap's best path, for one portrait (force over gap) and one top speed of the gap; without state."""
 
     def __init__(self, portrait: Portrait, gap_speed_mm_s: float) -> None:
         self._portrait: Final = portrait
@@ -53,10 +49,7 @@ class Path:
         return self._portrait.gap_mm_at(device.model_N(force_N))
 
     def is_near(self, from_mm: float, to_N: float, device: DeviceFit) -> bool:
-        """Tell whether the device's gap, at its top speed, gets from `from_mm` to the force `to_N` within NEAR_S.
-
-        It does not from a gap of NaN.
-        """
+        """Tell whether the device's gap, at its top speed, gets from `from_mm` to the force `to_N` within NEAR_S."""
         return abs(from_mm - self.gap_mm(to_N, device)) < NEAR_S * self._gap_speed_mm_s
 
     def pursue(
@@ -69,20 +62,7 @@ class Path:
         lag_s: float,
         most_N: list[tuple[float, float]] | None = None,
     ) -> tuple[list[float], float]:
-        """Find the best path for the forces `wanted_N` at TIMES_S, and return forces (7) at PATH_S and a gap to send.
-
-        `wanted_N` has n >= 7 forces, for the first n of TIMES_S. The carriages are to be sent now to the gap to send.
-        The gap follows its carriages with the time constant SPEEDING_UP_S + `lag_s`, and the forces (7) are those of
-        the gap. `dt_s` ago, the gap was at `from_mm` and the carriages were sent to `sent_mm`; gaps are the portrait's.
-
-        With `most_N` None the carriages are sent ahead of the path: by its speed times the time constant. `most_N` (7),
-        N, opens the path where it would give more; `wanted_N` has to be of a time constant later already. Its pairs are
-        the most at that time, and the most when the gap gets there. The carriages may set out to the second by as much
-        as the gap lags at top speed.
-
-        Forces are the device's; those returned are within what the portrait's gaps give. Neither lengths nor `dt_s` >=
-        0 are checked.
-        """
+        """Find the best path for the forces `wanted_N` at TIMES_S, and return forces (7) at PATH_S and a gap to send."""
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
         require_number("sent_mm", sent_mm)
@@ -120,12 +100,7 @@ def nearest_path_mm(
     speed_mm_s: float,
     count: int,
 ) -> list[float]:
-    """Return the first `count` gaps of the path that misses `wanted_mm` (n) least, in squares times `weights` (n) > 0.
-
-    The points are the first n >= `count` of the rising `times_s`. The path goes no faster than `speed_mm_s`, and was at
-    `start_mm` `elapsed_s` before the first point. It is chosen for all n points, though not all are returned. The gaps
-    are in mm, and not held within a device's. Nothing is checked, and the arguments stay as they are.
-    """
+    """Return the first `count` gaps of the path that misses `wanted_mm` (n) least, in squares times `weights` (n) > 0."""
     best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
     path_mm: list[float] = []
     gap_mm, before_s = start_mm, times_s[0] - elapsed_s
@@ -138,12 +113,7 @@ def nearest_path_mm(
 
 
 def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
-    """Return for each of n points the gap, mm, from which this point and all later ones are missed least.
-
-    What counts are the squares of the distances from `wanted_mm` (n), times `weights` (n) > 0. From point to point, at
-    the rising `times_s` (n), the gap moves at `speed_mm_s` at most. Where the gap was before the point is left out: the
-    caller limits the way from there. The arguments stay as they are.
-    """
+    """Return for each of n points the gap, mm, from which this point and all later ones are missed least."""
     best_mm = wanted_mm[:]
     # the least cost of what comes is convex in the gap, with a piecewise linear derivative: one point further back in
     # time, its two sides are shifted apart by what the gap can move, and the point adds a line

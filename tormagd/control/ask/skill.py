@@ -12,22 +12,14 @@ FORGIVEN_N: Final = 0.003
 
 @final
 class Skill(Value):
-    """Skill of one guess over another: means of squares, N², with the newest counting most.
-
-    gained   the other guess's squared error less this one's
-    apart    the squared difference of the two guesses
-    """
+    """Skill of one guess over another: means of squares, N², with the newest counting most."""
 
     def __init__(self, gained: float, apart: float) -> None:
         self.gained: Final = gained
         self.apart: Final = apart
 
     def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
-        """Return the skill with both guesses' newest errors, N, which count for `share` of the means, 0..1.
-
-        `error_N` is this guess's. Both errors have the same sense, guess less truth or truth less guess. Nothing is
-        checked: NaN stays in all skills that follow.
-        """
+        """Return the skill with both guesses' newest errors, N, which count for `share` of the means, 0..1."""
         gained = other_error_N * other_error_N - error_N * error_N
         difference_N = other_error_N - error_N
         apart = difference_N * difference_N
@@ -35,11 +27,6 @@ class Skill(Value):
 
     @property
     def score(self) -> float:
-        """Return the skill score: `gained` over `apart`. Above 0 this guess is the better one, at 0 both are as good.
-
-        The mixture with the share (1 + score) / 2 of the first guess would have had the least squared error. The score
-        is not held within -1..1, but guesses that hardly differ have one near 0.
-        """
         return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
 
 

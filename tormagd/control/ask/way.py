@@ -18,20 +18,14 @@ SLID_MM: Final = 0.5
 
 
 def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
-    """Return the handle's place, mm, and rate, mm/s, both positive pushing on. `push_sign` is 1 or -1, as for `Way`.
-
-    The place counts from the encoder's zero. The rate is the quick one, `quick_mm_s`. Nothing is checked.
-    """
+    """Return the handle's place, mm, and rate, mm/s, both positive pushing on."""
     handle = measured.handle
     return push_sign * measured.handle_mm, push_sign * handle.turn.direction * handle.quick_mm_s
 
 
 @final
 class Way:
-    """The stage that follows a brake's handle along the way of the task: its place, its rate, and whether it pushes on.
-
-    It keeps the newest `travel`, and where the way last changed.
-    """
+    """The stage that follows a brake's handle along the way of the task: its place, its rate, and whether it pushes on."""
 
     travel: Travel = AT_REST
     "The newest travel; at rest before a measurement."
@@ -39,17 +33,10 @@ class Way:
     "The encoder's place where the way last changed."
 
     def __init__(self, push_sign: int) -> None:
-        """`push_sign` is 1 where a handle that pushes on moves to greater places of its encoder, else -1."""
         self._push_sign: Final = float(push_sign)
 
     def update(self, measured: Measured | None, zero_N: float, is_sensor_believed: bool) -> Travel:
-        """Return the handle's travel, and keep it in `travel`.
-
-        `measured` is None while the device is silent: the handle counts as resting where it was, and keeps its way. A
-        force over PULLS_N, less the sensor's zero `zero_N`, shows the way that it resists. A smaller one shows nothing:
-        the way then changes after SLID_MM on the encoder, since it turned, and from where the way last changed. With
-        `is_sensor_believed` False, or a force of NaN, only such travel counts. A change of way is kept in `changed_mm`.
-        """
+        """Return the handle's travel, and keep it in `travel`."""
         before = self.travel
         if measured is None:
             self.travel = Travel(before.place_mm, 0.0, before.is_pushing)

@@ -32,7 +32,7 @@ CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
 STOPPING_MM_S: Final = 0.5 * MOVING_MM_S
 STUCK_N: Final = 0.08
 """A handle is stuck where its rate over the last 10 ms is under STOPPING_MM_S and its force so much less than friction.
-Its slower rate may still say that it slides."""
+"""
 COMES_TO_REST: Final = 3.0
 "A handle whose `sliding_mm_s` is at least this many times its rate only comes to rest: it does not creep."
 MIN_EXPECTED_N: Final = 0.1
@@ -47,14 +47,7 @@ MIN_FORESIGHT: Final = 0.5
 
 @final
 class Learned(Value):
-    """What is known of a device from another day.
-
-    device         the fit of its force
-    slow_factor    its force at a creep over its force at speed
-    slow_learned   the share of `slow_factor` that was learned at a creep, 0..1
-    sensor_zero_N  what its force sensor reads without a force
-    lag_s          how late its carriages come
-    """
+    """What is known of a device from another day."""
 
     def __init__(
         self,
@@ -76,11 +69,7 @@ NOTHING_LEARNED: Final = Learned()
 
 @final
 class Believe:
-    """The stage that learns one device from its readings: it updates the estimators, and says what is believed.
-
-    It holds the element's memory, the watch on the encoder, and the estimators of strength, slow friction, sensor zero,
-    sensor trust and carriage lag. It also keeps which fit was taught from another day.
-    """
+    """The stage that learns one device from its readings: it updates the estimators, and says what is believed."""
 
     read: int = -1
     "Number of the newest measurement that taught; -1 before the first."
@@ -98,7 +87,7 @@ class Believe:
     "Whether the first slide has shown another device than `taught`."
 
     def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
-        """Begin with an unseen device. `memory` is advanced by `update`."""
+        """Begin with an unseen device."""
         terms = scene.terms
         trim = config.trim
         self.memory, self.handle = memory, HandleWatch()
@@ -112,8 +101,7 @@ class Believe:
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
         self.read_s = -math.inf
         self.learns = terms.learning
-        """Whether anything is learned. Without learning the sensor is still judged, and a dispute still takes the fit
-        back."""
+        """Whether anything is learned."""
         self._has_lag: Final = terms.motor
         self._has_creep: Final = terms.creep and nominal.contact.slides
         self._fits: Final = terms.scale or terms.offset
@@ -121,11 +109,7 @@ class Believe:
     @property
     def device(self) -> DeviceFit:
         """Return the fit of the device's force to the model's without memory, at speed, with the element as relaxed as
-        now.
-
-        In a dispute of device and sensor the fit is scaled up by `sensor.lead_N`: the explanation with more force
-        counts.
-        """
+        now."""
         fit, lead_N = self.strength.fit, self.sensor.lead_N
         if lead_N > 0.0:
             fit = fit.times(1.0 + lead_N / max(fit.force_N(self.heard_N), MIN_EXPECTED_N))
@@ -133,7 +117,6 @@ class Believe:
 
     @property
     def min_N(self) -> float:
-        """F_min of this device: the force of its open gap at speed, with the lag of the element's field."""
         return self.device.force_N(self.memory.open_N())
 
     def knows_zero(self, now_s: float) -> bool:
@@ -141,19 +124,12 @@ class Believe:
         return self.zero.sd_N(now_s) <= self._unknown_sd_N
 
     def learned(self) -> Learned:
-        """Return what is known of this device now, to `teach` on another day.
-
-        The fit is that of `strength`, without a dispute's `lead_N`; UNSEEN itself for a device that has shown nothing.
-        """
+        """Return what is known of this device now, to `teach` on another day."""
         slow = self.slow
         return Learned(self.strength.fit, slow.factor_at(0.0), slow.learned, self.zero.zero_N, self.carriages.lag_s)
 
     def teach(self, learned: Learned) -> None:
-        """Replace all that is known of the device by `learned`, and begin its estimators anew.
-
-        Until the handle has slid, the device may still be another one. The element's memory and the watch on the
-        encoder stay. Nothing is checked.
-        """
+        """Replace all that is known of the device by `learned`, and begin its estimators anew."""
         self.strength.forget(learned.device)
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
@@ -164,18 +140,12 @@ class Believe:
         self.is_prior, self.is_contradicted = learned.device is not UNSEEN, False
 
     def forget(self) -> None:
-        """Forget the device, and begin the watch on the encoder anew. The element's memory stays."""
+        """Forget the device, and begin the watch on the encoder anew."""
         self.teach(NOTHING_LEARNED)
         self.handle = HandleWatch()
 
     def update(self, now_s: float, measured: Measured | None) -> Belief:
-        """Learn from `measured`, where it is new, and return the belief at `now_s`.
-
-        `measured` is None while the device is silent: nothing is learned. A device that is not homed teaches no force.
-        While `learns` is False, fit, slow friction and zero stay. An old force, or one within MIN_DT_S of the last,
-        teaches only the watch on the encoder. The element's memory follows the gap of a homed device. Raises
-        DomainError for a gap outside the field law's range.
-        """
+        """Learn from `measured`, where it is new, and return the belief at `now_s`."""
         slid_N: float | None = None
         if measured is not None:
             self.memory.update(now_s, measured)
@@ -189,12 +159,7 @@ class Believe:
         return self._belief(measured, slid_N)
 
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
-        """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan.
-
-        `foresight`, 0..1, is the plan's. Below MIN_FORESIGHT, or without a homed device (`measured` None: a silent
-        one), nothing is learned, and the expected gap starts again. While `learns` is False, or without the term
-        `motor`, nothing happens.
-        """
+        """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan."""
         if not (self.learns and self._has_lag):
             return
         if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:
@@ -204,13 +169,7 @@ class Believe:
             self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
-        """Return the belief, and change nothing. `slid_N` is the model's force as far as friction has followed it now.
-
-        With None nothing is predicted.
-
-        Nothing is predicted either without `measured` (None: a silent device), or where the contact's force is not
-        known. A lost encoder adds the limit HANDLE_LOST.
-        """
+        """Return the belief, and change nothing."""
         at_speed = self.device
         device = at_speed.times(self.slow.factor_at(self.slow.creep_mm_s)) if self._has_creep else at_speed
         predicted_N: float | None = None
@@ -224,14 +183,7 @@ class Believe:
         return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, self.sensor.doubted_s)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
-        """Learn from the newest reading, with the model's force `model_N` at the measured gap.
-
-        `slid_N` is that force as far as friction has followed it.
-
-        Where friction is mobilised and the handle moves, the reading counts as one at speed. It counts as one at a
-        creep else, and for a handle that is stuck or rests beside a moved gap. The watch on a brake's encoder takes
-        every reading. An old force, and a reading within MIN_DT_S of the last, teach nothing else.
-        """
+        """Learn from the newest reading, with the model's force `model_N` at the measured gap."""
         slides = self._nominal.contact.slides
         if slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
@@ -252,10 +204,7 @@ class Believe:
             self._hear_at_creep(now_s, measured, dt_s, is_mobilised)
 
     def _is_stuck(self, measured: Measured, model_N: float) -> bool:
-        """Tell whether the handle has stopped, with a force that is less than friction by more than STUCK_N.
-
-        A hand that meets a wall stops so, within 10 ms. `model_N` is the model's force now.
-        """
+        """Tell whether the handle has stopped, with a force that is less than friction by more than STUCK_N."""
         handle = measured.handle
         if abs(handle.quick_mm_s) >= STOPPING_MM_S:
             return False
@@ -263,11 +212,7 @@ class Believe:
         return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
 
     def _hear_at_creep(self, now_s: float, measured: Measured, dt_s: float, is_mobilised: bool) -> None:
-        """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise.
-
-        In a dispute, or without the term `creep`, nothing is learned. A handle that rests or comes to rest teaches
-        nothing, nor does a zero that is not known. Unless `is_mobilised`, only a reading greater than expected teaches.
-        """
+        """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise."""
         self.strength.settle()
         if not (self._has_creep and self.learns) or self.sensor.is_disputed:
             return
@@ -284,13 +229,7 @@ class Believe:
             self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
 
     def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
-        """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit.
-
-        A dispute of device and sensor may begin or end. A zero that a reversal shows may shift the fit in it. In a
-        dispute, or while the zero is unknown, the fit learns nothing. `model_N` is the model's force at the handle's
-        rate, as far as friction has followed it. Sets `limits`: SENSOR_ZERO, and SENSOR, DEVICE_OR_SENSOR,
-        OFFSET_UNKNOWN or TRIM.
-        """
+        """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit."""
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
         reading_N, zero_sd_N = measured.force_N - direction * zero.zero_N, zero.sd_N(now_s)
@@ -320,11 +259,7 @@ class Believe:
             zero.trust()
 
     def _dispute(self, model_N: float, rate_mm_s: float) -> None:
-        """Take the device for what it was before the readings left the fit, and the zero for unknown.
-
-        Before the handle has slid, only what was taught from another day remains of the fit. The force at a creep
-        stays, as far as it was learned there.
-        """
+        """Take the device for what it was before the readings left the fit, and the zero for unknown."""
         self.zero.doubt()
         before_N = self.strength.fit.force_N(model_N)
         if self.sensor.has_slid:
@@ -334,12 +269,7 @@ class Believe:
         self.slow.rescale(before_N, self.strength.fit.force_N(model_N), rate_mm_s)
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing.
-
-        `model_N` is the model's force at the handle's rate, `rate_mm_s`. A fit from another day that the first slide
-        contradicts is forgotten first. Where the fit does not learn, the readings' mean is only compared with it: a
-        dispute may begin. The force at a slower creep stays. A fit at one of its bounds adds the limit TRIM.
-        """
+        """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing."""
         if self.sensor.freshness.is_stale or self.sensor.wrong_s > 0.0:
             return  # the reading may be old or wrong
         if not (self.learns and self._fits):
@@ -358,11 +288,7 @@ class Believe:
             self.limits = (Limit.TRIM, *self.limits)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute of device and sensor; without a dispute do nothing.
-
-        `device`: the dispute ends, the sensor's zero is believed again, and scale and offset are as uncertain as an
-        unseen device's. `sensor`: the sensor is not believed until its readings agree again.
-        """
+        """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
         if not self.sensor.is_disputed:
             return
         self.sensor.confirm(wrong)

@@ -26,10 +26,7 @@ AGE_S: Final = 0.0015
 
 @final
 class CarriageLag:
-    """Estimator of one device's carriage lag: the time constant `lag_s` from planned to measured gap.
-
-    It keeps the gap that is expected now, None before a plan's, and whether the carriages are behind a jump.
-    """
+    """Estimator of one device's carriage lag: the time constant `lag_s` from planned to measured gap."""
 
     lag_s: float = 0.0
     "T, 0..MAX_LAG_S."
@@ -43,12 +40,7 @@ class CarriageLag:
     def update(
         self, dt_s: float, planned_mm: float | None, gap_mm: float, speed_mm_s: float, top_speed_mm_s: float
     ) -> None:
-        """Learn from one plan, made `dt_s` after the last, with the gap and its speed measured AGE_S before it.
-
-        `planned_mm` is None where the plan did not know what comes: nothing is learned, and the expected gap begins
-        anew. While the carriages are behind a jump nothing is learned either. `dt_s` counts as 0 to MAX_DT_S.
-        `top_speed_mm_s` bounds the measured speed, which a new filter may overstate.
-        """
+        """Learn from one plan, made `dt_s` after the last, with the gap and its speed measured AGE_S before it."""
         if planned_mm is None:
             self.expected_mm, self.is_settling = None, False
             return

@@ -19,18 +19,14 @@ FROZEN_RUNS: Final = 12.0
 "White noise as large as a step shows one value so often once in five million times."
 RESOLVED: Final = 1.5
 ALTERNATES: Final = 0.4
-"""A sensor's noise is resolved under two conditions. Its mean run is under RESOLVED times its shortest, and over the
-share ALTERNATES of its changes go back."""
+"""A sensor's noise is resolved under two conditions."""
 HEARD: Final = 100
 "Number of runs that tell a sensor's noise."
 
 
 @final
 class Freshness:
-    """Judge of whether one force sensor still shows new values.
-
-    It keeps the newest reading and how long it has stood, the force since, and the sensor's noise, runs and step.
-    """
+    """Judge of whether one force sensor still shows new values."""
 
     has_heard: bool = False
     "Whether a first reading has come."
@@ -57,17 +53,11 @@ class Freshness:
 
     @property
     def is_stale(self) -> bool:
-        """Whether the newest reading is an old one: the force has changed and the reading has not."""
         return self.changed_N > STALE_N + self._steps_N
 
     @property
     def is_frozen(self) -> bool:
-        """Tell whether the sensor is broken: it should have shown another value by now.
-
-        Within FROZEN_S of the last new value it is not. Later it is once the device's force has changed by FROZEN_N and
-        two of the sensor's steps. A sensor whose noise is resolved also is after FROZEN_RUNS mean times between new
-        values.
-        """
+        """Tell whether the sensor is broken: it should have shown another value by now."""
         if self.still_s <= FROZEN_S:
             return False
         is_resolved = self.alternates > ALTERNATES and self.run_s < RESOLVED * self.min_run_s
@@ -80,11 +70,7 @@ class Freshness:
         return 2.0 * min(self.step_N, FROZEN_N)
 
     def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> None:
-        """Take one reading, which stands for `dt_s` > 0, and update `is_stale` and `is_frozen`.
-
-        `model_N` is the model's force, `scale` the device's force over the model's. With `learns` a change of the
-        reading also teaches the sensor's noise and resolution.
-        """
+        """Take one reading, which stands for `dt_s` > 0, and update `is_stale` and `is_frozen`."""
         if not self.has_heard:
             self.has_heard, self.stood_N = True, model_N
         elif reading_N == self.reading_N:
@@ -97,11 +83,7 @@ class Freshness:
         self.changed_N = scale * abs(model_N - self.stood_N)
 
     def _take_run(self, change_N: float, run_s: float) -> None:
-        """Learn noise and resolution from a run that lasted `run_s` and ended with a change of `change_N`.
-
-        Updates the number of runs, their mean and least length, the least change, and how many changes go back. The
-        newest run counts for one in HEARD at least.
-        """
+        """Learn noise and resolution from a run that lasted `run_s` and ended with a change of `change_N`."""
         self.runs = min(self.runs + 1, HEARD)
         share = 1.0 / self.runs
         self.run_s += share * (run_s - self.run_s)

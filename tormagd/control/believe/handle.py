@@ -27,10 +27,7 @@ FORGETS_S: Final = 5.0
 
 @final
 class HandleWatch:
-    """Watch on the handle's encoder: compares the force of a resting handle with the model's force at the gap.
-
-    It keeps where and how long the handle has stood, the least force since, and whether the encoder `is_lost`.
-    """
+    """Watch on the handle's encoder: compares the force of a resting handle with the model's force at the gap."""
 
     at_mm: float = math.inf
     "The encoder's place at which the handle stands."
@@ -50,20 +47,11 @@ class HandleWatch:
     "Whether the encoder is lost: it is not believed until it moves."
 
     def moved_gap_at_rest(self, model_N: float) -> bool:
-        """Tell whether the gap's force has changed by more than MODEL_RISES_N since the handle came to stand.
-
-        `model_N` is the model's force now. Friction at rest does not follow a changing gap.
-        """
+        """Tell whether the gap's force has changed by more than MODEL_RISES_N since the handle came to stand."""
         return abs(model_N - self.rested_N) > MODEL_RISES_N
 
     def update(self, sensed_s: float, handle_mm: float, reading_N: float, model_N: float) -> None:
-        """Take one reading of handle and force, and update `is_lost`.
-
-        `model_N` is the model's force at the measured gap. Once it has stood for SETTLES_S, the encoder is lost where
-        the force has risen over RISES_N from its least, the model's over MODEL_RISES_N. The least is forgotten slowly.
-        A motion of over STANDS_MM, or a pause of more than UNHEARD_S, clears `is_lost`. A `sensed_s` (host's clock)
-        that is not newer changes nothing.
-        """
+        """Take one reading of handle and force, and update `is_lost`."""
         dt_s = sensed_s - self.heard_s
         if not dt_s > 0.0:
             return

@@ -24,11 +24,7 @@ BEYOND_MM: Final = 2.0
 
 @final
 class ElementMemory:
-    """Relaxation and field lag of one element, from the first known gap on: `relaxed_N` and `lag_mT`.
-
-    A brake is taken as rested at the gap it was switched on with, and relaxes for a handle at the roller's speed. A pad
-    is taken as untouched, and relaxes for what presses it. It also keeps the newest gap's field and its time.
-    """
+    """Relaxation and field lag of one element, from the first known gap on: `relaxed_N` and `lag_mT`."""
 
     field_mT: float = 0.0
     "The gap's field at the newest gap."
@@ -46,7 +42,7 @@ class ElementMemory:
     "Before the first known gap: by how much the gap has opened since the device was switched on."
 
     def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
-        """Begin before the first known gap. `gap_range_mm` is the closed and the open gap."""
+        """Begin before the first known gap."""
         self.time_s = -math.inf
         self._free: Final = memory.free
         self._added: Final = memory.added
@@ -61,10 +57,7 @@ class ElementMemory:
         self._open_mT: Final = field.field_mT(gap_range_mm[1])
 
     def lag_at_mT(self, field_mT: float) -> float:
-        """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`.
-
-        It is 0 before the first known gap.
-        """
+        """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`."""
         change_mT = field_mT - self.field_mT
         if self.time_s == -math.inf:
             return 0.0
@@ -74,27 +67,16 @@ class ElementMemory:
         return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
     def open_N(self) -> float:
-        """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed.
-
-        There the element's field lags behind: it still has some of what it had.
-        """
+        """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed."""
         field_mT = self._open_mT - self.lag_at_mT(self._open_mT)
         return self._nominal.only.force_N(within(field_mT, self._nominal.fields_mT))
 
     def force_N(self, curve: ForceCurve) -> float:
-        """Return the model's force now, N, with memory; `curve` is its force over the field without.
-
-        Before the first known gap the field is 0 mT, and nothing has relaxed.
-        """
+        """Return the model's force now, N, with memory; `curve` is its force over the field without."""
         return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
 
     def update(self, now_s: float, measured: Measured) -> None:
-        """Follow lag and relaxation to `now_s`, along a straight change to the `measured` gap.
-
-        The first known gap begins them, for a brake as rested where it was switched on. Where the device is not homed,
-        a brake only notes how far its gap has opened, and a pad's gap counts as open. A gap counts as at most BEYOND_MM
-        beyond the closed end. Raises DomainError for a gap outside the field law's range.
-        """
+        """Follow lag and relaxation to `now_s`, along a straight change to the `measured` gap."""
         slides = self._nominal.contact.slides
         is_empty = self.time_s == -math.inf
         if slides and not measured.is_homed:
@@ -117,16 +99,11 @@ class ElementMemory:
         self._follow(curve, free_N, field_mT, now_s)
 
     def _begin(self, field_mT: float, free_N: float, added_N: float, now_s: float) -> None:
-        """Begin after a long rest at `field_mT`, with the force `free_N` without field and `added_N` by the field."""
         self.field_mT, self.lag_mT, self.relaxed_N, self.opened_mm, self.time_s = field_mT, 0.0, 0.0, 0.0, now_s
         self.free, self.added = self._free.relaxed(free_N), self._added.relaxed(added_N)
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
-        """Follow a straight change of the gap's field to `field_mT` at `now_s`.
-
-        Sets `field_mT`, `time_s`, `lag_mT` and `relaxed_N`. `curve` is the force over the field without memory,
-        `free_N` its force at 0 mT. An element that does not relax keeps `relaxed_N`.
-        """
+        """Follow a straight change of the gap's field to `field_mT` at `now_s`."""
         self.lag_mT = self.lag_at_mT(field_mT)
         dt_s = max(now_s - self.time_s, 0.0)
         self.field_mT, self.time_s = field_mT, now_s

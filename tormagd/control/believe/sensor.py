@@ -66,11 +66,7 @@ TRUSTED_AGAIN_S: Final = 1.0
 
 @final
 class SensorTrust:
-    """Judge of one force sensor against the fit of its device. Finds, follows and ends their disputes.
-
-    It notes by how much the fit has to go back where a dispute begins (`back_N`). In one it follows by how much
-    readings lead the fit (`lead_N`). `is_disputed` stops learning; `is_doubted` says that the sensor is wrong.
-    """
+    """Judge of one force sensor against the fit of its device. Finds, follows and ends their disputes."""
 
     known_s: float = 0.0
     "How long the device has slid, LEARNS_S at most."
@@ -119,12 +115,10 @@ class SensorTrust:
 
     @property
     def has_slid(self) -> bool:
-        """Whether the device has slid for LEARNS_S, and so shown itself in this session."""
         return self.known_s >= LEARNS_S
 
     @property
     def is_named(self) -> bool:
-        """Whether the dispute has lasted long enough to be reported."""
         return self.is_disputed and self.disputed_s > NAMED_S
 
     def update(
@@ -137,13 +131,7 @@ class SensorTrust:
         zero_sd_N: float,
         dt_s: float,
     ) -> None:
-        """Take one reading and judge it against `fit`. May begin or end a dispute, and doubt the sensor.
-
-        The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1. `reading_N` is the force against this
-        motion, less the sensor's zero, which is known to within `zero_sd_N`; in a dispute it counts as known. The
-        model's force is `model_N`. The reading stands for `dt_s` > 0. All arguments are finite. In a dispute, updates
-        `lead_N` >= 0: it follows readings above the fit, by RISES_N_S at most, and else returns to 0.
-        """
+        """Take one reading and judge it against `fit`."""
         if self.is_disputed:
             zero_sd_N = 0.0  # a reversal has to tell the zero first
         self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
@@ -152,11 +140,7 @@ class SensorTrust:
         self._judge(self.measured_N - fit.force_N(model_N), self._is_strange(model_N, zero_sd_N), dt_s)
 
     def fit_moved(self, learned_N: float, force_N: float, dt_s: float) -> None:
-        """Take the change `learned_N` that one reading made to the fit's force, which now is `force_N`.
-
-        Begins a dispute when the changes of late exceed what a device changes by itself. Nothing happens before
-        LEARNS_S of sliding.
-        """
+        """Take the change `learned_N` that one reading made to the fit's force, which now is `force_N`."""
         if not self.has_slid:
             return
         self.moved_N += learned_N
@@ -168,31 +152,18 @@ class SensorTrust:
 
     def compare(self, fit: DeviceFit, model_N: float) -> None:
         """Begin a dispute where the mean of the last readings has left `fit`, unless the device has slid for under
-        LEARNS_S.
-
-        Call it instead of `fit_moved` for a reading that teaches the fit nothing. `model_N` is the model's force. The
-        mean has left the fit's force when it is off by more than MOVED_N, `slack_N` and SURE standard deviations of the
-        fit together.
-        """
+        LEARNS_S."""
         over_N = self.measured_N - fit.force_N(model_N)
         if self.has_slid and abs(over_N) > MOVED_N + self.slack_N + SURE * fit.deviation_N(model_N):
             self._begin(over_N)
 
     def zero_moved(self, found_N: float) -> float:
-        """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts the fit, N.
-
-        In a dispute that began since the reversal the shift is `found_N` times the handle's `direction`, else 0. The
-        force that has relaxed, `relaxed_N`, counts from 0 again.
-        """
+        """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts the fit, N."""
         self.relaxed_N = 0.0
         return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute. Call it in a dispute only.
-
-        `device`: the dispute ends, and the next takes LEARNS_S of sliding, or readings that no device gives. `sensor`:
-        the sensor counts as wrong, and the dispute lasts, until readings agree for TRUSTED_AGAIN_S or longer.
-        """
+        """Take the operator's word in a dispute."""
         if wrong == "device":
             self._settle()
             self.known_s = self.excused_N = 0.0
@@ -208,12 +179,7 @@ class SensorTrust:
     def _update_slack(
         self, fit: DeviceFit, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float, dt_s: float
     ) -> None:
-        """Update `slack_N`: what the device may show that its fit did not, as conditions have changed of late.
-
-        It is raised at once by what the model's force and the rate differ from their means. A zero that is not known
-        raises it, too, twice after a turn. It is forgotten over LATELY_S. Also updates these means, and the handle's
-        direction.
-        """
+        """Update `slack_N`: what the device may show that its fit did not, as conditions have changed of late."""
         # where the handle has turned a wrong zero counts twice
         is_turned = direction * self.direction < 0.0
         slack_N = (
@@ -229,13 +195,7 @@ class SensorTrust:
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LATELY_S)
 
     def _judge(self, over_N: float, is_strange: bool, dt_s: float) -> None:
-        """Judge who is right by how much the readings are over the fit's force, `over_N`.
-
-        With `is_strange` no device gives such readings: after WRONG_S of them the sensor is doubted, in a dispute. A
-        dispute ends once readings have agreed for AGREES_S, of a doubted sensor for TRUSTED_AGAIN_S. They have to agree
-        for longer than a reading that drifts on as it did would, but not over DRIFTS_S. In a dispute `lead_N` follows
-        readings above the fit, by RISES_N_S at most; it returns to 0 for others, and for a doubted sensor.
-        """
+        """Judge who is right by how much the readings are over the fit's force, `over_N`."""
         agrees = not is_strange and abs(over_N) <= AGREES_N
         self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
         if self.wrong_s > WRONG_S and not self.is_doubted:
@@ -268,11 +228,7 @@ class SensorTrust:
         self.back_N, self.moved_N = -self.moved_N, 0.0
 
     def _fade_moved(self, force_N: float, dt_s: float) -> None:
-        """Bring `moved_N` towards 0 by what is excused, and by what the device relaxes in `dt_s`.
-
-        A loss of force may be relaxing, and adds to `relaxed_N`. A gain may be won back, and takes off. Either ends at
-        RELAXED of the force, `force_N` >= 0.
-        """
+        """Bring `moved_N` towards 0 by what is excused, and by what the device relaxes in `dt_s`."""
         self._excuse(dt_s)
         self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
         relaxes_N = RELAXES_1_S * force_N * dt_s
@@ -283,11 +239,7 @@ class SensorTrust:
         self.relaxed_N = relaxed_N
 
     def _excuse(self, dt_s: float) -> None:
-        """Move from `moved_N` to `excused_N` what the slack of the last `dt_s` explains.
-
-        A field law of another shape errs anew at each force, and as much again where the force returns. So as the force
-        nears the usual, what is excused goes back to `moved_N`: a drift that steps have hidden is seen there.
-        """
+        """Move from `moved_N` to `excused_N` what the slack of the last `dt_s` explains."""
         most_N = EXCUSED * abs(self.model_N - self.usual_N) + EXCUSED_N
         by_slack_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
         now_N = self.excused_N + min(max(self.moved_N, -by_slack_N), by_slack_N)
@@ -296,11 +248,7 @@ class SensorTrust:
         self.excused_N = now_N
 
     def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
-        """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices.
-
-        Compared is their mean over FILTER_S. Relaxing, noise and `zero_sd_N`, how well the zero is known, widen the
-        bounds. `model_N` is the model's force.
-        """
+        """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices."""
         if self.freshness.is_frozen:
             return True
         unknown_N = NOISE_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)

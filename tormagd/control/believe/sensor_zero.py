@@ -39,10 +39,7 @@ LONGEST_TURN_S: Final = 10.0
 
 @final
 class Level(Value):
-    """Means over a handle's newest sliding one way: reading along the motion, model's force, and rate without sign.
-
-    `heard_s` is the time of sliding in the means, and `until_s` the host time of the last reading.
-    """
+    """Means over a handle's newest sliding one way: reading along the motion, model's force, and rate without sign."""
 
     def __init__(self, reading_N: float, model_N: float, rate_mm_s: float, heard_s: float, until_s: float) -> None:
         self.reading_N: Final = reading_N
@@ -52,10 +49,7 @@ class Level(Value):
         self.until_s: Final = until_s
 
     def heard(self, reading_N: float, model_N: float, rate_mm_s: float, dt_s: float, now_s: float) -> "Level":
-        """Return the level with one more reading, which stands for `dt_s` > 0 and came at `now_s`.
-
-        The mean is plain over the first LEVEL_S and forgets after them.
-        """
+        """Return the level with one more reading, which stands for `dt_s` > 0 and came at `now_s`."""
         heard_s = self.heard_s + dt_s
         share = dt_s / min(heard_s, max(LEVEL_S, dt_s))
         return Level(
@@ -69,10 +63,7 @@ class Level(Value):
 
 @final
 class SensorZero:
-    """Estimator of one sensor's zero, `zero_N`, with its variance.
-
-    It keeps the levels of the handle's present way and of the way before, until a reversal has told the zero.
-    """
+    """Estimator of one sensor's zero, `zero_N`, with its variance."""
 
     zero_N: float = 0.0
     "What the sensor reads without a force."
@@ -90,17 +81,13 @@ class SensorZero:
     "Level of the way before, until the two have been compared; None without one."
 
     def sd_N(self, now_s: float) -> float:
-        """Return the zero's standard deviation at `now_s`, N, at most MAX_SD_N.
-
-        It grows from the first reading, or the newest reversal that told the zero; at an earlier `now_s` it has not
-        grown. Before the first reading it is TARED_SD_N. After `doubt` it is MAX_SD_N until a reversal or `trust`.
-        """
+        """Return the zero's standard deviation at `now_s`, N, at most MAX_SD_N."""
         since_s = max(now_s - self.told_s, 0.0)
         drifted_N2 = DRIFT_N2_S * since_s * max(since_s / WANDERS_S, 1.0)
         return math.sqrt(min(self.variance_N2 + drifted_N2, MAX_SD_N * MAX_SD_N))
 
     def begin(self, now_s: float) -> None:
-        """Note the first reading at `now_s`: from then on the variance grows. Later calls change nothing."""
+        """Note the first reading at `now_s`: from then on the variance grows."""
         self.told_s = min(self.told_s, now_s)
 
     def doubt(self) -> None:
@@ -108,10 +95,7 @@ class SensorZero:
         self.undoubted_N2, self.variance_N2 = self.variance_N2, MAX_SD_N * MAX_SD_N
 
     def trust(self) -> None:
-        """Take back the last `doubt`: the variance from before returns, unless a reversal has made it smaller.
-
-        Call it only after a `doubt`.
-        """
+        """Take back the last `doubt`: the variance from before returns, unless a reversal has made it smaller."""
         self.variance_N2 = min(self.variance_N2, self.undoubted_N2)
 
     def update(
@@ -125,15 +109,7 @@ class SensorZero:
         scale: float,
         scale_sd: float,
     ) -> bool:
-        """Take one reading, and return whether a reversal has told the zero just now.
-
-        Zero and variance have then changed. A reversal tells the zero once the handle has slid for LEVEL_S both ways.
-        It does not after a turn of over LONGEST_TURN_S, or where the zero found is beyond MAX_ZERO_N. Either way the
-        level before is spent. The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1: give no reading of a
-        handle at rest. `reading_N` is the force that is read against this motion, with the zero in it. `model_N` is the
-        model's, without `scale`. The reading stands for `dt_s` > 0. `scale` is the device's force over the model's,
-        known to within `scale_sd`. All arguments are finite; nothing is checked.
-        """
+        """Take one reading, and return whether a reversal has told the zero just now."""
         level = self.level
         if level is None or direction != self.direction:
             # a mean over too short a time is no level
@@ -150,11 +126,7 @@ class SensorZero:
     def _compare(
         self, now_s: float, before: Level, level: Level, between_s: float, scale: float, scale_sd: float
     ) -> bool:
-        """Learn the zero from the levels before and after a reversal, and return whether they told it.
-
-        They do not tell it where `between_s`, the time between them, is over LONGEST_TURN_S, or the zero found is
-        beyond MAX_ZERO_N. `scale` is the device's force over the model's, known to within `scale_sd`.
-        """
+        """Learn the zero from the levels before and after a reversal, and return whether they told it."""
         by_model_N = level.model_N - before.model_N
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - scale * by_model_N)
         if between_s > LONGEST_TURN_S or abs(found_N) > MAX_ZERO_N:

@@ -21,8 +21,7 @@ SLOWEST_MM_S: Final = 0.3
 FASTEST_MM_S: Final = 2.0 * STRIBECK_MM_S
 "A faster handle does not creep."
 SLOWS_S: Final = 0.1
-"""A handle that slows down creeps after some SLOWS_S. One that sticks and slips does not: if the gap opened whenever it
-sticks, it would slip further."""
+"""A handle that slows down creeps after some SLOWS_S."""
 BRISTLES_N_MM: Final = 8.0
 "Stiffness of the contact's bristles, sample 1's (plant card): friction follows a rising field as they are bent."
 LEARNED_S: Final = 0.3
@@ -38,10 +37,7 @@ NOISE_N: Final = 0.03
 
 @final
 class SlowFriction:
-    """Estimator of one device's factor k, its force at rest over its force at speed, and of how much of it was learned.
-
-    It also keeps the model's force as far as the contact's bristles have followed it, `followed_N`.
-    """
+    """Estimator of one device's factor k, its force at rest over its force at speed, and of how much of it was learned."""
 
     factor: float = 1.0
     "k, before its bounds: a fit that errs at another rate, and comes back, leaves it as it was."
@@ -65,27 +61,17 @@ class SlowFriction:
         self._most: Final = most
 
     def factor_at(self, rate_mm_s: float) -> float:
-        """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest.
-
-        `factor_bounds` hold k.
-        """
+        """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
         return 1.0 + _slowness(rate_mm_s) * (min(max(self.factor, self._least), self._most) - 1.0)
 
     def slide(self, now_s: float, sliding_mm_s: float) -> None:
-        """Update `creep_mm_s` with the level of rate that friction has, `sliding_mm_s` >= 0, at `now_s`.
-
-        A rise is followed at once, a fall over SLOWS_S. Times must not fall.
-        """
+        """Update `creep_mm_s` with the level of rate that friction has, `sliding_mm_s` >= 0, at `now_s`."""
         from_mm_s = min(self.creep_mm_s, FASTEST_MM_S)
         self.creep_mm_s = max(low_pass(from_mm_s, sliding_mm_s, now_s - self.slid_s, SLOWS_S), sliding_mm_s)
         self.slid_s = now_s
 
     def follow(self, model_N: float, handle_mm: float) -> float:
-        """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`, and return it.
-
-        A fall is followed at once. A rise is followed by 1 - exp(-BRISTLES_N_MM travel / model_N), with the handle's
-        travel since the last call. The first call counts from 0 mm and 0 N.
-        """
+        """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`, and return it."""
         rise_N = model_N - self.followed_N
         if rise_N > 0.0 and model_N > 0.0:
             rise_N *= 1.0 - math.exp(-BRISTLES_N_MM * abs(handle_mm - self.handle_mm) / model_N)
@@ -94,24 +80,14 @@ class SlowFriction:
         return self.followed_N
 
     def rescale(self, before_N: float, after_N: float, rate_mm_s: float) -> None:
-        """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N` to `after_N`.
-
-        It stays where k was learned, and by the share that was `learned` there. The nearer to that `rate_mm_s` >= 0 is,
-        at which the fit learned, the less it stays: one reading cannot teach both. A force of 0 or less changes
-        nothing.
-        """
+        """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N` to `after_N`."""
         if before_N > 0.0 and after_N > 0.0:
             kept = self.learned * max(1.0 - _slowness(rate_mm_s) / self.slowness, 0.0)
             at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
             self.factor = 1.0 + (min(max(at_creep, self._least), self._most) - 1.0) / self.slowness
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within `believable`.
-
-        Call it behind `follow`. `reading_N` is the force against the motion, less the sensor's zero. A force below what
-        any device gives teaches nothing. That the handle creeps, and the force of `fit` at `followed_N` is above 0 N,
-        is not checked.
-        """
+        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within `believable`."""
         if reading_N < self._bounds.min_scale * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
@@ -129,16 +105,12 @@ def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
 
 
 def believable(fit: DeviceFit, model_N: float, bounds: DeviceBounds) -> tuple[float, float]:
-    """Return the least and the greatest k of a device with this `fit`, where the model's force is `model_N`.
-
-    The force of `fit` at `model_N` must be above 0 N.
-    """
+    """Return the least and the greatest k of a device with this `fit`, where the model's force is `model_N`."""
     unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
     least, most = factor_bounds(bounds)
     return max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)
 
 
 def _slowness(rate_mm_s: float) -> float:
-    """Return e(v): 1 at rest, 0 at speed."""
     ratio = rate_mm_s / STRIBECK_MM_S
     return math.exp(-ratio * ratio)

@@ -22,7 +22,7 @@ OFFSET_SD_N: Final = 0.1
 "Spread of the offset of devices not yet seen: what relaxation and hysteresis do around 0.5 N."
 ERROR_N2_S: Final = 3e-4
 """Density of what the model does not follow, N^2 s: with these spreads a new device is learned in some hundredths of a
-second. Chosen on sample 1 and draws 0 to 11, for their steps."""
+second."""
 SCALE_LASTS_S: Final = 600.0
 "Time constant in which the scale is forgotten: the device has warmed, by a kelvin or less."
 SCALE_VARIANCE: Final = SCALE_SD * SCALE_SD
@@ -31,8 +31,7 @@ SURE: Final = 2.0
 "Standard deviations within which a force is taken to lie."
 SURPRISE_S: Final = 0.03
 SURPRISE_N: Final = 0.01
-"""A mean error over SURPRISE_S of more than SURPRISE_N is the device's own. Its offset is then learned sooner: at twice
-SURPRISE_N in a fifth of its time."""
+"""A mean error over SURPRISE_S of more than SURPRISE_N is the device's own."""
 MIN_ADAPTS_IN_S: Final = 0.04
 "However great the surprise, the offset is learned no sooner than in this time."
 
@@ -73,12 +72,10 @@ class DeviceFit(Value):
 
     @property
     def scale_sd(self) -> float:
-        """Standard deviation of the scale."""
         return math.sqrt(max(self.scale_variance, 0.0))
 
     @property
     def offset_sd_N(self) -> float:
-        """Standard deviation of the offset."""
         return math.sqrt(max(self.offset_variance_N2, 0.0))
 
     def force_N(self, model_N: float) -> float:
@@ -128,11 +125,7 @@ class DeviceFit(Value):
         )
 
     def surely_within_N(self, max_N: float, bounds: DeviceBounds) -> float:
-        """Return the model's force, N, at which the device, taken SURE deviations stronger, gives `max_N`.
-
-        The result is held from `max_N` / `bounds.max_scale` to `max_N` / `bounds.min_scale`. The first is returned
-        where the fit is so uncertain that no force is surely within `max_N`.
-        """
+        """Return the model's force, N, at which the device, taken SURE deviations stronger, gives `max_N`."""
         # scale m + offset + SURE sqrt(variance of that) = max, a quadratic: the smaller root is where the sum is meant
         room_N, sure = max_N - self.offset_N, SURE * SURE
         square = self.scale * self.scale - sure * self.scale_variance
@@ -149,10 +142,7 @@ UNSEEN: Final = DeviceFit()
 
 
 def forgotten(fit: DeviceFit, dt_s: float, adapts_in_s: float) -> DeviceFit:
-    """Return the fit after `dt_s` without a reading: its variances go to those of a device not yet seen.
-
-    Scale and offset stay. The offset's variance goes sooner where `adapts_in_s`, s, is less.
-    """
+    """Return the fit after `dt_s` without a reading: its variances go to those of a device not yet seen."""
     keeps_scale = math.exp(-dt_s / SCALE_LASTS_S)
     keeps_offset = math.exp(-dt_s * ERROR_N2_S / (2.0 * OFFSET_VARIANCE_N2 * (adapts_in_s * adapts_in_s)))
     return DeviceFit(
@@ -175,13 +165,7 @@ def observe(
     learns_scale: bool = True,
     learns_offset: bool = True,
 ) -> tuple[DeviceFit, bool]:
-    """Return the fit after one reading, and whether one of the `bounds` held its scale.
-
-    `measured_N` is the reading, `model_N` the model's force, `dt_s` the time since the last reading. At `dt_s` <= 0 the
-    fit is unchanged. The offset adapts in about `adapts_in_s`, and is not bounded here. Where the scale is held, the
-    offset alone takes the error. Without `learns_scale` or `learns_offset` this value stays, and its variance counts
-    (Schmidt). All arguments are finite.
-    """
+    """Return the fit after one reading, and whether one of the `bounds` held its scale."""
     if dt_s <= 0.0:
         return fit, False
     prior = forgotten(fit, dt_s, adapts_in_s)
@@ -221,21 +205,13 @@ class Strength:
     "Whether scale or offset is at one of its bounds."
 
     def __init__(self, adapts_in_s: float, bounds: DeviceBounds, learns: tuple[bool, bool]) -> None:
-        """Begin with the fit of a device not yet seen.
-
-        `adapts_in_s` is the time in which the offset adapts without surprise. `learns` says whether scale and offset
-        are learned.
-        """
+        """Begin with the fit of a device not yet seen."""
         self._adapts_in_s: Final = adapts_in_s
         self._bounds: Final = bounds
         self._learns: Final = learns
 
     def update(self, model_N: float, reading_N: float, dt_s: float) -> None:
-        """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`.
-
-        Scale and offset are held within the bounds; `is_held` says so. Updates `surprise_N`, with which the offset is
-        learned sooner.
-        """
+        """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`."""
         error_N = reading_N - self.fit.force_N(model_N)
         self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)
         adapts_in_s = self._adapts_in_s / (1.0 + (self.surprise_N / SURPRISE_N) ** 2)

@@ -26,12 +26,7 @@ class Acted:
 
 @final
 class Drive(Value):
-    """The duties of one tick, and the limits that held the gap back.
-
-    left_duty, right_duty     as the device takes them, each within its limit
-    left_motor, right_motor   the duties that the motors need at their nominal supply
-    limits                    the limits that held the gap back
-    """
+    """The duties of one tick, and the limits that held the gap back."""
 
     def __init__(
         self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: list[Limit]
@@ -44,10 +39,7 @@ class Drive(Value):
 
 
 class Actuator:
-    """What makes the gap follow a plan, by duties of two motors.
-
-    `begin`, `resume` and `update` raise NotImplementedError; each actuator gives its own.
-    """
+    """What makes the gap follow a plan, by duties of two motors."""
 
     reference: Reference | None = None
     "Where the gap is driven; None while nothing is driven."
@@ -79,13 +71,8 @@ class Actuator:
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """Return the duties of one tick, `dt_s` > 0 after the last. Call `begin` first, and again after `stop`.
-
-        `measurement` is the device's newest, `measured` what is made of it; `now_s` is on the clock of `plan.time_s`.
-        `plan` None holds the gap. With or without one it opens while the force is over the ceiling, `is_over`. The gap
-        is never to be closer than the plan's least. Updates `reference`, `acted`, and may learn `acceleration_scale`.
-        Raises DomainError for a duty that is not finite: call `forget` then.
-        """
+        """Return the duties of one tick, `dt_s` > 0 after the last. Call `begin` first, and again after `stop`. Raises
+        DomainError for a duty that is not finite: call `forget` then."""
         raise NotImplementedError
 
     def stop(self) -> None:

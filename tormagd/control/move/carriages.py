@@ -38,12 +38,7 @@ LAGGING_MM: Final = 0.1
 
 @final
 class Carriages(Actuator):
-    """The actuator that drives the two carriages of one device.
-
-    It keeps the gap's reference, the gap expected behind it, and a position loop for each carriage. Carriages whose
-    motors are livelier than believed get ahead of what is expected, and `acceleration_scale` grows. Weaker ones are
-    asked for no less.
-    """
+    """The actuator that drives the two carriages of one device."""
 
     def __init__(self, config: Config, scene: Scene) -> None:
         super().__init__()
@@ -77,11 +72,7 @@ class Carriages(Actuator):
         self.right.begin()
 
     def resume(self, measured: Measured) -> None:
-        """Go on from the measured gap and speed after a blind time, in which the device kept its last duty.
-
-        Reference and expected gap begin there anew. The speed counts as no faster than the motors' own, either way; the
-        integrals stay.
-        """
+        """Go on from the measured gap and speed after a blind time, in which the device kept its last duty."""
         self.reference = self._begun_at(measured)
 
     def forget(self) -> None:
@@ -98,14 +89,7 @@ class Carriages(Actuator):
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """Return the duties of one tick, `dt_s` > 0 after the last, and take both position loops one tick on.
-
-        `plan` None holds the gap. With or without one it opens while the force is over the ceiling, `is_over`.
-        `measured` gives places and speeds, `measurement` the open switches and the supply. The limits OVER_FORCE, RATE
-        and SATURATED may show, in this order. Updates reference, expected gap, integrals and counts, and may learn
-        `acceleration_scale`. Call `begin` first: an actuator without a reference raises AssertionError. Raises
-        DomainError for a duty that is not finite: call `forget` then.
-        """
+        """Return the duties of one tick, `dt_s` > 0 after the last, and take both position loops one tick on."""
         assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
         # a homed carriage may be found beyond the closed end: its pull counts as at the closed end
@@ -144,15 +128,7 @@ class Carriages(Actuator):
         is_over: bool,
         limits: list[Limit],
     ) -> tuple[Reference, bool]:
-        """Return the reference `dt_s` later, and whether the limit of its acceleration held it back.
-
-        Where the carriages are LAGGING_MM behind what is expected, and the target is behind them, it turns at once:
-        from the `measured` gap.
-        With `plan` None the reference comes to rest. A force over the ceiling (`is_over`) sends it open, with
-        OVER_FORCE. What holds the gap back is added to `limits`: RATE only with a plan, and only where speed leaves it
-        over LAGGING_MM behind. Counts one more tick in `acted.rate` where speed limits the reference, and in
-        `acted.slew` where acceleration does. The caller keeps the reference.
-        """
+        """Return the reference `dt_s` later, and whether the limit of its acceleration held it back."""
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
@@ -173,21 +149,13 @@ class Carriages(Actuator):
         return reference, is_slewed
 
     def _begun_at(self, measured: Measured) -> Reference:
-        """Begin the expected gap anew at the measured gap and speed, and return a reference there.
-
-        The speed counts as no faster than the motors' own, either way.
-        """
+        """Begin the expected gap anew at the measured gap and speed, and return a reference there."""
         speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
         self.expected.begin(measured.gap_mm, speed_mm_s)
         return Reference(measured.gap_mm, speed_mm_s)
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
-        """Return the gap's speeds, mm/s: at no load, and the greatest that the reference may open and close with.
-
-        `pull` is the duty that the magnets' pull takes: to open, it leaves less. Where the carriages are over WEAK_MM
-        from where they are expected, their measured speed takes the place of the motors'. This speed counts as at least
-        half of the motors', so that a carriage held still is found by its following error. Changes nothing.
-        """
+        """Return the gap's speeds, mm/s: at no load, and the greatest that the reference may open and close with."""
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
@@ -197,11 +165,7 @@ class Carriages(Actuator):
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
-        """Update `acceleration_scale` after a period in which the acceleration limit held the reference back.
-
-        The errors are the gap's place and speed, expected minus measured: carriages that are ahead raise it, others
-        lower it, within 1 to MAX_ACCELERATION_SCALE. While the reference slows down or rests nothing is learned.
-        """
+        """Update `acceleration_scale` after a period in which the acceleration limit held the reference back."""
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
             return
         # a carriage that did not get as far as it should is not ahead because it need not come back as far
@@ -211,12 +175,7 @@ class Carriages(Actuator):
         self.acceleration_scale = min(max(scale, 1.0), MAX_ACCELERATION_SCALE)
 
     def _feed_forward(self, reference: Reference, pull: float) -> float:
-        """Return one carriage's duty, positive to open and not limited, at the nominal supply.
-
-        It is for half the reference's speed and acceleration, the gap's, with friction and the magnets' `pull`, a duty.
-        The pull counts only to open; both fade while the carriage's speed is below COULOMB_SPEED_MM_S. The duty is 0 in
-        a scene without the term `motor`.
-        """
+        """Return one carriage's duty, positive to open and not limited, at the nominal supply."""
         if not self._has_motor:
             return 0.0
         speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
@@ -229,13 +188,7 @@ class Carriages(Actuator):
         return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
     def _drive(self, left: float, right: float, supply_V: float, limits: list[Limit]) -> Drive:
-        """Return the duties at the device's real supply, held within the duty limit.
-
-        `left` and `right` are the loops' duties at the nominal supply: `left_motor` and `right_motor` of the result.
-        The same volts take less duty of a higher supply. A `supply_V` under half of the nominal counts
-        as half. Counts a tick with a saturated loop or a duty out of range in `acted.range`. SATURATED is added to
-        `limits`, which the result keeps, where a loop is saturated.
-        """
+        """Return the duties at the device's real supply, held within the duty limit."""
         is_saturated = self.left.is_saturated or self.right.is_saturated
         if is_saturated:
             limits.append(Limit.SATURATED)

@@ -29,11 +29,7 @@ _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
 
 @final
 class Homing:
-    """The watch on one homing of the device after another; `faults` are those of the newest look.
-
-    It keeps how far open each carriage has been, which open switches were seen, and for how long the force was too
-    great.
-    """
+    """The watch on one homing of the device after another; `faults` are those of the newest look."""
 
     is_running: bool = False
     "Whether the device homes, as of the newest look."
@@ -59,12 +55,10 @@ class Homing:
     "What was wrong at the newest look."
 
     def __init__(self, ceiling_N: float) -> None:
-        """Begin before a homing. `ceiling_N` is the force that the sensor may show at any time."""
         self._ceiling_N: Final = ceiling_N
 
     @property
     def went_back_mm(self) -> tuple[float, float]:
-        """How far the left and the right carriage have come back towards closed from where they were most open."""
         return self.left_mm - self.left_at_mm, self.right_mm - self.right_at_mm
 
     def __str__(self) -> str:
@@ -78,11 +72,7 @@ class Homing:
         )
 
     def update(self, now_s: float, measurement: Measurement) -> None:
-        """Take one look at the device, and set `faults`: WRONG_DIRECTION, HOMING, OVER_FORCE, STATUS_STALE, or none.
-
-        At most one is set, for this look only. The first look at a homing, and a device that neither homes nor has just
-        stopped homing, have none. `now_s` is on the clock of `measurement.reported_s`.
-        """
+        """Take one look at the device, and set `faults`: WRONG_DIRECTION, HOMING, OVER_FORCE, STATUS_STALE, or none."""
         self.faults = ()
         if measurement.mode is not _HOMING:
             if self.is_running:
@@ -93,10 +83,7 @@ class Homing:
             self._follow(now_s, measurement)
 
     def _begin(self, now_s: float, measurement: Measurement) -> None:
-        """Begin with a device that was found homing: note the time, its places and switches, and the force it may show.
-
-        That force is the ceiling, or RISES times what the sensor shows now, without its sign, where this is more.
-        """
+        """Begin with a device that was found homing: note the time, its places and switches, and the force it may show."""
         self.is_running, self.began_s, self.time_s, self.over_s = True, now_s, now_s, 0.0
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -104,12 +91,7 @@ class Homing:
         self.max_N = max(self._ceiling_N, RISES * abs(measurement.force_N))
 
     def _follow(self, now_s: float, measurement: Measurement) -> None:
-        """Watch a homing that goes on, and set the first fault that shows; else leave `faults`.
-
-        In this order: `_went_back` over BACKS_OFF_MM, HOMING after LONGEST_S, OVER_FORCE, STATUS_STALE. OVER_FORCE
-        shows after over OVER_S of too much force without a break, STATUS_STALE for a Status older than STATUS_S. Notes
-        places, switches and time.
-        """
+        """Watch a homing that goes on, and set the first fault that shows; else leave `faults`."""
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -126,12 +108,7 @@ class Homing:
             self.faults = (Fault.STATUS_STALE,)
 
     def _end(self, now_s: float, measurement: Measurement) -> None:
-        """Judge a homing that has ended, and set `faults`; it is done, given up, or ended by a request to open.
-
-        A homed device that has not shown both open switches, now or before, has the fault HOMING. One that
-        is latched and not homed has that of `_went_back`, where a carriage went over WENT_BACK_MM towards closed. The
-        places are those of the look before. Others have none.
-        """
+        """Judge a homing that has ended, and set `faults`; it is done, given up, or ended by a request to open."""
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN
         if measurement.is_homed:
@@ -141,12 +118,7 @@ class Homing:
             self.faults = (self._went_back(WENT_BACK_MM, measurement),)
 
     def _went_back(self, most_mm: float, measurement: Measurement) -> Fault:
-        """Return the fault of a carriage that has gone over `most_mm` towards closed from where it was most open.
-
-        HOMING where its open switch is closed there: the device believes a switch that is stuck, or another's. Else
-        WRONG_DIRECTION. That a carriage has gone so far is the caller's to know. The way counts from the beginning, and
-        again from when the device sets its zero.
-        """
+        """Return the fault of a carriage that has gone over `most_mm` towards closed from where it was most open."""
         left_mm, right_mm = self.went_back_mm
         is_left_stuck = left_mm > most_mm and measurement.is_left_open
         is_right_stuck = right_mm > most_mm and measurement.is_right_open
@@ -154,5 +126,4 @@ class Homing:
 
 
 def _outermost_mm(outermost_mm: float, last_mm: float, now_mm: float) -> float:
-    """Return how far open a carriage has been; begin anew at `now_mm` where the device has set its zero."""
     return now_mm if abs(now_mm - last_mm) > ZEROED_MM else max(outermost_mm, now_mm)

@@ -31,12 +31,7 @@ class TransferFunction(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Stability margins of the open position loop.
-
-    gain_margin_dB     to more or less gain, whichever is nearer, within +-MAX_MARGIN_DB; negative where the loop swings
-    phase_margin_deg   negative where the loop swings
-    crossover_Hz       where the gain falls through 1 for the last time; 0.05 Hz where it never does
-    """
+    """Stability margins of the open position loop."""
 
     gain_margin_dB: float
     phase_margin_deg: float
@@ -49,11 +44,7 @@ def full_speed_mm_s(motor: Motor) -> float:
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:
-    """Return the voltage that one motor needs against the magnets' pull, to open from `gap_mm` >= 0.
-
-    `stated_V` is the voltage at PULL_STATED_MM (`motor.pull_V`), 0 for a pull that does not count. The pull falls with
-    the fourth power of `gap_mm` + PULL_DEPTH_MM. Nothing is checked.
-    """
+    """Return the voltage that one motor needs against the magnets' pull, to open from `gap_mm` >= 0."""
     nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
     nearness *= nearness
     return stated_V * nearness * nearness
@@ -70,12 +61,7 @@ def electrical_time_s(motor: Motor) -> float:
 
 
 def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
-    """Return H(z) from duty to carriage position, mm, of third order, exact for a duty held over each period.
-
-    `period_s` > 0 is its sampling time. Friction and load are left out. Numerator and denominator have 4 coefficients
-    each, the highest power of z first; the numerator's first is 0, the denominator's 1. Nothing is checked: the
-    configuration has.
-    """
+    """Return H(z) from duty to carriage position, mm, of third order, exact for a duty held over each period."""
     inductance_H = motor.inductance_mH * 1e-3
     advance_mm = motor.screw_lead_mm / (2.0 * math.pi * motor.gear_ratio)
     # states: current A, motor speed rad/s, carriage position mm; last row and column carry the held input
@@ -102,11 +88,7 @@ def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
 
 
 def _exponential(matrix: Array) -> Array:
-    """Return the exponential of a square matrix, by scaling and squaring a Taylor series; the matrix stays as it is.
-
-    It is exact to rounding for matrices of a few rows. An element that is not finite raises ValueError or
-    OverflowError.
-    """
+    """Return the exponential of a square matrix, by scaling and squaring a Taylor series; the matrix stays as it is."""
     squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300))) + 4)
     scaled = matrix / 2.0**squarings
     total = term = np.eye(len(matrix))
@@ -119,23 +101,13 @@ def _exponential(matrix: Array) -> Array:
 
 
 def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
-    """Return the delay, s, beyond one period's exchange, that the position loop bears before it swings.
-
-    It is the phase margin over the crossover, of a loop that already has the delay of one period; 0 where that loop
-    swings. `period_s` is the control period.
-    """
+    """Return the delay, s, beyond one period's exchange, that the position loop bears before it swings."""
     known = margins(motor, position, period_s)
     return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
 
 
 def margins(motor: Motor, position: Position, period_s: float, *, delay_periods: float = 1.0) -> Margins:
-    """Return the margins of one carriage's position loop as it is computed: PID and its filter in z, H(z), and a delay.
-
-    They are the gain margin, dB, the phase margin, degrees, and the crossover, Hz; see `Margins`. Margins are negative
-    where the loop swings, and then the gain margin is how much less gain would end that. `delay_periods` is the delay
-    of the exchange, in periods of `period_s`. They are read from 4,000 frequencies from 0.05 Hz to half the sampling
-    rate, so the crossover is one of these. Nothing is checked.
-    """
+    """Return the margins of one carriage's position loop as it is computed: PID and its filter in z, H(z), and a delay."""
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)
     plant = zero_order_hold(motor, period_s)

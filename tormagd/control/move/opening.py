@@ -35,11 +35,7 @@ _FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED
 
 
 def is_open(measurement: Measurement, is_placed: bool) -> bool:
-    """Tell whether the gap is open.
-
-    With `is_placed` the carriages' places are known: both have to be within OPEN_MM of their open switches or beyond,
-    whatever the contacts say. Without it, the contacts of both open switches have to be closed.
-    """
+    """Tell whether the gap is open."""
     if is_placed:
         return min(measurement.left_mm, measurement.right_mm) >= -OPEN_MM
     return measurement.is_left_open and measurement.is_right_open
@@ -47,11 +43,7 @@ def is_open(measurement: Measurement, is_placed: bool) -> bool:
 
 @final
 class Opening:
-    """The watch on the opening of a device that is not driven by the core; `faults` are those of the newest look.
-
-    It keeps how late each carriage is, how long a device without known places has not been open, and which requests
-    count.
-    """
+    """The watch on the opening of a device that is not driven by the core; `faults` are those of the newest look."""
 
     is_watching: bool = False
     "Whether the newest look was judged."
@@ -91,21 +83,11 @@ class Opening:
         )
 
     def rest(self, request_number: int) -> None:
-        """Stop watching, and clear `faults`: the device is driven, homes or has gone.
-
-        Requests up to `request_number` are not judged.
-        """
+        """Stop watching, and clear `faults`: the device is driven, homes or has gone."""
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
-        """Take one look at a device that is not driven, and set `faults` to NOT_OPENING or to none.
-
-        With `is_placed` the carriages' places are known, but with `is_blind` not at present: then, and without
-        `is_placed`, the device's word is judged. `safety` gives the newest request and its number. Known places are
-        judged whether or not the device was asked to open. After a fault the next look clears `faults`, and the device
-        is not judged before another request. A device that homes is not judged either. The first look after `rest`, or
-        after one that judged nothing, counts from its own time.
-        """
+        """Take one look at a device that is not driven, and set `faults` to NOT_OPENING or to none."""
         number = safety.request_number
         if self.faults:
             self.told_request, self.faults = number, ()
@@ -131,17 +113,11 @@ class Opening:
         self._place(measurement)
 
     def _place(self, measurement: Measurement) -> None:
-        """Note the carriages' places and the device's time."""
         self.device_s = measurement.device_time_s
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
 
     def _judge_by_places(self, measurement: Measurement) -> None:
-        """Judge the carriages by their places, and set `faults` to NOT_OPENING where one is later than LATE_S.
-
-        Else `faults` stays. Updates how late both are, and where; `waits_s` becomes 0. The device's own opening speed,
-        lower at a low supply voltage, says how far they should have come. Time is that since the last State, on the
-        device's clock.
-        """
+        """Judge the carriages by their places, and set `faults` to NOT_OPENING where one is later than LATE_S."""
         dt_s = max(measurement.device_time_s - self.device_s, 0.0)
         share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
         speed_mm_s = share * self._full_mm_s
@@ -154,12 +130,7 @@ class Opening:
 
     def _judge_by_word(self, measurement: Measurement, is_asked: bool, is_placed: bool) -> None:
         """Judge the device by its word, while its places are unknown or the loop is blind; may set `faults` to
-        NOT_OPENING.
-
-        A device that says that it opens is late after a search's time. One that was asked to open (`is_asked`) and does
-        not is late after LATE_S. A device that shows both open switches, or a failure, is not late: `waits_s` becomes
-        0. It counts the time between Status messages, at most REPORT_S each. Without `is_placed` the places are noted.
-        """
+        NOT_OPENING."""
         if not is_placed:
             self._place(measurement)
         dt_s = min(measurement.reported_s - self.reported_s, REPORT_S)
@@ -175,9 +146,4 @@ class Opening:
 
 
 def _late_s(late_s: float, before_mm: float, now_mm: float, speed_mm_s: float) -> float:
-    """Return how late a carriage is at `now_mm`, s, that is `late_s` late if it stood at `before_mm`.
-
-    `speed_mm_s` > 0 is what it should open with. One that goes back is later still. A carriage within OPEN_MM of its
-    open switch is not late, and none is less than 0 s late.
-    """
     return 0.0 if now_mm >= -OPEN_MM else max(late_s - (now_mm - before_mm) / speed_mm_s, 0.0)

@@ -20,10 +20,7 @@ ON_TARGET_MM: Final = 0.001
 
 @final
 class Pid:
-    """The position loop of one carriage: it keeps the integral, and whether the newest duty was held back.
-
-    The integral starts at 0: friction holds a resting carriage.
-    """
+    """The position loop of one carriage: it keeps the integral, and whether the newest duty was held back."""
 
     integral: float = 0.0
     "The integral part of the duty."
@@ -42,22 +39,12 @@ class Pid:
         self.integral, self.is_saturated = 0.0, False
 
     def rest(self, error_mm: float, dt_s: float) -> None:
-        """Let the integral decay for `dt_s`, in the integral time, where |`error_mm`| is at most ON_TARGET_MM.
-
-        Further away it stays. Call it before `update` while the reference rests.
-        """
+        """Let the integral decay for `dt_s`, in the integral time, where |`error_mm`| is at most ON_TARGET_MM."""
         if abs(error_mm) <= ON_TARGET_MM:
             self.integral = self.integral * self._integral_time_s / (self._integral_time_s + dt_s)
 
     def update(self, error_mm: float, error_mm_s: float, feed_forward: float, dt_s: float, is_blocked: bool) -> float:
-        """Return the duty, within the duty limit, `dt_s` > 0 after the last; update `integral` and `is_saturated`.
-
-        `error_mm` is the place error, `error_mm_s` the speed error, both wanted less measured and positive to open;
-        `feed_forward` is a duty. The duty uses the integral from before; `integral` is then that of the next update,
-        within the duty limit. Where `is_blocked`, opening moves nothing: no duty above 0 is given, the integral does
-        not rise, and this is no saturation. Raises DomainError for a duty that is not finite or beyond LARGEST: nothing
-        has changed then. `dt_s` is not checked.
-        """
+        """Return the duty, within the duty limit, `dt_s` > 0 after the last; update `integral` and `is_saturated`."""
         proportional = self._proportional_per_mm * error_mm
         derivative = self._proportional_per_mm * self._derivative_time_s * error_mm_s
         asked = proportional + self.integral + derivative + feed_forward

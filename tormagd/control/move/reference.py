@@ -27,11 +27,7 @@ class Reference(Value):
 
 @final
 class Speeds(Value):
-    """Speeds of the gap, mm/s, > 0.
-
-    no_load_mm_s                 where the motors have no torque left
-    opening_mm_s, closing_mm_s   the reference's greatest each way
-    """
+    """Speeds of the gap, mm/s, > 0."""
 
     def __init__(self, no_load_mm_s: float, opening_mm_s: float, closing_mm_s: float) -> None:
         self.no_load_mm_s: Final = no_load_mm_s
@@ -40,12 +36,7 @@ class Speeds(Value):
 
 
 def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
-    """Return where `plan` leads, with speed and acceleration, `lag_s` from now, when the present duty takes effect.
-
-    A plan is carried on by its age, CARRY_S at most, and `lag_s`; one from the future has the age 0. The least gap
-    `floor_mm` and the greatest `open_mm` hold the place, and end the motion towards them. The plan's own least gap is
-    not looked at: the caller puts it into `floor_mm`. Nothing is checked; NaN in the plan stays.
-    """
+    """Return where `plan` leads, with speed and acceleration, `lag_s` from now, when the present duty takes effect."""
     age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + lag_s
     gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
     speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
@@ -65,15 +56,7 @@ def follow(
     speeds: Speeds,
     floor_mm: float = -math.inf,
 ) -> tuple[Reference, bool, bool]:
-    """Return the reference `dt_s` > 0 later, and two limits: whether speed held it back, and whether acceleration did.
-
-    The reference closes no faster than it can stop at `floor_mm`, but is not moved out of there. It approaches `target`
-    at the greatest speed that it can still brake from with `acceleration_mm_s2`. So a step is time-optimal and does not
-    overshoot. The target's own speed is added, which follows a moving target without lag. A target that turns round
-    leaves less to brake with, MIN_BRAKING of it at least. While speeding up, the acceleration falls to nothing at
-    `speeds.no_load_mm_s`. A reference that moves away from its target brakes with up to twice as much at that speed, as
-    a motor does. Speeds are held within `speeds` each way. Nothing is checked, and `reference` stays as it is.
-    """
+    """Return the reference `dt_s` > 0 later, and two limits: whether speed held it back, and whether acceleration did."""
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
     relative = max(relative, MIN_BRAKING * acceleration_mm_s2)
@@ -93,11 +76,7 @@ def follow(
 
 
 def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> float:
-    """Return the greatest speed, mm/s, from which `distance_mm` >= 0 still suffices to come to rest in steps of `dt_s`.
-
-    It brakes with `braking_mm_s2` > 0. The speed is at most the distance in APPROACH_S, or in `dt_s` where that is
-    more, which counts near the target; 0 at no distance. A negative distance is not checked, and may raise ValueError.
-    """
+    """Return the greatest speed, mm/s, from which `distance_mm` >= 0 still suffices to come to rest in steps of `dt_s`."""
     change = braking_mm_s2 * dt_s
     fastest = (math.sqrt(change * change + 8.0 * braking_mm_s2 * distance_mm) - change) / 2.0
     return min(fastest, distance_mm / max(APPROACH_S, dt_s))
@@ -105,10 +84,7 @@ def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> flo
 
 @final
 class Expected:
-    """The gap that the carriages are expected at: the reference with its jerk limited.
-
-    The windings take the acceleration with a lag, and the exchange adds a delay.
-    """
+    """The gap that the carriages are expected at: the reference with its jerk limited."""
 
     gap_mm: float = 0.0
     speed_mm_s: float = 0.0
@@ -120,11 +96,7 @@ class Expected:
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """Follow the place and speed of `reference` for `dt_s` > 0, with the time constant `lag_s`.
-
-        `filtered_mm_s` follows the speed with the time constant `filter_s`, as the measured speeds are filtered. All
-        three fields change. Nothing is checked: NaN stays until `begin`.
-        """
+        """Follow the place and speed of `reference` for `dt_s` > 0, with the time constant `lag_s`."""
         self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
         self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)
         self.filtered_mm_s = low_pass(self.filtered_mm_s, self.speed_mm_s, dt_s, filter_s)

@@ -27,7 +27,7 @@ OVER_HELD_S: Final = 0.03
 OVER_FAULT_S: Final = 0.1
 "A force over the ceiling opens the gap after OVER_HELD_S, and is a fault after OVER_FAULT_S."
 OVER_FADES: Final = 0.25
-"While it is under, the time over it falls by so much a second. A force that is over again and again is a fault, too."
+"While it is under, the time over it falls by so much a second."
 SENSOR_FAULT_S: Final = 2.0
 "A sensor not believed for so long of sliding is a fault: forces are then only as good as the model."
 SENSE_FAULT_S: Final = 0.1
@@ -39,8 +39,7 @@ WENT_AGAINST_S: Final = 0.015
 "Carriages that come apart, or to a stop, do so by wrong wiring if one has gone against its duty for so long."
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
-"""Shares of the delay that the position loop bears besides its own period. A round trip over the first is a limit; over
-the second a fault, and refuses enabling."""
+"""Shares of the delay that the position loop bears besides its own period."""
 CLOCK_OFF: Final = 0.01
 CLOCK_FAULT: Final = 0.1
 "A device's clock that is off by more than CLOCK_OFF is a limit, by more than CLOCK_FAULT a fault."
@@ -51,20 +50,13 @@ _DEVICE_RUN: Final = DeviceMode.RUN
 
 
 def ceiling_N(scene: Scene) -> float:
-    """Return the greatest force, N, that the sensor may show in `scene`.
-
-    It is STARTS_OVER times the scene's greatest force, plus OVER_N.
-    """
+    """Return the greatest force, N, that the sensor may show in `scene`."""
     return STARTS_OVER * scene.force.most_N + OVER_N
 
 
 @final
 class Watch:
-    """The watch on one device: counts for how long a driven device misbehaves, and tells its faults and limits.
-
-    It keeps these times, when the device was enabled, and the newest duties. Times add up the ticks' lengths, s: a
-    process that stood still saw nothing.
-    """
+    """The watch on one device: counts for how long a driven device misbehaves, and tells its faults and limits."""
 
     enabled_s: float = math.inf
     "When the device was enabled; inf while it is not."
@@ -106,12 +98,7 @@ class Watch:
         self._ceiling_N: Final = ceiling_N(scene)
 
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
-        """Return `conditions` completed by the carriages' skew, and by the greatest values that a command may find.
-
-        The values are those of skew, mm, round trip, s, and clock drift, a share. Nothing is judged here: `command`
-        does. `measured` is None while the device is silent: the conditions are then not fresh, and the skew is
-        infinite. Without a silence they are as fresh as they were.
-        """
+        """Return `conditions` completed by the carriages' skew, and by the greatest values that a command may find."""
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
@@ -136,15 +123,7 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        """Return all faults that show now, and change nothing: `operating_state.latch` sorts them.
-
-        Those that the device reports may always show, OUT_OF_STROKE while it is homed and its places count. `leap` is
-        an encoder step that no carriage makes, None without one: ENCODER shows once a later Status has come, and
-        OUT_OF_STROKE does not. `sensor_doubted_s` is how long of sliding the force sensor has not been believed. Faults
-        of link and motion show only while `safety.is_driven`, those of motion not during a leap. DEVICE_NOT_RUNNING
-        shows alone, where a driven device is not in RUN once STARTING_S have passed since enabling. Motion is judged by
-        the times that `update` counted. Empty: nothing is wrong.
-        """
+        """Return all faults that show now, and change nothing: `operating_state.latch` sorts them."""
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
@@ -166,12 +145,7 @@ class Watch:
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """Return the limits that show now, and change nothing: SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK.
-
-        They show, in this order, over the warning skew, for SHOWN_S after a stall of the loop, and with a Sense older
-        than `sight.unsensed_s`. LINK_DEGRADED shows on a lossy wire, or a round trip over SLOW_SHARE, CLOCK for a
-        device's clock off by over CLOCK_OFF, either way.
-        """
+        """Return the limits that show now, and change nothing: SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK."""
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
@@ -187,14 +161,7 @@ class Watch:
         return limits
 
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
-        """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`.
-
-        Duties are the motors', at the nominal supply. Counts for how long a gap strays from `reference_mm`, a carriage
-        stands or goes against its duty, and the force is over the ceiling. Where its cause has gone, a count begins
-        again; that of the force falls by OVER_FADES s a second. A gap strays by over `limits.following_error_mm`; a
-        reference of NaN is no straying. On a brake the force counts only while the handle moves. The duties are kept
-        for the next tick.
-        """
+        """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`."""
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
@@ -210,11 +177,7 @@ class Watch:
         self.left_duty = self.right_duty = 0.0
 
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
-        """Return the faults that the device reports; none while a clearing of its faults may still be under way.
-
-        A command timeout of the device is the fault HOST_STALL where this host has just stalled for nearly as long. So
-        it is where that fault is latched already. Changes nothing.
-        """
+        """Return the faults that the device reports; none while a clearing of its faults may still be under way."""
         shown: int = measurement.faults
         if not shown or now_s < safety.clearing_until_s:
             return []
@@ -224,13 +187,7 @@ class Watch:
         return list(device_faults(measurement.faults, is_host_stall=is_ours))
 
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
-        """Return the faults of the link: messages too old, a round trip too long, a device's clock too far off.
-
-        They are, in this order, MEASUREMENT_STALE, SENSE_STALE, STATUS_STALE, LINK_DEGRADED and CLOCK; empty for none.
-        While the answer to the first Drive after a stall may be on its way, no message is too old. A Sense is too old
-        only where the scene needs the sensor. A State's delay on the line counts as age. Ages are as of half a period
-        from now. Changes nothing.
-        """
+        """Return the faults of the link: messages too old, a round trip too long, a device's clock too far off."""
         faults: list[Fault] = []
         # the tick nearest to the end of a timeout judges it: the next one could be a period late
         at_s = now_s + self._period_s / 2.0
@@ -249,12 +206,7 @@ class Watch:
         return faults
 
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
-        """Return the faults of motion and force, by the counted times; empty for none. Changes nothing.
-
-        WRONG_DIRECTION, SKEW, FOLLOWING_ERROR, OVER_FORCE, SENSOR and NO_MOTION may show. `sensor_doubted_s` is for how
-        long of sliding the force sensor has not been believed, s. SENSOR is one only where the scene needs the sensor,
-        OVER_FORCE only on a brake. A carriage against its duty shows sooner with SKEW or NO_MOTION.
-        """
+        """Return the faults of motion and force, by the counted times; empty for none."""
         faults: list[Fault] = []
         is_skewed = abs(measured.skew_mm) > self._max_apart_mm
         is_still = self.still_s > self._no_motion_time_s
@@ -273,11 +225,7 @@ class Watch:
         return faults
 
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
-        """Tell whether a carriage stands while it is driven the same way as a step before; one of the two is enough.
-
-        It is driven by a duty over `limits.no_motion_duty`, without its sign. It stands below STILL_MM_S. The duties of
-        the step before are those kept; a kept 0 counts as positive. Changes nothing.
-        """
+        """Tell whether a carriage stands while it is driven the same way as a step before; one of the two is enough."""
         # a duty that turns round before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
         is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
@@ -286,12 +234,7 @@ class Watch:
         return is_left_still or is_right_still
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        """Count in `opposed_s`, by `dt_s`, for how long a carriage moves against its duty.
-
-        Only a duty over `limits.no_motion_duty`, without its sign, drives a carriage, and only a speed over STILL_MM_S
-        is a motion. While either carriage moves against its duty, `opposed_s` grows by `dt_s`. Else it becomes 0 where
-        one moves the right way or none is driven, and stays where driven carriages stand.
-        """
+        """Count in `opposed_s`, by `dt_s`, for how long a carriage moves against its duty."""
         left_mm_s = right_mm_s = 0.0
         is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
         if is_left_driven:

@@ -28,10 +28,7 @@ from tormagd.lab.tables import read_columns
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab characterise`: a kind of record, and for each kind its own.
-
-    `handle` of the parsed options is the function for that kind, which `run` calls.
-    """
+    """Add the options of `tormag-lab characterise`: a kind of record, and for each kind its own."""
     kinds = parser.add_subparsers(required=True)
     pressed, pulled, held = (kinds.add_parser(name) for name in ("compression", "tension", "relaxation"))
     for kind, handle in ((pressed, compression), (pulled, tension), (held, relaxation)):
@@ -51,29 +48,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the constants of one record, by the function for its kind. Raises LabError and DomainError."""
+    """Return the constants of one record, by the function for its kind."""
     return Found(options.handle(options))
 
 
 def compression(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the keys of `moduli` for the evaluated cycle of a compression test, its number `cycle`, and `deviations`.
-
-    These are sentences, as the function of that name gives them. Options read: `file`, `diameter_mm`, `height_mm`,
-    `cycle`, from 1, and `terms`. Raises LabError as `read_compression`, `evaluated_cycle` and `moduli`, and DomainError
-    as `Sample` and `moduli`.
-    """
+    """Return the keys of `moduli` for the evaluated cycle of a compression test, its number `cycle`, and `deviations`."""
     record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
     curve = evaluated_cycle(record, sample, options.cycle)
     return {"cycle": options.cycle, "deviations": deviations(record, sample), **moduli(curve, options.terms)}
 
 
 def tension(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the keys of `moduli` for the rows of a tension test from `from_strain` to `to_strain`, these included.
-
-    Options read: `file`, `delimiter`, the columns `strain`, a fraction, and `stress_mpa`, MPa, both bounds, and
-    `terms`. Raises LabError as `read_columns` and `moduli`, DomainError as `moduli`. Rows of other strains are read,
-    too, and refused alike.
-    """
+    """Return the keys of `moduli` for the rows of a tension test from `from_strain` to `to_strain`, these included."""
     names = (options.strain, options.stress_mpa)
     columns = read_columns(options.file, names, delimiter=options.delimiter)
     strain, stress_MPa = (columns[name] for name in names)
@@ -82,12 +69,7 @@ def tension(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
-    """Fit three laws to a curve and return each one's shear modulus, `shear_modulus_kPa`, and R2, `r2`.
-
-    Keys: `points`, their number; `stretch`, least and most; `neo_hookean`; `ogden`, up to `terms` terms, also with
-    `moduli_kPa` and `exponents`; `thesis_eq_3`, Eq. 3 as printed, also with `G_o_kPa` and `alpha`. Raises LabError and
-    DomainError as `fit_ogden`.
-    """
+    """Fit three laws to a curve and return each one's shear modulus, `shear_modulus_kPa`, and R2, `r2`."""
     neo_hookean, ogden = fit_neo_hookean(*curve), fit_ogden(*curve, terms=terms)
     thesis = fit_thesis_ogden(*curve)
     return {
@@ -110,12 +92,7 @@ def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
 
 
 def relaxation(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the fit of the relaxation record in `options.file`, with up to `options.branches` time constants.
-
-    Keys: `fractions` and `times_s` of the series, lists with the shortest time first. Also `scale_N`, the instant force
-    per unit of driving force, `r2`, and `rms_N` of the residual. Raises LabError as `read_columns` and
-    `fit_relaxation`, DomainError as the latter.
-    """
+    """Return the fit of the relaxation record in `options.file`, with up to `options.branches` time constants."""
     record = RelaxationRecord(**read_columns(options.file, RelaxationRecord._fields))
     fit = fit_relaxation(record, options.branches)
     return {

@@ -40,7 +40,6 @@ class Sample:
 
     @property
     def area_m2(self) -> float:
-        """Undeformed cross-section, m^2."""
         return math.pi * (self.diameter_mm * 1e-3) ** 2 / 4.0
 
 
@@ -60,8 +59,7 @@ class StressStretch(NamedTuple):
 
 
 def read_compression(path: Path) -> CompressionRecord:
-    """Read a CSV file with `time_s,displacement_mm,force_N`. Raises `LabError` as `read_columns`, and where time does
-    not rise strictly."""
+    """Read a CSV file with `time_s,displacement_mm,force_N`."""
     record = CompressionRecord(**read_columns(path, CompressionRecord._fields))
     if not (np.diff(record.time_s) > 0.0).all():
         raise LabError(f"{path}: time_s does not rise strictly")
@@ -69,12 +67,7 @@ def read_compression(path: Path) -> CompressionRecord:
 
 
 def loading_halves(record: CompressionRecord) -> list[slice]:
-    """Return the loading half of each cycle, in order, as a slice of rows; empty where the plates only opened.
-
-    It goes from the smallest displacement before the cycle to the largest in it, which is included. A cycle passes
-    three quarters of the record's whole stroke, and then one quarter or the end. Raises `LabError` if the plates moved
-    by 1 um or less.
-    """
+    """Return the loading half of each cycle, in order, as a slice of rows; empty where the plates only opened."""
     displacement = record.displacement_mm
     low, high = float(displacement.min()), float(displacement.max())
     if not high - low > 1e-3:
@@ -95,10 +88,7 @@ def loading_halves(record: CompressionRecord) -> list[slice]:
 
 
 def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCLES) -> StressStretch:
-    """Return stretch and stress in the loading half of `cycle`, counted from 1: under 1 and negative in compression.
-
-    Raises `LabError` if the record has no such cycle, the plates hardly moved, or they reach the sample's height in it.
-    """
+    """Return stretch and stress in the loading half of `cycle`, counted from 1: under 1 and negative in compression."""
     halves = loading_halves(record)
     if not 1 <= cycle <= len(halves):
         raise LabError(f"cycle {cycle} of {len(halves)}: the record holds no such cycle")
@@ -110,12 +100,7 @@ def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCL
 
 
 def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
-    """Return where a test differs from ISO 7743 with lubricated plates, one sentence each; empty if nowhere.
-
-    Judged are the sample (test piece A), the number of cycles, and each one's strain and rate while loading. The
-    thesis's 30 mm is outside, which matters little: the shear modulus from lubricated plates does not depend on the
-    diameter. Raises `LabError` if the plates hardly moved.
-    """
+    """Return where a test differs from ISO 7743 with lubricated plates, one sentence each; empty if nowhere."""
     halves = loading_halves(record)
     found = []
     for name, value, nominal in (("diameter", sample.diameter_mm, 29.0), ("height", sample.height_mm, 12.5)):

@@ -30,20 +30,12 @@ class MooneyRivlin(NamedTuple):
 
 
 def stretches(radial: float, circumferential: float) -> Array:
-    """Return the principal stretches (3) with these two; incompressibility gives the axial one (Eq. 14).
-
-    Both are above 0: 0 raises ZeroDivisionError, and less is not refused.
-    """
+    """Return the principal stretches (3) with these two; incompressibility gives the axial one (Eq."""
     return np.array([radial, circumferential, 1.0 / (radial * circumferential)])
 
 
 def cauchy_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressure_Pa: float) -> Array:
-    """Return the true stress T, Pa (3 x 3), of a stretch (3) and a field b (3), T (Eq. 25 and 27); tension is positive.
-
-    The order is radial, circumferential, axial. `b_T` is the field per undeformed area. `pressure_Pa` is the multiplier
-    p of the incompressibility, which only the boundary settles: see `pressure_for_free_ends_Pa`. Without strain and
-    field, p = 2 C10 + 4 C01 makes the stress zero. No value is checked, nor that the stretch keeps the volume.
-    """
+    """Return the true stress T, Pa (3 x 3), of a stretch (3) and a field b (3), T (Eq."""
     square, flux_T = stretch**2, stretch * b_T
     # I1 - lambda_i^2 is the sum of the two other squares
     elastic = 2.0 * square * (material.c10_Pa + material.c01_Pa * (np.roll(square, 1) + np.roll(square, 2)))

@@ -37,7 +37,7 @@ _STARTS = 4
 
 
 def thesis_shape(stretch: FloatArray, exponent: float) -> FloatArray:
-    """Return Eq. 3 over mu, the true stress of Ogden's law; by expm1 no digits are lost towards lambda = 1."""
+    """Return Eq."""
     log = np.log(stretch)
     return 2.0 / exponent * np.exp(-0.5 * exponent * log) * np.expm1(1.5 * exponent * log)
 
@@ -56,50 +56,29 @@ class Fit(NamedTuple):
 
     @property
     def shear_modulus_Pa(self) -> float:
-        """Initial shear modulus, a third of the slope at lambda = 1."""
         return sum(self.moduli_Pa)
 
 
 def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit:
-    """Fit the shear modulus of the neo-Hookean law to stretch and engineering stress, Pa (n each, 2 at least).
-
-    Its `exponents` are (2.0,). Raises `LabError` and `DomainError` like `fit_ogden`, but needs no third point.
-    """
+    """Fit the shear modulus of the neo-Hookean law to stretch and engineering stress, Pa (n each, 2 at least)."""
     _check(stretch, stress_Pa, 2)
     return _fitted(ogden_shape, stretch, stress_Pa, (2.0,))
 
 
 def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit:
-    """Fit Ogden's law with up to `terms` terms, 1..3, to stretch and engineering stress, Pa (n each), in any order.
-
-    A term whose best modulus is zero is dropped. Exponents are from 0.05 to 30, terms in no set order. Negative
-    exponents are left out, because one direction of loading cannot tell them from positive ones. Under tension alpha =
-    -2 (alpha' - 1) grows like alpha', but the two differ widely under compression.
-
-    Raises `LabError` for other `terms`, arrays of another shape, and fewer than 2 points a term and one more. Raises it
-    for a stretch or stress that does not vary, and for stress of the wrong sign, which no positive modulus fits. Raises
-    `DomainError` for NaN, a stretch outside 0.05..20, and a stress beyond 1e12 Pa either way.
-    """
+    """Fit Ogden's law with up to `terms` terms, 1..3, to stretch and engineering stress, Pa (n each), in any order."""
     if not 1 <= terms <= MAX_TERMS:
         raise LabError(f"terms = {terms}: allowed is 1..{MAX_TERMS}")
     return _searched(ogden_shape, stretch, stress_Pa, terms)
 
 
 def fit_thesis_ogden(stretch: Array, stress_Pa: Array) -> Fit:
-    """Fit Eq. 3 of the thesis as printed, one term with alpha > 0, to stretch and stress, Pa (n each, 3 at least).
-
-    Raises like `fit_ogden`.
-    """
+    """Fit Eq."""
     return _searched(thesis_shape, stretch, stress_Pa, 1)
 
 
 def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit:
-    """Return the best fit of a law with up to `terms` terms, each of which has the stress `shape`, to a curve.
-
-    `shape` takes stretches and an exponent, and returns stress over modulus. It is searched from the best _STARTS
-    points of a grid of exponents. Raises LabError and DomainError for a curve that `fit_ogden` refuses; `terms` is not
-    checked.
-    """
+    """Return the best fit of a law with up to `terms` terms, each of which has the stress `shape`, to a curve."""
     _check(stretch, stress_Pa, 2 * terms + 1)
 
     def norm(exponents: tuple[float, ...]) -> float:
@@ -121,10 +100,7 @@ def _searched(shape: Shape, stretch: Array, stress_Pa: Array, terms: int) -> Fit
 
 
 def _moduli(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return the best moduli >= 0, Pa, for given exponents, in their order, and the residual (n).
-
-    The residual is the law's stress less `stress_Pa`, over the norm of `stress_Pa`.
-    """
+    """Return the best moduli >= 0, Pa, for given exponents, in their order, and the residual (n)."""
     columns = np.column_stack([shape(stretch, exponent) for exponent in exponents])
     # columns and stress to unit size: the shapes differ by many orders of magnitude
     sizes, size_Pa = np.linalg.norm(columns, axis=0), float(np.linalg.norm(stress_Pa))
@@ -133,10 +109,7 @@ def _moduli(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[flo
 
 
 def _fitted(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[float, ...]) -> Fit:
-    """Return the law of `shape` with these exponents and its best moduli, without terms of modulus 0.
-
-    Raises LabError where no modulus is positive. The curve is not checked: a stress that does not vary makes r2 NaN.
-    """
+    """Return the law of `shape` with these exponents and its best moduli, without terms of modulus 0."""
     moduli, residual = _moduli(shape, stretch, stress_Pa, exponents)
     if not (moduli > 0.0).any():
         raise LabError("the stress does not rise with the stretch: no positive modulus fits")
@@ -147,11 +120,7 @@ def _fitted(shape: Shape, stretch: Array, stress_Pa: Array, exponents: tuple[flo
 
 
 def _check(stretch: Array, stress_Pa: Array, least: int) -> None:
-    """Refuse stretch and stress unless they are `least` pairs or more, in range and not constant.
-
-    Raises LabError for too few, other shapes, and what does not vary. Raises DomainError for a stretch outside
-    MIN_STRETCH to MAX_STRETCH, a stress beyond 1e12 Pa, and NaN.
-    """
+    """Refuse stretch and stress unless they are `least` pairs or more, in range and not constant."""
     if stretch.ndim != 1 or stretch.shape != stress_Pa.shape or len(stretch) < least:
         raise LabError(f"stretch {stretch.shape}, stress_Pa {stress_Pa.shape}: wanted are {least} pairs or more")
     require("stretch", stretch, MIN_STRETCH, MAX_STRETCH)

@@ -48,16 +48,7 @@ class RelaxationFit:
 
 
 def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit:
-    """Fit a series of up to `branches` (1..6) time constants; the fit has them in rising order.
-
-    The element counts as rested at the first row. The driving force is linear between rows, so a step is two rows close
-    together. Time constants are sought from a third of the shortest time step to three times the record. A slower one
-    cannot be told from the equilibrium. Branches that the record does not show are dropped.
-
-    Raises `LabError` for other `branches`, and for a record of too few rows, not in order, or without a change of
-    force. A record that leaves no force at equilibrium is too short and raises `LabError`, too. Raises `DomainError`
-    for values out of range.
-    """
+    """Fit a series of up to `branches` (1..6) time constants; the fit has them in rising order."""
     _check(record, branches)
     span = float(record.time_s[-1] - record.time_s[0])
     low, high = math.log(float(np.diff(record.time_s).min()) / 3.0), math.log(3.0 * span)
@@ -90,11 +81,7 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
 
 
 def _columns(record: RelaxationRecord, times_s: Array) -> Array:
-    """Return an array (n, 1 + branches) for the n rows of `record`: the driving force, then each branch's response.
-
-    A branch has one time constant of `times_s`, s. Responses are in the driving force's unit and begin at 0, at rest.
-    Each is updated exactly for a force that is linear between rows.
-    """
+    """Return an array (n, 1 + branches) for the n rows of `record`: the driving force, then each branch's response."""
     ratios = np.diff(record.time_s)[:, None] / times_s
     changes = np.diff(record.driving)[:, None] * -np.expm1(-ratios) / ratios
     decays = np.exp(-ratios)
@@ -112,23 +99,14 @@ def _responded(response: float, step: tuple[float, float]) -> float:
 
 
 def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
-    """Return the coefficients (1 + branches) for the time constants `times_s`, s, and the residual (n), N.
-
-    A coefficient is a force, N, per unit of driving force, 0 or more: that of equilibrium, then one for each time
-    constant. The residual is fitted less measured. `record` is not checked.
-    """
+    """Return the coefficients (1 + branches) for the time constants `times_s`, s, and the residual (n), N."""
     columns = _columns(record, times_s)
     coefficients, _ = nnls(columns, record.force_N)
     return coefficients, columns @ coefficients - record.force_N
 
 
 def _check(record: RelaxationRecord, branches: int) -> None:
-    """Refuse a record that is not fit for so many branches, or a wrong number of them; else do nothing.
-
-    Raises LabError for `branches` outside 1..MAX_BRANCHES, columns of different length, and under 4 rows a branch and 2
-    more. It is raised, too, where times do not rise strictly, or one of the two forces never changes. Raises
-    DomainError for NaN, a time beyond +-1e12 s, and a force of either column beyond +-MAX_FORCE_N.
-    """
+    """Refuse a record that is not fit for so many branches, or a wrong number of them; else do nothing."""
     if not 1 <= branches <= MAX_BRANCHES:
         raise LabError(f"branches = {branches}: allowed is 1..{MAX_BRANCHES}")
     rows = len(record.time_s)

@@ -51,11 +51,7 @@ KINDS = {
 
 
 def write_parquet(summaries: dict[str, Summary], url: str) -> None:
-    """Write `summaries`, by file name, as Parquet to `url`, a file or a URL; what is there is replaced.
-
-    A row has `file` and the fields of a Summary. Without summaries the table has no rows. Raises OSError, also where
-    its folder does not exist; ValueError for an unknown kind of URL, ImportError where its package is missing.
-    """
+    """Write `summaries`, by file name, as Parquet to `url`, a file or a URL; what is there is replaced."""
     fields = msgspec.structs.fields(Summary)
     columns = [("file", pyarrow.string()), *((field.name, KINDS[field.type]) for field in fields)]
     rows = [{"file": name, **msgspec.structs.asdict(each)} for name, each in summaries.items()]
@@ -65,11 +61,7 @@ def write_parquet(summaries: dict[str, Summary], url: str) -> None:
 
 
 def _cells(console: Console) -> tuple[str, ...]:
-    """Return a console's texts for a person, one under each of HEADINGS.
-
-    `unknown` stands for what no recording says. At most MAX_LIMITS limits are told, those of most time, none under
-    MIN_SHARE of it; every fault is. What recordings say is made printable.
-    """
+    """Return a console's texts for a person, one under each of HEADINGS."""
     errors_N = (console.tracking_rms_N, console.worst_rms_N)
     held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= MIN_SHARE][:MAX_LIMITS]
     faults = [f"{code} in {count}" for code, count in console.faults.items()]
@@ -88,10 +80,7 @@ def _cells(console: Console) -> tuple[str, ...]:
 
 
 def _shown(drift: Drift | None, form: str) -> str:
-    """Return the first and newest value in `form`, a format of floats, and the change per day where it is known.
-
-    As `1.000..1.080 (+0.04/day)`; `unknown` for None. Two values that look alike are shown once, without a change.
-    """
+    """Return the first and newest value in `form`, a format of floats, and the change per day where it is known."""
     if drift is None:
         return "unknown"
     first, newest = f"{drift.first:{form}}", f"{drift.newest:{form}}"
@@ -115,14 +104,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Sum up all recordings in `options.recordings`, a folder or a URL; for a person as a table of consoles.
-
-    Figures: `consoles`, a list of Console; `recordings`, a Summary by file name; `left_out`, reasons by file name.
-    `options.out`, unless None, gets a Parquet file of the recordings. The exit code is 1 where a file was left out, and
-    2 where `out` could not be written; both are told on stderr. Raises LabError where there is nothing to read, for an
-    unknown kind of URL, and where its package is missing. Raises OSError where the place cannot be reached, and as
-    `executors.chosen`.
-    """
+    """Sum up all recordings in `options.recordings`, a folder or a URL; for a person as a table of consoles."""
     try:
         urls = files(options.recordings)
     except (ValueError, ImportError) as error:

@@ -44,12 +44,7 @@ class Wanted(Glance, total=False):
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of one recording; what was not recorded is null, or an empty text.
-
-    `trim` is the device's force over its model's, `current_A` the RMS of the motor that needed more. `clock_drift_ppm`
-    by how much the device's clock runs fast. Each is over the time ENABLED. `tracking_rms_N` is that of while
-    following, with the sensor's noise in it. Of a trim, a clock and a temperature it is the median.
-    """
+    """Figures of one recording; what was not recorded is null, or an empty text."""
 
     serial_number: int | None
     insert: str
@@ -73,13 +68,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(file: BinaryIO, name: str) -> Summary:
-    """Return the summary of the recording in `file`, open and seekable, which errors call `name`.
-
-    Figures of the device and lateness are of ticks while ENABLED, or of no stated operating state. Limits and faults
-    are of the whole recording. What the recording does not say, or says as another type, is None or an empty text.
-    Raises RecordingError and OSError where it cannot be read, and ValueError for one without messages. A recording that
-    was cut is summed up as far as it goes, with `is_complete` False.
-    """
+    """Return the summary of the recording in `file`, open and seekable, which errors call `name`."""
     builder, enabled = OverviewBuilder(), {name: array("d") for name in FIGURES}
 
     def take(seen: Seen) -> None:
@@ -123,12 +112,7 @@ def summarise(file: BinaryIO, name: str) -> Summary:
 
 
 def files(url: str) -> dict[str, str]:
-    """Return the full address of every file of READ in and under a folder or URL, by its path there, sorted by that.
-
-    `url` may also be one file, which is then returned by its name. Empty where no name fits. Nothing is read. Raises
-    FileNotFoundError where there is no such folder or file, and OSError where it cannot be listed. Raises ValueError
-    for an unknown kind of URL, and ImportError for one whose package is missing.
-    """
+    """Return the full address of every file of READ in and under a folder or URL, by its path there, sorted by that."""
     system, root = fsspec.core.url_to_fs(url)
     if not system.exists(root):
         raise FileNotFoundError(f"{url}: no such folder or file")
@@ -138,12 +122,7 @@ def files(url: str) -> dict[str, str]:
 
 
 def read(url: str) -> Summary | Report | str:
-    """Read the file at `url`; return a recording's summary, a commissioning's report, or the reason why there is none.
-
-    A name that ends with SUFFIX is a recording, any other a report, of which MAX_BYTES are read. A reason is one
-    sentence for a person: the file is missing, not regular, damaged, or says nothing. Raises ImportError for a kind of
-    address whose package is missing.
-    """
+    """Read the file at `url`; return a recording's summary, a commissioning's report, or the reason why there is none."""
     name = url.rpartition("/")[2]
     try:
         system, path = fsspec.core.url_to_fs(url)
@@ -158,11 +137,7 @@ def read(url: str) -> Summary | Report | str:
 
 
 def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summary], dict[str, Report], dict[str, str]]:
-    """Read all files of `urls`, addresses by name, by `executor`; return summaries, reports and reasons, each by name.
-
-    Every name is in one of the three, which have the order of `urls`. A reason says why a file has neither; a failed
-    worker makes one, too, and no error. The progress is shown on stderr.
-    """
+    """Read all files of `urls`, addresses by name, by `executor`; return summaries, reports and reasons, each by name."""
     found: dict[str, Summary | Report | str] = {}
     for url, future in finished(executor, read, urls.values(), "recording"):
         error = future.exception()
@@ -176,10 +151,7 @@ def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summar
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """A quantity of a device in its first and newest recording, and its change per day by a straight line through all.
-
-    `per_day` is null where the recordings are too few or of one day.
-    """
+    """A quantity of a device in its first and newest recording, and its change per day by a straight line through all."""
 
     first: float
     newest: float
@@ -187,10 +159,7 @@ class Drift(msgspec.Struct, frozen=True):
 
 
 class Console(msgspec.Struct, frozen=True, kw_only=True):
-    """All recordings of one device with one insert; unknown is None, or an empty text for the insert.
-
-    `tracking_rms_N` is over all time ENABLED, `worst_rms_N` of the worst recording.
-    """
+    """All recordings of one device with one insert; unknown is None, or an empty text for the insert."""
 
     serial_number: int | None
     insert: str
@@ -210,12 +179,7 @@ class Console(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Console]:
-    """Return one console for each device and insert, sorted by serial number and insert.
-
-    Recordings of unknown devices count as one device, which comes first. A device that was only commissioned has a
-    console, too, with an empty text as insert and 0 recordings. Each console of a device has the newest of its reports,
-    None without one. Empty for no input.
-    """
+    """Return one console for each device and insert, sorted by serial number and insert."""
     groups: dict[tuple[int, str], list[Summary]] = defaultdict(list)
     for each in summaries:
         groups[-1 if each.serial_number is None else each.serial_number, each.insert].append(each)
@@ -229,11 +193,7 @@ def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Co
 
 
 def _console(serial_number: int, insert: str, group: list[Summary], commissioned: Report | None) -> Console:
-    """Return the console of a group of recordings; what none of them says is None.
-
-    The group is in order of time, which is not checked, and may be empty. A `serial_number` below 0 is unknown. The
-    error over all is weighted by the time ENABLED. `commissioned` is taken as it is.
-    """
+    """Return the console of a group of recordings; what none of them says is None."""
     enabled_s = sum(each.enabled_s for each in group)
     errors = [(each.enabled_s, each.tracking_rms_N) for each in group if each.tracking_rms_N is not None]
     limits_s: Counter[str] = Counter()
@@ -256,10 +216,7 @@ def _console(serial_number: int, insert: str, group: list[Summary], commissioned
 
 
 def _pooled(errors: list[tuple[float, float]]) -> float | None:
-    """Return the RMS over all parts from (duration, RMS) of each, weighted by duration; None without parts.
-
-    Where all durations are 0, parts weigh alike.
-    """
+    """Return the RMS over all parts from (duration, RMS) of each, weighted by duration; None without parts."""
     if not errors:
         return None
     weights, rms_N = np.array(errors).T
@@ -267,10 +224,7 @@ def _pooled(errors: list[tuple[float, float]]) -> float | None:
 
 
 def _drift(values: list[tuple[float, float | None]]) -> Drift | None:
-    """Return the drift of (start, s, value) pairs in order of time, ignoring None; None where no value is known.
-
-    Its `per_day` is None for under MIN_RECORDINGS known values or MIN_DAYS from the first to the newest.
-    """
+    """Return the drift of (start, s, value) pairs in order of time, ignoring None; None where no value is known."""
     known = [(start_s, value) for start_s, value in values if value is not None]
     if not known:
         return None

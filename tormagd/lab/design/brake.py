@@ -15,11 +15,7 @@ CLOSED_MM, OPEN_MM = 45.0, 95.0
 
 @dataclass(frozen=True, slots=True)
 class Brake:
-    """An elastomer in a geometry between magnets whose gap goes from `closed_mm` to `open_mm`.
-
-    Raises `DomainError` unless both gaps lie in the field law's range, closed below open. It also does where the
-    elastomer does not bear the field of the closed gap (lambda1 >= 0.05).
-    """
+    """An elastomer in a geometry between magnets whose gap goes from `closed_mm` to `open_mm`."""
 
     field: FieldLaw
     elastomer: Elastomer
@@ -36,43 +32,31 @@ class Brake:
 
     @classmethod
     def as_built(cls, elastomer: Elastomer, field: FieldLaw | None = None) -> "Brake":
-        """Return the thesis's device with this elastomer: geometry TORMAG, gaps CLOSED_MM to OPEN_MM.
-
-        `field` None: the power law of the field. Raises `DomainError` where the elastomer does not bear the field of
-        the closed gap, or `field` does not reach to both end positions.
-        """
+        """Return the thesis's device with this elastomer: geometry TORMAG, gaps CLOSED_MM to OPEN_MM."""
         return cls(field or PowerFieldLaw(), elastomer, TORMAG, CLOSED_MM, OPEN_MM)
 
     @property
     def range_N(self) -> float:
-        """Greatest less least force."""
         return self.most_N - self.least_N
 
     @property
     def least_N(self) -> float:
-        """Force of the open gap: a passive brake gives no less while the handle moves."""
         return self.force_N(self.open_mm)
 
     @property
     def most_N(self) -> float:
-        """Force of the closed gap."""
         return self.force_N(self.closed_mm)
 
     def force_N(self, gap_mm: Real) -> Real:
-        """Return the brake force at a gap; it falls as the gap opens. Raises `DomainError` outside the field law's
-        range."""
+        """Return the brake force at a gap; it falls as the gap opens."""
         return brake_force_N(self.field.radial_moment_Tm(gap_mm), self.elastomer, self.geometry)
 
     def slope_N_mm(self, gap_mm: Real) -> Real:
-        """Return |dF/dgap|, N per mm of gap (the bracket of Eq. 36). Raises `DomainError` outside the field law's
-        range."""
+        """Return |dF/dgap|, N per mm of gap (the bracket of Eq."""
         return abs(d_force_d_gap(gap_mm, self.field, self.elastomer, self.geometry))
 
     def gap_mm(self, force_N: Real) -> Real:
-        """Return the gap, mm, within the end positions, that gives `force_N`; a float or an array as `force_N` is.
-
-        Raises `DomainError` for a force, or any of an array, that no gap between the end positions gives.
-        """
+        """Return the gap, mm, within the end positions, that gives `force_N`; a float or an array as `force_N` is."""
         require("force_N", force_N, self.least_N, self.most_N)
         moment_Tm = radial_moment_for_force_Tm(force_N, self.elastomer, self.geometry)
         # the forces of the end positions must come back as those, not as a rounding beyond them

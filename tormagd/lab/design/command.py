@@ -17,10 +17,7 @@ from tormagd.lab.main import GAP_SPEED, SEED, Found, whole, within
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab optimise-design`; numbers outside their ranges are refused with exit code 2.
-
-    The four numbers of `--region` are only checked where the region is made.
-    """
+    """Add the options of `tormag-lab optimise-design`; numbers outside their ranges are refused with exit code 2."""
     parser.add_argument(
         "--region",
         required=True,
@@ -49,13 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Find the best design from each random start that `options` ask for, and return all, best first.
-
-    Figures: `outcomes`, a list of dicts with the fields of Outcome, `design` as a dict, and `coverage_as_made`, the
-    least with dimensions off by `options.off` percent. The best has the greatest coverage, with the measure `corners`
-    the least corner cost; then the least volume. Raises DomainError for a region that is no task, and where a solver
-    finds no design. Raises as `executors.chosen`.
-    """
+    """Find the best design from each random start that `options` ask for, and return all, best first."""
     with executors.chosen(options) as executor:
         outcomes = sweep(_runs(options), executor)
     by_cost = options.measure == "corners"
@@ -68,11 +59,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _runs(options: argparse.Namespace) -> list[Run]:
-    """Return `options.starts` runs on one problem, each from a random start between the problem's bounds.
-
-    The starts are drawn by `options.seed`, which the solver gets, too: the same options make the same runs. Raises
-    DomainError for a region that is no task.
-    """
+    """Return `options.starts` runs on one problem, each from a random start between the problem's bounds."""
     problem = Problem(Region(*options.region), options.measure, options.gap_speed)
     low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
     drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))

@@ -18,22 +18,14 @@ _NEWTON_STEPS = 100
 
 
 def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29).
-
-    A float gives a float, an array one of its shape and type. Raises `DomainError` unless 0 <= radial_moment_Tm <=
-    `max_radial_moment_Tm`.
-    """
+    """Return the radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return -law.curve.compression(law.load(radial_moment_Tm))
 
 
 def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the slope of the brake force over the radial moment, N / (T m), >= 0; 0 without field.
-
-    A float gives a float, an array one of its shape and type. Raises `DomainError` unless 0 <= radial_moment_Tm <=
-    `max_radial_moment_Tm`.
-    """
+    """Return the slope of the brake force over the radial moment, N / (T m), >= 0; 0 without field."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     load = law.load(radial_moment_Tm)
@@ -42,20 +34,12 @@ def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geo
 
 
 def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36).
-
-    A float gives a float, an array one of its shape and type. Raises `DomainError` for a gap outside the field law's
-    range, or one whose radial moment is above `max_radial_moment_Tm`.
-    """
+    """Return the slope of the force over the gap, N/mm, <= 0 (the bracket of Eq."""
     return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
 
 
 def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the radial moment, T m, that gives the force: inverse of `brake_force_N`; 0 for 0 N.
-
-    A float gives a float, an array one of its shape and type. Raises `DomainError` unless 0 <= force_N <= the force at
-    `max_radial_moment_Tm`.
-    """
+    """Return the radial moment, T m, that gives the force: inverse of `brake_force_N`; 0 for 0 N."""
     law = reduced(elastomer, geometry)
     # evaluated as any other force, so that the force of the largest moment is admitted to the last digit
     require("force_N", force_N, 0.0, law.force(law.max_moment_Tm))
@@ -65,10 +49,7 @@ def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Ge
 
 
 def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
-    """Return d phi / d y, the slope of the reduced force phi over the load y, both without unit; it is above 0.
-
-    `compression`, from 0 to 0.95, has to be that of `load`. Nothing is checked.
-    """
+    """Return d phi / d y, the slope of the reduced force phi over the load y, both without unit; it is above 0."""
     stretch, w = 1.0 - compression, curve.wall
     # d phi / d eps at constant load, then d phi / d y at constant stretch
     elastic, magnetic = 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + w) * load / stretch**4
@@ -76,15 +57,7 @@ def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
 
 
 def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
-    """Return the compression eps = 1 - lambda1, from 0 to 0.95, at which the reduced force phi(eps) is `force`.
-
-    `force` is a float or an array, and the result of the same shape, both without unit. It is from 0 to phi(0.95),
-    which is not checked. 0, less than 0 and NaN give 0, a finite force above phi(0.95) gives 0.95. Infinity raises
-    ValueError, but gives NaN in an array.
-
-    Newton's method on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside a
-    shrinking bracket. It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
-    """
+    """Return the compression eps = 1 - lambda1, from 0 to 0.95, at which the reduced force phi(eps) is `force`."""
     fn = functions(force)
     rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)
     wanted = fn.where(force > 0.0, force, 1.0)
@@ -113,5 +86,4 @@ def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
 
 
 def _compression_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
-    """Return d eps / d y = (B + A eps) / r, with r = p + eps."""
     return (curve.b + curve.a * compression) / (1.0 - curve.a * load + compression)

@@ -66,7 +66,7 @@ class Problem(msgspec.Struct, frozen=True):
     friction_coefficient: float = 0.2
 
     def geometry(self, design: Design) -> Geometry:
-        """Return the geometry of a design, m; the open gap does not count. Raises `DomainError` as `Geometry`."""
+        """Return the geometry of a design, m; the open gap does not count."""
         return Geometry(
             inner_radius_m=1e-3 * self.inner_radius_mm,
             outer_radius_m=1e-3 * design.outer_radius_mm,
@@ -76,19 +76,15 @@ class Problem(msgspec.Struct, frozen=True):
 
     @property
     def elastomer(self) -> Elastomer:
-        """The given elastomer."""
         return Elastomer(self.shear_modulus_Pa, self.relative_permeability, self.friction_coefficient)
 
     def portrait(self, design: Design) -> PhasePortrait:
-        """Return the phase portrait of a design. Raises `DomainError` for a design that no brake can have."""
+        """Return the phase portrait of a design."""
         brake = Brake(PowerFieldLaw(), self.elastomer, self.geometry(design), self.closed_mm, design.open_mm)
         return PhasePortrait(brake, self.gap_speed_mm_s)
 
     def load_margin(self, design: Design) -> float:
-        """Return 1 - the closed gap's field over the largest that the elastomer bears: under 0 it does not bear it.
-
-        The open gap does not count. Raises `DomainError` as `geometry`.
-        """
+        """Return 1 - the closed gap's field over the largest that the elastomer bears: under 0 it does not bear it."""
         moment_Tm = PowerFieldLaw().radial_moment_Tm(self.closed_mm)
         return 1.0 - moment_Tm / max_radial_moment_Tm(self.elastomer, self.geometry(design))
 
@@ -121,11 +117,7 @@ class Run(msgspec.Struct, frozen=True):
 
 
 def coverage(problem: Problem, design: Design) -> float:
-    """Return the share of the problem's region, by area, that the design covers, 0..1.
-
-    Counted is what the true boundary covers where `problem.measure` is "true", else what the trapezoid covers. The
-    problem's bounds do not count. Raises `DomainError` as `Problem.portrait`, also for an elastomer too soft.
-    """
+    """Return the share of the problem's region, by area, that the design covers, 0..1."""
     portrait = problem.portrait(design)
     if problem.measure == "true":
         return portrait.true_coverage(problem.region)
@@ -133,12 +125,7 @@ def coverage(problem: Problem, design: Design) -> float:
 
 
 def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
-    """Return the least coverage of the design, 0..1, where each dimension may be off by `share` of it, or not at all.
-
-    All 27 combinations of less, exact and more are tried. The result is 0 where the elastomer of one of them does not
-    bear the field. Raises `DomainError` for a combination that no brake can have, such as an open gap under the closed
-    one. `share` is a fraction, 0.01 for a percent, and not checked.
-    """
+    """Return the least coverage of the design, 0..1, where each dimension may be off by `share` of it, or not at all."""
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
     made = [
         Design(*(value * factor for value, factor in zip(msgspec.structs.astuple(design), each, strict=True)))
@@ -148,11 +135,7 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
 
 
 def corner_cost(problem: Problem, design: Design) -> float:
-    """Return the thesis's cost, Eq. 39: the sum of squared distances of the trapezoid's four corners from the region's.
-
-    N and N/s count as equal; 0 is a perfect match. Raises `DomainError` as `Problem.portrait`, also for an elastomer
-    too soft.
-    """
+    """Return the thesis's cost, Eq."""
     offered, wanted = problem.portrait(design).trapezoid(), problem.region
     # the lower corners mirror the upper ones
     return 2.0 * (
@@ -164,13 +147,7 @@ def corner_cost(problem: Problem, design: Design) -> float:
 
 
 def solve(run: Run) -> Outcome:
-    """Return the design that the run's solver finds from its start, with its figures.
-
-    By the measure it has the greatest coverage or the least corner cost that the solver reaches within the problem's
-    bounds. With "global" and a coverage, a second search takes the smallest design within SLACK of the best. The same
-    run gives the same design anywhere. Raises `DomainError` where the solver finds no design whose elastomer bears the
-    field. From a start outside the bounds "local" goes to the nearest within, "global" raises ValueError.
-    """
+    """Return the design that the run's solver finds from its start, with its figures."""
     began_s = time.thread_time()
     search = _Search(run.problem)
     cost = search.corner_cost if run.problem.measure == "corners" else search.miss
@@ -210,25 +187,19 @@ class _Search:
         return Design(*(float(value) for value in self._low + self._span * np.clip(x, 0.0, 1.0)))
 
     def miss(self, x: Array) -> float:
-        """Return the share of the region that is not covered; 1 where the elastomer would not bear the field."""
         return 1.0 - self._at(coverage, x, 0.0)
 
     def corner_cost(self, x: Array) -> float:
         return self._at(corner_cost, x, math.inf)
 
     def size(self, x: Array) -> float:
-        """Return the volume of elastomer over that of the upper bounds, and a trace of the open gap."""
         volume = self.problem.volume_mm3(self.design(x)) / self.problem.volume_mm3(self.problem.upper)
         return volume + _GAP_WEIGHT * float(x[2])
 
     def global_minimum(
         self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
     ) -> Array:
-        """Return the point (3) of least `cost` by differential evolution, which `start` takes part in, then COBYQA.
-
-        Points are coordinates from 0 to 1. `also` are constraints besides that of the elastomer's load. Where no point
-        meets them all, the one that comes nearest is returned.
-        """
+        """Return the point (3) of least `cost` by differential evolution, which `start` takes part in, then COBYQA."""
         limits = [*also, self._margin]
         result = differential_evolution(
             cost,
@@ -275,11 +246,7 @@ def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult
 
 
 def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
-    """Solve every run on `executor` and return the outcomes by run, in the order of the runs.
-
-    Equal runs are solved once. The progress is shown on stderr. Raises what the first run to fail, in time, raised,
-    DomainError as `solve`; runs that have not begun are then cancelled. `executor` is left open.
-    """
+    """Solve every run on `executor` and return the outcomes by run, in the order of the runs."""
     wanted = list(dict.fromkeys(runs))
     outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}
     return {run: outcomes[run] for run in wanted}

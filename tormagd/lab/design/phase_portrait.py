@@ -26,10 +26,7 @@ _PANELS = 256
 
 
 class Region(msgspec.Struct, frozen=True):
-    """Task's requirement: |dF/dt| up to a rate that is linear in the force, from the least to the greatest force.
-
-    Raises `DomainError` unless 0 <= least_N < most_N, both rates are finite and not negative, and not both are zero.
-    """
+    """Task's requirement: |dF/dt| up to a rate that is linear in the force, from the least to the greatest force."""
 
     least_N: float
     least_rate_N_s: float
@@ -45,14 +42,10 @@ class Region(msgspec.Struct, frozen=True):
 
     @property
     def half_area(self) -> float:
-        """Area of the half with rising force, N^2/s; the other half is its mirror image."""
         return 0.5 * (self.least_rate_N_s + self.most_rate_N_s) * (self.most_N - self.least_N)
 
     def rate_N_s(self, force_N: FloatArray) -> FloatArray:
-        """Return the greatest rate, N/s, that the region requires at each force (n): its upper edge.
-
-        Outside least_N to most_N the straight line goes on, and may fall below 0. NaN stays NaN.
-        """
+        """Return the greatest rate, N/s, that the region requires at each force (n): its upper edge."""
         share = (force_N - self.least_N) / (self.most_N - self.least_N)
         return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
 
@@ -68,16 +61,12 @@ class CloudCoverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Return covered points over all points; NaN where there are none."""
         return float(np.mean(self.covered))
 
 
 @dataclass(frozen=True, slots=True)
 class PhasePortrait:
-    """Phase portrait of a brake whose gap moves at up to `gap_speed_mm_s`.
-
-    Raises `DomainError` unless the speed is above 0 and up to 10 m/s.
-    """
+    """Phase portrait of a brake whose gap moves at up to `gap_speed_mm_s`."""
 
     brake: Brake
     gap_speed_mm_s: float
@@ -86,21 +75,14 @@ class PhasePortrait:
         require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
 
     def outline(self, points: int = 201) -> tuple[FloatArray, FloatArray]:
-        """Return the true boundary's upper half as two arrays of `points` elements: force, N, falling, and rate, N/s.
-
-        It goes from the closed gap to the open one; each gap is the one before times the same factor. The lower half is
-        its mirror image.
-        """
+        """Return the true boundary's upper half as two arrays of `points` elements: force, N, falling, and rate, N/s."""
         gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, points)
         # a geometric series may end a rounding beyond its ends
         gap_mm = np.clip(gap_mm, self.brake.closed_mm, self.brake.open_mm)
         return self.brake.force_N(gap_mm), self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)
 
     def trapezoid(self) -> Region:
-        """Return the thesis's portrait: the end points of the true boundary, joined by a straight line.
-
-        It is a Region: from the open gap's force and rate to the closed gap's.
-        """
+        """Return the thesis's portrait: the end points of the true boundary, joined by a straight line."""
         speed, brake = self.gap_speed_mm_s, self.brake
         return Region(
             brake.least_N,
@@ -110,10 +92,7 @@ class PhasePortrait:
         )
 
     def true_coverage(self, region: Region) -> float:
-        """Return the share of the region's area inside the true boundary, 0..1, good to 1e-5.
-
-        0 where the brake gives none of the region's forces.
-        """
+        """Return the share of the region's area inside the true boundary, 0..1, good to 1e-5."""
         brake = self.brake
         least, most = brake.least_N, brake.most_N
         low, high = max(region.least_N, least), min(region.most_N, most)
@@ -132,10 +111,7 @@ class PhasePortrait:
         return min(area / region.half_area, 1.0)
 
     def trapezoid_coverage(self, region: Region) -> float:
-        """Return the share of the region's area inside the thesis's trapezoid, 0..1; exact.
-
-        0 where the brake gives none of the region's forces.
-        """
+        """Return the share of the region's area inside the thesis's trapezoid, 0..1; exact."""
         offered = self.trapezoid()
         low, high = max(region.least_N, offered.least_N), min(region.most_N, offered.most_N)
         if low >= high:
@@ -148,21 +124,14 @@ class PhasePortrait:
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge the points of a task, force, N, and force rate, N/s, of either sign (n each), by the true boundary.
-
-        On the boundary counts as covered. NaN is not refused: a point with a rate of NaN and a possible force counts as
-        covered. One with a force of NaN is too fast, unless its rate is 0 or NaN.
-        """
+        """Judge the points of a task, force, N, and force rate, N/s, of either sign (n each), by the true boundary."""
         inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
         limit = np.zeros_like(force_N)
         limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
         return self._judge(force_N, rate_N_s, limit)
 
     def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge points of a task, force and force rate (n), by the thesis's trapezoid.
-
-        NaN is not refused: a point with a force of NaN, or a rate of NaN and a possible force, counts as covered.
-        """
+        """Judge points of a task, force and force rate (n), by the thesis's trapezoid."""
         return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
 
     def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:

@@ -29,24 +29,16 @@ class RangeFit(NamedTuple):
     exponent: float
 
     def range_N(self, insert: Insert) -> float:
-        """Return the force range of an insert by this fit, N. Raises KeyError for a matrix that was not fitted."""
+        """Return the force range of an insert by this fit, N."""
         return self.friction[insert.shore_hardness] * frictionless_range_N(insert, self.field, self.exponent)
 
     def relative_error(self, insert: Insert) -> float:
-        """Return |range / measured range - 1| of an insert.
-
-        Raises KeyError as `range_N`, DomainError for an insert whose range has not been measured.
-        """
+        """Return |range / measured range - 1| of an insert."""
         return abs(self.range_N(insert) / insert.force_range.measured_N - 1.0)
 
 
 def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0) -> float:
-    """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N.
-
-    The field grows with the permeability to the power `exponent`; it is 1 in the thesis. The permeability is always
-    that of Eq. 5, the friction of the insert does not count. Raises `DomainError` outside Eq. 5's range, for a `field`
-    that does not reach to both gaps, and for an elastomer that does not bear the closed one.
-    """
+    """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N."""
     mu_r = relative_permeability(insert.cip_fraction)
     elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
     # the force law takes b ~ (mu_r / 4) a: another exponent is another moment
@@ -56,12 +48,7 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
 
 
 def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
-    """Fit one friction coefficient for each matrix (Shore 00 hardness), for the least mean relative error of range.
-
-    The mean is over the matrix's `inserts`. The field grows with the permeability to the power `exponent`, which is not
-    fitted. Raises `DomainError` for an insert whose range has not been measured, and as `frictionless_range_N`. Without
-    inserts the fit has no friction.
-    """
+    """Fit one friction coefficient for each matrix (Shore 00 hardness), for the least mean relative error of range."""
     ratios: dict[int, list[float]] = {}
     for item in inserts:
         ratio = frictionless_range_N(item, field, exponent) / item.force_range.measured_N
@@ -70,10 +57,7 @@ def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1
 
 
 def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
-    """Fit the friction of each matrix, as `fit_friction`, and one permeability exponent, from 0 to 3, to 1e-4.
-
-    Both are for the least mean relative error over all `inserts`. Raises `DomainError` as `fit_friction`.
-    """
+    """Fit the friction of each matrix, as `fit_friction`, and one permeability exponent, from 0 to 3, to 1e-4."""
     # the mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point
     low, high = MIN_EXPONENT, MAX_EXPONENT
     while True:
@@ -87,16 +71,12 @@ def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
 
 
 def mean_relative_error(fit: RangeFit, inserts: Sequence[Insert]) -> float:
-    """Return the mean over the inserts of `RangeFit.relative_error`; NaN without inserts. Raises as that."""
+    """Return the mean over the inserts of `RangeFit.relative_error`; NaN without inserts."""
     return float(np.mean([fit.relative_error(item) for item in inserts]))
 
 
 def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
-    """Return each insert's relative error, as `RangeFit.relative_error`, under the fit to all the others, by name.
-
-    `free_exponent` also fits the permeability exponent. Raises KeyError for an insert that is the only one of its
-    matrix, and `DomainError` as `fit_friction`.
-    """
+    """Return each insert's relative error, as `RangeFit.relative_error`, under the fit to all the others, by name."""
     fit = fit_exponent if free_exponent else fit_friction
     return {
         left_out.name: fit([item for item in inserts if item is not left_out], field).relative_error(left_out)
@@ -105,11 +85,7 @@ def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: 
 
 
 def _friction(ratios: list[float]) -> float:
-    """Return the friction coefficient with the least mean relative error of range over the inserts of one matrix.
-
-    `ratios` are each insert's range at a friction coefficient of 1 over its measured range: one or more, all over 0.
-    Neither is checked.
-    """
+    """Return the friction coefficient with the least mean relative error of range over the inserts of one matrix."""
     # the minimum of sum |mu r - 1| = sum r |mu - 1/r| is the median of 1/r, weighted by r
     ordered = sorted(ratios, reverse=True)
     reached = np.cumsum(ordered)

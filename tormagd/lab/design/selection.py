@@ -34,22 +34,12 @@ class Verdict:
     served_share: float
     """Share of the task's force range between the insert's least and most force."""
     sufficient_gap_mm: float
-    """Gap at which the force is as low as the task tolerates, its least and resolution: at least the open gap.
-
-    NaN beyond the field law's range.
-    """
+    """Gap at which the force is as low as the task tolerates, its least and resolution: at least the open gap."""
     reasons: tuple[str, ...]
 
 
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
-    """Return the verdict on one insert, a name, in its brake, for a task; the gap goes in steps of `gap_resolution_mm`.
-
-    It serves where it reaches the task's forces in steps no larger than the task's resolution. Else the reasons say
-    what is missed, one sentence each. A least force that is missed by no more than the resolution counts as reached,
-    but not in `served_share`. Where the insert reaches no force of the task, or the task is one force, the share is 0.
-    The step is then the open gap's. The task is not checked. Raises DomainError where it tolerates only forces under 0
-    N.
-    """
+    """Return the verdict on one insert, a name, in its brake, for a task; the gap goes in steps of `gap_resolution_mm`."""
     least, most = brake.least_N, brake.most_N
     low, high = max(least, task.least_N), min(most, task.most_N)
     reasons = []
@@ -71,21 +61,13 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
 
 
 def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
-    """Judge all inserts, brakes by name, and return the verdicts, best first; empty without any.
-
-    First come those that serve, finest force step first; then the others, greatest share served first. Raises as
-    `judge`.
-    """
+    """Judge all inserts, brakes by name, and return the verdicts, best first; empty without any."""
     verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
     return sorted(verdicts, key=lambda v: (bool(v.reasons), -v.served_share if v.reasons else 0.0, v.resolution_N))
 
 
 def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:
-    """Return the gap, mm, at which the brake's force is as low as the task tolerates, at least the open gap.
-
-    The task tolerates its least force and its resolution more. NaN where this gap is beyond the field law's range.
-    Raises DomainError where only forces under 0 N are tolerated.
-    """
+    """Return the gap, mm, at which the brake's force is as low as the task tolerates, at least the open gap."""
     tolerated_N = task.least_N + task.resolution_N
     if tolerated_N >= brake.least_N:
         return brake.open_mm

@@ -28,7 +28,7 @@ VAGUE_SHARE = 0.5
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab identify-motor`: the log, and what to write of it. No value is checked here."""
+    """Add the options of `tormag-lab identify-motor`: the log, and what to write of it."""
     parser.add_argument("log", type=Path, help="motor log CSV, or DATA_EMPS.mat")
     parser.add_argument("--gain-N-V", type=float, dest="gain", help="force per volt, N/V; replaces a current")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="measured against simulated voltage")
@@ -37,12 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Identify the motor from the log `options.log` and return the dict of `identify`; write what is asked for.
-
-    `options.gain` None takes the log's own, if any. `options.write_config` and then `options.plot` are files to write;
-    None: none. Raises LabError for a plot that is no .png, before anything is read, and as `read_log`, `identify` and
-    `write_config`. Raises ConfigError where `options.config` is refused, OSError where the plot cannot be written.
-    """
+    """Identify the motor from the log `options.log` and return the dict of `identify`; write what is asked for."""
     if options.plot is not None and options.plot.suffix != ".png":
         raise LabError(f"--plot {options.plot}: allowed is a name that ends with .png")
     log = read_log(options.log)
@@ -55,12 +50,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
-    """Write a new file with the table `[motor]`: the identified values, to four digits, the others as in `config`.
-
-    `result` is that of `identify`. Gear ratio and screw lead of `config` turn its carriage into the motor. The
-    inductance is taken only where its interval is under VAGUE_SHARE of it. Raises LabError where `result` has no
-    `motor`, the file exists or cannot be written, or `tormagd` would refuse a value.
-    """
+    """Write a new file with the table `[motor]`: the identified values, to four digits, the others as in `config`."""
     found = result["motor"]
     if found is None:
         raise LabError("--write-config: needs a log with current_A, and no --gain-N-V")
@@ -90,12 +80,7 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
 
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
-    """Draw measured and predicted voltage, and their difference, over the log's second half, as a picture at `path`.
-
-    The prediction is by a fit of the first half, which is made here. `result` is that of `identify` for the same log. A
-    picture that is there is replaced. Raises LabError as `fit_volts`, OSError where it cannot be written, and
-    ValueError for an ending that matplotlib does not know.
-    """
+    """Draw measured and predicted voltage, and their difference, over the log's second half, as a picture at `path`."""
     half = len(log.t_s) // 2
     fitted = fit_volts(log.part(slice(None, half)))
     time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))

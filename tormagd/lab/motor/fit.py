@@ -63,11 +63,7 @@ class Estimate(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion of a log at its own rate: position from its mean, m; speed, m/s; acceleration, m/s^2; sign of the speed.
-
-    Each column has a row for each of the log's; the sign is 0 where the log rests or is slower than SLOW_M_S. `factor`
-    is the number of rows for one thinned row.
-    """
+    """Motion of a log at its own rate: position from its mean, m; speed, m/s; acceleration, m/s^2; sign of the speed."""
 
     x: Array
     v: Array
@@ -76,10 +72,7 @@ class Motion(NamedTuple):
     factor: int
 
     def thin(self, column: Array) -> Array:
-        """Return a column (n) as the equations use it: low-passed, thinned by `factor`, without EDGE rows at both ends.
-
-        That are about n / `factor` - 2 EDGE values; empty where no more than EDGE at each end are left.
-        """
+        """Return a column (n) as the equations use it: low-passed, thinned by `factor`, without EDGE rows at both ends."""
         thinned = decimate(column, self.factor, ftype="fir", zero_phase=True) if self.factor > 1 else column
         return np.asarray(thinned[EDGE:-EDGE])
 
@@ -94,14 +87,10 @@ class Fit(NamedTuple):
 
     @property
     def half_widths(self) -> Array:
-        """Half widths of the values' 95% intervals."""
         return np.asarray(self.deviations * np.sqrt(np.diag(self.covariance)))
 
     def half_widths_of(self, function: Callable[[Array], Array]) -> Array:
-        """Return the half widths (m) of the 95% intervals of m functions of the values, linearised about these.
-
-        `function` takes values (k) and returns all m as an array; it is called twice for each of the k.
-        """
+        """Return the half widths (m) of the 95% intervals of m functions of the values, linearised about these."""
         steps = np.maximum(1e-3 * np.sqrt(np.diag(self.covariance)), np.finfo(np.float64).tiny)
         rises = [function(self.values + shift) - function(self.values - shift) for shift in np.diag(steps)]
         slopes = np.array(rises) / (2.0 * steps[:, None])
@@ -109,11 +98,7 @@ class Fit(NamedTuple):
 
 
 def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
-    """Return the motion of a log, low-passed at CUTOFF_HZ without lag, at the log's own rate.
-
-    Its `thin` goes to about `thinned_Hz`. Raises LabError where that leaves under MIN_BLOCKS * BLOCK_S seconds, or the
-    log does not move both ways at over SLOW_M_S.
-    """
+    """Return the motion of a log, low-passed at CUTOFF_HZ without lag, at the log's own rate."""
     smooth = _low_pass(log)
     position = smooth(log.position_m)
     speed = np.gradient(position, log.period_s)
@@ -131,7 +116,6 @@ def moving(seen: Motion, share: float) -> Array:
 
 
 def _low_pass(log: Log) -> Callable[[Array], Array]:
-    """Return a filter of a log's columns at CUTOFF_HZ, without lag."""
     sections = butter(4, CUTOFF_HZ, fs=1.0 / log.period_s, output="sos")
     return lambda column: np.asarray(sosfiltfilt(sections, column))
 
@@ -143,11 +127,7 @@ def block_numbers(seen: Motion, period_s: float) -> Array:
 
 
 def linear(rows: Array, target: Array, blocks: Array) -> Fit:
-    """Fit `target` (n) by `rows` (n, k) in least squares; the fit has k values, in the order of the columns.
-
-    `blocks` (n) numbers each row's block: rows of one block may be correlated. Raises LabError for under MIN_BLOCKS
-    blocks or columns that depend on each other. A target of 0 makes the relative residual NaN.
-    """
+    """Fit `target` (n) by `rows` (n, k) in least squares; the fit has k values, in the order of the columns."""
     values, covariance = solved(rows, target, blocks)
     count = len(np.unique(blocks))
     if count < MIN_BLOCKS or not np.isfinite(values).all():
@@ -168,21 +148,13 @@ class Volts(NamedTuple):
     relative_residual: float
 
     def voltage(self, log: Log) -> tuple[Array, Array]:
-        """Return the applied and the predicted voltage, V (n each), for the thinned rows of `log` in motion.
-
-        `log` need not be the one that was fitted. Rows where the carriage stands are left out. Raises LabError as
-        `motion`.
-        """
+        """Return the applied and the predicted voltage, V (n each), for the thinned rows of `log` in motion."""
         _, measured, predicted = self.over_time(log)
         known = np.isfinite(measured)
         return measured[known], predicted[known]
 
     def over_time(self, log: Log) -> tuple[Array, Array, Array]:
-        """Return the thinned times of `log`, s by its clock, and applied and predicted voltage, V (n each).
-
-        Both voltages are NaN where the carriage stands. The applied one is that of `delay` earlier, low-passed. `log`
-        need not be the one that was fitted. Raises LabError as `motion`.
-        """
+        """Return the thinned times of `log`, s by its clock, and applied and predicted voltage, V (n each)."""
         seen = motion(log)
         values = np.array([self.mass.value, self.viscous.value, self.coulomb.value, self.offset.value])
         measured, _ = _voltage(log, seen, self.delay.value)
@@ -192,22 +164,16 @@ class Volts(NamedTuple):
 
 
 def _volts_rows(seen: Motion) -> Array:
-    """Return the thinned columns of the model `volts`: acceleration, speed, sign, 1."""
     return np.column_stack([seen.thin(column) for column in (seen.a, seen.v, seen.sign, np.ones_like(seen.v))])
 
 
 def _voltage(log: Log, seen: Motion, delay_s: float) -> tuple[Array, Array]:
-    """Return the voltage of `delay_s` earlier, V, and its slope over time, V/s: low-passed and thinned."""
     volts = _low_pass(log)(np.interp(log.t_s - delay_s, log.t_s, log.input_V))
     return seen.thin(volts), seen.thin(np.gradient(volts, log.period_s))
 
 
 def fit_volts(log: Log) -> Volts:
-    """Fit mass, friction, offset and delay in volts, from the log's voltage and position alone; a current is not used.
-
-    Intervals also cover what terms that the model leaves out would change. Raises LabError where the log moves too
-    little, or the voltage fits best with a delay over LONGEST_DELAY_S, either way.
-    """
+    """Fit mass, friction, offset and delay in volts, from the log's voltage and position alone; a current is not used."""
     seen = motion(log)
     kept = moving(seen, MOSTLY)
     blocks = block_numbers(seen, log.period_s)[kept]
@@ -231,12 +197,7 @@ def fit_volts(log: Log) -> Volts:
 
 
 def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array) -> tuple[Fit, float]:
-    """Fit the delayed voltage by `rows` (n, k); return the fit, and the delay, s, which DELAY_TURNS steps find.
-
-    `kept` is the mask of the thinned rows of `log` that count, n of them, and `blocks` (n) are their blocks. The fit
-    has k + 1 values: the last, of the voltage's slope, is what is left of the delay, and widens the others' intervals.
-    Raises LabError for a delay over LONGEST_DELAY_S of either sign, and as `linear`.
-    """
+    """Fit the delayed voltage by `rows` (n, k); return the fit, and the delay, s, which DELAY_TURNS steps find."""
     delay_s = 0.0
     for _ in range(DELAY_TURNS):
         target, slope = _voltage(log, seen, delay_s)
@@ -268,11 +229,7 @@ OTHER_WAYS = (
 
 
 def _estimates(fit_in: Callable[[Variant], tuple[Array, Array]]) -> list[Estimate]:
-    """Return n estimates: the values of the plain way to fit, with intervals that cover what OTHER_WAYS make of them.
-
-    `fit_in` fits in one way, and gives values and half widths (n each). Of each group of ways the one that differs most
-    widens the interval. Raises what `fit_in` raises, in any way.
-    """
+    """Return n estimates: the values of the plain way to fit, with intervals that cover what OTHER_WAYS make of them."""
     values, widths = fit_in(Variant())
     apart = [np.max([np.abs(fit_in(variant)[0] - values) for variant in group], axis=0) for group in OTHER_WAYS]
     widths = np.sum([widths, *apart], axis=0)
@@ -289,11 +246,7 @@ class Windings(NamedTuple):
 
 
 def fit_windings(log: Log) -> Windings:
-    """Fit resistance, inductance, back-EMF and delay from voltage, current and position.
-
-    Raises LabError where the log moves too little, has no current, or fits best with a delay over LONGEST_DELAY_S. It
-    does so, too, where only one of the other ways to fit fails. Signs are not checked.
-    """
+    """Fit resistance, inductance, back-EMF and delay from voltage, current and position."""
 
     def fit_in(variant: Variant) -> tuple[Array, Array]:
         seen = motion(log, variant.thinned_Hz)
@@ -310,11 +263,7 @@ def fit_windings(log: Log) -> Windings:
 
 
 class Gearbox(NamedTuple):
-    """The fitted model `gearbox`: kg, N s/m, the gears' efficiency, and two forces in N.
-
-    `coulomb` is half the difference, `offset` half the sum of the forces for slow opening and slow closing, as means
-    over where the log moved.
-    """
+    """The fitted model `gearbox`: kg, N s/m, the gears' efficiency, and two forces in N."""
 
     mass: Estimate
     viscous: Estimate
@@ -324,11 +273,7 @@ class Gearbox(NamedTuple):
 
 
 def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
-    """Fit inertia, friction and gear losses from current and position; the voltage is not used.
-
-    `force_N_A` is the motor's force at the carriage per current, as a number without an interval; it is not checked.
-    Raises LabError where the log moves too little, also in one of the other ways to fit, or has no current.
-    """
+    """Fit inertia, friction and gear losses from current and position; the voltage is not used."""
 
     def fit_in(variant: Variant) -> tuple[Array, Array]:
         seen = motion(log, variant.thinned_Hz)
@@ -358,7 +303,7 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
 
 
 def _current(log: Log, variant: Variant) -> Array:
-    """Return the log's current at its times, shifted and thinned by `variant`. Raises LabError without a current."""
+    """Return the log's current at its times, shifted and thinned by `variant`."""
     if log.current_A is None:
         raise LabError("current_A: needed to tell the motor's windings from its load")
     times = log.t_s + variant.current_shift * log.period_s
@@ -366,11 +311,7 @@ def _current(log: Log, variant: Variant) -> Array:
 
 
 def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
-    """Return the force, N (n), with which the motor moves the carriage slowly at positions `x` (n); positive opens.
-
-    `direction` is 1, opening, or -1. `values` are those of the fit in `fit_gearbox`, 8 or 10 of them, and `x` is scaled
-    as there: over its standard deviation. `idle_N` is the force that the gears take idling; it counts with 10 values.
-    """
+    """Return the force, N (n), with which the motor moves the carriage slowly at positions `x` (n); positive opens."""
     lost = float(values[2])
     idling = float(values[8]) if len(values) > 8 else 0.0
     load: Array = values[3] + values[4] * x + values[5] * x**2 + direction * (values[6] + values[7] * x)

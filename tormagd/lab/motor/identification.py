@@ -15,19 +15,7 @@ BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 
 
 def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
-    """Identify a motor from its log; return estimates, residuals and notes as plain data.
-
-    An estimate is a dict of `value` and `ci95`, the half width of its 95% interval. `parameters` has PARAMETERS and
-    `delay_s`, and `backlash_um`, which is always None. `ratios_to_gain` has RATIOS, `motor` the names of
-    `motor_parameters`; `time_constant_s` is an estimate, too. Numbers are `gain_N_V`, `relative_residual`, and
-    `holdout_voltage_nrmse`: of the second half, by a fit of the first. `notes` are sentences.
-
-    With `gain_N_V` the parameters are scaled from volts; a current is not used, and `motor` is None. With None they
-    come from the log's current, which also gives `motor` and the gain. With neither a gain nor a current, each of
-    PARAMETERS, `motor` and the gain are None. `log.gain_N_V` is not used. Raises LabError for a gain that is not above
-    0 and finite, and for a log, or half of one, that moves too little. It does so, too, where the voltage fits best
-    with a delay over `fit.LONGEST_DELAY_S`.
-    """
+    """Identify a motor from its log; return estimates, residuals and notes as plain data."""
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
     half = len(log.t_s) // 2
@@ -72,12 +60,7 @@ def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
 
 
 def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
-    """Return by name what only a log with a current shows of windings and gearbox; all are referred to the carriage.
-
-    The names end in their units: `gain_N_V`, `resistance_ohm`, `inductance_mH`, `back_emf_V_s_m`,
-    `friction_viscous_N_s_m`, `gear_efficiency`, a share, `mass_kg`, `coulomb_N`. A resistance of 0 raises
-    ZeroDivisionError.
-    """
+    """Return by name what only a log with a current shows of windings and gearbox; all are referred to the carriage."""
     return {
         "gain_N_V": _product((windings.back_emf, 1), (windings.resistance, -1)),
         "resistance_ohm": windings.resistance,

@@ -29,26 +29,16 @@ class Log(NamedTuple):
 
     @property
     def period_s(self) -> float:
-        """Time from row to row, the median, s."""
         return float(np.median(np.diff(self.t_s)))
 
     def part(self, rows: slice) -> "Log":
-        """Return the log of the rows in a slice, with the same gain; its columns are views of this one's.
-
-        Times are not moved to 0. A slice with a step has a longer period. Of under two rows the period is NaN, with
-        NumPy's RuntimeWarning. A log without a current stays without.
-        """
+        """Return the log of the rows in a slice, with the same gain; its columns are views of this one's."""
         current = None if self.current_A is None else self.current_A[rows]
         return Log(self.t_s[rows], self.input_V[rows], self.position_m[rows], self.gain_N_V, current)
 
 
 def read_log(path: Path) -> Log:
-    """Read the log in an EMPS .mat file, or for any other ending in a CSV file.
-
-    The CSV columns are `t_s,input_V,position_mm`, optionally `current_A`; others are skipped. Only a .mat file has a
-    gain. Raises LabError, which names the file, for an unreadable or malformed one, under MIN_ROWS rows, values that
-    are not finite, or under MIN_RATE_HZ. Steps of time that are off the median by over half of it raise LabError, too.
-    """
+    """Read the log in an EMPS .mat file, or for any other ending in a CSV file."""
     log = _read_mat(path) if path.suffix == ".mat" else _read_csv(path)
     if len(log.t_s) < MIN_ROWS:
         raise LabError(f"{path}: {len(log.t_s)} rows: allowed are at least {MIN_ROWS}")
@@ -68,10 +58,7 @@ def read_log(path: Path) -> Log:
 
 
 def _read_mat(path: Path) -> Log:
-    """Read an EMPS .mat file: t, s, vir, V, qm, m, and its gain gtau, N/V. Values are not checked.
-
-    Raises LabError for a file that is unreadable, without t, vir, qm and gtau, or with columns of different lengths.
-    """
+    """Read an EMPS .mat file: t, s, vir, V, qm, m, and its gain gtau, N/V."""
     try:
         require_regular(path, MAX_TABLE_BYTES)
         data = loadmat(path)
@@ -88,7 +75,7 @@ def _read_mat(path: Path) -> Log:
 
 
 def _read_csv(path: Path) -> Log:
-    """Read a CSV file, with its current if it has one. Raises LabError."""
+    """Read a CSV file, with its current if it has one."""
     named = read_columns(path, COLUMNS, (CURRENT_COLUMN,))
     t_s, input_V, position_mm = (named[name] for name in COLUMNS)
     return Log(t_s, input_V, position_mm * 1e-3, None, named.get(CURRENT_COLUMN))

@@ -29,12 +29,7 @@ MODELS = {"pad": ("tactile_mre_c", "tactile", (0.0, 365.0)), "brake": ("torque_m
 
 
 def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float | None) -> list[tuple[float, float]]:
-    """Draw CONTACTS contacts from the model's box, the same each time: displacement, mm, and rate, mm/s.
-
-    `shallow_mm` None: every draw counts. Else displacements end there, and a contact counts where the force falls, or
-    stays, between two of the fields `range_mT`, 1 mT apart or so. `shallow_mm` is not checked against the box. Raises
-    LabError where MAX_DRAWS do not give as many.
-    """
+    """Draw CONTACTS contacts from the model's box, the same each time: displacement, mm, and rate, mm/s."""
     draw, fields = np.random.default_rng(SEED), np.linspace(*range_mT, 366)
     (low_mm, high_mm), rates, _, (cip_percent, _) = model.feature_ranges
     found: list[tuple[float, float]] = []
@@ -51,13 +46,7 @@ def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float
 def followed(
     search: NearestFieldSearch, model: ForceModel, at: list[tuple[float, float]], path_mT: list[float]
 ) -> dict[str, Any]:
-    """Let `search` follow the fields `path_mT` at every contact of `at`, each answer from the last; return how it went.
-
-    At each field the search is asked for the model's own force there. A contact is displacement, mm, and rate, mm/s.
-    `jump_share` is that of answers over JUMP_MT from the last. `travel` is the answers' way over the path's own.
-    Besides `worst_force_error_N`, and `answers`, mT, contact after contact. The first field is where a contact begins,
-    and is not answered. One contact at least is needed, and a path that moves; else ZeroDivisionError or NaN.
-    """
+    """Let `search` follow the fields `path_mT` at every contact of `at`, each answer from the last; return how it went."""
     cip_percent = model.feature_ranges[3][0]
     travels_mT, worst_N, answers = [], 0.0, []
     for contact in at:
@@ -79,22 +68,13 @@ def followed(
 
 
 def measured() -> dict[str, Any]:
-    """Return what every number of neighbours decides on two shipped models: by the names of MODELS, as `measured_on`.
-
-    Besides `synthetic`, True, and `jump_mT`. Raises as `measured_on`.
-    """
+    """Return what every number of neighbours decides on two shipped models: by the names of MODELS, as `measured_on`."""
     return {"synthetic": True, "jump_mT": JUMP_MT} | {name: measured_on(*MODELS[name]) for name in MODELS}
 
 
 def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) -> dict[str, Any]:
     """Return what every number of NEIGHBOURS decides on one shipped model: `model`, `not_rising_share_of_box` and
-    `rows`.
-
-    The path of fields is one swing up and down within `range_mT`. A row has `neighbours`, and the figures of `followed`
-    without its answers. In their place is `other_answers`, the share of answers that differ from those of the most
-    neighbours. `not_rising_share_of_box` is the share of the model's box where its force does not rise. Raises LabError
-    as `contacts`, ConfigError or ModelFileError for a model that cannot be loaded, or is of another `element`.
-    """
+    `rows`."""
     model = load_model(model_path(model_name, scene_path("pulse").parent), element=element)
     low_mT, high_mT = range_mT
     middle_mT, swing_mT = (low_mT + high_mT) / 2.0, 0.48 * (high_mT - low_mT)

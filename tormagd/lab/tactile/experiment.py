@@ -25,14 +25,7 @@ NOISES_N = (0.05, 0.5)
 
 def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]:
     """Run the experiment; return its figures as plain data, what table 4.1 was trained on, and the pulse's traces by
-    name.
-
-    Keys: `table_4_1`, as `models.table_4_1`, `pulse` and `relaxation`. `pulse` is as `pulse.pulse`, with `hold`, as
-    `pulse.hold`, and `hold_1h_force_error` besides. `relaxation` has `fractions`, `field_fractions` and `times_s`, s.
-    Table 4.1 is of the last of NOISES_N, hold and traces of the first. With a quick effort the figures show that all
-    runs, not how well; what is called an hour is `effort.hold_s`. Limits torch to one thread, for good. Raises
-    ModuleNotFoundError where heartpy is not installed.
-    """
+    name."""
     torch.set_num_threads(1)
     trained = [train(noise_N, effort) for noise_N in tqdm(NOISES_N, desc="training", disable=None, leave=False)]
     tabled = trained[-1]
@@ -59,13 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Found:
     """Return the experiment's figures, for a person as the page; with `options.out` also write it there with its
-    pictures.
-
-    `options.quick` takes few rows. With `options.branches` return instead what the number of neighbours decides on
-    shipped models, as `branches.measured`; nothing is written then. Raises LabError where `out` is no directory,
-    OSError where a file there cannot be written, ModuleNotFoundError where heartpy, torch or matplotlib is not
-    installed.
-    """
+    pictures."""
     if options.branches:
         return Found(branches.measured())
     if options.out is not None and not options.out.is_dir():

@@ -61,15 +61,7 @@ Moment = tuple[float, float, Plan, str]
 
 
 def hold(case: Case) -> dict[str, Any]:
-    """Hold a force on the pad of `case` and return how well it was held, as plain data beside the case's own fields.
-
-    Errors are shares of the force asked for, FORCE_N, one a second, from the end of learning on. `force_error` is the
-    greatest and `mean_force_error` the mean of their magnitudes. `last_force_error` has its sign, positive for too
-    much, and so have `shares`, one in each `every_s`. `last_gap_mm` is the last gap. `limits` has the share of the time
-    that each limit was there, by its name, `held_s` the seconds. `fault` names the fault that ended the hold; it is
-    empty where none did. Raises PlantError for a plant that cannot be loaded or has no pad. Raises LabError for a fault
-    in the first second, and for under half a second.
-    """
+    """Hold a force on the pad of `case` and return how well it was held, as plain data beside the case's own fields."""
     shares, limits, last_mm, fault = [], Counter[str](), math.nan, ""
     for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
         if fault:
@@ -94,10 +86,7 @@ def hold(case: Case) -> dict[str, Any]:
 
 
 class _Prepared:
-    """What both ways to hold need: configuration, core, finger, pad, and `begins_s`, when learning is over.
-
-    Raises PlantError for a plant that cannot be loaded or has no pad.
-    """
+    """What both ways to hold need: configuration, core, finger, pad, and `begins_s`, when learning is over."""
 
     def __init__(self, case: Case) -> None:
         stated = load_scene(SCENE)
@@ -114,11 +103,7 @@ class _Prepared:
 
 def _whole(case: Case) -> Iterator[Moment]:
     """Yield the moments of a hold by the daemon's loop with the whole device, once a second from the end of learning
-    on.
-
-    The last element of a moment names the faults that are latched, after commas; it is empty without one. A moment with
-    a fault may be followed by others: the caller ends the hold. Raises as `_Prepared`, at the first step.
-    """
+    on."""
     made = _Prepared(case)
     planner, device = made.core.planner(), VirtualDevice(made.plant, made.hand, seed=1)
     loop = ClosedLoop(made.config, made.core.stepper(), planner, device)
@@ -138,11 +123,7 @@ def _whole(case: Case) -> Iterator[Moment]:
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
-    """Yield the moments of a hold by the plans alone: one plan each COARSE_S, and the gap is where the last one leads.
-
-    They come once a second from the end of learning on. The only fault that a moment can name is SENSOR; it does not
-    end the moments. Raises as `_Prepared`, at the first step.
-    """
+    """Yield the moments of a hold by the plans alone: one plan each COARSE_S, and the gap is where the last one leads."""
     made = _Prepared(case)
     planner = made.core.planner()
     element = PressedPad(made.plant, planner.planned.gap_mm, COARSE_S)
@@ -177,11 +158,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Found:
     """Hold a force on every plant of `options.plant`, with relaxation and without, learning and frozen, and return all
-    holds.
-
-    Holds last `options.seconds` of virtual time and run in `options.workers` processes. Keys: `synthetic`, `force_N`,
-    and `holds`, as `hold`, four for each plant in the order of MODES. Raises PlantError and LabError as `hold`.
-    """
+    holds."""
     cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
     with ProcessPoolExecutor(options.workers) as pool:
         holds = list(tqdm(pool.map(hold, cases), total=len(cases), desc="holds", disable=None))

@@ -53,11 +53,7 @@ QUICK = Effort(24, 280, 15, 12, 4, 4, 5, 60.0, 24)
 
 @dataclass(frozen=True)
 class Trained:
-    """Models trained on cycles with sensor noise `noise_N`: the thesis's network, and a model of the pad in use.
-
-    `model` learned from the three classes. `grey`, the relaxation-aware model, learned from the cycles of one class and
-    from its relaxation tests, as a laboratory would do with its pad.
-    """
+    """Models trained on cycles with sensor noise `noise_N`: the thesis's network, and a model of the pad in use."""
 
     noise_N: float
     cycles: PadRecord
@@ -66,13 +62,7 @@ class Trained:
 
 
 def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
-    """Train the network on made cycles of the three pads, and the relaxation-aware model on those of the pad in use.
-
-    The latter also learns from relaxation tests of its pad. Both learn from the training part of the random split.
-    `noise_N`, N, is the sensor's noise, and not checked. `seed` draws that of the cycles only: the noise of the
-    relaxation tests and the split are the same for every `seed`. Returns the cycles and both models. Nothing is
-    written.
-    """
+    """Train the network on made cycles of the three pads, and the relaxation-aware model on those of the pad in use."""
     cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
     data = cycles.data
     known = ~random_split(len(data), SPLIT_SEED)
@@ -90,14 +80,7 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
 
 
 def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
-    """Return table 4.1 per class on the random split, with the noise floor, whole groups left out, and monotonicity.
-
-    Keys: `synthetic`, `sensor_noise_N`, `random` (`r2`, `mae_N`, `noise_mae_N`). `leave_one_field_out`,
-    `leave_one_class_out` and `leave_cycles_out` are as `left_out`, of every `effort.thin`-th row. `monotonicity` has
-    `network` and `relaxation_aware`, each as the function `monotonicity`. `rows` has a dict for each class, and for All
-    at the end: `class`, `train` and `test`. These have `mae_N`, `sd_N`, `mae_percent` of the class's span, and `r2`.
-    Trains one network for each group left out.
-    """
+    """Return table 4.1 per class on the random split, with the noise floor, whole groups left out, and monotonicity."""
     data = trained.cycles.data
     held = random_split(len(data), SPLIT_SEED)
     predicted = trained.model.predict(data.features)
@@ -137,12 +120,7 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
 
 
 def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) -> dict[str, Any]:
-    """Train a network without the rows of each fold, judge it on them, and return the errors, N.
-
-    A fold is a label, which stands in the result, and the mask (n) of its rows. Networks take `epochs` steps at most.
-    The result has `r2` and `mae_N` over all folds together, and `folds`: a dict of `left_out`, the label, and `mae_N`
-    for each. At least one fold with rows is needed, with two rows beside it.
-    """
+    """Train a network without the rows of each fold, judge it on them, and return the errors, N."""
     predicted = np.empty(len(data))
     judged = np.zeros(len(data), dtype=np.bool_)
     each = []
@@ -156,13 +134,7 @@ def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) ->
 
 
 def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, float]:
-    """Return two shares, 0..1, of places where the model's dF/dB <= 0.
-
-    `not_rising_share_of_box` is of the model's training box, as `not_rising_share`. The box spans from class to class,
-    also where there are no data. `not_rising_share_where_scored` is of a grid of displacement, rate and field at the
-    classes of `pads`. There only places count where the pad's own slope is `SCORED_SLOPE_N_MT` or more;
-    ZeroDivisionError where none is.
-    """
+    """Return two shares, 0..1, of places where the model's dF/dB <= 0."""
     places = np.meshgrid(
         np.linspace(TOUCHING_MM, FULL_INDENTATION_MM, 18),
         np.sort([*RATES_MM_S, *(-rate for rate in RATES_MM_S)]),
@@ -181,11 +153,7 @@ def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, 
 
 def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
     """Return dF/dB, N/mT (n), of a worked pad at places (n x 3), without relaxation: a secant over 0.5 mT to either
-    side.
-
-    A place is displacement, mm, rate, mm/s, and field, mT. At 0 mT the secant is over the upper side. Raises
-    DomainError for a place outside the pad's law.
-    """
+    side."""
     pad = worked_pad(parameters)
     displacement, rate, field = places.T
     low, high = np.maximum(field - 0.5, 0.0), field + 0.5
@@ -195,9 +163,5 @@ def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
 
 
 def plant_force_N(pad: Any, places: Array) -> Array:
-    """Return the force, N (n), of a pad at places (n x 3), without relaxation; its state stays.
-
-    A place is displacement, mm, rate, mm/s, and field, mT. `pad` is a `TactilePad`. Raises DomainError for a place
-    outside its law.
-    """
+    """Return the force, N (n), of a pad at places (n x 3), without relaxation; its state stays."""
     return np.array([sum(pad.elastic_parts_N(*place)) for place in places.tolist()])

@@ -40,16 +40,11 @@ PADS = MappingProxyType(
         "MRE-C": PadParameters(45.0, 281.0, 592.0, 0.85),
     }
 )
-"""Moduli from section 4.2.3. The breakdown puts the force at 4.5 mm and 365 mT near 65, 141 and 186 N, the full scales
-that table 4.1 implies."""
+"""Moduli from section 4.2.3."""
 
 
 def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
-    """Draw another pad of the same recipe: moduli, saturation, relaxation and rate gain 3..15 % about `parameters`.
-
-    The same seed gives the same pad. Size and iron stay. The bounds of a plant file are not checked again. Raises
-    ValueError where the drawn shares of relaxation sum to 1 or more.
-    """
+    """Draw another pad of the same recipe: moduli, saturation, relaxation and rate gain 3..15 % about `parameters`."""
     draw = np.random.default_rng(seed)
 
     def about(value: float, spread: float) -> float:
@@ -71,10 +66,7 @@ def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
 
 
 class Program(NamedTuple):
-    """What is done to a pad, sample by sample (n each): time, s, displacement, mm, its rate, mm/s, and field, mT.
-
-    The rate is the two-point difference.
-    """
+    """What is done to a pad, sample by sample (n each): time, s, displacement, mm, its rate, mm/s, and field, mT."""
 
     time_s: Array
     displacement_mm: Array
@@ -107,12 +99,7 @@ def cyclic_records(
     pads: Iterable[PadParameters] = tuple(PADS.values()),
 ) -> PadRecord:
     """Return the data of figure 4.3: eleven fields, twelve cycles of `samples_per_cycle` rows at four rates, without
-    holds.
-
-    By default these are 69,300 rows of the three pads; `pads` takes others. They stand pad after pad, field after
-    field. Each field is a record of its own after a rest, preceded by three unrecorded passes of the same cycles.
-    `noise_N`, N, is the standard deviation of the sensor's noise, drawn by `seed`; below 0 it raises ValueError.
-    """
+    holds."""
     time_s, displacement_mm, rate_mm_s, cycle = cycling_program(samples_per_cycle)
     passes: list[Pass] = []
     for parameters in pads:
@@ -135,12 +122,7 @@ def holding_records(
     fields_mT: tuple[float, ...] = (0.0, 91.25, 182.5, 273.75, 365.0),
     samples: int = 500,
 ) -> PadRecord:
-    """Return relaxation tests, one at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely.
-
-    Each has `samples` rows, of a worked pad, with the sensor's noise `noise_N`, N, drawn by `seed`. `cycle` numbers the
-    tests from 0. The thesis did not have these. Raises ValueError for under RISE_SAMPLES or a noise under 0,
-    DomainError for a field outside 0..500 mT.
-    """
+    """Return relaxation tests, one at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely."""
     rise_s = FULL_INDENTATION_MM
     held_s = np.geomspace(0.05, HOLD_S, samples - RISE_SAMPLES)
     time_s = np.concatenate((np.linspace(0.0, rise_s, RISE_SAMPLES), rise_s + held_s))
@@ -151,11 +133,7 @@ def holding_records(
 
 
 def _recorded(passes: list[Pass], cycle: NDArray[np.int64], noise_N: float, seed: int) -> PadRecord:
-    """Return the passes one after the other as a record, with the sensor's noise `noise_N`, N, drawn by `seed`.
-
-    `cycle` numbers the cycles of one pass from 0, and has as many rows as each pass. In the record each pass has
-    numbers of its own. Raises ValueError without a pass, or for a noise below 0.
-    """
+    """Return the passes one after the other as a record, with the sensor's noise `noise_N`, N, drawn by `seed`."""
     features = np.concatenate([program.features(pad.cip_percent) for pad, program, _ in passes])
     true_N = np.concatenate([force_N for *_, force_N in passes])
     noisy_N = true_N + np.random.default_rng(seed).normal(0.0, noise_N, len(true_N))

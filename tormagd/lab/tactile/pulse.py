@@ -36,16 +36,12 @@ TEN_MINUTES_S = 600.0
 
 
 def pulse_shape(duration_s: float, rate_hz: int) -> Array:
-    """Return a measured pulse between 0 and 1. Raises ModuleNotFoundError where heartpy is not installed."""
+    """Return a measured pulse between 0 and 1."""
     return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1]
 
 
 def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
-    """Return measured arterial pulses (n) between 0 and 1 by file name, repeated to `duration_s` at `rate_hz`.
-
-    The name has no ending. The result is empty unless TORMAG_DATA names a folder with `aac_nibp_pulse`. Each file has a
-    head, then time, s, and pressure. Raises OSError for a file that cannot be read, ValueError for one of other cells.
-    """
+    """Return measured arterial pulses (n) between 0 and 1 by file name, repeated to `duration_s` at `rate_hz`."""
     shapes = {}
     for path in recorded("aac_nibp_pulse"):
         time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
@@ -56,12 +52,7 @@ def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
 
 
 def program(shape: Array) -> Program:
-    """Return the experiment's program: indentation to 4.5 mm at 1 mm/s, then a hold while the field follows `shape`.
-
-    `shape` (0..1, not checked) is mapped to REFERENCE_FIELDS_MT, and fills the last of the SAMPLES samples. Before it
-    the field is that of its first. The first sample is 1 / RATE_HZ after time 0. Raises ValueError for a longer one,
-    IndexError for an empty one.
-    """
+    """Return the experiment's program: indentation to 4.5 mm at 1 mm/s, then a hold while the field follows `shape`."""
     time_s = np.arange(1, SAMPLES + 1) / RATE_HZ
     displacement_mm = np.minimum(time_s, FULL_INDENTATION_MM)
     rate_mm_s = np.diff(displacement_mm, prepend=0.0) * RATE_HZ
@@ -78,13 +69,7 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 def solve_all(
     solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
 ) -> list[FieldSolution]:
-    """Find the field for each of `force_N` (n), N, in turn, from the last answer on; return the answers (n).
-
-    `features` (n x 4) are the network's, their field unused; another number of them raises ValueError. The first search
-    has no last answer. With `memory` each force is freed of the pad's relaxation first, and `memory` advances with the
-    fields found. None: forces are taken as they are. A force out of reach is no error: its answer says so in `reach`.
-    Raises DomainError for a feature that is not finite.
-    """
+    """Find the field for each of `force_N` (n), N, in turn, from the last answer on; return the answers (n)."""
     answers: list[FieldSolution] = []
     for row, wanted_N in zip(features.tolist(), force_N.tolist(), strict=True):
         displacement_mm, rate_mm_s, _, cip_percent = row
@@ -115,16 +100,10 @@ class Course(NamedTuple):
 
     @property
     def scored(self) -> Mask:
-        """Rows (n, bool) where the force depends enough on the field to score a field error."""
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 
     def scores(self, fields_mT: Array) -> dict[str, float]:
-        """Return how far `fields_mT` (n) are off: the field over the scored rows, mT, over the others the force, N.
-
-        Keys: `mae_mT`, `sd_mT`, `max_mT`, `elsewhere_force_mae_N`; the last is NaN where all rows are scored. The force
-        is what the wrong field would cost on the pad itself, without relaxation. Raises ValueError where no row is
-        scored, DomainError for a field outside the pad's law.
-        """
+        """Return how far `fields_mT` (n) are off: the field over the scored rows, mT, over the others the force, N."""
         absolute = np.abs(fields_mT - self.features[:, 2])[self.scored]
         pad, places = worked_pad(self.pad), self.features[~self.scored, :3].copy()
         right_N = plant_force_N(pad, places)
@@ -138,10 +117,7 @@ class Course(NamedTuple):
 
 
 def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
-    """Run the experiment on one pad with the pulse `shape`, and return every `every`-th of its samples, to be solved.
-
-    The pad is worked, and runs through all samples, whatever `every` is. Raises as `program`.
-    """
+    """Run the experiment on one pad with the pulse `shape`, and return every `every`-th of its samples, to be solved."""
     done = program(shape)
     force_N = worked_pad(pad).run(*done)
     features = done.features(pad.cip_percent)[::every]
@@ -156,23 +132,14 @@ def nearest() -> NearestFieldSearch:
 
 
 def aware_fields(trained: Trained, along: Course, noise_N: float = 0.0) -> Array:
-    """Return the fields (n), mT, that the relaxation-aware model finds for the forces of `along`, from a rested pad on.
-
-    Noise of the sensor, `noise_N`, N, is added to the forces first, the same each time.
-    """
+    """Return the fields (n), mT, that the relaxation-aware model finds for the forces of `along`, from a rested pad on."""
     noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
     memory = GreyBoxMemory(trained.grey, along.dt_s)
     return fields_of(solve_all(nearest(), trained.grey.model, along.features, noisy_N, memory))
 
 
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return the scores of each way from force to field by name, and the traces over time by name (n each).
-
-    The ways are the network, `mlp`, the network with the thesis's search, `mlp_thesis_search`, and the relaxation-aware
-    model without and with noise, `relaxation_aware` and `relaxation_aware_noisy`. Scores are as `Course.scores`.
-    Besides, `noise_bound_mae_mT`, the field error that noise alone would make, and `scored_share` of the rows. Traces
-    are the ways' fields and `reference`, mT, `time_s`, `displacement_mm`, `force_N`, and the pad's `slope_N_mT`.
-    """
+    """Return the scores of each way from force to field by name, and the traces over time by name (n each)."""
     linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
         "mlp": fields_of(solve_all(nearest(), trained.model, along.features, along.force_N, None)),
@@ -189,13 +156,7 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 
 
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Run the pulse experiment with each of `trainings`, and return its figures and the traces of the first training.
-
-    The first training's scores, but for the noisy way's, stand on top, beside `synthetic` and `shape`. `by_noise` has
-    each training's by its sensor noise, N, as text. There `other_pads` is a list of scores, and `other_pulses` a dict
-    by file, empty without recorded pulses. Traces are as `pulse_on`. One training at least is needed, else IndexError.
-    Raises ModuleNotFoundError where heartpy is not installed.
-    """
+    """Run the pulse experiment with each of `trainings`, and return its figures and the traces of the first training."""
     shape = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
@@ -212,13 +173,7 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
 
 
 def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
-    """Render pulses by feed-forward on a pad held at 4.5 mm for `duration_s` of virtual time, and return the errors.
-
-    Keys: `duration_s`, and `without` and `with`, of the network alone and with memory. Each has `force_error_10min` and
-    `force_error_1h`, the greatest of the first ten minutes and of all, and `mean_force_error`. These are shares of the
-    force asked for. `out_of_reach_share` is that of forces out of the field's reach. Raises ModuleNotFoundError where
-    heartpy is not installed, ValueError for a duration without a sample.
-    """
+    """Render pulses by feed-forward on a pad held at 4.5 mm for `duration_s` of virtual time, and return the errors."""
     dt_s = 1.0 / HOLD_RATE_HZ
     rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)
     count = rising + round(duration_s * HOLD_RATE_HZ)

@@ -28,12 +28,7 @@ UNSEEN_FIELDS_MT = (130.0, 230.0)
 
 
 def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceModel:
-    """Train the model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen; return it.
-
-    Its metadata have the figures of that, the pad's memory, the insert INSERT and the date `created`. `plant_name` is a
-    plant file or the name of a committed one. Rows and steps are those of `effort`. Nothing is written, and the same
-    arguments give the same model. Raises PlantError for a plant that cannot be loaded or has no pad.
-    """
+    """Train the model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen; return it."""
     plant = load_plant(plant_name)
     if plant.pad is None:
         raise PlantError(f"plant {plant_name}: allowed is one with a [pad]")
@@ -73,12 +68,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Train the model of the pad of `options.plant`, write it to `options.out` and return `out` and its metrics.
-
-    A file there is replaced; `options.created` None means today. Limits torch to one thread, for good. Raises
-    PlantError for a plant that cannot be loaded or has no pad, OSError where the model cannot be written, after the
-    training.
-    """
+    """Train the model of the pad of `options.plant`, write it to `options.out` and return `out` and its metrics."""
     torch.set_num_threads(1)
     model = trained(options.plant, FULL, options.created or datetime.date.today())
     save_model(options.out, model)

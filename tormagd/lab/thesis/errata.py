@@ -28,20 +28,13 @@ KEYS = ("place", "printed", "found", "used")
 
 
 def errata() -> list[dict[str, str]]:
-    """Return all errata in the order of the thesis: a dict of plain text for each.
-
-    Its keys are `place` in the thesis, `printed` there, `found` here, and the reading `used`.
-    """
+    """Return all errata in the order of the thesis: a dict of plain text for each."""
     found = (*_chapter_2(), _eq_25(), *_chapter_3(), *_appendices(), *_chapter_4())
     return [dict(zip(KEYS, row, strict=True)) for row in found]
 
 
 def table_2_4_errors() -> list[dict[str, object]]:
-    """Return the lines of table 2.4 whose printed error does not follow from the printed ranges, within their rounding.
-
-    Each is a dict: `insert`, and the error `printed_N`, `recomputed_N`, `printed_percent` and `recomputed_percent`.
-    Errors are magnitudes, the percents of the measured range.
-    """
+    """Return the lines of table 2.4 whose printed error does not follow from the printed ranges, within their rounding."""
     wrong = []
     for name, (printed_N, printed_percent) in TABLE_2_4_ERRORS.items():
         ranges = INSERTS[name].force_range
@@ -66,11 +59,7 @@ Row = tuple[str, str, str, str]
 
 
 def _chapter_2() -> list[Row]:
-    """Return the errata of chapter 2 but for Eq. 25, in order: place, what is printed, what was found, and the reading
-    used.
-
-    Figures are computed from what is printed. Nothing is read, and the rows are the same each time.
-    """
+    """Return the errata of chapter 2 but for Eq."""
     eq7, power = ThesisFieldLaw(), PowerFieldLaw()
     closed_Tm, open_Tm = eq7.radial_moment_Tm(CLOSED_MM), eq7.radial_moment_Tm(OPEN_MM)
     stretched = (1.206 * (200.0 - CLOSED_MM) ** 1.867 + 1256.0) * 1e-6
@@ -171,11 +160,7 @@ def _chapter_2() -> list[Row]:
 
 
 def _eq_25() -> Row:
-    """Return the erratum of Eq. 25: place, what is printed, what was found, and the reading used.
-
-    Found are both stresses of SAMPLE at the closed gap, the true and the nominal one, with the kinematics of Eq. 33 and
-    free ends.
-    """
+    """Return the erratum of Eq."""
     moment_Tm = ThesisFieldLaw().radial_moment_Tm(CLOSED_MM)
     radial = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     stretch = constitutive.stretches(radial, 1.0)
@@ -194,10 +179,7 @@ def _eq_25() -> Row:
 
 
 def _chapter_3() -> list[Row]:
-    """Return the errata of chapter 3, in order: place, what is printed, what was found, and the reading used.
-
-    How many starts lie outside appendix B's bounds, and optima at them, is counted from table 3.2.
-    """
+    """Return the errata of chapter 3, in order: place, what is printed, what was found, and the reading used."""
     low, high = APPENDIX_B_BOUNDS
     lines = [line for case in USE_CASES.values() for line in case.starts]
     outside = [f"R_o {line.start.outer_radius_mm:g}" for line in lines if not _inside(line.start, low, high)]
@@ -226,11 +208,7 @@ def _chapter_3() -> list[Row]:
 
 
 def _appendices() -> list[Row]:
-    """Return the errata of the appendices: place, what is printed, what was found, and the reading used.
-
-    They are of field, traction, gap speed, stress and cost. Fields and stresses are computed at the closed gap, of
-    SAMPLE.
-    """
+    """Return the errata of the appendices: place, what is printed, what was found, and the reading used."""
     exponent_T = 0.44 * CLOSED_MM ** (-1.3 / 6.0 * APPENDIX_MU_R) / 0.004
     sixth_T = 0.44 * CLOSED_MM**-1.3 / 6.0 * APPENDIX_MU_R / 0.004
     used_T = 0.44 * CLOSED_MM**-1.3 / 4.0 * APPENDIX_MU_R / 0.004
@@ -274,10 +252,6 @@ def _appendices() -> list[Row]:
 
 
 def _chapter_4() -> list[Row]:
-    """Return the errata of chapter 4: place, what is printed, what was found, and the reading used.
-
-    They are of the full scale that its field errors imply, and of the rate of its search.
-    """
     return [
         (
             "Abstract and section 4.3",
@@ -295,7 +269,7 @@ def _chapter_4() -> list[Row]:
 
 
 def _eq_28(moment_Tm: float) -> float:
-    """Return the force, N, by Eq. 28 as printed, for SAMPLE in TORMAG at a radial moment, T m."""
+    """Return the force, N, by Eq."""
     stretch = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     magnetic = MU0_H_M * SAMPLE.relative_permeability * (moment_Tm / TORMAG.inner_radius_m) ** 2 / stretch**2
     area = 2.0 * math.pi * TORMAG.thickness_m * TORMAG.inner_radius_m**2 * SAMPLE.friction_coefficient
@@ -303,10 +277,7 @@ def _eq_28(moment_Tm: float) -> float:
 
 
 def _literal_stretch(moment_Tm: float, *, appendix: bool = False) -> float:
-    """Return lambda1 of SAMPLE in TORMAG by Eq. 29 as printed, at a radial moment, T m; NaN where the root is not real.
-
-    With `appendix` Gamma_1 and Gamma_2 are those of the appendix, else of Eq. 30 and Eq. 31.
-    """
+    """Return lambda1 of SAMPLE in TORMAG by Eq."""
     inner, outer, t = TORMAG.inner_radius_m, TORMAG.outer_radius_m, TORMAG.thickness_m
     mu_r, g0 = SAMPLE.relative_permeability, SAMPLE.shear_modulus_Pa
     over = moment_Tm**2 / (MU0_H_M * mu_r)

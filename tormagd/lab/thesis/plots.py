@@ -18,11 +18,7 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
-    """Draw every picture of the page, and return figures by the names of files, without an ending; nothing is written.
-
-    `result` is of `reproduction.run`, `tests` are the three step tests that it was made of, in the same order. Raises
-    ModuleNotFoundError without matplotlib.
-    """
+    """Draw every picture of the page, and return figures by the names of files, without an ending; nothing is written."""
     return {
         "table_2_4": _table_2_4(result["table_2_4"]),
         "figure_2_5": _figure_2_5(result["figure_2_5"]),
@@ -34,10 +30,7 @@ def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
 
 def _table_2_4(table: Json) -> Figure:
     """Draw the force range of each insert, F(45 mm) less F(95 mm): measured with deviation, the thesis's, and ours
-    twice.
-
-    Ours are with friction fitted, and with the exponent free, too. `table` is of `reproduction.table_2_4`.
-    """
+    twice."""
     figure, axes = subplots((9.5, 4.2))
     rows = table["rows"]
     place = np.arange(len(rows))
@@ -58,10 +51,7 @@ def _table_2_4(table: Json) -> Figure:
 
 
 def _figure_2_5(data: Json) -> Figure:
-    """Draw the least and greatest force, by Eq. 7, as surfaces over shear modulus and permeability.
-
-    `data` is of `reproduction.figure_2_5`. Two dots are the thesis's working point.
-    """
+    """Draw the least and greatest force, by Eq."""
     figure = Figure(figsize=(7.5, 5.4), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
     moduli, permeabilities = np.meshgrid(data["shear_modulus_kPa"], data["relative_permeability"])
@@ -77,10 +67,7 @@ def _figure_2_5(data: Json) -> Figure:
 
 
 def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
-    """Draw the step tests over time beside the force law, and on a second axis the force ranges of all inserts.
-
-    `data` is of `reproduction.figure_2_7`, made of `tests`, three exactly; others raise ValueError.
-    """
+    """Draw the step tests over time beside the force law, and on a second axis the force ranges of all inserts."""
     figure, (axes, ranges) = subplots((12.0, 4.2), 1, 2)
     for test, row, colour in zip(tests, data["rows"], (OURS, FREE, THESIS), strict=True):
         axes.plot(test.time_s, test.force_N, color=colour, linewidth=0.9, label=f"{test.insert}, simulated device")
@@ -97,11 +84,7 @@ def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
 
 
 def _force_ranges(axes: Axes, rows: list[Json]) -> None:
-    """Draw on `axes` each insert's least and greatest force over its share of iron, one colour a matrix.
-
-    `rows` are the `ranges` of `reproduction.figure_2_7`, of three matrices exactly; others raise ValueError. A mark
-    shows where the range that the thesis measured would end above our least force.
-    """
+    """Draw on `axes` each insert's least and greatest force over its share of iron, one colour a matrix."""
     for place, (matrix, colour) in enumerate(
         zip(dict.fromkeys(row["matrix"] for row in rows), (OURS, FREE, THESIS), strict=True)
     ):
@@ -117,10 +100,7 @@ def _force_ranges(axes: Axes, rows: list[Json]) -> None:
 
 def _figure_3_2(table: Json) -> Figure:
     """Draw the portrait of the device as built over both use cases, an axis each, at the thesis's gap speed and the
-    controller's.
-
-    `table` is of `reproduction.table_3_2`, which knows these speeds.
-    """
+    controller's."""
     figure, axes = subplots((9.5, 4.0), 1, 2)
     speeds = (table["gap_speed_mm_s"]["true_thesis_speed"], table["gap_speed_mm_s"]["true"])
     for axis, (number, case) in zip(axes, USE_CASES.items(), strict=True):
@@ -132,11 +112,7 @@ def _figure_3_2(table: Json) -> Figure:
 
 
 def _figure_3_4(table: Json) -> Figure:
-    """Draw our best and the thesis's best portrait: a row for each use case, a column for each gap speed.
-
-    Ours are the best starts of `table`, of `reproduction.table_3_2`. The thesis's is the design of the greatest printed
-    coverage; its label has the true coverage. Raises ValueError where a use case has no start.
-    """
+    """Draw our best and the thesis's best portrait: a row for each use case, a column for each gap speed."""
     figure, axes = subplots((9.5, 7.6), 2, 2)
     for row, (number, case) in zip(axes, USE_CASES.items(), strict=True):
         for axis, objective in zip(row, ("true_thesis_speed", "true"), strict=True):

@@ -56,14 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return all tables and figures of the reproduction by name, for a person as the page.
-
-    Each is as the function of its name here; `table_4_1` and `pulse` are `chapter_4`'s, `errata` are a list. The folder
-    `options.out`, if given, gets reproduction.md and its pictures, in `reproduction`; both are made where missing, and
-    files there replaced. With `options.table_2_5` only that table is made, and nothing is written. Runs go to
-    `options.workers` processes. Raises ModuleNotFoundError where a package is missing, OSError where `out` cannot be
-    written. Raises RuntimeError where a simulated device faults, DomainError as `phase_portrait`.
-    """
+    """Return all tables and figures of the reproduction by name, for a person as the page."""
     if options.table_2_5:
         found = table_2_5()
         return Found(found, table(dict(zip(COLUMNS, row, strict=True)) for row in readings(found)))
@@ -95,11 +88,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def chapter_4(is_quick: bool) -> Json:
-    """Run chapter 4's experiment and return its figures, as `experiment.contract`; none of what was trained is pickled.
-
-    `is_quick` takes few rows and epochs: then the figures show only that it runs. Limits torch to one thread in this
-    process. Raises ModuleNotFoundError where heartpy or torch is not installed.
-    """
+    """Run chapter 4's experiment and return its figures, as `experiment.contract`; none of what was trained is pickled."""
     from tormagd.lab.tactile.experiment import contract
     from tormagd.lab.tactile.models import FULL, QUICK
 
@@ -108,12 +97,7 @@ def chapter_4(is_quick: bool) -> Json:
 
 
 def table_2_3() -> Json:
-    """Return each insert's masses, g in 100 cc, from volume fractions and densities, beside the printed ones.
-
-    Keys: `rows`, `max_error_g` of all, and `note`. A row has `insert`, `thesis_g` and `ours_g` by component, and
-    `max_error_g`, the greatest difference. Its `G0_kPa` is the thesis's, as printed: nothing is compared with it.
-    Components that the thesis does not print are in `ours_g` only.
-    """
+    """Return each insert's masses, g in 100 cc, from volume fractions and densities, beside the printed ones."""
     rows: list[Json] = []
     for item in INSERTS.values():
         printed = TABLE_2_3_MASSES_G[round(100 * item.cip_fraction)]
@@ -134,12 +118,7 @@ def table_2_3() -> Json:
 
 
 def table_2_4() -> Json:
-    """Return friction per matrix fitted to the measured ranges, with Eq. 7 and, beside it, with the power law.
-
-    The fit with Eq. 7 stands on top, as `_range_fit`, that of the power law in `power_field_law`, without `rows`.
-    `thesis` has the printed `mean_rel_error` and `max_rel_error`, as shares, and `registry` is as `_registry_errors`.
-    Besides `thesis_errors`, as `table_2_4_errors`, and `measure`, a sentence.
-    """
+    """Return friction per matrix fitted to the measured ranges, with Eq."""
     ours, beside = _range_fit(ThesisFieldLaw()), _range_fit(PowerFieldLaw())
     return {
         **ours,
@@ -153,13 +132,7 @@ def table_2_4() -> Json:
 
 
 def _range_fit(law: FieldLaw) -> Json:
-    """Return the fits of friction under one field law, with a fixed and a free exponent, and their relative errors.
-
-    Keys with a fixed exponent: `friction` by Shore hardness, `mean_rel_error`, `max_rel_error` and
-    `leave_one_out_mean_rel_error`. With `_free_exponent` behind each they are of the other fit, whose `exponent` stands
-    beside. `rows` are as `_range_row`. Errors are shares of the measured range. *Left out*: predicted by the fit to all
-    other inserts.
-    """
+    """Return the fits of friction under one field law, with a fixed and a free exponent, and their relative errors."""
     known = list(INSERTS.values())
     fixed, free = fit_friction(known, law), fit_exponent(known, law)
     left_out = leave_one_out(known, law, free_exponent=False)
@@ -179,11 +152,7 @@ def _range_fit(law: FieldLaw) -> Json:
 
 
 def _registry_errors() -> Json:
-    """Return the errors of range with the registry's friction, the one that inserts and simulated device have.
-
-    Keys: `friction` by Shore hardness, `mean_rel_error` and `max_rel_error`, shares of the measured range, by Eq. 7.
-    This friction is the least-squares fit of the relative errors.
-    """
+    """Return the errors of range with the registry's friction, the one that inserts and simulated device have."""
     known = list(INSERTS.values())
     friction = {item.shore_hardness: item.elastomer.friction_coefficient for item in known}
     used = RangeFit(ThesisFieldLaw(), friction, exponent=1.0)
@@ -195,12 +164,6 @@ def _registry_errors() -> Json:
 
 
 def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -> Json:
-    """Return one insert's measured and fitted ranges, N, and their relative errors, shares of the measured one.
-
-    `fixed` and `free` are the fits with a fixed and a free exponent. `left_out` is the insert's error where the fixed
-    fit was made without it. Keys: `insert`, `measured_N`, `deviation_N`, `thesis_N` with `thesis_rel_error`, `ours_N`
-    with `rel_error`, `ours_free_exponent_N` with `rel_error_free_exponent`, and `leave_one_out_rel_error`.
-    """
     ranges = item.force_range
     return {
         "insert": item.name,
@@ -217,12 +180,7 @@ def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -
 
 
 def figure_2_5() -> Json:
-    """Return the least and greatest force, N, over permeability and shear modulus, with mu_d = 0.2, by both field laws.
-
-    `eq_7` and `power` have `least_N` and `most_N` each, a row for each of `relative_permeability`, a column for each of
-    `shear_modulus_kPa`. They also have `working_point_N`, least and greatest force at the thesis's working point, and
-    `error_N`, these less the thesis's. Besides `thesis_working_point_N`, `measured_earlier_N` and `note`.
-    """
+    """Return the least and greatest force, N, over permeability and shear modulus, with mu_d = 0.2, by both field laws."""
     permeabilities = np.linspace(2.0, 4.0, 9)
     moduli_kPa = np.linspace(80.0, 280.0, 11)
     result: Json = {}
@@ -251,13 +209,7 @@ def figure_2_5() -> Json:
 
 
 def figure_2_7(tests: list[StepTest]) -> Json:
-    """Return the settled force at each gap on the simulated device, beside the force law, and all inserts' ranges.
-
-    `rows` has a dict for each of `tests`: `insert`, and `gap_mm`, `simulated_N`, `analytic_N` and `rel_error` by step.
-    `simulated_range_N`, last less first, and `measured_range_N` are single numbers. `ranges` has `insert`, `matrix`,
-    `cip_percent`, `least_N`, `most_N` and `measured_range_N` of every insert. Besides `rpm` and `note`. Raises
-    DomainError for a test of an unknown insert.
-    """
+    """Return the settled force at each gap on the simulated device, beside the force law, and all inserts' ranges."""
     rows = []
     for test in tests:
         brake = Brake.as_built(insert(test.insert).elastomer)
@@ -297,13 +249,7 @@ def figure_2_7(tests: list[StepTest]) -> Json:
 
 
 def phase_portrait(*gap_speeds_mm_s: float) -> Json:
-    """Return how much of both use cases, and of a measured pulse's points, the device as built covers.
-
-    `as_built` has a row for each use case and gap speed: `use_case`, `gap_speed_mm_s`, and the shares `trapezoid`,
-    `true` and `thesis`. `thesis` is the share printed for the use case, the same at every gap speed. `pulse` is as
-    `_pulse_cloud`. Besides `note`. Without a gap speed both have no rows. Raises DomainError for a gap speed outside
-    1e-6 mm/s to 10 m/s, ModuleNotFoundError where heartpy is not installed.
-    """
+    """Return how much of both use cases, and of a measured pulse's points, the device as built covers."""
     rows = []
     for number, case in USE_CASES.items():
         for speed in gap_speeds_mm_s:
@@ -327,13 +273,7 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
 
 
 def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
-    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed; a point is force and force rate.
-
-    `rows` has a dict for each speed: `gap_speed_mm_s`, the shares `true` and `trapezoid`, and the numbers `points`,
-    `too_fast`, `below_least_force` and `above_most_force`. `worst` are the five fastest points that it misses: `t_s`,
-    `force_N` and `rate_N_s`. Besides `insert`, `range_N` and `note`. Raises DomainError for a gap speed as
-    `phase_portrait`, ModuleNotFoundError where heartpy is not installed.
-    """
+    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed; a point is force and force rate."""
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
     rates_N_s = np.gradient(forces_N, times_s)
     brake = Brake.as_built(insert("MRE-50-40").elastomer)
@@ -371,11 +311,7 @@ RunKey = tuple[int, int, str, str]
 
 
 def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
-    """Return the runs of table 3.2 by use case, start from 1, objective and solver, which is `global` and `local`.
-
-    Nothing is run yet. `starts` is the number of starts of each use case; None: all. `gap_speed_mm_s` is the
-    controller's. Objectives are those of `_problems`. Raises DomainError for a seed outside 0..2^31.
-    """
+    """Return the runs of table 3.2 by use case, start from 1, objective and solver, which is `global` and `local`."""
     runs = {}
     for number, case in USE_CASES.items():
         for objective, problem in _problems(number, gap_speed_mm_s).items():
@@ -386,11 +322,6 @@ def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = Non
 
 
 def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
-    """Return the problems of a use case, 1 or 2, by objective: trapezoid, true, true_thesis_speed and corners.
-
-    `gap_speed_mm_s` is the controller's, with which `true` is judged; the others are with the thesis's gap speed.
-    Raises KeyError for another use case.
-    """
     region = USE_CASES[use_case].region
     return {
         "trapezoid": Problem(region, "trapezoid", GAP_SPEED_MM_S),
@@ -401,20 +332,7 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
 
 
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
-    """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's designs.
-
-    `outcomes` holds the outcome of each of `runs`; one that is missing raises KeyError. `gap_speed_mm_s` is the
-    controller's. Raises ValueError where `runs` have no global run of another objective than `corners`.
-
-    `starts` are the global runs, `local_starts` the local ones, `corner_cost_starts` those of the thesis's cost by
-    either solver. They have a row for each run, in the order of `runs`. A row has `use_case`, `start`, `objective`,
-    `design`, `coverage`, `corner_cost`, `volume_cm3` and `seconds`; of the thesis's cost `solver`, too. All coverages
-    are shares, 0 to 1.
-
-    `thesis_designs` has rows of `use_case`, `name` and `design`; `thesis` is the thesis's coverage, `ours` our own by
-    objective. `best` has a row for each use case and objective: the greatest `coverage` of `starts`, and the `spread`
-    from the least to it. Besides `gap_speed_mm_s` by objective, and `note`; `max_seconds` is that of `starts`.
-    """
+    """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's designs."""
     rows: dict[RunKey, Json] = {}
     for (use_case, start, objective, solver), run in runs.items():
         outcome = outcomes[run]

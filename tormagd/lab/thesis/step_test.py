@@ -41,16 +41,11 @@ class StepTest(NamedTuple):
 
     @property
     def gap_speed_mm_s(self) -> float:
-        """Speed of the gap in that rise."""
         return 0.8 * float(np.median(-np.diff(self.level_gap_mm))) / self.rise_s
 
 
 def step_test(fitted: Insert, seed: int) -> StepTest:
-    """Run one insert through GAPS_MM in virtual time, HOLD_S each, and return the record; times count from its start.
-
-    The record is thinned to every EVERY-th ms. Levels are means of the last SETTLED_S of each hold. `seed` draws the
-    device's noise. Raises RuntimeError where the device faults, or does not arm.
-    """
+    """Run one insert through GAPS_MM in virtual time, HOLD_S each, and return the record; times count from its start."""
     config, scene = load_config(None), load_scene("coronary")
     scene = msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N))
     plant = load_plant("sample_1")

@@ -27,12 +27,7 @@ COLUMNS = (
 
 
 def table_2_5() -> Json:
-    """Judge every insert for every task; return the verdicts, best first by the strict reading.
-
-    Keys: `tasks`, each with `task`, `range_N` (least, most), `resolution_N`, `thesis_mN`, the thesis's resolution by
-    insert, and `ranked`, a dict as `_row` for each insert. Besides `gap_resolution_mm`, `implied_gap_resolution_mm`,
-    least and greatest gap step that the thesis's figures imply, and `note`.
-    """
+    """Judge every insert for every task; return the verdicts, best first by the strict reading."""
     # the open gap is that of the device, but the law must hold beyond it where a task asks for less force
     brakes = {item.name: Brake.as_built(item.elastomer) for item in INSERTS.values()}
     steps = [
@@ -60,14 +55,6 @@ def table_2_5() -> Json:
 
 
 def _row(verdict: Verdict, task: ForceTask) -> Json:
-    """Return one insert's verdict as plain data, in both readings: by its range alone, and from the task's least force
-    on.
-
-    `measured_range_N` is table 2.4's, `matched_share` that over the task's, 1 at most. `serves`, `served_share` and
-    `reasons`, sentences, are strict. `force_N` is least and greatest force, `resolution_mN` that of a gap step.
-    `sufficient_gap_mm` would give the task's least force, but for its resolution; None where the field law does not
-    know it.
-    """
     measured_N = INSERTS[verdict.insert].force_range.measured_N
     return {
         "insert": verdict.insert,
@@ -103,10 +90,7 @@ def readings(table: Json) -> list[tuple[str, ...]]:
 
 
 def _missed(row: Json, task: Json) -> str:
-    """Return in words the forces under its least that the insert misses, and by what its measured range is too narrow.
-
-    `row` is of `task`, both of `table_2_5`. The word is `nothing` where it misses neither.
-    """
+    """Return in words the forces under its least that the insert misses, and by what its measured range is too narrow."""
     (least_N, most_N), given_N = task["range_N"], row["force_N"][0]
     missed = [f"{least_N:g}..{given_N:.2f} N"] if given_N > least_N else []
     if row["matched_share"] < 1.0:
@@ -115,7 +99,5 @@ def _missed(row: Json, task: Json) -> str:
 
 
 def _narrowest(task: Json) -> str:
-    """Return the insert with the least range among those that match, whose force changes least in a gap step; else
-    `none`."""
     matching = [row for row in task["ranked"] if row["matched_share"] == 1.0]
     return min(matching, key=lambda row: row["measured_range_N"], default={"insert": "none"})["insert"]

@@ -41,8 +41,7 @@ TABLE_2_5 = (
         {"MRE-30-30": 15.0, "MRE-50-30": 20.0, "MRE-50-40": 29.0},
     ),
 )
-"""Tasks, and the inserts the thesis names for each with the resolution it states, mN. It requires one of 0.1 N for the
-first and none for the others. A tenth of the range is taken, about the JND of force."""
+"""Tasks, and the inserts the thesis names for each with the resolution it states, mN."""
 
 FIGURE_2_5_N = (0.46, 5.4)
 "Least and most force at mu_r = 4, G0 = 277 kPa, read off the surfaces; an earlier prototype measured the second pair."

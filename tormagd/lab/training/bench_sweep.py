@@ -91,11 +91,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Record all sweeps, write the training CSV `options.out`, and return `out`, `rows` (their number) and `synthetic`.
-
-    A missing folder is made, and a file that is there replaced. Raises PlantError, ConfigError, DomainError, and
-    RuntimeError where the device faults: nothing is written then. Raises OSError where the file cannot be written.
-    """
+    """Record all sweeps, write the training CSV `options.out`, and return `out`, `rows` (their number) and `synthetic`."""
     data = record(options.plant, options.scene, options.insert, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_csv(options.out, data)
@@ -103,13 +99,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int) -> Dataset:
-    """Record a hold of the last insert and SWEEPS sweeps of each, in processes, and return the rows of all.
-
-    `cycle` is the number of the record: 0 is the hold, then come the sweeps, insert after insert. `time_s` counts from
-    when the device was switched on, anew in each record. `inserts` None or empty: the scene's own. `seed` draws hands
-    and noise; the same arguments give the same rows. Raises PlantError, ConfigError and DomainError for what cannot be
-    used, RuntimeError where the device faults.
-    """
+    """Record a hold of the last insert and SWEEPS sweeps of each, in processes, and return the rows of all."""
     scene = load_scene(scene_name)
     names = inserts or [scene.insert.name]
     courses = [Course(names[-1], (HOLD_GAP_MM,) * HOLD_STROKES, seed + SWEEPS)]  # the longest first
@@ -123,11 +113,7 @@ def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int
 
 
 def sweep_course(scene: Scene, name: str, seed: int) -> Course:
-    """Return the course of a sweep of the insert `name`, from the open gap down and up again, in steps of GAP_STEP_MM.
-
-    `seed` draws where the steps lie, and goes into the course. Both ends, BEYOND_MM beyond the scene's gaps, are
-    reached. `name` is not checked.
-    """
+    """Return the course of a sweep of the insert `name`, from the open gap down and up again, in steps of GAP_STEP_MM."""
     closed_mm, open_mm = scene.insert.gap_closed_mm - BEYOND_MM, scene.insert.gap_open_mm + BEYOND_MM
     offset_mm = np.random.default_rng(seed).uniform(0.0, GAP_STEP_MM)
     between = np.arange(open_mm - offset_mm, closed_mm, -GAP_STEP_MM)
@@ -136,11 +122,7 @@ def sweep_course(scene: Scene, name: str, seed: int) -> Course:
 
 
 def swept(plant: str, scene_name: str, course: Course) -> Array:
-    """Record one course in virtual time and return its rows (n x 6): time_s, the features, force_N along the motion.
-
-    `plant` and `scene_name` are names or files. Times count from when the device was switched on. Raises RuntimeError
-    where the device faults or does not arm; PlantError, ConfigError and DomainError as `record`.
-    """
+    """Record one course in virtual time and return its rows (n x 6): time_s, the features, force_N along the motion."""
     scene = bench_scene(load_scene(scene_name), course.insert)
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
     device = VirtualDevice(bench(with_insert(load_plant(plant), course.insert), scene), hand, seed=course.seed)
@@ -162,13 +144,7 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
 
 
 def rows_of(ticks: Array, scene: Scene) -> Array:
-    """Return the training rows (n x 6) that are kept of all ticks (m x 4, 1 ms apart), in order of time.
-
-    A tick is time_s, handle_mm, gap_mm and the force, N, with the sign of the handle's way. A row is time_s, the four
-    features, and the force along the motion. Its field is that of the gap by the field law, in the insert of `scene`.
-    Of the ticks of steady sliding one in EVERY is kept, of those due before mobilisation one in LOADED_EVERY. Raises
-    DomainError for an insert that is not in the registry.
-    """
+    """Return the training rows (n x 6) that are kept of all ticks (m x 4, 1 ms apart), in order of time."""
     _, handle_mm, gap_mm, signed_N = ticks.T
     sliding_mm_s, slides = sliding(handle_mm, gap_mm)
     loading_mm_s, loading_mm = loading(handle_mm, gap_mm, signed_N)
@@ -185,12 +161,7 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
 
 
 def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Array]:
-    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick (n) of 1 ms.
-
-    `signed_N` is the force with the sign of the handle's last way. The rate is that over the RATE_TICKS that follow,
-    with its sign; it is 0 at the end. The way has no sign, and is NaN where no row is due. Rows are due after a turn,
-    at one speed and a resting gap, every LOADED_STEP_MM up to LOADED_MM. Over RATE_TICKS ticks are needed.
-    """
+    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick (n) of 1 ms."""
     gap_mm_s, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     is_resting &= np.abs(gap_mm_s) <= RESTING_GAP_MM_S
     gone = (handle_mm[RATE_TICKS:] - handle_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
@@ -217,13 +188,7 @@ def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Ar
 
 
 def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
-    """Return the handle's rate, mm/s with its sign, at each tick (n) of 1 ms, and a mask (n) of steady sliding.
-
-    `handle_mm` and `gap_mm` (n each) are positions. Sliding counts at CREEP_MM_S / 2 or faster, while rate and gap are
-    even: a gap that moves evenly counts as one that rests. It counts after SETTLED_MM since either last changed, and
-    MOBILISED_AFTER_MM since the handle turned. The rate is as `_even` has it. Over RATE_TICKS ticks are needed. Under
-    RATE_TICKS, and for arrays of two lengths, it raises ValueError.
-    """
+    """Return the handle's rate, mm/s with its sign, at each tick (n) of 1 ms, and a mask (n) of steady sliding."""
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     slides = np.zeros(len(handle_mm), dtype=np.bool_)
@@ -242,12 +207,7 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
 
 
 def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
-    """Return the rate at each tick of 1 ms over a window around it, mm/s (n), and a mask (n) of where it is even.
-
-    Even are rates that both halves of the window agree on, to `changes_mm_s` and a share STEADY_SHARE of the rate. So
-    what moves evenly is even, as is what rests. Each half has RATE_TICKS ticks, and the record needs more, which is not
-    checked. Beyond its ends the rate counts as 0.
-    """
+    """Return the rate at each tick of 1 ms over a window around it, mm/s (n), and a mask (n) of where it is even."""
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)
     before, after = np.concatenate((edge, gone)), np.concatenate((gone, edge))
@@ -256,11 +216,7 @@ def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array,
 
 
 def bench_scene(scene: Scene, name: str) -> Scene:
-    """Return `scene` for the bench: with the insert called `name`, wider gaps and a greater force allowed.
-
-    Only the name of the insert changes; a name that does not exist is not refused here. The closed gap is BEYOND_MM
-    less, the open one STOPS_MM more. The greatest force is BENCH_MOST_N, which no gap gives, so that none is a fault.
-    """
+    """Return `scene` for the bench: with the insert called `name`, wider gaps and a greater force allowed."""
     stroke = msgspec.structs.replace(
         scene.insert,
         name=name,
@@ -274,11 +230,7 @@ def bench_scene(scene: Scene, name: str) -> Scene:
 
 
 def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
-    """Return `plant` on the bench of `scene`, which `bench_scene` made: with its switches at that scene's gaps.
-
-    The inner switches stand half a millimetre of gap further in. Both carriages start just short of the open gap. The
-    bounds of a plant file are not checked again.
-    """
+    """Return `plant` on the bench of `scene`, which `bench_scene` made: with its switches at that scene's gaps."""
     home_mm = scene.insert.gap_open_mm / 2.0
     stops = msgspec.structs.replace(
         plant.assumed,
@@ -296,12 +248,7 @@ def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan
 
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:
-    """Return the hand's motion from BEGIN_S on, and when each of its `count` strokes ends, s.
-
-    A stroke goes there and back, with a rest of STOP_S after either way; it ends before its last rest. Speeds are drawn
-    by `seed` evenly over their logarithm. The second speed of either way is fast enough to mobilise friction before a
-    creep. Until BEGIN_S, and after all strokes, the handle stands.
-    """
+    """Return the hand's motion from BEGIN_S on, and when each of its `count` strokes ends, s."""
     random = np.random.default_rng(seed)
     times, positions, ends_s = [BEGIN_S], [0.0], []
     for _ in range(count):

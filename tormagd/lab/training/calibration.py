@@ -36,7 +36,7 @@ from tormagd.physics.inserts import Insert, insert
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Columns of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the
-roller. Then its rate and the measured force, both positive in the direction of motion."""
+roller."""
 
 MIN_MOVING_SHARE = 0.3
 "Least share of every sweep in motion. Turning to and fro with rests keeps over half of it."
@@ -72,14 +72,7 @@ class CalibrationError(ValueError):
 
 
 def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
-    """Return the training rows of sweeps (n x 6, order of COLUMNS, sweep by sweep) in which the handle moves.
-
-    Rows before a sweep's displacement is known are left out; rates have no sign. `cycle` is the sweep. `field_mT` is
-    the field law's at the measured gap, in the insert `fitted`, at `inner_radius_mm`, which is not checked. A rate or a
-    displacement that hardly varied is made constant, so that the network cannot learn from its noise. Raises
-    CalibrationError where the handle hardly moved in a sweep (handle_still), LabError for too few rows, DomainError for
-    a gap outside the field law.
-    """
+    """Return the training rows of sweeps (n x 6, order of COLUMNS, sweep by sweep) in which the handle moves."""
     _, sweep, _, handle_mm, rate_mm_s, _ = table.T
     rate_mm_s = np.abs(rate_mm_s)
     is_moving = rate_mm_s >= MOVING_MM_S
@@ -115,11 +108,7 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
 
 
 def displacement(handle_mm: Array) -> Array:
-    """Return the displacement at each of the handle's positions `handle_mm` (n, in order of time), mm.
-
-    It is the distance from the last turn, without a sign, MOBILISED_MM at most. NaN until the first turn, or until so
-    much travel that an earlier turn no longer matters. One position at least is needed, else IndexError.
-    """
+    """Return the displacement at each of the handle's positions `handle_mm` (n, in order of time), mm."""
     found = np.full_like(handle_mm, np.nan)
     start_mm = float(handle_mm[0])
     turn, is_known = Turn(1.0, start_mm, start_mm), False
@@ -134,11 +123,7 @@ def displacement(handle_mm: Array) -> Array:
 
 
 def require_usable(data: Dataset) -> None:
-    """Raise CalibrationError for data of `training_rows` that no fit can make a model of; else do nothing.
-
-    Its codes are few_sweeps, field_range (too small a range) and force_dead (a force that hardly rises with the field,
-    or is always the same).
-    """
+    """Raise CalibrationError for data of `training_rows` that no fit can make a model of; else do nothing."""
     assert data.cycle is not None  # training_rows sets it
     sweeps = len(np.unique(data.cycle))
     if sweeps < MIN_SWEEPS:
@@ -167,11 +152,7 @@ def require_usable(data: Dataset) -> None:
 
 
 def noise_sd_N(data: Dataset) -> float:
-    """Return the standard deviation of the force sensor's noise, N, from third differences of neighbouring rows.
-
-    Third differences hold hardly anything but noise. Four rows are neighbours where none of the three steps between is
-    twice the usual one. 0 where no rows are. The data must have `time_s`, in order within each sweep, and four rows.
-    """
+    """Return the standard deviation of the force sensor's noise, N, from third differences of neighbouring rows."""
     assert data.time_s is not None  # training_rows sets it
     steps = np.diff(data.time_s)
     third = np.diff(data.force_N, 3)
@@ -189,14 +170,7 @@ def fit(
     epochs: int = 200,
     by_law: bool = False,
 ) -> ForceModel:
-    """Train a model on all sweeps but the judging ones, and return it with the judgement in its metrics.
-
-    `data` are of `training_rows`, and usable. The model is a network of `hidden` units, trained for `epochs` steps at
-    most, or `by_law` the law of the brake. Metrics of the judging sweeps begin with `judged_`; beside them stand
-    `noise_mae_N`, `most_mae_N`, `judged_rows` and `sweeps`. Raises CalibrationError where the judging sweeps fit too
-    badly (poor_fit), or the force falls with the field (not_rising). Raises LabError and DomainError as
-    `Dataset.split`, `fit_model` and `fit_law_model`, ModuleNotFoundError without torch, or SciPy for the law.
-    """
+    """Train a model on all sweeps but the judging ones, and return it with the judgement in its metrics."""
     assert data.cycle is not None  # training_rows sets it
     numbers = np.unique(data.cycle)
     is_judging = np.isin(data.cycle, numbers[JUDGING[1] :: JUDGING[0]])
@@ -235,11 +209,7 @@ def fit(
 
 
 def require_rising(model: ForceModel) -> None:
-    """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1 % of its span.
-
-    Else do nothing. Tried are 64 fields over those seen in training, at the greatest displacement, the middle rate and
-    the least iron. Where the force falls, more than one field gives it.
-    """
+    """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1 % of its span."""
     ranges = dict(zip(FEATURES, model.feature_ranges, strict=True))
     rate_mm_s = sum(ranges["rate_mm_s"]) / 2.0
     rows = np.array(
@@ -268,14 +238,7 @@ def calibrate(
     created: datetime.date,
     by_law: bool = False,
 ) -> dict[str, Any]:
-    """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file).
-
-    `inner_radius_mm` is where the field is stated. The model is a network, `by_law` the law of the brake; files are
-    replaced. Returns as plain data `model` and `csv`, the files' names, `insert`, `created`, and the data's `rows`,
-    `ranges` and `metrics`. Raises CalibrationError, LabError, DomainError, OSError, and ModuleNotFoundError as `fit`.
-    No new file is there then, so that the same command can be given again. Only a `training_csv` that cannot be
-    replaced leaves the new model.
-    """
+    """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file)."""
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     require_usable(data)
     model = fit(data, insert_name, created, by_law=by_law)
@@ -295,21 +258,12 @@ def calibrate(
 
 
 def read_sweep(path: Path) -> Array:
-    """Read a sweep file and return its rows (n x 6), in the order of COLUMNS.
-
-    Raises LabError naming the file and what is wrong: unreadable, another header, a cell that is no number, or out of
-    bounds.
-    """
+    """Read a sweep file and return its rows (n x 6), in the order of COLUMNS."""
     return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED, is_exact=True).values()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the calibration from the command line, print one JSON object on stdout and return the exit code.
-
-    `arguments` None: those of the process. Code 0: the model was written, or without a sweep the insert is known and
-    the needed packages are there. Code 1: there is no model, and the object holds `error` with `code`, `message` and
-    `hint`. Usage ends the process with 2.
-    """
+    """Run the calibration from the command line, print one JSON object on stdout and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(
         "sweep", type=Path, nargs="?", metavar="SWEEP.csv", help=f"columns {','.join(COLUMNS)}; none: check the insert"

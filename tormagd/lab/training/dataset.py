@@ -33,18 +33,12 @@ ALLOWED = {
     "cycle": (0.0, 1e9),
     "time_s": (0.0, 1e9),
 }
-"""Wider than any device this program drives, and narrow enough to catch a wrong unit or a shifted column.
-
-Force and displacement may be negative by noise; rate is negative when the element is unloaded."""
+"""Wider than any device this program drives, and narrow enough to catch a wrong unit or a shifted column."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Measured rows: features (n x 4, order of `FEATURES`), force_N (n), and optionally cycle (n) and time_s (n).
-
-    `cycle` labels rows that belong together (one loading cycle, one run), so that a split can keep them together.
-    Raises `LabError` on fewer than two rows.
-    """
+    """Measured rows: features (n x 4, order of `FEATURES`), force_N (n), and optionally cycle (n) and time_s (n)."""
 
     features: Array
     force_N: Array
@@ -53,11 +47,7 @@ class Dataset:
 
     @classmethod
     def of(cls, columns: Mapping[str, NDArray[Any]]) -> "Dataset":
-        """Return the data of columns by name, as the method `columns` gives them; `cycle` is cut to whole numbers.
-
-        Columns of other names are passed over. Neither values nor that all columns have the same length is checked.
-        Raises KeyError without one of COLUMNS, LabError as the class.
-        """
+        """Return the data of columns by name, as the method `columns` gives them; `cycle` is cut to whole numbers."""
         cycle = columns["cycle"].astype(np.int64) if "cycle" in columns else None
         features = np.column_stack([columns[name] for name in FEATURES])
         return cls(features, columns["force_N"], cycle, columns.get("time_s"))
@@ -81,10 +71,7 @@ class Dataset:
         return {name: (float(columns[name].min()), float(columns[name].max())) for name in COLUMNS}
 
     def scaling(self) -> Scaling:
-        """Return the scaling that maps each feature's range, and the force's, onto -1..1.
-
-        A constant feature gets gain 0, so that it has no effect. Raises `DomainError` where the force does not vary.
-        """
+        """Return the scaling that maps each feature's range, and the force's, onto -1..1."""
         low, high = self.features.min(axis=0), self.features.max(axis=0)
         span = high - low
         gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
@@ -102,10 +89,7 @@ class Dataset:
 
     def sha256(self) -> str:
         """Return the digest, in hexadecimal, of names and values: the same whatever the file's number format or line
-        ends.
-
-        The order of rows counts, that of a file's columns does not.
-        """
+        ends."""
         digest = hashlib.sha256()
         for name, column in self.columns().items():
             digest.update(f"{name} {len(column)} ".encode())
@@ -113,19 +97,11 @@ class Dataset:
         return digest.hexdigest()
 
     def subset(self, rows: NDArray[np.integer] | Mask) -> "Dataset":
-        """Return the chosen `rows`, indices or a mask (n), as data of their own, in the order of the indices.
-
-        Raises `LabError` for fewer than two, IndexError for an index that is no row.
-        """
+        """Return the chosen `rows`, indices or a mask (n), as data of their own, in the order of the indices."""
         return Dataset.of({name: column[rows] for name, column in self.columns().items()})
 
     def split(self, validation_share: float, seed: int) -> tuple["Dataset", "Dataset"]:
-        """Split at random into (training, validation), the same way for the same seed; rows keep their order.
-
-        `validation_share` is of the rows, or with cycle labels of the cycles: whole cycles go to one side. Neighbours
-        in a time series are nearly copies of each other, and a validation that holds copies of the training rows proves
-        nothing. Raises `LabError` for a share outside 0..1, or one that leaves fewer than two rows on a side.
-        """
+        """Split at random into (training, validation), the same way for the same seed; rows keep their order."""
         if not 0 < validation_share < 1:
             raise LabError(f"validation_share = {validation_share} is not allowed, only between 0 and 1")
         groups = np.arange(len(self)) if self.cycle is None else self.cycle
@@ -148,7 +124,7 @@ def records(time_s: Array) -> list[slice]:
 
 
 def times_of(data: Dataset) -> Array:
-    """Return `time_s` of the data. Raises `DomainError` where they have none."""
+    """Return `time_s` of the data."""
     if data.time_s is None:
         raise DomainError("time_s", None, "a column of the data: a model with memory needs it")
     return data.time_s
@@ -156,12 +132,7 @@ def times_of(data: Dataset) -> Array:
 
 def read_csv(path: Path) -> Dataset:
     """Read training data: header `displacement_mm,rate_mm_s,field_mT,cip_percent,force_N` (+ `cycle`, `time_s`), in any
-    order.
-
-    Raises `LabError` for a file that cannot be read, another column, and a value outside ALLOWED. It names the row of
-    the file, from 1, the column, the value and what is allowed. Also for fewer than two rows, and a `cycle` that is no
-    whole number.
-    """
+    order."""
     named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, allowed=ALLOWED, is_exact=True)
     cycle = named.get("cycle", np.zeros(0))
     for row in np.flatnonzero(cycle != np.floor(cycle))[:1].tolist():
@@ -170,11 +141,7 @@ def read_csv(path: Path) -> Dataset:
 
 
 def write_csv(path: Path | str, dataset: Dataset) -> None:
-    """Write `dataset` to `path`, replacing a file, so that `read_csv` gives back the same numbers to the last bit.
-
-    `cycle` and `time_s` are written where the data have them. Values outside ALLOWED are written, too, and `read_csv`
-    refuses them. Raises OSError; then a part of the file may be there.
-    """
+    """Write `dataset` to `path`, replacing a file, so that `read_csv` gives back the same numbers to the last bit."""
     columns = dataset.columns()
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -183,12 +150,7 @@ def write_csv(path: Path | str, dataset: Dataset) -> None:
 
 
 def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
-    """Return a mask (rows), True for the rows held out: `share` of them, rounded, drawn by `seed`. The thesis's is 70 :
-    30.
-
-    Rows of a time series are nearly copies of their neighbours: this split flatters, and is for comparison only.
-    `share` is not checked: 0 holds out none, 1 all.
-    """
+    """Return a mask (rows), True for the rows held out: `share` of them, rounded, drawn by `seed`."""
     held = np.zeros(rows, dtype=np.bool_)
     held[np.random.default_rng(seed).permutation(rows)[: round(share * rows)]] = True
     return held
@@ -202,11 +164,7 @@ def leave_one_out(dataset: Dataset, feature: str) -> Iterator[tuple[float, Mask]
 
 
 def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[int, Mask]]:
-    """Yield the number of each of `folds` folds, from 0, and the mask (n) of its rows, True for those held out.
-
-    A fold has whole cycles, drawn by `seed`, and every cycle is in one fold. The data must have cycles. More folds than
-    cycles leave some without a row.
-    """
+    """Yield the number of each of `folds` folds, from 0, and the mask (n) of its rows, True for those held out."""
     assert dataset.cycle is not None
     parts = np.array_split(np.random.default_rng(seed).permutation(np.unique(dataset.cycle)), folds)
     for fold, part in enumerate(parts):
@@ -214,10 +172,7 @@ def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[
 
 
 def trained_metrics(model: ForceModel, training: Dataset, validation: Dataset) -> dict[str, float]:
-    """Return what a model file says of its training: errors on both data sets, their rows, and `not_rising_share`.
-
-    Keys are those of `fit_metrics` behind `train_` and `validation_`, and `train_rows` and `validation_rows`, floats.
-    """
+    """Return what a model file says of its training: errors on both data sets, their rows, and `not_rising_share`."""
     return {
         **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},
         **{f"validation_{name}": value for name, value in fit_metrics(model, validation).items()},
@@ -233,11 +188,7 @@ def fit_metrics(model: ForceModel, dataset: Dataset) -> dict[str, float]:
 
 
 def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str, float]:
-    """Return mae_N, rmse_N, max_N, mae_percent (of `span_N`) and r2 of forces (n), N, predicted by any model.
-
-    There is no r2 where all measured forces are equal. Raises ZeroDivisionError for a `span_N` of 0, ValueError without
-    rows.
-    """
+    """Return mae_N, rmse_N, max_N, mae_percent (of `span_N`) and r2 of forces (n), N, predicted by any model."""
     error_N = predicted_N - force_N
     variance = float(np.var(force_N))
     mae_N = float(np.abs(error_N).mean())
@@ -254,11 +205,7 @@ def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str
 
 
 def not_rising_share(model: ForceModel, points: int = 17) -> float:
-    """Return the share, 0..1, of a grid over the training box (`points` per feature that varies) where dF/dB <= 0.
-
-    In these places no single field gives a force, or the force does not depend on the field. A model of several inserts
-    gets the greatest share of one.
-    """
+    """Return the share, 0..1, of a grid over the training box (`points` per feature that varies) where dF/dB <= 0."""
     if model.metadata.boxes:
         return max(not_rising_share(model.of(name), points) for name in model.metadata.boxes)
     axes = [np.linspace(low, high, points if high > low else 1) for low, high in model.feature_ranges]

@@ -37,15 +37,7 @@ def fit_model(
     start: ForceModel | None = None,
     rising: bool = False,
 ) -> tuple[ForceModel, Training]:
-    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went.
-
-    The data are of the `inserts`, told apart by their iron; a single name is not looked up. `memory` is what was taken
-    out of the data before. `data_sha256` and `created` go into the file. The network has `hidden` units, and takes
-    `epochs` steps at most. It is scaled by the ranges of `scaled_by` (None: of `training`), and begins with the weights
-    of `start` (None: random ones by `seed`). With `rising` its force rises with the field everywhere. Deterministic for
-    given data and seed. Raises `DomainError` for a name or count that a model file may not have, an insert without
-    rows, or a force that does not vary.
-    """
+    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went."""
     ranging = scaled_by or training
     scaling = ranging.scaling()
     network = ForceNetwork(scaling, hidden, seed=seed)
@@ -76,12 +68,7 @@ def fit_model(
 def fit_network(
     data: Dataset, known: Mask, hidden: int = 50, epochs: int = 162, start: ForceModel | None = None
 ) -> tuple[ForceModel, Training]:
-    """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` in the mask `known` (n).
-
-    A tenth of these rows, chosen at random, decides when the training stops. `start` gives the first weights; None:
-    random ones. The seeds are fixed: the same data give the same network, but for today's date in it. Returns as
-    `fit_model`. Raises DomainError as that, LabError for too few rows.
-    """
+    """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` in the mask `known` (n)."""
     rows = data.subset(known)
     stop = random_split(len(rows), 0, VALIDATION_SHARE)
     return fit_model(
@@ -99,7 +86,7 @@ def fit_network(
 
 
 def _box(data: Dataset, name: str) -> Ranges:
-    """Return the ranges of an insert's own rows. Raises DomainError for an insert with fewer than two."""
+    """Return the ranges of an insert's own rows."""
     is_own = data.features[:, CIP] == 100.0 * insert(name).cip_fraction
     if is_own.sum() < 2:
         raise DomainError("insert", name, "one that there are rows of, by cip_percent")
@@ -108,11 +95,7 @@ def _box(data: Dataset, name: str) -> Ranges:
 
 @torch.no_grad()
 def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> None:
-    """Give `network`, in place, the weights of `start`, folded from its scaling into `scaling`, that of `network`.
-
-    It then gives the same forces as `start`. A feature that is constant in `scaling` loses its weights. Both have to
-    have the same number of hidden units, else RuntimeError.
-    """
+    """Give `network`, in place, the weights of `start`, folded from its scaling into `scaling`, that of `network`."""
     weight, bias, output, constant = start.physical
     gain = np.array(scaling.input_gain)
     network.hidden_weight.copy_(torch.tensor(np.divide(weight, gain, out=np.zeros_like(weight), where=gain != 0)))

@@ -35,15 +35,12 @@ class GreyBox:
     field_series: PronySeries
 
     def predict(self, data: Dataset) -> Array:
-        """Return the force (n), N, along the records of `data`. Raises `DomainError` without `time_s`."""
+        """Return the force (n), N, along the records of `data`."""
         return _with_memory((self.series, self.field_series), elastic_parts_N(self.model, data), data)
 
 
 class GreyBoxMemory:
-    """Relaxation state of a pad while it is driven, in steps of `dt_s`, beginning at rest.
-
-    Holds the model, and the state of both its parts: that without field, and what the field adds.
-    """
+    """Relaxation state of a pad while it is driven, in steps of `dt_s`, beginning at rest."""
 
     def __init__(self, grey: GreyBox, dt_s: float) -> None:
         self._model = grey.model
@@ -51,13 +48,7 @@ class GreyBoxMemory:
         self._state, self._field_state = grey.series.relaxed(0.0), grey.field_series.relaxed(0.0)
 
     def elastic_N(self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float) -> float:
-        """Return the force without memory, N, at which the pad gives `force_N` at the end of the next step.
-
-        It is for the network to give: search the network for the field of this force. Whether any field gives it is not
-        checked. The step comes to `displacement_mm` and `rate_mm_s`, on a pad with `cip_percent` of iron. The state
-        stays: `advance` takes the step. Raises DomainError for a motion or iron that is not finite; a `force_N` of NaN
-        gives NaN.
-        """
+        """Return the force without memory, N, at which the pad gives `force_N` at the end of the next step."""
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         rest_N, _ = self._step.advance(self._state, free_N)
         # the force is affine in the driving one: its value at 0 and its slope
@@ -68,10 +59,7 @@ class GreyBoxMemory:
 
     def advance(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
         """Take one step, which ends at this motion and field, and return the force, N, that the model expects at its
-        end.
-
-        The state goes on by it. Raises DomainError for what is not finite; then the state may have gone on in part.
-        """
+        end."""
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         whole_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
         rest_N, self._state = self._step.advance(self._state, free_N)
@@ -92,12 +80,7 @@ def _with_memory(series: tuple[PronySeries, PronySeries], parts: tuple[Array, Ar
 
 
 def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
-    """Return the force with memory (n), N, from the force without, `elastic_N` (n), along the records of `data`.
-
-    Of `data` only the times count. `time_s` counts from the last rest. A record that begins later counts as having been
-    run before, from the rest on, as often as the time allows. Laboratories cycle a specimen until it repeats and then
-    record. Raises `DomainError` without `time_s`.
-    """
+    """Return the force with memory (n), N, from the force without, `elastic_N` (n), along the records of `data`."""
     times = times_of(data)
     # records with the same times run side by side: a laboratory repeats one program, and rows are slow one by one
     alike: dict[bytes, list[slice]] = {}
@@ -112,11 +95,7 @@ def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
 
 
 def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
-    """Return the force with memory (n x r), N, of r records with the same times `time_s` (n), s from the last rest.
-
-    `driving_N` (n x r) is the force without memory. A first time above 0 makes the first step a ramp as long as the
-    second; from 0 it is a jump.
-    """
+    """Return the force with memory (n x r), N, of r records with the same times `time_s` (n), s from the last rest."""
     first_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 and time_s[0] > 0 else 0.0
     # rounded, so that steps that are equal but for the rounding of the time share one update
     steps_s = np.round(np.diff(time_s, prepend=time_s[0] - first_s), 9).tolist()
@@ -138,13 +117,7 @@ def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
 
 
 def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries, PronySeries]:
-    """Fit the relaxation of two parts of the force to `holds`, and return a series for each part, with the same times.
-
-    `parts` are the forces (n each), N, that the rows of `holds` would have without memory. The first is that without
-    field, the second what the field adds. Each record is scaled to fit: a network that never saw a hold is off by some
-    percent, which must not pass for relaxation. For this reason only rows at rest, a rate of 0, count; the others make
-    the state that they begin in. Each record needs one. Raises `DomainError` without `time_s`.
-    """
+    """Fit the relaxation of two parts of the force to `holds`, and return a series for each part, with the same times."""
     at_rest = holds.features[:, RATE] == 0.0
     still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(times_of(holds))]
     terms = len(START_TIMES_S)
@@ -183,12 +156,7 @@ def fit_grey_box(
     data: Dataset, known: Mask, holds: Dataset, *, hidden: int = 30, epochs: int = 100, settling_epochs: int = 30
 ) -> GreyBox:
     """Fit the model to the rows of cycles, `data`, in the mask `known` (n), and to relaxation tests, `holds`; return
-    it.
-
-    Both begin each record as `relaxed_N` says. The network, of `hidden` units, learns for `epochs` as if there were no
-    memory, then for `settling_epochs` in each of `ROUNDS` rounds. Raises `DomainError` without `time_s`,
-    ModuleNotFoundError without torch.
-    """
+    it."""
     from tormagd.lab.training.fitting import fit_network  # with torch, which a fitted model does without
 
     model, _ = fit_network(data, known, hidden, epochs)

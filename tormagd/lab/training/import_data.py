@@ -93,10 +93,7 @@ class Imported(NamedTuple):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab import-data`; only the files and `--out` are needed.
-
-    `--column` may be given again and again. What it states is not checked here.
-    """
+    """Add the options of `tormag-lab import-data`; only the files and `--out` are needed."""
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.csv", help="several are one cycle each")
     parser.add_argument("--out", type=Path, required=True, metavar="ROWS.csv", help="for train-model, a new file")
     parser.add_argument("--cip", type=within(0.0, 100.0, "%"), metavar="PERCENT", help="iron, where no column has it")
@@ -111,14 +108,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Write `options.out` from `options.files` and return what was taken for what, left out, and missing.
-
-    Keys: `out`, `rows`, `taken`, `made`, `left_out`, `ranges` and `missing`. `taken`, `made` and `left_out` are as in
-    `Imported`, of all files together. `ranges` has least and greatest of each quantity, `missing` is as `_missing`.
-    With several files each is a `cycle` of its own, from 0. `options.picture` gets a picture of fields and rates.
-    Raises LabError for input that is refused, also an `out` that exists; nothing is written then. Raises OSError where
-    a file cannot be written, ModuleNotFoundError for a picture without matplotlib, after `out` was written.
-    """
+    """Write `options.out` from `options.files` and return what was taken for what, left out, and missing."""
     if options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
     if options.picture is not None and options.picture.suffix != ".png":
@@ -150,11 +140,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | None, cycle: int | None) -> Imported:
-    """Return the rows of a file as training data; `cip_percent` and `cycle` stand for columns that it lacks.
-
-    `stated` has the columns that a person states, by quantity. `cip_percent` None: a column has to have it. `cycle`
-    None: without a column there are no cycles. Raises LabError, naming the file, for input that is refused.
-    """
+    """Return the rows of a file as training data; `cip_percent` and `cycle` stand for columns that it lacks."""
     columns, quantities, missing = _read(path, stated)
     if cip_percent is None and "cip_percent" not in quantities:
         raise LabError(f"{path}: no column has the share of iron; state it by --cip PERCENT")
@@ -178,11 +164,7 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
 
 
 def _stated(text: str) -> tuple[str, Stated]:
-    """Return the quantity, and the column's name and unit, of the option `QUANTITY=NAME[:UNIT]`; no unit is None.
-
-    A name with a colon needs a unit. Raises LabError for an unknown quantity, no `=`, or a unit that is not the
-    quantity's; the name is not checked.
-    """
+    """Return the quantity, and the column's name and unit, of the option `QUANTITY=NAME[:UNIT]`; no unit is None."""
     quantity, equals, column = text.partition("=")
     name, colon, unit = column.rpartition(":")
     if not colon:
@@ -194,12 +176,7 @@ def _stated(text: str) -> tuple[str, Stated]:
 
 
 def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], dict[str, Array], int]:
-    """Return the columns of a file by quantity, their values in our units, and how many rows lacked one.
-
-    Values (n each) are finite, and stand in the order of the file; rows that lack one are left out. A first row that is
-    all words is taken for units. Raises LabError for a file that cannot be read, has no header or too few columns. Also
-    for a cell that is no number, for under MIN_ROWS rows, and as `_refuse_unlikely`.
-    """
+    """Return the columns of a file by quantity, their values in our units, and how many rows lacked one."""
     rows = _rows(path)
     header, columns = _header(path, rows, stated)
     places = {name: header.index(column.name) for name, column in columns.items()}
@@ -231,11 +208,7 @@ def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], 
 def _header(
     path: Path, rows: Iterator[tuple[int, list[str]]], stated: Mapping[str, Stated]
 ) -> tuple[list[str], dict[str, Column]]:
-    """Take rows until one names MIN_NAMED quantities; return its cells, and the columns by quantity.
-
-    `rows` are line and cells, as `_rows` yields them; those behind the header are left. Raises LabError where no row
-    does, force or field is not among them, or as `_columns`.
-    """
+    """Take rows until one names MIN_NAMED quantities; return its cells, and the columns by quantity."""
     header: list[str] = []
     columns: dict[str, Column] = {}
     for _, header in rows:
@@ -249,11 +222,7 @@ def _header(
 
 
 def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[str, Array]) -> None:
-    """Raise LabError for fields of no stated unit that are more likely in tesla, and for a time that falls in a cycle.
-
-    From cycle to cycle time may begin anew, where a column says which cycle a row is of. Each has two rows at least.
-    `columns` and `found` are by quantity; the message names `path`.
-    """
+    """Raise LabError for fields of no stated unit that are more likely in tesla, and for a time that falls in a cycle."""
     field, most_mT = columns["field_mT"], found["field_mT"].max()
     if not field.has_unit and most_mT < MIN_FIELD_MT:
         raise LabError(
@@ -274,11 +243,7 @@ def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[s
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line, from 1, and the cells of each row, with decimal points; comments and empty rows are left out.
-
-    Cells are parted by the semicolon, tab or comma, whichever is most frequent in the file. A comment begins with # or
-    %. Raises LabError for a file that cannot be read, is too large, or no text in UTF-8.
-    """
+    """Yield the line, from 1, and the cells of each row, with decimal points; comments and empty rows are left out."""
     try:
         text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8-sig")
     except OSError as error:
@@ -295,12 +260,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _columns(path: Path, header: list[str], stated: Mapping[str, Stated]) -> dict[str, Column]:
-    """Return which column of `header` is which quantity, stated ones first; a cell that no name fits is passed over.
-
-    The unit stands behind the name in brackets, or after an underscore. Raises LabError for a unit that is not known,
-    and for two columns of one quantity. In a row with MIN_NAMED known columns it is raised for a stated one that is not
-    there, too.
-    """
+    """Return which column of `header` is which quantity, stated ones first; a cell that no name fits is passed over."""
     found: dict[str, Column] = {}
     for cell in header:
         match = re.fullmatch(r"([A-Za-z ]+?)[ _]*(?:[\[(](.*)[\])]|_([A-Za-z_/%]+))?", cell)
@@ -344,11 +304,7 @@ def _without_duplicates(quantities: Mapping[str, Array]) -> tuple[dict[str, Arra
 
 
 def _outliers(path: Path, force_N: Array) -> Mask:
-    """Return a mask (n) of the forces that are far from the median of their neighbours, in order of time.
-
-    No force is, where most differ from their neighbours as much as in a table without order. Raises LabError, naming
-    `path`, where over MAX_OUTLIERS are.
-    """
+    """Return a mask (n) of the forces that are far from the median of their neighbours, in order of time."""
     half = NEIGHBOURS // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(force_N, half, mode="edge"), NEIGHBOURS)
     off_N = np.abs(force_N - np.median(around, axis=1))
@@ -362,12 +318,7 @@ def _outliers(path: Path, force_N: Array) -> Mask:
 
 
 def _sign(path: Path, quantities: dict[str, Array]) -> str:
-    """Turn `quantities["force_N"]` so that it is positive against the motion, and return in words what was done.
-
-    The motion is `rate_mm_s` with its sign, or else the change of `displacement_mm`; call it before `_motion`. A force
-    of one sign needs neither. Rows without motion keep their force. Raises LabError, naming `path`, where under
-    SIGN_SHARE of the rows beyond the noise follow one sign, or the rate's.
-    """
+    """Turn `quantities["force_N"]` so that it is positive against the motion, and return in words what was done."""
     force_N, rate = quantities["force_N"], quantities.get("rate_mm_s")
     if rate is None:
         rate = np.gradient(quantities["displacement_mm"]) if "displacement_mm" in quantities else np.ones(len(force_N))
@@ -387,12 +338,7 @@ def _sign(path: Path, quantities: dict[str, Array]) -> str:
 
 def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
     """Give the rate its magnitude and the displacement its meaning, travel since the turn; return in words what was
-    made of what.
-
-    Sets `rate_mm_s` and `displacement_mm` of `quantities`, and makes the one that is missing. A displacement within
-    0..MOBILISED_MM is taken as it is. Without one every row counts as sliding. Raises LabError, naming `path`, where
-    neither a rate nor time and displacement are there.
-    """
+    made of what."""
     made = []
     place, time_s = quantities.get("displacement_mm"), quantities.get("time_s")
     if "rate_mm_s" not in quantities:
@@ -415,11 +361,7 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
 
 
 def _missing(data: Dataset) -> list[str]:
-    """Return in words what the data lack: gaps in field and rate, and rates at the ends of what a handle meets.
-
-    Empty where nothing is lacking. Of each the widest gap is told, where it is over GAP_OF_RANGE of the data's own
-    range; rates count by their logarithm. The ends of the field are not judged. `data` need a row.
-    """
+    """Return in words what the data lack: gaps in field and rate, and rates at the ends of what a handle meets."""
     fields_mT = np.unique(data.features[:, 2])
     rates = np.log10(np.unique(np.clip(data.features[:, 1], RATES_MM_S[0], None)))
     missing = []
@@ -439,12 +381,7 @@ def _missing(data: Dataset) -> list[str]:
 
 
 def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
-    """Draw field and rate of all rows, coloured by force, into the PNG file `path`.
-
-    `missing`, as of `_missing`, is the title, a line each; where it is empty, the title says that nothing lacks. The
-    axis of rates is logarithmic: rows of rate 0 do not show. A file there is replaced. Raises OSError, and
-    ModuleNotFoundError without matplotlib.
-    """
+    """Draw field and rate of all rows, coloured by force, into the PNG file `path`."""
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)
     title = "\n".join(missing) or "fields and rates are covered"

@@ -65,11 +65,7 @@ class Law(NamedTuple):
     saturating_1_T: float
 
     def forces_N(self, rows: Array, fitted: Insert) -> Array:
-        """Return the force (n), N, at `rows` (n x 4, order of `FEATURES`) of the insert `fitted`.
-
-        Rates are magnitudes, above -SLOW_MM_S, and fields not below 0; neither is checked, and NaN comes of others. The
-        iron of a row plays no part. The level is MIN_N at least.
-        """
+        """Return the force (n), N, at `rows` (n x 4, order of `FEATURES`) of the insert `fitted`."""
         displacement_mm, rate_mm_s, field_mT, _ = rows.T
         nominal, thickness_m = fitted.elastomer, TORMAG.thickness_m
         inner_m, outer_m = TORMAG.inner_radius_m, TORMAG.outer_radius_m
@@ -90,11 +86,7 @@ class Law(NamedTuple):
 
 
 def mobilised_N(level_N: Array, displacement_mm: Array, stiffness_N_mm: float) -> Array:
-    """Return the force (n), N, at displacements (n) of an element whose friction has the level (n), N, above 0.
-
-    Before mobilisation the elastomer bears `stiffness_N_mm` at first, and less and less; from MOBILISED_MM on it is the
-    level. Nothing is checked.
-    """
+    """Return the force (n), N, at displacements (n) of an element whose friction has the level (n), N, above 0."""
     borne_N: Array = level_N * -np.expm1(-stiffness_N_mm * displacement_mm / level_N)
     return np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
 
@@ -106,11 +98,7 @@ SCALE = Law(0.1, 0.1, 0.1, 0.05, 0.1, 0.5, 0.01, 1e-3, 0.5, 0.3)
 
 
 def fit_law(data: Dataset, fitted: Insert) -> Law:
-    """Return the law of the insert `fitted` that is nearest to `data`, by least squares; rows far off count less.
-
-    Of many rows some FITTED_ROWS are taken, evenly. The numbers lie within LEAST and MOST. Whether the fit is good, or
-    settled, is not checked. Rates and fields have to be as for `Law.forces_N`; else ValueError.
-    """
+    """Return the law of the insert `fitted` that is nearest to `data`, by least squares; rows far off count less."""
     kept = data.subset(np.arange(0, len(data), max(1, len(data) // FITTED_ROWS)))
 
     def residual(numbers: Array) -> Array:
@@ -133,15 +121,7 @@ def fit_law_model(
     epochs: int = 200,
     seed: int = 0,
 ) -> ForceModel:
-    """Fit the law of a brake's insert to `training`, and return it as a network of `hidden` units.
-
-    The metrics are those of the network on both data sets, and the numbers of the law, by `law_` and their names.
-    `law_mae_N` and `law_max_N` say how far law and network differ in the training's box. `memory` is what was taken out
-    of the data before. `data_sha256` and `created` go into the file. `seed` begins the network, which takes `epochs`
-    steps at most. Deterministic for given data and seed. Raises DomainError for an insert that is not in the registry,
-    and for numbers that a model file may not have. Raises it for forces or fields that do not vary, and for rates below
-    0, too.
-    """
+    """Fit the law of a brake's insert to `training`, and return it as a network of `hidden` units."""
     fitted, (low_mT, high_mT) = insert(insert_name), training.ranges()["field_mT"]
     require_that(low_mT < high_mT, "field_mT", low_mT, "fields that differ: a law is of the force over the field")
     slowest_mm_s = min(float(side.features[:, RATE].min()) for side in (training, validation))
@@ -172,10 +152,7 @@ def fit_law_model(
 
 
 def _drawn(data: Dataset) -> Array:
-    """Return DRAWN rows (n x 4) spread over the box of `data`, its edges included; rates are spread by logarithm.
-
-    A share SLIDING of them has the greatest displacement. The same box gives the same rows.
-    """
+    """Return DRAWN rows (n x 4) spread over the box of `data`, its edges included; rates are spread by logarithm."""
     low, high = data.features.min(axis=0), data.features.max(axis=0)
     share = Halton(len(FEATURES), scramble=False).random(DRAWN)
     share = np.clip((1.0 + 2.0 * EDGE) * share - EDGE, 0.0, 1.0)
@@ -187,13 +164,7 @@ def _drawn(data: Dataset) -> Array:
 
 
 def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: int, seed: int) -> ForceModel:
-    """Return a network that rises with the field everywhere, fitted to `forces_N` (n) at `rows` (n x 4).
-
-    The columns of `rows` are FEATURES, unscaled, in UNITS. Size and scaling are of `metadata`. It takes `epochs` steps
-    at most; whether the fit settled is not checked. Least squares over the weights, by Newton's method with the
-    Jacobian's normal equations. The weights of the field and of the output are positive, because their logarithms are
-    what is sought.
-    """
+    """Return a network that rises with the field everywhere, fitted to `forces_N` (n) at `rows` (n x 4)."""
     scaling, hidden = metadata.scaling, metadata.hidden
     inputs = scaling.scaled(rows)
     targets = (forces_N - scaling.output_offset) * scaling.output_gain
@@ -232,12 +203,7 @@ def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: i
 
 
 def _first(metadata: ModelMetadata, rows: Array, seed: int) -> Array:
-    """Return the numbers (p) that the fit of a network begins with, as `_as_network` has them, drawn by `seed`.
-
-    They are the hidden weights unit by unit, hidden biases, output weights and the output bias. Weights of the field
-    and of the output are logarithms. Each unit turns at one of `rows`, over half of a feature's range. Over the rate it
-    turns within that rate: friction changes most where a handle is slow.
-    """
+    """Return the numbers (p) that the fit of a network begins with, as `_as_network` has them, drawn by `seed`."""
     random = np.random.default_rng(seed)
     scaling, hidden = metadata.scaling, metadata.hidden
     turns = rows[random.integers(len(rows), size=hidden)]

@@ -51,11 +51,7 @@ class Training:
 
 
 def jacobian(network: ForceNetwork, inputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return scaled force (n) and its derivatives (n x p) by every weight, for scaled `inputs` (n x 4).
-
-    Columns: hidden_weight row by row, hidden_bias, output_weight, output_bias: the order of `network.parameters()`.
-    Forces are from -1 to 1 over the range of the scaling.
-    """
+    """Return scaled force (n) and its derivatives (n x p) by every weight, for scaled `inputs` (n x 4)."""
     hidden = torch.sigmoid(torch.addmm(network.hidden_bias, inputs, network.hidden_weight.T))
     by_bias = hidden * (1 - hidden) * network.output_weight
     by_weight = (by_bias[:, :, None] * inputs[:, None, :]).flatten(start_dim=1)
@@ -74,17 +70,7 @@ def train(
     patience: int = 10,
     rising: bool = False,
 ) -> Training:
-    """Fit `network`, of float64, to `training` in place, and leave it with the weights that did best on `validation`.
-
-    These are the weights of the start, `best.epoch` 0, where no step did better. It stops (`stopped_by`) after `epochs`
-    accepted steps ("epochs"), or when no damping lowers the training error any more ("damping"). It also stops when
-    `patience` steps in a row have not lowered the validation error by the share MIN_IMPROVEMENT ("validation").
-    Deterministic for a given network and data.
-
-    With `rising` the force rises with the field everywhere, whatever the data. The start is changed first, as in
-    `_made_rising`, and its constant output is lost. Each unit's weight of the field and its output stay positive,
-    because a step changes their logarithms. Raises `DomainError` for a count below 1.
-    """
+    """Fit `network`, of float64, to `training` in place, and leave it with the weights that did best on `validation`."""
     for name, count in (("epochs", epochs), ("patience", patience)):
         if count < 1:
             raise DomainError(name, count, "1 or more")
@@ -135,12 +121,7 @@ def train(
 
 def _made_rising(network: ForceNetwork) -> Tensor:
     """Turn each unit of `network`, in place, so that it rises with the field; return which parameters must stay
-    positive.
-
-    The result is a mask (p) of bool in the order of `network.parameters()`. It is True for the hidden units' weights of
-    the field and for the output's weights, which are MIN_POSITIVE at least. The output's constant is set so that units
-    that are all half on give the middle of the forces.
-    """
+    positive."""
     weight, output = network.hidden_weight, network.output_weight
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
     weight.mul_(side[:, None])
@@ -164,10 +145,7 @@ def _mean_square(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> floa
 
 
 def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return J'J / n (p x p) and J'r / n (p) of the scaled force over p parameters, with r = output - target.
-
-    The n rows of `inputs` (n x 4) and `targets` (n) are scaled, and taken in batches.
-    """
+    """Return J'J / n (p x p) and J'r / n (p) of the scaled force over p parameters, with r = output - target."""
     size = sum(parameter.numel() for parameter in network.parameters())
     normal = torch.zeros(size, size, dtype=inputs.dtype)
     gradient = torch.zeros(size, dtype=inputs.dtype)
@@ -179,10 +157,7 @@ def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) ->
 
 
 def _step(normal: Tensor, gradient: Tensor, damping: float) -> Tensor | None:
-    """Return the step (p), -(J'J + damping I)^-1 J'r; None where rounding has cost the matrix its definiteness.
-
-    `normal` is J'J (p x p), `gradient` J'r (p); neither is changed.
-    """
+    """Return the step (p), -(J'J + damping I)^-1 J'r; None where rounding has cost the matrix its definiteness."""
     damped = normal + damping * torch.eye(len(gradient), dtype=normal.dtype)
     factor, failed = torch.linalg.cholesky_ex(damped)
     if int(failed):

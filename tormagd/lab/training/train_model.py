@@ -23,10 +23,7 @@ from tormagd.output import write_line
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab train-model`; data, element, insert and the file to write are needed.
-
-    Numbers are not checked here, but for the seed.
-    """
+    """Add the options of `tormag-lab train-model`; data, element, insert and the file to write are needed."""
     parser.add_argument(
         "data", type=Path, metavar="DATA.csv", help="training CSV; a `cycle` column keeps cycles together"
     )
@@ -55,12 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Found:
     """Train a model on the CSV `options.data`, write it to `options.out` and return `out`, `data_sha256` and its
-    metrics.
-
-    A file there is replaced. Of a network `stopped_by` is returned, too. Raises LabError for data or an option that is
-    refused, DomainError and ModuleNotFoundError as `fit`, OSError where the model cannot be written. Nothing is written
-    then.
-    """
+    metrics."""
     if options.out.is_dir() or not options.out.parent.is_dir():
         raise LabError(f"cannot write {options.out}: allowed is a file in a folder that exists")
     if options.law and (options.element is not Element.TORQUE or len(options.insert) > 1):
@@ -72,14 +64,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, dict[str, str]]:
-    """Train on `data` as `options` say, and return the model with its metrics, and of a network `stopped_by`.
-
-    With `options.law` it is the law of a brake with one insert, else a network; the former returns an empty dict. With
-    `options.without_memory` the memory is taken out of the data first, told on stderr, and kept in the model.
-    `options.created` None means today. Raises DomainError as `fit_model`, `fit_law_model` and `identify`, LabError for
-    a share that leaves too few rows on a side. Raises ModuleNotFoundError for a network without torch, before anything
-    is computed.
-    """
+    """Train on `data` as `options` say, and return the model with its metrics, and of a network `stopped_by`."""
     if not options.law:
         from tormagd.lab.training.fitting import fit_model  # with torch, which a law does without
     data_sha256, memory = data.sha256(), NO_MEMORY

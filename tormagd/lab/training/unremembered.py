@@ -24,8 +24,7 @@ from tormagd.model.memory import Memory
 START_TIMES_S = (10.0, 100.0, 1000.0)
 "Time constants of field-step tests."
 TIME_SPREADS = (3.0, 3.0, 1.01)
-"""A fitted time stays within this factor of its start, so that times cannot change places. The last is hardly fitted:
-records of ten minutes do not tell a slow term from one that is slower and greater."""
+"""A fitted time stays within this factor of its start, so that times cannot change places."""
 START_FRACTION = 0.03
 DEGREE = 4
 "Degree of the polynomial for the logarithm of D over that of the field."
@@ -37,12 +36,7 @@ ROBUST_N = 0.05
 
 
 def identify(data: Dataset) -> tuple[Memory, Dataset]:
-    """Identify the memory in the records of `data`; return it, and the rows with the forces of a device without memory.
-
-    The rows returned are all of `data`, in order, with other forces. Every record begins after a long rest, and a new
-    one wherever time goes back. Fields are above 0, rates are magnitudes; that is not checked. How well the fit does is
-    not judged. Deterministic. Raises `DomainError` without `time_s`.
-    """
+    """Identify the memory in the records of `data`; return it, and the rows with the forces of a device without memory."""
     every = max(1, len(data) // FITTED_ROWS)
     kept = data.subset(np.arange(0, len(data), every))
     terms = len(START_TIMES_S)
@@ -106,12 +100,7 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
 
 
 def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
-    """Return by how much the element's field lags behind `field_mT` (n) at each row, mT (n).
-
-    The element's field is `field_mT` less the lag. While the field rises, the lag goes to `memory.lag_mT`, while it
-    falls, to the negative of that. A change by `memory.turn_mT` takes it most of the way; time has no effect. Each
-    record of `rows`, of which only the times count, begins without a lag. Raises DomainError without `time_s`.
-    """
+    """Return by how much the element's field lags behind `field_mT` (n) at each row, mT (n)."""
     lag_mT = np.zeros_like(field_mT)
     for record in records(times_of(rows)):
         now, found = 0.0, []
@@ -125,11 +114,7 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
 
 
 def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:
-    """Return how much of the force `driving_N` (n) has relaxed away at each row, N (n).
-
-    Each record of `rows`, of which only the times count, begins as after a long rest under its first force. Between
-    rows the force counts as the mean of both. Raises DomainError without `time_s`.
-    """
+    """Return how much of the force `driving_N` (n) has relaxed away at each row, N (n)."""
     times, away_N = times_of(rows), np.zeros_like(driving_N)
     fractions = np.array(memory.fractions)
     for record in records(times):

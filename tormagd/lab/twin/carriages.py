@@ -44,12 +44,7 @@ def lag_s(plant: PlantParameters) -> float:
 
 
 def priors_of(plant: PlantParameters, supply_V: float, tick_ms: float) -> list[Prior]:
-    """Return what is believed of carriages before, about `plant`: the spread of the plant card's devices.
-
-    Of the keys of the plant file, and at the end of `supply` and `pull`, factors of what was told, and `delay_s`.
-    `supply_V` is what the recording tells of the supply, `tick_ms` the time between two control ticks; neither is
-    checked.
-    """
+    """Return what is believed of carriages before, about `plant`: the spread of the plant card's devices."""
     ripple = RIPPLE_MS * tick_ms
     shares = {
         "motor.resistance_Ohm": (0.15, 0.0),
@@ -72,12 +67,7 @@ def priors_of(plant: PlantParameters, supply_V: float, tick_ms: float) -> list[P
 
 
 def fit_carriages(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Driven:
-    """Fit both motors, gearboxes and screws to all moving rows of `ways`, and return them as told beside `prior`.
-
-    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Keys that carriages do not have are
-    passed over. Supply and rate of ticks are those of the first of `ways`, which has to be there. Raises LabError where
-    either carriage moved in under MIN_MOVING rows.
-    """
+    """Fit both motors, gearboxes and screws to all moving rows of `ways`, and return them as told beside `prior`."""
     tick_ms = 1e3 / GRID_HZ / float(np.median(ways[0].ticks))
     priors = [
         each
@@ -113,10 +103,7 @@ def fit_carriages(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequenc
 
 
 def _volts_off(plant: PlantParameters, seen: Moves, told: Mapping[str, float]) -> Array:
-    """Return by how much each row (n) of one carriage misses the law of volts, V; above 0 where too much was applied.
-
-    `told` has `supply`, the supply's factor, and `delay_s`, s.
-    """
+    """Return by how much each row (n) of one carriage misses the law of volts, V; above 0 where too much was applied."""
     motor, omega = plant.motor, _screw(plant, seen.speed_m_s)
     applied = told["supply"] * (seen.volts - told["delay_s"] * seen.volts_s)
     return (
@@ -129,10 +116,7 @@ def _volts_off(plant: PlantParameters, seen: Moves, told: Mapping[str, float]) -
 
 def _amps_off(plant: PlantParameters, seen: Moves, pull_N: Array, side: str) -> Array:
     """Return by how much each row (n) of one carriage misses the law of torque, A; above 0 where the current is too
-    much.
-
-    `pull_N` (n) is the magnets' pull at the rows' gaps, `side` one of SIDES. A row that stands has no friction.
-    """
+    much."""
     gear, screw = plant.gear, plant.screw
     coupling = gear.ratio * plant.motor.back_emf_V_s_rad
     way = np.sign(seen.speed_m_s)
@@ -150,5 +134,4 @@ def _amps_off(plant: PlantParameters, seen: Moves, pull_N: Array, side: str) -> 
 
 
 def _screw(plant: PlantParameters, along_m: Array) -> Array:
-    """Return a carriage's motion as the screw's, in radians."""
     return along_m / (plant.screw.lead_mm * 1e-3 / math.tau)

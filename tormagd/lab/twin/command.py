@@ -69,13 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Fit a plant to the recordings `options.files`, and return what is told, what is not, and the model error.
-
-    The figures are as `figures_of`. The exit code is 1 where the laws do not explain the device. The plant is written
-    to `options.out`, and drawn to `options.plot`, all the same. A picture that is there is replaced, a plant is
-    refused. Raises LabError for recordings or a sensor that are refused, PlantError for the prior. Raises OSError where
-    a file cannot be written, ModuleNotFoundError for a picture without matplotlib.
-    """
+    """Fit a plant to the recordings `options.files`, and return what is told, what is not, and the model error."""
     if options.out is not None and options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
     if options.plot is not None and options.plot.suffix != ".png":
@@ -95,13 +89,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> dict[str, Any]:
-    """Return a twin as plain data: numbers with half the width of their 95 % intervals, and sentences.
-
-    `prior` and `ways` are those of `twin_of`. `says` are sentences for a person, `cut_out` those of the sensor,
-    `field_law` the law's name. `told` has `name`, `value` and `half_width` of combinations and keys, `unknown` the
-    other keys with `name`, `prior` and `motion`, in words. `sensors` has `file`, `zero_mN` and `drift_mN_min` of each
-    recording. `model_error` has `force_mN`, `sensor_noise_mN`, `gap_mm` and `is_explained`.
-    """
+    """Return a twin as plain data: numbers with half the width of their 95 % intervals, and sentences."""
     strength = value_at(twin.plant, STRENGTH) / value_at(prior, STRENGTH)
     error_mN, noise_mN = 1e3 * twin.force.error_N, 1e3 * twin.noise_N
     says = [
@@ -137,11 +125,7 @@ def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> d
 
 def draw(path: Path, twin: Twin, way: Excerpt) -> None:
     """Draw the measured force of one recording, what the plant explains of it, and the difference, to the PNG file
-    `path`.
-
-    `way` has to be the first recording of the twin: its zero and memory are taken. A file there is replaced. Raises
-    OSError, and ModuleNotFoundError where matplotlib is not installed.
-    """
+    `path`."""
     zero_N = 1e-3 * (twin.force.zeros[0]["zero_mN"] + twin.force.zeros[0]["drift_mN_min"] * way.minute)
     explained_N = along(twin.plant, way, twin.force.memory_N, fresh_along(twin.plant, way)) + zero_N
     draw_beside(
@@ -162,11 +146,7 @@ def motion_for(key: str) -> str:
 
 
 def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
-    """Write the plant to the new file `path`, with the lines of `head` as comments above, and read it again.
-
-    Lines of `head` have no line ends. Raises LabError where the file exists, or what was fitted is no plant; then there
-    is no new file. Raises OSError, which may leave a part of the file.
-    """
+    """Write the plant to the new file `path`, with the lines of `head` as comments above, and read it again."""
     text = "\n".join([*(f"# {line}" for line in head), *_lines(twin)]) + "\n"
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -181,10 +161,7 @@ def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
 
 def _lines(twin: Twin) -> Iterator[str]:
     """Yield the lines of the plant file: each table's head after an empty line, then `key = value # comment` for each
-    key.
-
-    Numbers have six digits. Tables that the plant has not, and what is assumed as usual, are left out.
-    """
+    key."""
     tables: dict[str, Any] = msgspec.to_builtins(twin.plant)
     usual = msgspec.to_builtins(Assumed())
     for title in PlantParameters.__struct_fields__:
@@ -205,10 +182,7 @@ def _short(value: Any) -> Any:
 
 
 def _comment(twin: Twin, key: str, value: Any) -> str:
-    """Return the comment of a key: how sure it is, or what would tell it.
-
-    `value` is a number, a list of them or a name. Of a list each number's half width is told.
-    """
+    """Return the comment of a key: how sure it is, or what would tell it."""
     if isinstance(value, list | tuple):
         told = [twin.keys.get(f"{key}.{place}") for place in range(len(value))]
         if any(told):

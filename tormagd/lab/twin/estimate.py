@@ -30,10 +30,7 @@ PlantOf = Callable[[Values], PlantParameters]
 
 
 def value_at(plant: PlantParameters, key: str) -> float:
-    """Return the number at a key of the plant file, as `motor.resistance_Ohm`; `.0` is the first of a list.
-
-    Raises AttributeError or IndexError for a key that is none, ValueError or TypeError for one of no number.
-    """
+    """Return the number at a key of the plant file, as `motor.resistance_Ohm`; `.0` is the first of a list."""
     found: Any = plant
     for name in key.split("."):
         found = found[int(name)] if name.isdigit() else getattr(found, name)
@@ -42,10 +39,7 @@ def value_at(plant: PlantParameters, key: str) -> float:
 
 def keys_of(plant: PlantParameters) -> list[str]:
     """Return the keys of all numbers in a plant file, as `value_at` takes them; not of what is assumed, of [pad] or
-    [second].
-
-    They stand in the order of the file; each number of a list has its own key.
-    """
+    [second]."""
     tables = msgspec.to_builtins(plant)
     named = ((f"{title}.{name}", value) for title in PARTS for name, value in tables[title].items())
     listed = (
@@ -57,11 +51,7 @@ def keys_of(plant: PlantParameters) -> list[str]:
 
 
 def with_values(plant: PlantParameters, values: Mapping[str, float]) -> PlantParameters:
-    """Return the plant with other numbers at some keys, as `value_at` takes them; `plant` itself stays.
-
-    Neither numbers nor bounds are checked. A key of a name that the table has not raises TypeError, of a table
-    AttributeError.
-    """
+    """Return the plant with other numbers at some keys, as `value_at` takes them; `plant` itself stays."""
     for key, value in values.items():
         table, name, *index = key.split(".")
         part = getattr(plant, table)
@@ -75,10 +65,7 @@ def with_values(plant: PlantParameters, values: Mapping[str, float]) -> PlantPar
 
 
 class Prior(NamedTuple):
-    """What is known of a number before: its key, its value, and half the width of its interval.
-
-    A key without a dot is no key of the plant file.
-    """
+    """What is known of a number before: its key, its value, and half the width of its interval."""
 
     key: str
     value: float
@@ -90,10 +77,7 @@ class Prior(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Values (p) of some priors and their covariance (p x p), what they leave (n), and the plant that they make.
-
-    `deviations` make an interval of 95 %.
-    """
+    """Values (p) of some priors and their covariance (p x p), what they leave (n), and the plant that they make."""
 
     priors: Sequence[Prior]
     values: Array
@@ -104,23 +88,15 @@ class Estimate(NamedTuple):
 
     @property
     def plant(self) -> PlantParameters:
-        """Return the plant that fits."""
         return self.plant_of(named(self.priors, self.values))
 
     def width_of(self, key: str) -> float:
-        """Return half the width of the 95 % interval of the values at a key, told or not: the widest.
-
-        Floors do not count. Raises ValueError for a key that no prior has.
-        """
+        """Return half the width of the 95 % interval of the values at a key, told or not: the widest."""
         places = [place for place, each in enumerate(self.priors) if each.key == key]
         return self.deviations * math.sqrt(float(np.diag(self.covariance)[places].max()))
 
     def half_width(self, function: Callable[[PlantParameters], float]) -> float:
-        """Return half the width of the 95 % interval of a number of the plant, in its unit.
-
-        `function` gives the number for a plant. NaN where the data do not tell it: where the interval is over TOLD of
-        the prior's, or the number depends on no value. The floors of the priors count, too.
-        """
+        """Return half the width of the 95 % interval of a number of the plant, in its unit."""
         widths = np.array([each.half_width for each in self.priors])
 
         def at(values: Array) -> float:
@@ -142,12 +118,7 @@ def estimated(
     residuals: Callable[[Array], Array], priors: Sequence[Prior], blocks: Array, noise: float, plant_of: PlantOf
 ) -> Estimate:
     """Return the values that make `residuals` (n, of the p values) small beside `noise`, and stay near their priors
-    (p).
-
-    Values are in the priors' order and units, and not under their least. Residuals of one number in `blocks` (n) may be
-    correlated in any way. `plant_of` makes a plant of values by key. At most ROUNDS evaluations with their slopes are
-    made, and whether they settled is not told. Raises ValueError where the residuals are not finite at the priors.
-    """
+    (p)."""
     middle, widths = (np.array([getattr(each, name) for each in priors]) for name in ("value", "half_width"))
     least = (np.array([each.least for each in priors]) - middle) / widths
 

@@ -73,11 +73,7 @@ class Moves(NamedTuple):
 
 
 class Excerpt(NamedTuple):
-    """What one recording says: rows (n) at GRID_HZ, without a gap in time, and the moving carriages.
-
-    `force_N` is as the sensor says it, NaN where the daemon had no new one. `readings` counts the changes of the
-    reading in each row, `ticks` its control ticks. `noise_N` has a sensor's noise by chunk, one sample's.
-    """
+    """What one recording says: rows (n) at GRID_HZ, without a gap in time, and the moving carriages."""
 
     name: str
     gap_mm: Array
@@ -93,7 +89,6 @@ class Excerpt(NamedTuple):
 
     @property
     def sensor_noise_N(self) -> float:
-        """Return the noise of one reading of the force sensor, N."""
         return float(np.median(self.noise_N))
 
     def first(self, lasts_s: float) -> "Excerpt":
@@ -103,12 +98,10 @@ class Excerpt(NamedTuple):
 
     @property
     def time_s(self) -> Array:
-        """Times of the rows (n) from the first, s."""
         return np.arange(len(self.gap_mm)) / GRID_HZ
 
     @property
     def minute(self) -> Array:
-        """Times of the rows (n) from the middle, minutes."""
         return np.asarray((self.time_s - self.time_s[-1] / 2.0) / 60.0)
 
 
@@ -117,11 +110,7 @@ ROWS = ("gap_mm", "handle_mm", "force_N", "temperature_C", "readings", "ticks")
 
 
 def excerpt_of(path: Path) -> Excerpt:
-    """Read the recording in `path`, once from its beginning, and return its excerpt.
-
-    Raises LabError, naming the file, where it is none or damaged, too short, too long, or has too few ticks a second.
-    Also where time falls, or a needed quantity is never told.
-    """
+    """Read the recording in `path`, once from its beginning, and return its excerpt."""
     taking = Taking(str(path))
     try:
         read_recording(path, Tick, taking.see)
@@ -145,11 +134,7 @@ class Taking:
         self._moves: dict[str, list[Array]] = {side: [] for side in SIDES}
 
     def see(self, seen: Seen) -> None:
-        """Take a message of a recording; snapshots, and ticks without a time, are passed over.
-
-        The message of a tick is a `Tick`. Time that falls, or more than LONGEST_S, is refused by `done`; what follows
-        is passed over.
-        """
+        """Take a message of a recording; snapshots, and ticks without a time, are passed over."""
         if not seen.is_tick or self._refusal or math.isnan(now_s := seen.message.monotonic_s):
             return
         if not self._rows:
@@ -165,11 +150,7 @@ class Taking:
         self._rows.append((*numbers, float(mode == "RUN")))
 
     def done(self) -> Excerpt:
-        """Return what all ticks said; to be called once, after the last. It ends the chunk that is begun.
-
-        Gap, handle and temperature that are not known are the last known ones. Raises LabError, naming the recording,
-        where the ticks do not serve: what `see` refused, too short, too rare, or a quantity that is never told.
-        """
+        """Return what all ticks said; to be called once, after the last."""
         if self._rows:
             self._end_chunk()
         grid = np.concatenate(self._grids, axis=1) if self._grids else np.zeros((6, 1))
@@ -204,10 +185,7 @@ class Taking:
         )
 
     def _end_chunk(self) -> None:
-        """Reduce the waiting ticks, one at least, to rows, noise, supply, clock and moves of a chunk, and drop them.
-
-        A row without a tick has NaN, and counts of 0. Under MIN_TICKS ticks give no moves.
-        """
+        """Reduce the waiting ticks, one at least, to rows, noise, supply, clock and moves of a chunk, and drop them."""
         columns = dict(zip((*NUMBERS, "runs"), np.array(self._rows).T, strict=True))
         columns["gap_mm"] = columns["left_mm"] + columns["right_mm"]
         self._rows = []
@@ -247,12 +225,7 @@ class Taking:
 
 def _moving(columns: dict[str, Array], side: str, times_s: Array, period_s: float) -> Array:
     """Return the rows of `Moves` of a chunk (10 x n), in order of its fields, while the duties drive the carriage
-    `side`.
-
-    `columns` has NUMBERS, `runs` and `gap_mm` by tick, `times_s` the ticks' times from the recording's first. Rows
-    stand MOVING_EVERY_S apart at least, and keep off gaps in time, other modes, and the chunk's ends. There may be
-    none.
-    """
+    `side`."""
     seen = smoothed(period_s, columns, side)
     margin = 2 * seen.window
     even = np.ones(len(times_s))
@@ -288,6 +261,5 @@ def _moving(columns: dict[str, Array], side: str, times_s: Array, period_s: floa
 
 
 def _held(values: Array) -> Array:
-    """Return values where each that is not known is the last known one, or before the first that one."""
     known = np.flatnonzero(np.isfinite(values))
     return values[known[np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)]]

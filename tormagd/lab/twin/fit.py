@@ -39,10 +39,7 @@ class Told(NamedTuple):
 
 
 class Twin(NamedTuple):
-    """A plant, what is told of its keys and of COMBINATIONS, and what is not explained: RMS, in N and in mm.
-
-    A key that is not told has the value of the prior.
-    """
+    """A plant, what is told of its keys and of COMBINATIONS, and what is not explained: RMS, in N and in mm."""
 
     plant: PlantParameters
     keys: dict[str, Told]
@@ -53,7 +50,6 @@ class Twin(NamedTuple):
 
     @property
     def is_explained(self) -> bool:
-        """Whether the laws are this device's."""
         return self.force.error_N <= EXPLAINED_N and self.gap_error_mm <= EXPLAINED_MM
 
 
@@ -80,12 +76,7 @@ STANDS_FOR = {STRENGTH: strength_N, EXPONENT: slope}
 
 
 def twin_of(prior: PlantParameters, ways: Sequence[Excerpt]) -> Twin:
-    """Fit a plant about `prior` to the recordings `ways` of one device, one at least, and return it with what is told.
-
-    The field law is the one that explains the first two minutes better. Keys are fitted twice: all, and then those that
-    were told alone. Nothing is judged: see `is_explained`. Raises LabError for a prior with [pad] or [second], a force
-    sensor that is not to be believed, and a device whose carriages hardly moved.
-    """
+    """Fit a plant about `prior` to the recordings `ways` of one device, one at least, and return it with what is told."""
     if prior.pad is not None or prior.second is not None:
         raise LabError("--prior: allowed is a plant with an insert, without [pad] and [second]")
     under = [
@@ -115,10 +106,7 @@ def twin_of(prior: PlantParameters, ways: Sequence[Excerpt]) -> Twin:
 
 
 def _told(estimate: Estimate) -> dict[str, float]:
-    """Return half the width of the interval of each key of the plant file that the data tell; the others are absent.
-
-    The width of a key of STANDS_FOR is that of its combination, in the key's unit.
-    """
+    """Return half the width of the interval of each key of the plant file that the data tell; the others are absent."""
     found, plant = {}, estimate.plant
     for key in (each.key for each in estimate.priors if "." in each.key):
         function = STANDS_FOR.get(key, lambda plant, key=key: value_at(plant, key))
@@ -138,11 +126,7 @@ def _noise_N(ways: Sequence[Excerpt]) -> tuple[float, float]:
 
 
 def _of_sensor(ways: Sequence[Excerpt], force: Fitted) -> dict[str, Told]:
-    """Return by key what is seen without a law: the sensor's noise, drift and rate, the supply, and the device's clock.
-
-    Values are means over `ways`; the drift has no sign. The drift is absent where its interval is too wide, the rate
-    where the sensor is as fast as the ticks.
-    """
+    """Return by key what is seen without a law: the sensor's noise, drift and rate, the supply, and the device's clock."""
     noise_N, width_N = _noise_N(ways)
     drift_mN_min = float(np.mean([abs(zero["drift_mN_min"]) for zero in force.zeros]))
     rows, readings, ticks = (

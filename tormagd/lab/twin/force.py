@@ -43,11 +43,7 @@ WANDER_S = 30.0
 
 
 class Fitted(NamedTuple):
-    """The element's estimate, what was cut out of the recordings, and the sensor's zero in each.
-
-    `zeros` has `zero_mN` in the recording's middle, and `drift_mN_min`. `error_N` is what the law leaves, RMS, without
-    the sensor's own noise.
-    """
+    """The element's estimate, what was cut out of the recordings, and the sensor's zero in each."""
 
     estimate: Estimate
     cut_out: list[str]
@@ -75,10 +71,7 @@ def strength_N(plant: PlantParameters, gap_mm: float = PIVOT_MM) -> float:
 
 
 def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
-    """Return the fresh insert's kinetic friction (n), N, along the way, as warm as it is, with the lag of its field.
-
-    At the first row the field does not lag.
-    """
+    """Return the fresh insert's kinetic friction (n), N, along the way, as warm as it is, with the lag of its field."""
     moment_Tm = moments_Tm(plant, way.gap_mm)
     warmer_K = way.temperature_C - plant.assumed.ambient_C
     lag_Tm = lag_of(plant).along_Tm(moment_Tm, 0.0, float(moment_Tm[0]))
@@ -86,11 +79,7 @@ def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
 
 
 def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh: Array) -> Array:
-    """Return the friction (n), N, with the sign of the handle's motion, as the sensor shows it after its delay.
-
-    `memory_N` is what each branch of the elastomer still remembers at the first row, N; 0 after a long rest. It has an
-    element for each branch, else ValueError. `fresh` (n) is `fresh_along`. The handle stands before the first row.
-    """
+    """Return the friction (n), N, with the sign of the handle's motion, as the sensor shows it after its delay."""
     series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
     step = series.discretise(1.0 / GRID_HZ)
     changes = np.diff(fresh, prepend=fresh[0])
@@ -104,10 +93,7 @@ def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh
 
 def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
     """Return the friction at the roller (n), N, for kinetic levels (n), N, and handle speeds (n), mm/s, at rows of
-    GRID_HZ.
-
-    It has the sign of the motion. Bristles are unbent before the first row.
-    """
+    GRID_HZ."""
     friction, bristles_mm, forces = friction_of(plant), 0.0, []
     for speed, level_N in zip(speed_mm_s.tolist(), kinetic_N.tolist(), strict=True):
         force_N, bristles_mm = friction.advance(bristles_mm, speed, level_N, 1.0 / GRID_HZ)
@@ -116,12 +102,7 @@ def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
 
 
 def made(prior: PlantParameters, values: Values) -> PlantParameters:
-    """Return the plant with values at keys of the element; the others stay as in `prior`. Bounds are not checked.
-
-    The strength, at STRENGTH, is that of the prior times how much its kinetic friction grows, whatever else changes.
-    The exponent turns the field about PIVOT_MM. Magnets, modulus and friction share what is left. `values` without a
-    key leave it; an exponent needs the power law.
-    """
+    """Return the plant with values at keys of the element; the others stay as in `prior`."""
     field, own_N = prior.field, strength_N(prior)
     exponent = values.get(EXPONENT, field.exponent)
     turned = {"field.coefficient": field.coefficient * PIVOT_MM ** (field.exponent - exponent)}
@@ -131,11 +112,7 @@ def made(prior: PlantParameters, values: Values) -> PlantParameters:
 
 
 def priors_of(plant: PlantParameters) -> list[Prior]:
-    """Return what is believed of an element before, about `plant`: the spread of the plant card's devices.
-
-    All are keys of the plant file, as `value_at` takes them. The field's exponent is among them only under the power
-    law.
-    """
+    """Return what is believed of an element before, about `plant`: the spread of the plant card's devices."""
 
     def about(key: str, share: float = 0.0, plain: float = 0.0, least: float = 0.0, floor: float = 0.0) -> Prior:
         value = value_at(plant, key)
@@ -157,13 +134,7 @@ def priors_of(plant: PlantParameters) -> list[Prior]:
 
 
 def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Fitted:
-    """Fit the element, under the field law of `prior`, to the forces along `ways`, one at least, and return it.
-
-    Only the keys `only` may differ from `prior`; None: all that `priors_of` has. Keys that it does not have are passed
-    over. Zero, drift and memory of each recording are fitted besides. The first BURN_S of each, s, do not count: one
-    that is no longer raises ValueError. Raises LabError for a sensor that says nothing in over MAX_LOST of a recording,
-    or whose zero is far off, drifts or wanders.
-    """
+    """Fit the element, under the field law of `prior`, to the forces along `ways`, one at least, and return it."""
     shared = [each for each in priors_of(prior) if only is None or each.key in only]
     branches = [Prior(f"memory_{place}", 0.0, 0.5) for place in range(len(prior.relaxation.fractions))]
     sensor = [Prior("zero_N", 0.0, 0.06), Prior("drift_N_min", 0.0, 0.02), *branches]
@@ -216,11 +187,7 @@ def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[st
 
 def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mask], list[str]]:
     """Return a mask of the rows of each way that count, and a sentence for each stretch in which the sensor stands
-    still.
-
-    It stands still where its reading stays for FROZEN_S while `prior` expects a change of over FROZEN_N. Rows without a
-    force and those of the first BURN_S do not count. Raises LabError where over MAX_LOST of a way has no force.
-    """
+    still."""
     kept, cut_out = [], []
     for way in ways:
         known = np.isfinite(way.force_N)
@@ -245,11 +212,7 @@ def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mas
 def _require_steady(
     way: Excerpt, zero_mN: float, drift_mN_min: float, width_mN_min: float, residual_N: Array, time_s: Array
 ) -> None:
-    """Raise LabError for a sensor whose zero is far off, surely drifts, or wanders; else do nothing.
-
-    `zero_mN` and `drift_mN_min` are as fitted, `width_mN_min` is half the width of the drift's interval. `residual_N`
-    (n), at `time_s` (n), is what the law leaves: its means of WANDER_S each show the wandering.
-    """
+    """Raise LabError for a sensor whose zero is far off, surely drifts, or wanders; else do nothing."""
     part = np.floor(time_s / WANDER_S).astype(np.int64)
     sums, counts = np.bincount(part, residual_N), np.bincount(part)
     wander_mN = 1e3 * float(np.ptp(sums[counts > 0] / counts[counts > 0]))
