@@ -111,7 +111,7 @@ class Bus(Wire):
     def read(self, until_s: float) -> list[tuple[float, int, bytes]]:  # type: ignore[override]
         self.time_s = max(self.time_s, until_s)
         delivered = self.device.transmit(self.time_s)
-        return [(self.time_s, frame.identifier, frame.data) for sender, frame in delivered if sender == DEVICE]
+        return [(self.time_s, frame.identifier, frame.data) for sender, frame, _ in delivered if sender == DEVICE]
 
 
 def serial_line(

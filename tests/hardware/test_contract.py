@@ -203,7 +203,7 @@ class PacketEnd:
         self.device = CanDevice(device.messages)
 
     def units(self, now_s: float) -> list[bytes]:
-        return [unit_of(frame) for sender, frame in self.device.transmit(now_s) if sender == DEVICE]
+        return [unit_of(frame) for sender, frame, _ in self.device.transmit(now_s) if sender == DEVICE]
 
     def take(self, now_s: float, unit: bytes) -> None:
         self.device.receive(now_s, frame_of(unit))
@@ -221,7 +221,7 @@ class TormagsimEnd(PacketEnd):
         self._host: socket.socket | None = None
 
     def hear(self) -> bytes:
-        return unit_of(from_socket(self._connected().recv(64)))
+        return unit_of(from_socket(self._connected().recv(64)).frame)
 
     def say(self, unit: bytes, backend: Backend) -> None:
         self._connected().send(to_socket(frame_of(unit)))

@@ -29,8 +29,9 @@ from firmware_protocol.codec import (
     encode,
 )
 from tormagd.config import Device, Rates
-from tormagd.hardware.backend import BackendError, choose
+from tormagd.hardware.backend import choose
 from tormagd.simulation.__main__ import main
+from tormagd.simulation.can_bus import SimulatorBus
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.can_door import MAX_HOSTS, CanDoor
 from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, from_socket, to_socket
@@ -88,8 +89,8 @@ def meet(device: Device) -> None:
             seen |= {type(message) for message in backend.receive()}
 
 
-def on_a_bus(interface: str, channel: str) -> Device:
-    return Device(backend="can", options={"interface": interface}, port=channel)
+def on_a_bus(channel: str) -> Device:
+    return Device(backend="can", options={"interface": "tormagsim"}, port=channel)
 
 
 def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Start, tmp_path: Path) -> None:
@@ -98,7 +99,7 @@ def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Star
     assert Path(path).is_socket()
     assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
     for _ in range(2):
-        meet(on_a_bus("tormagsim", path))
+        meet(on_a_bus(path))
     with (
         can.Bus(interface="tormagsim", channel=path, ignore_config=True) as one,
         can.Bus(interface="tormagsim", channel=path, ignore_config=True) as other,
@@ -131,18 +132,7 @@ def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_no
     killed.wait()
     assert Path(path).is_socket()
     assert channel(start("--can", path)) == path
-    meet(on_a_bus("tormagsim", path))
-
-
-@pytest.mark.parametrize("address", ["udp_multicast:239.74.163.88", "socketcan:vcan0"])
-def test_the_device_is_a_node_of_a_bus_that_is_there(start: Start, address: str) -> None:
-    interface, _, name = address.partition(":")
-    try:
-        choose(on_a_bus(interface, name), Rates()).open().close()
-    except BackendError as error:
-        pytest.skip(f"no {address} on this machine: {error}")
-    assert channel(start("--bus", address)) == name
-    meet(on_a_bus(interface, name))
+    meet(on_a_bus(path))
 
 
 # -- the serial door, and calls of the process -----------------------------------------------------------------------
@@ -182,7 +172,6 @@ def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, 
         (("--can", "--bitrate", "7"), "10000"),
         (("--can", "--node", "16"), "16"),
         (("--can", "/nonexistent/can"), "/nonexistent"),
-        (("--bus", "telepathy:0"), "telepathy"),
         (("--can", "--pty"), "not allowed"),
     ],
 )
@@ -236,7 +225,8 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
     good = served.host()
-    for packet in (b"x", bytes(17), SOCKET_FRAME.pack(0x21, 9, bytes(8)), SOCKET_FRAME.pack(ERROR_FLAG, 0, b"")):
+    too_long = SOCKET_FRAME.pack(0x21, 9, False, bytes(8), 0.0)
+    for packet in (b"x", bytes(SOCKET_FRAME.size + 1), too_long, to_socket(CanFrame(ERROR_FLAG, b""))):
         bad = served.host()
         bad.send(packet)
         served.exchange(0.002)
@@ -245,10 +235,38 @@ def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
         bad.close()
     good.send(to_socket(CanFrame(0x081, encode(HELLO))))
     served.exchange(0.005)
-    while (frame := from_socket(good.recv(64))) is not None and frame.identifier != IDENTITY:
-        assert frame.identifier == STATUS
-    assert frame is not None
+    while (heard := from_socket(good.recv(64))) is not None and heard.frame.identifier != IDENTITY:
+        assert heard.frame.identifier == STATUS
+    assert heard is not None
     good.close()
+
+
+def test_a_frame_carries_its_time_and_comes_back_where_its_sender_asks(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("time.time", lambda: 1.7e9 + served.now_s)
+    with contextlib.ExitStack() as stack:
+        one, other, itself = (
+            stack.enter_context(SimulatorBus(served.door.address, receive_own_messages=is_own))
+            for is_own in (False, False, True)
+        )
+        served.exchange(0.003)
+        assert other.recv(0) is None
+        for data in (b"123", b"12345678"):
+            for number, bus in enumerate((one, itself)):
+                bus.send(can.Message(arbitration_id=0x300 + number, data=data, is_extended_id=False))
+            served.exchange(0.002)
+        heard = {bus: list(iter(lambda bus=bus: bus.recv(0), None)) for bus in (one, other, itself)}
+    said = [(message.arbitration_id, bytes(message.data), message.is_rx) for message in heard[itself]]
+    assert said == [
+        *[(0x300, b"123", True), (0x301, b"123", False)],
+        *[(0x300, b"12345678", True), (0x301, b"12345678", False)],
+    ]
+    assert [message.arbitration_id for message in heard[one]] == [0x301] * 2
+    times_s = [message.timestamp for message in heard[other]]
+    assert [message.timestamp for message in heard[itself]] == times_s
+    ends_us = [time_s * 1e6 for time_s in (0.003071, 0.003142, 0.005111, 0.005222)]
+    assert [(time_s - 1.7e9) * 1e6 for time_s in times_s] == pytest.approx(ends_us, abs=1.0)
 
 
 def test_no_more_hosts_than_a_bus_has_places(served: Served) -> None:

@@ -140,7 +140,7 @@ class BadBus(_Spoilt[CanDevice]):
             self._owed -= 1.0
             self._device.receive(now_s, FOREIGN, FOREIGN_HOST)
         ours = [unit_of(delivery.frame) for delivery in delivered if delivery.sender == 0]
-        return [Delivery(0, frame_of(unit)) for unit in self._up(now_s, ours)]
+        return [Delivery(0, frame_of(unit), now_s) for unit in self._up(now_s, ours)]
 
 
 def unit_of(frame: CanFrame) -> bytes:

@@ -97,7 +97,7 @@ MATRIX = (
     Injection("round trip of 7 ms", ("LINK_DEGRADED",), HELD, way=partial(delaying, 0.003)),
     Injection("round trip of 15 ms", ("LINK_DEGRADED",), way=partial(delaying, 0.007)),
     Injection("every other Drive answered", ("LINK_DEGRADED",), HELD, device="answers_half"),
-    Injection("bus full", ("LINK_DEGRADED", "STATUS_STALE"), HELD_OR_OPENS, fill_frames_ms=6.5, buses=(CAN,)),
+    Injection("bus full", ("LINK_DEGRADED", "STATUS_STALE"), HELD_OR_OPENS, fill_frames_ms=7.4, buses=(CAN,)),
     Injection("cable pulled: nothing goes either way", ("LINK_LOST", "MEASUREMENT_STALE"), way=partial(losing, 1.0)),
     Injection("daemon stalls for 12 ms, ten times a second", ("HOST_STALL",), HELD, host="hogged"),
     Injection(

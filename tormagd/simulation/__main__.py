@@ -81,10 +81,6 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
     device = CanDevice(MessageDevice(plant, hand, faults, options.seed, boot), options.bitrate, options.node)
     if options.slcan:
         door = SlcanDoor(device)
-    elif options.bus is not None:
-        from tormagd.simulation.bus_door import BusDoor  # python-can takes 0.15 s to import, and no other door needs it
-
-        door = BusDoor(device, options.bus)
     else:
         folder = resources.enter_context(tempfile.TemporaryDirectory(prefix=FOLDER_PREFIX))
         door = CanDoor(device, Path(options.can or f"{folder}/can"))
@@ -104,9 +100,6 @@ def parser() -> argparse.ArgumentParser:
         const="",
         metavar="PATH",
         help="CAN bus for python-can's interface tormagsim, its channel printed first",
-    )
-    doors.add_argument(
-        "--bus", metavar="INTERFACE:CHANNEL", help="node of an existing bus, as in socketcan:vcan0, printed first"
     )
     made.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
     made.add_argument("--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing")

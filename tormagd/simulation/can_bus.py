@@ -1,7 +1,7 @@
 """The python-can interface `tormagsim`: how a host comes to the simulated device's CAN bus.
 
 `can.Bus(interface="tormagsim", channel=PATH)` with the path that `python -m tormagd.simulation --can` prints. Several
-hosts may be on the bus; each hears the others and the device, and not itself.
+hosts may be on the bus; each hears the others and the device, and itself with `receive_own_messages`.
 """
 
 import errno
@@ -33,10 +33,13 @@ SEND_BUFFER_BYTES = 4_608
 class SimulatorBus(can.BusABC):
     """A host's CAN controller on the simulated bus. Classical frames with 11-bit identifiers only."""
 
-    def __init__(self, channel: str, can_filters: Any = None, **settings: object) -> None:
+    def __init__(
+        self, channel: str, can_filters: Any = None, receive_own_messages: bool = False, **settings: object
+    ) -> None:
         """Connect to the simulator that serves `channel`."""
         self.channel_info = f"tormagsim {channel}"
         self._name = "".join(Path(channel).name.split())
+        self._hears_itself = receive_own_messages
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -61,9 +64,10 @@ class SimulatorBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a classical data frame, waiting up to `timeout` seconds for room; None waits for ever, 0 not at all."""
-        if msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd or len(msg.data) > MAX_DATA:
+        is_classical = not (msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd)
+        if not (is_classical and 0 <= msg.arbitration_id <= MAX_IDENTIFIER and len(msg.data) <= MAX_DATA):
             raise can.CanOperationError(f"{msg}: allowed are classical data frames of 11-bit identifiers")
-        packet = to_socket(CanFrame(msg.arbitration_id & MAX_IDENTIFIER, bytes(msg.data)))
+        packet = to_socket(CanFrame(msg.arbitration_id, bytes(msg.data)), self._hears_itself)
         try:
             if timeout != 0:
                 select.select([], [self._socket], [], timeout)
@@ -85,15 +89,17 @@ class SimulatorBus(can.BusABC):
             raise can.CanOperationError("the simulator has gone", error.errno) from error
         if not packet:
             raise can.CanOperationError("the simulator has gone", errno.ENODEV)
-        frame = from_socket(packet)
-        if frame is None:
+        heard = from_socket(packet)
+        if heard is None:
             raise can.CanOperationError(f"the simulator sent {packet.hex()}, which is no frame", errno.EBADMSG)
         message = can.Message(
-            arbitration_id=frame.identifier & MAX_IDENTIFIER,
+            timestamp=heard.time_s,
+            arbitration_id=heard.frame.identifier & MAX_IDENTIFIER,
             is_extended_id=False,
-            is_error_frame=bool(frame.identifier & ERROR_FLAG),
-            data=frame.data,
+            is_error_frame=bool(heard.frame.identifier & ERROR_FLAG),
+            data=heard.frame.data,
             channel=self._name,
+            is_rx=not heard.is_own,
         )
         return message, False
 

@@ -1,13 +1,15 @@
-"""The simulated device on a CAN bus: frames in, frames out, each for as long as its bits take.
+"""The simulated device on a CAN bus: frames in, frames out.
 
-One bus: whoever has something to send waits until it is free, then the lowest identifier goes first.
+A frame of n bytes takes 47 + 8 n bits, those of ISO 11898-1 without stuffed ones, its pause of 3 included. Whoever has
+something to send waits until the bus is free, then the lowest identifier goes first.
 """
 
 import math
 from heapq import heappop, heappush
+from itertools import count
 from typing import NamedTuple, Protocol
 
-from tormagd.simulation.can_frame import MAX_IDENTIFIER, CanFrame, frame_bits
+from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.plant import Truth
 
@@ -16,7 +18,7 @@ DEFAULT_NODE = 1
 MAX_WAITING = 32
 """Frames that the controllers on the bus hold together; what comes on top is lost, as in a full transmit queue."""
 DEVICE = 0
-"""The device as a sender; hosts count from 1."""
+"""The device as a sender; hosts have any other number."""
 
 
 class Delivery(NamedTuple):
@@ -24,6 +26,8 @@ class Delivery(NamedTuple):
 
     sender: int
     frame: CanFrame
+    time_s: float
+    """When its last bit went by, from power-on."""
 
 
 class CanLine(Protocol):
@@ -50,14 +54,11 @@ class CanDevice:
     def __init__(self, messages: MessageDevice, bitrate: int = DEFAULT_BITRATE, node: int = DEFAULT_NODE) -> None:
         self.messages = messages
         """The device itself."""
-        self.lost = 0
-        """Frames that found the queue full."""
         self._bit_s = 1.0 / bitrate
         self._node = node
-        self._order = 0
-        self._waiting: list[tuple[int, int, Delivery]] = []
+        self._order = count()
+        self._waiting: list[tuple[int, int, int, CanFrame]] = []
         self._flight: Delivery | None = None
-        self._free_s = 0.0
         self._now_s = 0.0
         self._delivered: list[Delivery] = []
 
@@ -67,17 +68,13 @@ class CanDevice:
 
     @property
     def next_event_s(self) -> float:
-        """Return when something happens next, s from power-on: a frame ends or may start, or an event inside the
-        device."""
-        event_s = self.messages.next_event_s
-        is_used = self._flight is not None or self._waiting
-        return min(event_s, max(self._free_s, self._now_s)) if is_used else event_s
+        return min(self.messages.next_event_s, math.inf if self._flight is None else self._flight.time_s)
 
     def receive(self, now_s: float, frame: CanFrame, host: int = 1) -> None:
-        """Let time pass until `now_s` and queue the frame that `host` sends then; in a full queue it is lost, and
-        counted in `lost`."""
+        """Let time pass until `now_s` and queue the frame that `host` sends then; in a full queue it is lost."""
         self.advance(now_s)
-        self._queue(Delivery(host, frame))
+        self._queue(host, frame)
+        self._start_frame()
 
     def transmit(self, now_s: float) -> list[Delivery]:
         """Let time pass until `now_s` and return the frames whose last bit has gone by since the last call, in that
@@ -92,38 +89,30 @@ class CanDevice:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._now_s} on")
         while (event_s := self.next_event_s) <= now_s:
             self._pass_time(event_s)
-            if self._flight is not None and self._free_s <= event_s:
-                self._end_frame(self._flight)
-            if self._flight is None and self._waiting and self._free_s <= event_s:
-                self._start_frame(event_s)
         self._pass_time(now_s)
 
     def _pass_time(self, time_s: float) -> None:
-        """Advance the device to `time_s`, take what it sends out of its `outbox`, and queue that."""
+        """Advance the device to `time_s`, take what it sends out of its `outbox`, and end and start frames."""
         self.messages.advance(time_s)
         self._now_s = time_s
         outbox = self.messages.outbox
         while outbox:
             packet = outbox.popleft()
-            self._queue(Delivery(DEVICE, CanFrame(packet.function << 4 | self._node, packet.payload)))
+            self._queue(DEVICE, CanFrame(packet.function << 4 | self._node, packet.payload))
+        if self._flight is not None and self._flight.time_s <= time_s:
+            self._delivered.append(self._flight)
+            sender, frame, _ = self._flight
+            self._flight = None
+            if sender != DEVICE and frame.identifier & 0xF == self._node:
+                self.messages.receive(time_s, frame.identifier >> 4, frame.data)
+        self._start_frame()
 
-    def _queue(self, delivery: Delivery) -> None:
-        """Queue a frame by its identifier, behind equal ones; where MAX_WAITING are waiting, drop it and count it in
-        `lost`."""
-        if len(self._waiting) >= MAX_WAITING:
-            self.lost += 1
-            return
-        self._order += 1
-        heappush(self._waiting, (delivery.frame.identifier, self._order, delivery))
+    def _queue(self, sender: int, frame: CanFrame) -> None:
+        if len(self._waiting) < MAX_WAITING:
+            heappush(self._waiting, (frame.identifier, next(self._order), sender, frame))
 
-    def _start_frame(self, time_s: float) -> None:
-        _, _, self._flight = heappop(self._waiting)
-        self._free_s = time_s + frame_bits(self._flight.frame) * self._bit_s
-
-    def _end_frame(self, delivery: Delivery) -> None:
-        """Free the bus, and put its frame among the delivered."""
-        self._flight = None
-        self._delivered.append(delivery)
-        sender, frame = delivery
-        if sender != DEVICE and frame.identifier <= MAX_IDENTIFIER and frame.identifier & 0xF == self._node:
-            self.messages.receive(self._free_s, frame.identifier >> 4, frame.data)
+    def _start_frame(self) -> None:
+        """Put the waiting frame of the lowest identifier on the bus, if the bus is free and one waits."""
+        if self._flight is None and self._waiting:
+            _, _, sender, frame = heappop(self._waiting)
+            self._flight = Delivery(sender, frame, self._now_s + (47 + 8 * len(frame.data)) * self._bit_s)

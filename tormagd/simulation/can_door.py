@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +23,7 @@ class CanDoor:
         self._device = device
         self._path = path
         self._hosts: dict[int, socket.socket] = {}
+        self._power_on_s = 0.0
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             _remove_abandoned(path)
@@ -40,15 +42,17 @@ class CanDoor:
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
         """Admit hosts, take their frames, and hand on every frame that has gone by until `now_s`, seconds from
         power-on."""
+        # later where the device's time stood still, and never earlier: so no frame is stamped before the last
+        self._power_on_s = max(self._power_on_s, time.time() - now_s)
         for descriptor in readable:
             if descriptor in self._hosts:
                 self._take(now_s, descriptor)
             else:
                 self._welcome()
-        for sender, frame in self._device.transmit(now_s):
-            packet = to_socket(frame)
-            for descriptor in [descriptor for descriptor in self._hosts if descriptor != sender]:
-                self._hand(descriptor, packet)
+        for sender, frame, time_s in self._device.transmit(now_s):
+            for descriptor in list(self._hosts):
+                if descriptor != sender:
+                    self._hand(descriptor, to_socket(frame, descriptor == -sender, self._power_on_s + time_s))
 
     def close(self) -> None:
         """Disconnect all hosts and remove the socket from its folder."""
@@ -80,11 +84,12 @@ class CanDoor:
                 return
             except OSError:
                 packet = b""
-            frame = from_socket(packet)
-            if frame is None or frame.identifier & ERROR_FLAG:  # end of file, or no host of ours
+            said = from_socket(packet)
+            if said is None or said.frame.identifier & ERROR_FLAG:  # end of file, or no host of ours
                 self._dismiss(descriptor)
                 return
-            self._device.receive(now_s, frame, descriptor)
+            # a sender that hears itself has the negative number
+            self._device.receive(now_s, said.frame, -descriptor if said.is_own else descriptor)
 
     def _hand(self, descriptor: int, packet: bytes) -> None:
         """Send a packet to the host at `descriptor`."""

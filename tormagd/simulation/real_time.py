@@ -37,7 +37,7 @@ class PacedDevice(Protocol):
 
 
 class Door(Protocol):
-    """Where hosts reach a device: a pseudo-terminal, a socket, or a CAN bus."""
+    """Where hosts reach a device: a pseudo-terminal or a socket."""
 
     @property
     def address(self) -> str:

@@ -81,7 +81,7 @@ class SlcanDoor(Pty):
             out, frames = self._adapter.feed(self.read())
             for frame in frames:
                 self._device.receive(now_s, frame)
-        for sender, frame in self._device.transmit(now_s):
+        for sender, frame, _ in self._device.transmit(now_s):
             if sender == DEVICE and self._adapter.is_open:
                 out += self._adapter.line(frame)
         if out:

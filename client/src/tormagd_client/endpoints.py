@@ -68,10 +68,7 @@ class Endpoints(Strict, frozen=True):
 
 
 def require_usable(endpoints: Endpoints) -> None:
-    """Raise ValueError for an address that cannot be used, is used twice, or needs keys that are not given.
-
-    `also_local` without keys is refused too. The text names the key and what is allowed.
-    """
+    """Raise ValueError for an address that cannot be used, is used twice, or needs keys that are not given."""
     taken: dict[str, str] = {}
     curve = endpoints.curve
     has_keys = curve is not None and bool(curve.server_secret or curve.client_secret)
@@ -105,7 +102,7 @@ def in_folder(folder: str) -> Endpoints:
 
 
 def _ipc_place(name: str, address: str) -> str:
-    """Return the socket path that an `ipc://` address comes to, links resolved. Raises ValueError naming `name`."""
+    """Return the socket path that an `ipc://` address comes to, links resolved."""
     path = address.removeprefix("ipc://")
     require(
         path not in ("", "@", "*")
@@ -120,10 +117,7 @@ def _ipc_place(name: str, address: str) -> str:
 
 
 def _tcp_place(name: str, address: str, has_keys: bool) -> str:
-    """Return host and port of a `tcp://` address; without keys only loopback. Raises ValueError naming `name`.
-
-    IPv4 only: a ZeroMQ socket speaks no IPv6 unless it is told to, at both ends.
-    """
+    """Return host and port of a `tcp://` address; without keys only loopback."""
     matched = _TCP.fullmatch(address)
     host, port = matched.groups() if matched else ("", "0")
     require(
