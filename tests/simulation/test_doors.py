@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -242,7 +243,7 @@ def test_a_frame_carries_its_time_and_comes_back_where_its_sender_asks(
         for refused in ({"is_extended_id": True}, {"is_extended_id": False, "arbitration_id": 0x800}):
             with pytest.raises(can.CanOperationError, match="11-bit"):
                 one.send(can.Message(**refused))
-        heard = {bus: list(iter(lambda bus=bus: bus.recv(0), None)) for bus in (one, other, itself)}
+        heard = {bus: list(iter(partial(bus.recv, 0), None)) for bus in (one, other, itself)}
     said = [(message.arbitration_id, bytes(message.data), message.is_rx) for message in heard[itself]]
     assert said == [
         *[(0x300, b"123", True), (0x301, b"123", False)],
