@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LOWEST = {"firmware_protocol", "config", "messages"}
+LOWEST = {"firmware_protocol", "config"}
 FILES = {"bounded_file", "named_file", "toml_file"}
 DECIDES = {"firmware_protocol", "config", "physics", "model", "inverse", "scenes", "safety", "hardware"}
 """What the core is made of."""
@@ -19,13 +19,12 @@ MAY_IMPORT = {
     "bounded_file": set(),
     "named_file": set(),
     "toml_file": {"bounded_file", "named_file"},
-    "force_file": {"bounded_file", "messages"},
+    "force_file": {"bounded_file"},
     "config": {"toml_file"},
-    "messages": set(),
     "output": set(),
     "command_line": {"named_file", "output"},
     "exact": set(),
-    "following": {"messages"},
+    "following": set(),
     "keeping": set(),
     "slices": set(),
     "interrupt": set(),
@@ -38,14 +37,13 @@ MAY_IMPORT = {
     "safety": {"firmware_protocol"},
     "hardware": LOWEST | {"named_file", "exact", "safety"},
     "control": DECIDES,
-    "assembly": DECIDES | {"messages", "exact", "keeping", "control"},
+    "assembly": DECIDES | {"exact", "keeping", "control"},
     "daemon": LOWEST
     | FILES
     | {"command_line", "following", "output", "keys", "keeping", "slices"}
     | {"inverse", "scenes", "safety", "hardware", "control", "assembly"},
-    "recording": FILES | {"following", "messages", "output", "keeping"},
-    "client": {"config", "keys", "messages", "output"},
-    "dashboard": {"client", "following", "messages", "output", "recording", "safety"},
+    "recording": FILES | {"following", "output", "keeping"},
+    "dashboard": {"following", "output", "recording", "safety"},
     "commission": {"config", "control", "dashboard", "safety"},
     "ctl": FILES
     | {
@@ -55,9 +53,7 @@ MAY_IMPORT = {
         "dashboard",
         "following",
         "force_file",
-        "client",
         "config",
-        "messages",
         "output",
         "interrupt",
         "keys",

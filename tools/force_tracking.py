@@ -6,8 +6,8 @@ How soon a device is known: `steps`, `creep` and `speeds`, of samples, second pl
 of the plant card. How well signals are followed: the `pulse` of `make run` on all of these, and in full on the
 `samples` and the second plant. There are 500 setpoints a second, with a preview of 70 ms and live. Recorded `signals`
 are from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a file, and live. Beside them
-stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does with carriages that lose no
-time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
+stands what ideal carriages miss (`tormag-lab bound`), and beside `samples` what the same core does with carriages that
+lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
 
 Each case gives plain data. Nothing is removed from an error: no mean, no delay. A step has *arrived* ARRIVES_S after
 the device's ideal carriages would have brought the force.

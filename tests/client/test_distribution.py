@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 
 import tormagd
-import tormagd.client.aio
-import tormagd_client.aio
 from tormagd_client import __version__
 
 ROOT = Path(__file__).parents[2]
@@ -63,13 +61,6 @@ def test_both_distributions_are_of_one_version() -> None:
         "pyzmq",
         "msgpack",
         "msgspec",
-    }
-
-
-def test_its_older_name_goes_on_working() -> None:
-    assert tormagd.client.aio.AsyncClient is tormagd_client.aio.AsyncClient
-    assert {name: getattr(tormagd.client, name) for name in tormagd.client.__all__} == {
-        name: getattr(tormagd_client, name) for name in tormagd_client.__all__
     }
 
 
