@@ -243,13 +243,13 @@ def draw(picture: Path) -> None:
     figure.savefig(picture)
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> int:
     """Exit code 0: all that has to hold does; else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=0, metavar="N", help="random touches instead of the matrix")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--picture", type=Path, metavar="FILE.png")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     played = drawn(options.draws) if options.draws else cases()
     with ProcessPoolExecutor() as pool:
         rows = list(tqdm(pool.map(judged, played), total=len(played), disable=options.json))

@@ -1,6 +1,6 @@
 """How well a force is followed: the true force of simulated devices less what was asked, in virtual time.
 
-    force_tracking.py [CASE ...] [--draws N] [--json]
+    force_tracking.py [CASE ...] [--json]
 
 How soon a device is known: `steps`, `creep` and `speeds`, of samples, second plant (its structure is another) and draws
 of the plant card. How well signals are followed: the `pulse` of `make run` on all of these, and in full on the
@@ -276,11 +276,11 @@ OF_SIGNALS = {"samples": samples, "signals": signals}
 CASES = (*OF_DEVICES, *OF_SIGNALS)
 
 
-def measure(case: str, draws: int, pool: Executor) -> Json:
+def measure(case: str, pool: Executor) -> Json:
     """One case."""
     if case in OF_SIGNALS:
         return OF_SIGNALS[case](pool)
-    names = judging(draws)
+    names = judging(DRAWS)
     found = tqdm(pool.map(OF_DEVICES[case], names), desc=case, total=len(names), disable=not sys.stderr.isatty())
     return dict(zip(names, found, strict=True))
 
@@ -310,15 +310,10 @@ def main() -> int:
     """Measures and prints; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("cases", nargs="*", choices=(*CASES, "all"), default="all", help="default: all")
-    parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     with ProcessPoolExecutor() as pool:
-        result = {
-            case: measure(case, options.draws, pool)
-            for case in CASES
-            if case in options.cases or "all" in options.cases
-        }
+        result = {case: measure(case, pool) for case in CASES if case in options.cases or "all" in options.cases}
     told = {case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}
     print(json.dumps(result) if options.json else "\n".join(lines(told)))
     return 0

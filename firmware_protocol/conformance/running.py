@@ -34,7 +34,6 @@ from firmware_protocol.conformance.host import (
 
 PAGE: Final = "Modes"
 TAKES: Final = "What each mode takes"
-MET: Final = "Who says what when, 1"
 OPENING: Final = "Opening"
 RAMP_PER_S: Final = 1.0
 MAX_DUTY: Final = 0.5

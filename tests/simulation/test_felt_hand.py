@@ -13,7 +13,6 @@ from tormagd.simulation.hand import (
     Impedance,
     RecordedHand,
     SteadyHand,
-    drawn_impedance,
     parse_hand,
 )
 from tormagd.simulation.parameters import PlantParameters, load_plant
@@ -140,17 +139,6 @@ def test_it_moves_one_plant_and_no_pad() -> None:
         at_brake("sample_1", hand, 0.1)
     with pytest.raises(HandError, match=r"felt.*pressing"):
         Plant(load_plant("pad_1"), FeltHand(STROKE, WRIST))
-
-
-def test_drawn_hands_are_the_same_again_and_go_from_a_finger_to_an_arm() -> None:
-    drawn = [drawn_impedance(seed) for seed in range(60)]
-    assert drawn == [drawn_impedance(seed) for seed in range(60)]
-    assert len({each.mass_kg for each in drawn}) == 60
-    assert min(each.mass_kg for each in drawn) < 0.005 < 1.7 < max(each.mass_kg for each in drawn)
-    damping_ratios = [
-        each.damping_N_s_mm / (2.0 * (1e-3 * each.mass_kg * each.stiffness_N_mm) ** 0.5) for each in drawn
-    ]
-    assert 0.05 < min(damping_ratios) < max(damping_ratios) < 5.0
 
 
 def test_a_felt_hand_of_the_command_line_strokes_once_the_device_is_homed() -> None:

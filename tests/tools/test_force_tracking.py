@@ -39,7 +39,7 @@ BEGINS_S, IDEAL_S = 4.0, 0.9
 
 @pytest.mark.parametrize(("named", "measured"), [([], force_tracking.CASES), (["pulse", "steps"], ("steps", "pulse"))])
 def test_without_a_name_every_case_is_measured(monkeypatch: pytest.MonkeyPatch, capsys, named, measured) -> None:
-    monkeypatch.setattr(force_tracking, "measure", lambda case, draws, pool: {"of": [case]})
+    monkeypatch.setattr(force_tracking, "measure", lambda case, pool: {"of": [case]})
     monkeypatch.setattr("sys.argv", ["force_tracking.py", "--json", *named])
     assert force_tracking.main() == 0
     assert tuple(json.loads(capsys.readouterr().out)) == measured

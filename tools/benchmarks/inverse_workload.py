@@ -91,17 +91,16 @@ def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
     return Dataset(np.column_stack((displacement, rate, field, np.full(rows, CIP_PERCENT))), force)
 
 
-def trained(data: Dataset, hidden: int, epochs: int, seed: int = 0) -> ForceModel:
+def trained(data: Dataset, hidden: int, epochs: int) -> ForceModel:
     """A network with that many units, trained by Levenberg-Marquardt; its metrics hold `validation_mae_N`."""
     model, _ = fit_model(
-        *data.split(0.3, seed),
+        *data.split(0.3, 0),
         element=Element.TORQUE,
         inserts=(INSERT.name,),
         data_sha256=data.sha256(),
         created=datetime.date(2024, 1, 1),
         hidden=hidden,
         epochs=epochs,
-        seed=seed,
     )
     return model
 

@@ -98,10 +98,6 @@ class Watch:
         if is_so:
             self._since_s.setdefault(what, self._loop.now_s)
 
-    @property
-    def is_open(self) -> bool:
-        return "open" in self._since_s
-
     def refuse(self, error: RefusedError) -> None:
         """A command was refused."""
         self._refusal = f"{error.code}: {error.message.partition(': ')[2]}"

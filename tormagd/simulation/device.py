@@ -299,11 +299,11 @@ class MessageDevice:
             math.floor(right_rad * self._counts_per_rad) + self._right_extra_counts,
         )
 
-    def _count_on(self, stuck_left: int | None, left_count_sign: int) -> None:
+    def _count_on(self, left_count_sign: int) -> None:
         """Let the left encoder go on from its present count, without a leap."""
         (left_rad, _), (right_rad, _) = self.plant.shafts
         left_counts, _ = self._encoders(left_rad, right_rad)
-        self._stuck_left, self._left_count_sign = stuck_left, left_count_sign
+        self._stuck_left, self._left_count_sign = None, left_count_sign
         self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
 
     def mend(self) -> None:
@@ -319,7 +319,7 @@ class MessageDevice:
         self._stuck_handle = None
         self._opening_share = 1.0
         if self._stuck_left is not None or self._left_count_sign < 0:
-            self._count_on(None, 1)
+            self._count_on(1)
         self._run_clock_at(time_s, 1.0 + parameters.firmware.clock_ppm * 1e-6)
         self._drive_bridges()
 
@@ -358,7 +358,7 @@ class MessageDevice:
                 if fault.name == "encoder_jump":
                     self._right_extra_counts += counts
             case "encoder_reversed_left":
-                self._count_on(None, -self._left_count_sign)
+                self._count_on(-self._left_count_sign)
             case "opening":
                 self._opening_share = 1.0 + fault.percent / 100.0
             case "clock":

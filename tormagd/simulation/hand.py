@@ -2,7 +2,6 @@
 
 import bisect
 import math
-import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol, final
@@ -171,21 +170,6 @@ class FeltHand:
         self.speed_mm_s = 2.0 * mean_mm_s - speed_mm_s
         self._time_s, self._place_mm = time_s, self._place_mm + dt_s * mean_mm_s
         return self._place_mm
-
-
-_PUBLISHED: Final = (
-    ((0.004, 0.007), (0.2, 0.8), (0.004, 0.007)),
-    ((0.05, 0.2), (0.1, 1.0), (0.002, 0.01)),
-    ((0.8, 2.0), (0.1, 0.6), (0.005, 0.03)),
-)
-"Finger, wrist, arm: mass, kg, stiffness, N/mm, and damping, N s/mm, from .. to."
-
-
-def drawn_impedance(seed: int) -> Impedance:
-    """Draw a person's hand by `seed`: a finger's, a wrist's or an arm's in turn, evenly in the logarithms of published
-    sizes."""
-    draw = random.Random(f"hand {seed}")
-    return Impedance(*[low * (high / low) ** draw.random() for low, high in _PUBLISHED[seed % len(_PUBLISHED)]])
 
 
 def _root(function: Callable[[float], float], start: float, slope: float) -> float:

@@ -106,12 +106,12 @@ def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
     return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
 
 
-def margins(motor: Motor, position: Position, period_s: float, *, delay_periods: float = 1.0) -> Margins:
+def margins(motor: Motor, position: Position, period_s: float) -> Margins:
     """Return the margins of one carriage's position loop as it is computed: PID and its filter in z, H(z), and a delay."""
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)
     plant = zero_order_hold(motor, period_s)
-    open_loop = np.polyval(plant.numerator, z) / np.polyval(plant.denominator, z) * z**-delay_periods
+    open_loop = np.polyval(plant.numerator, z) / np.polyval(plant.denominator, z) / z
     integral = period_s / position.integral_time_s / (1.0 - 1.0 / z)
     smoothing = period_s / (position.derivative_filter_s + period_s)
     derivative = position.derivative_time_s * smoothing * (1.0 - 1.0 / z) / period_s / (1.0 - (1.0 - smoothing) / z)

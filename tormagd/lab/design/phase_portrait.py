@@ -74,9 +74,9 @@ class PhasePortrait:
     def __post_init__(self) -> None:
         require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
 
-    def outline(self, points: int = 201) -> tuple[FloatArray, FloatArray]:
-        """Return the true boundary's upper half as two arrays of `points` elements: force, N, falling, and rate, N/s."""
-        gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, points)
+    def outline(self) -> tuple[FloatArray, FloatArray]:
+        """Return the true boundary's upper half as two arrays of 201 elements: force, N, falling, and rate, N/s."""
+        gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, 201)
         # a geometric series may end a rounding beyond its ends
         gap_mm = np.clip(gap_mm, self.brake.closed_mm, self.brake.open_mm)
         return self.brake.force_N(gap_mm), self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)

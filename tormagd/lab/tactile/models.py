@@ -61,9 +61,9 @@ class Trained:
     grey: GreyBox
 
 
-def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
+def train(noise_N: float, effort: Effort) -> Trained:
     """Train the network on made cycles of the three pads, and the relaxation-aware model on those of the pad in use."""
-    cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
+    cycles = cyclic_records(noise_N, 0, samples_per_cycle=effort.samples_per_cycle)
     data = cycles.data
     known = ~random_split(len(data), SPLIT_SEED)
     model, _ = fit_network(data, known, epochs=effort.epochs)
