@@ -1,7 +1,4 @@
-"""The bound on cases whose optimum is known by hand or by a search of everything. All devices are synthetic.
-
-By hand: a force that falls by 0.1 N/mm, and carriages that reach their speed, SPEED_MM_S, within a step; the closed
-forms are those of a speed that is reached at once."""
+"""The bound on cases whose optimum is known by hand or by a search of everything."""
 
 import json
 import math
@@ -56,7 +53,6 @@ N_MM = 0.1
 
 
 def asked(gap_mm: np.ndarray) -> Asked:
-    """What has the straight brake at these gaps."""
     force_N = np.interp(gap_mm, STRAIGHT.gap_mm, STRAIGHT.moment_Tm)
     found = asked_of(STRAIGHT, force_N, most_N=20.0, hand_mm_s=42.0, step_s=STEP_S)
     assert found.force_N == pytest.approx(force_N)
@@ -64,7 +60,7 @@ def asked(gap_mm: np.ndarray) -> Asked:
 
 
 def errors_N(gap_mm: np.ndarray, drive: Drive = AT_ONCE, ends: int = 0) -> tuple[float, float]:
-    """RMS without delay and with foresight of a way of the gap, less so many steps at either end."""
+    """RMS without delay and with foresight, less `ends` steps at either end."""
     wanted = asked(gap_mm)
     greedy_mm = no_delay_mm(drive, STRAIGHT, wanted, STEP_S)
     best_mm = foresight_mm(drive, STRAIGHT, wanted, STEP_S)
@@ -77,7 +73,6 @@ def time_s(seconds: float) -> np.ndarray:
 
 
 def zigzag(phase: np.ndarray) -> np.ndarray:
-    """Between -1 and 1, from 0 upward, of period 1."""
     return 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * phase))
 
 
@@ -163,7 +158,7 @@ def test_the_force_of_the_gap_is_that_of_the_devices_element() -> None:
         found.append((element.kinetic_N, element.force_N))
     kinetic_N, felt_N = np.array(found).T
     assert wanted.scale * kinetic_N + wanted.offset_N == pytest.approx(rendered_N, abs=2e-3)
-    # friction follows a rising level within some hundredths of a second at this speed
+    # friction follows a rising level within some hundredths of a second
     assert np.median(np.abs(felt_N - rendered_N)[1000:]) <= 0.02
 
 
@@ -188,7 +183,7 @@ def test_the_fields_lag_takes_some_of_what_foresight_gains() -> None:
     best_N = error_N(brake, best_mm)
     straight = brake._replace(lag=Lag(0.0, 1.0))
     assert best_N > error_N(straight, foresight_mm(drive, straight, wanted, STEP_S))
-    # what only moves or shrinks the way is within the drive's limits as well
+    # a shifted or shrunk way is within the drive's limits as well
     others_mm = [best_mm - 0.05, best_mm + 0.05, np.roll(best_mm, -5), np.roll(best_mm, 5)]
     others_mm += [best_mm.mean() + share * (best_mm - best_mm.mean()) for share in (0.9, 0.97)]
     assert min(error_N(brake, gap_mm) for gap_mm in others_mm) > best_N
@@ -229,11 +224,7 @@ def test_the_command_prints_its_figures(capsys, tmp_path) -> None:
     assert re.search(r"^no_delay_rms_N +0\.1713$", capsys.readouterr().out, re.MULTILINE)
 
 
-# -- ideal carriages, a second actuator in the same core: what a loop misses with them is the plan's -------------------
-
-
 def missed_N(core: Core, device: VirtualDevice, stepper: Stepper) -> float:
-    """RMS error of a force that swings three times a second, live, once the gap has come there."""
     loop = ClosedLoop(core.config, stepper, core.planner(), device)
     loop.arm()
     errors_N = []
@@ -263,6 +254,6 @@ def test_they_stand_where_nothing_is_planned_for(command: str) -> None:
     stood_mm = device.truth.gap_mm
     loop.command(command)
     list(loop.run(0.1))
-    # the firmware opens a device that is disabled, by its own motors
+    # the firmware opens a disabled device by its own motors
     assert (device.truth.gap_mm > stood_mm + 0.3) is (command == "disable")
     assert device.truth.gap_mm > stood_mm - 0.01

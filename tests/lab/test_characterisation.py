@@ -1,4 +1,4 @@
-"""A material: laws, fits, tests of a sample, relaxation. Synthetic data, but for measured rubber."""
+"""Laws, fits, tests of a sample, relaxation: on synthetic data, and on measured rubber."""
 
 import json
 import math
@@ -44,8 +44,6 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N
 from tormagd.physics.relaxation import PronySeries
 
-# -- uniaxial laws: initial slopes, digits near no strain --------------------------------------------------------------
-
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
@@ -73,9 +71,6 @@ def test_stress_keeps_its_digits_at_small_strain(strain: float, compressed: bool
     at: Any = stretch
     assert thesis_shape(at, exponent) == pytest.approx(2.0 / exponent * float(printed), rel=1e-13)
     assert ogden_shape(at, exponent) == pytest.approx(float(engineering), rel=1e-13)
-
-
-# -- fits: synthetic curves with a known answer, and measured rubber where the data are at hand ------------------------
 
 
 COMPRESSION = np.linspace(1.0, 0.75, 60)
@@ -143,9 +138,6 @@ def test_curves_that_cannot_be_fitted(fit, stretch, stress_Pa, error, said) -> N
         fit(stretch, stress_Pa)
 
 
-# -- cyclic compression: the right cycle is evaluated, the standard's rules are checked --------------------------------
-
-
 MODULUS_PA, EXPONENT = 120e3, 3.0
 SAMPLE = Sample()
 SOFTENING = (1.5, 1.2, 1.05, 1.0, 0.99)
@@ -154,7 +146,7 @@ SOFTENING = (1.5, 1.2, 1.05, 1.0, 0.99)
 def cyclic_test(
     cycles: int = 4, strain: float = 0.25, rate_mm_min: float = 10.0, noise: float = 0.0, set_mm: float = 0.0
 ) -> CompressionRecord:
-    """Triangles from zero to the strain; stiffer in the first cycles and while loading; a set shifts later starts."""
+    """Triangles, stiffer in the first cycles and while loading; a set shifts later starts."""
     rng = np.random.default_rng(0)
     top_mm, dt_s = strain * SAMPLE.height_mm, 0.05
     half = round(top_mm / (rate_mm_min / 60.0) / dt_s)
@@ -206,9 +198,6 @@ def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(LabError, match=said):
             read_compression(path)
-
-
-# -- relaxation --------------------------------------------------------------------------------------------------------
 
 
 SERIES = PronySeries((0.05, 0.04, 0.04), (8.0, 90.0, 900.0))
@@ -267,12 +256,8 @@ def test_records_that_cannot_be_evaluated(evaluated: Callable[[], object], error
         evaluated()
 
 
-# -- the command, from a file to a figure ------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def characterised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    """What the command finds in a file of these columns."""
 
     def run(kind: str, columns: Iterable[np.ndarray], names: str, *options: str) -> dict[str, Any]:
         path = tmp_path / "record.csv"
@@ -302,9 +287,6 @@ def test_tension_and_relaxation(characterised) -> None:
     hold = (time_s, driving, driving * (2.0 + 0.4 * np.expm1(-time_s / 5.0)))
     found = characterised("relaxation", hold, "time_s,driving,force_N", "--branches", "1")
     assert (found["fractions"], found["times_s"]) == (pytest.approx([0.2], rel=1e-3), pytest.approx([5.0], rel=1e-3))
-
-
-# -- constitutive model: stress against the energy's derivative, and its link to the brake's force law -----------------
 
 
 stretch_values = st.floats(0.3, 3.0)

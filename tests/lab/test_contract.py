@@ -1,4 +1,4 @@
-"""What `tormag-lab` promises: its commands, how they refuse, what they need, and who may import the laboratory."""
+"""What `tormag-lab` promises: its commands, how they refuse, and what they need."""
 
 import json
 import re
@@ -43,7 +43,7 @@ LIGHT = ("characterise", "identify-motor", "optimise-design", "tune-position", "
 
 
 def without_heavy(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """The program in an interpreter that has none of the heavy packages, as the Debian package."""
+    """The program without the heavy packages, as from the Debian package."""
     line = [sys.executable, "-P", "-c", WITHOUT.format(heavy=HEAVY) + program, *arguments]
     return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
 

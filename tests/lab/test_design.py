@@ -1,5 +1,4 @@
-"""The design of a brake: its coverage, the best designs, sweeps of searches, inserts before tasks, and the thesis's
-tables 2.4 and 2.5."""
+"""The design of a brake, and the thesis's tables 2.4 and 2.5."""
 
 import dataclasses
 import itertools
@@ -43,21 +42,17 @@ from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.inserts import INSERTS
 
 BRAKE = Brake.as_built(Elastomer(300e3, 3.8, 0.2))
-"The thesis's device with the elastomer of its chapter 3."
 USE_CASE_1, USE_CASE_2 = Region(0.0, 0.0, 2.5, 1.0), Region(0.5, 0.25, 3.0, 1.0)
 THESIS_SPEED_MM_S = 25.0 / 3.0
 PROBLEM = Problem(USE_CASE_2, "true", 40.0)
 AS_BUILT = Design(11.0, 20.0, 95.0)
 
 
-# -- coverage in the phase portrait ------------------------------------------------------------------------------------
-
-
 def count_points(portrait: PhasePortrait, region: Region, *, true: bool, side: int = 500) -> float:
-    """Coverage by counting a grid of points in the region: slow, and without an integral."""
+    """Coverage by counting points of the region, without an integral."""
     force, share = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
     force = region.least_N + force * (region.most_N - region.least_N)
-    # rows of equal share of the rate have unequal height: weigh each point with it
+    # equal steps of rate share have unequal height: weigh each point with it
     required = region.rate_N_s(force)
     judge = portrait.true_cloud if true else portrait.trapezoid_cloud
     covered = judge(force.ravel(), (share * required).ravel()).covered.reshape(force.shape)
@@ -112,7 +107,7 @@ def test_cloud_says_which_points_fail_and_why() -> None:
 def test_end_forces_come_back_as_end_gaps(law: FieldLaw, g0_Pa: float) -> None:
     device = Brake.as_built(Elastomer(g0_Pa, 2.7, 0.2), law)
     ends = [device.most_N, device.least_N]
-    # Eq. 7 is flat at 95 mm: its inverse has half of the digits there
+    # Eq. 7 is flat at 95 mm, so its inverse has half of the digits there
     assert [device.gap_mm(force) for force in ends] == pytest.approx([45.0, 95.0], abs=1e-4)
     assert device.gap_mm(np.array(ends)) == pytest.approx([45.0, 95.0], abs=1e-4)
 
@@ -137,12 +132,9 @@ def test_impossible_regions_brakes_and_speeds_are_refused(made: Callable[[], obj
         made()
 
 
-# -- the best design ---------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def few_generations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An evolution that ends at less than a fifth: what it keeps only gets better."""
+    """An evolution that ends early: what it keeps only gets better."""
     monkeypatch.setattr(optimisation, "_GENERATIONS", 8)
 
 
@@ -218,12 +210,8 @@ def test_a_design_that_cannot_bear_its_field_as_made_covers_nothing() -> None:
     assert coverage_as_made(soft, Design(6.5, 12.5, 197.0), 0.01) == 0.0
 
 
-# -- sweeps of searches ------------------------------------------------------------------------------------------------
-
-
 STARTS = (AS_BUILT, Design(7.0, 27.0, 150.0), Design(20.0, 15.0, 100.0))
 RUNS = [Run(Problem(USE_CASE_2, "true", 8.0), start, "local") for start in STARTS]
-"Local ones: quick, and each with its own answer."
 
 
 @pytest.fixture
@@ -250,9 +238,6 @@ def test_a_run_that_fails_ends_the_sweep(thread: Executor) -> None:
         sweep([*RUNS, Run(JELLY, AS_BUILT, "local")], thread)
 
 
-# -- inserts before a task ---------------------------------------------------------------------------------------------
-
-
 STEP_MM = 0.1
 
 
@@ -272,7 +257,7 @@ def test_a_task_within_the_brake_is_served_by_its_coarsest_step() -> None:
         ((0.0, 2.0, 0.1), ["least force"]),
         ((1.0, 50.0, 0.1), ["most force"]),
         ((1.0, 2.0, 0.001), ["one gap"]),
-        # a least force that is missed by less than the resolution is served
+        # a least force missed by less than the resolution is served
         ((BRAKE.least_N - 0.05, 2.0, 0.051), []),
         ((BRAKE.least_N - 0.05, 2.0, 0.049), ["least force"]),
     ],
@@ -300,11 +285,6 @@ def test_ranking_puts_the_finest_that_serves_first() -> None:
     assert ([verdict.insert for verdict in ranked][-1], len(serving)) == ("short", 3)
     assert [v.resolution_N for v in serving] == sorted(v.resolution_N for v in serving)
 
-
-# -- table 2.4: friction and exponent fitted to the measured ranges ----------------------------------------------------
-
-
-# -- tables 2.4 and 2.5 of the thesis: the fits of the ranges, and what serves which task ------------------------
 
 ALL = list(INSERTS.values())
 LAWS = (ThesisFieldLaw(), PowerFieldLaw())
@@ -337,9 +317,6 @@ def test_exponent_one_is_the_force_law_itself() -> None:
     forces = brake_force_N(law.radial_moment_Tm(np.array([45.0, 95.0])), item.elastomer, TORMAG)
     friction = item.elastomer.friction_coefficient
     assert friction * frictionless_range_N(item, law) == pytest.approx(forces[0] - forces[1], rel=1e-12)
-
-
-# -- table 2.5 in both readings: what the thesis names matches by width, no brake gives the least forces ---------------
 
 
 FOUND = table_2_5.table_2_5()

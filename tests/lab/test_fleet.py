@@ -1,4 +1,4 @@
-"""Many consoles' recordings: what each says, and all of them one by one, on Dask workers and from a bucket the same."""
+"""Recordings of many consoles: one by one, on Dask workers and from a bucket."""
 
 import json
 import os
@@ -19,9 +19,6 @@ from tormagd.lab.main import main
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
 
-# -- many of them ------------------------------------------------------------------------------------------------------
-
-
 DAY_S = 86_400
 START_S = 1_790_000_000
 COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "operating_state", "limits", "faults", "trim", "left_current_A")
@@ -29,14 +26,13 @@ SCENE = json.dumps({"insert": {"name": "MRE-50-40"}})
 
 
 def put(path: Path, columns: tuple[str, ...], rows: Iterable[tuple[object, ...]], **about: str) -> None:
-    """A recording of these ticks, with `about` as its metadata."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with RecordingWriter(path, about) as writer:
         writer.ticks(TickBatch(v=1, columns=columns, rows=tuple(rows)))
 
 
 def write(path: Path, serial_number: int, day: int, error_N: float, trim: float) -> None:
-    """2 s: RATE for the first half of it."""
+    """2 s, with RATE for the first half."""
     begin_ns = (START_S + day * DAY_S) * 10**9
     rows = (
         (begin_ns + k * 20 * 10**6, 1.5, 1.5 + error_N, "ENABLED", ("RATE",) if k < 50 else (), (), trim, 0.5)
@@ -47,7 +43,7 @@ def write(path: Path, serial_number: int, day: int, error_N: float, trim: float)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two consoles, three days; one file is none, and another a pipe that nobody writes to."""
+    """Two consoles, three days; one file is no recording, another a pipe without a writer."""
     folder = tmp_path_factory.mktemp("fleet")
     for console in 1, 2:
         for day in range(3):
@@ -150,9 +146,6 @@ def test_a_worker_that_dies_is_told_with_its_file(folder):
     assert left_out["a.mcap"].startswith("the worker that read it failed: ")
 
 
-# -- one recording: what it says of its console, and what it does not --------------------------------------------------
-
-
 START_NS = 1_790_000_000_000_000_000
 ALL_COLUMNS = (
     *("t_ns", "setpoint_cf", "measured_cf", "operating_state", "limits", "faults", "trim", "device_clock_drift"),
@@ -162,7 +155,7 @@ PULSE = json.dumps({"name": "pulse", "insert": {"name": "MRE-50-40"}})
 
 
 def tick(k):
-    """Every ms: DISABLED and far off for 50 ms, then ENABLED and 20 mN off; RATE for 10 ms, and a fault at 100 ms."""
+    """Every ms: DISABLED and far off for 50 ms, then ENABLED and 20 mN off; RATE for 10 ms, a fault at 100 ms."""
     row = (START_NS + k * 1_000_000, 1.5)
     if k < 50:
         return *row, 9.0, "DISABLED", (), (), 7.0, 1e-3, 9.0, 9.0, 900.0, 70.0

@@ -1,7 +1,4 @@
-"""What is identified of a device: its motor, from logs with a known answer and the EMPS benchmark; then all of it.
-
-A twin of synthetic devices, in virtual time: what is told holds, what is not is named, no sensor's lie is fitted.
-"""
+"""A motor identified from logs with a known answer and the EMPS benchmark; a twin of synthetic devices."""
 
 import json
 import math
@@ -42,7 +39,7 @@ MASS, VISCOUS, COULOMB, OFFSET, GAIN, DELAY_S = 80.0, 150.0, 12.0, -2.0, 30.0, 0
 
 @pytest.fixture(scope="module")
 def computed_log(tmp_path_factory):
-    """A mass with friction on a multi-sine path, the voltage that it takes, and noise on it; read from a file."""
+    """A mass with friction on a multi-sine path, and the noisy voltage that it takes."""
     path = tmp_path_factory.mktemp("log") / "log.csv"
     t = np.arange(0.0, 20.0, 1e-3)
     tones = ((0.23, 0.06), (0.61, 0.02), (1.7, 0.004))
@@ -90,7 +87,6 @@ def test_emps_is_within_the_published_values_and_drawn(recordings, capsys, tmp_p
 
 
 def compare(log: Log) -> dict:
-    """Identified and true, by parameter, of sample 3."""
     true = truth(load_plant("sample_3"), "left", 2e3 * log.position_m[fit.motion(log).sign != 0.0])
     result = identification.identify(log, None if log.current_A is not None else true["gain_N_V"])
     identified = {**(result["motor"] or {}), **result["parameters"], "time_constant_s": result["time_constant_s"]}
@@ -102,13 +98,13 @@ def compare(log: Log) -> dict:
 
 
 def calibrated() -> Columns:
-    """The control ticks of `tormagctl calibrate --motors` on simulated sample 3, in virtual time."""
+    """Control ticks of `tormagctl calibrate --motors` on simulated sample 3."""
     core = build_core(Config())
     device = VirtualDevice(load_plant("sample_3"), SteadyHand(), seed=1)
     loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
     loop.arm()
     list(loop.run(1.0))
-    # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
+    # as a daemon's status says it: what the device gives with its gap open, as far as it has shown itself
     shown = Range(loop.planner.believe.min_N, min(core.portrait.max_N, core.scene.force.most_N))
     waveform = excitation(shown, 2)
     start_s = loop.now_s
@@ -136,7 +132,7 @@ def calibrated() -> Columns:
 
 
 def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, float]:
-    """What the plant file says, in the identified quantities; friction and offset as means over the gaps of the log."""
+    """The identified quantities by the plant file, averaged over the gaps of the log."""
     motor, gear, screw = plant.motor, plant.gear, plant.screw
     lead_m_rad = screw.lead_mm * 1e-3 / math.tau
     k = gear.ratio * motor.back_emf_V_s_rad / lead_m_rad
@@ -172,7 +168,6 @@ def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, fl
 
 @pytest.fixture(scope="module")
 def sample_log():
-    """The log of the left motor that `tormagctl calibrate --motors` makes of what it recorded."""
     columns = motor_log(calibrated(), "left")
     return Log(columns["t_s"], columns["input_V"], columns["position_mm"] * 1e-3, None, columns["current_A"])
 
@@ -227,7 +222,7 @@ LASTS_S = 36.0
 
 
 def record(path: Path, plant: PlantParameters) -> None:
-    """A recording in virtual time: steps every 2 s with a pulse on them, a handle that goes to and fro."""
+    """Steps every 2 s with a pulse on them, and a handle that goes to and fro."""
     core = build_core(CONFIG)
     loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), VirtualDevice(plant, ReversingHand(3.0), seed=2))
     loop.arm()

@@ -11,7 +11,7 @@ from tormagd.lab.training.dataset import read_csv
 
 
 def measured() -> dict[str, np.ndarray]:
-    """A synthetic sweep: the handle to and fro at three speeds while the field rises; quantities in our units."""
+    """A sweep in our units: the handle to and fro at three speeds while the field rises."""
     step = np.arange(600)
     way = np.where(step // 20 % 2 == 0, 1.0, -1.0)
     rate = way * np.array([2.0, 40.0, 300.0])[step // 40 % 3]

@@ -1,4 +1,4 @@
-"""The tactile pad: what is printed of the thesis's pads; the experiment of chapter 4, sampled; the pad's tools."""
+"""The tactile pad, the experiment of chapter 4, sampled, and the pad's tools."""
 
 import datetime
 import json
@@ -21,9 +21,6 @@ from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.scenes.scene import scene_path
 from tormagd.simulation.tactile_pad import TactilePad, cycling_program, worked_pad
-
-# -- pads --------------------------------------------------------------------------------------------------------------
-
 
 AREA_M2 = np.pi / 4 * 0.030**2
 
@@ -100,9 +97,6 @@ def test_impossible_places_are_refused(place: tuple[float, float, float], name: 
         TactilePad(PADS["MRE-A"]).advance(0.1, *place)
 
 
-# -- the experiment: that it runs, has the contract's shape, and shows what relaxation does ----------------------------
-
-
 @pytest.fixture(scope="module")
 def run():
     # whole groups left out are only looked at for their shape
@@ -123,7 +117,7 @@ def test_the_contract_s_keys_are_there_and_finite(run):
         assert keys <= set(judged)
     assert not re.search("NaN|Infinity", json.dumps(figures))
     assert table["synthetic"] is pulse["synthetic"] is True
-    # even sampled it beats the thesis, and not the noise
+    # even sampled it beats the thesis, but not the noise
     assert table["random"]["r2"] > 0.97
     assert 0.95 * table["random"]["noise_mae_N"] < table["random"]["mae_N"] < 1.26
 
@@ -174,11 +168,7 @@ def test_field_errors_count_only_where_the_force_depends_on_the_field():
     assert scores["mae_mT"] == pytest.approx(2.0)
     assert scores["elsewhere_force_mae_N"] > 0.0
     assert along.scores(reference)["elsewhere_force_mae_N"] == 0.0
-    # near no displacement nothing does
     assert not along.scored[0]
-
-
-# -- the pad's tools ---------------------------------------------------------------------------------------------------
 
 
 def test_neighbours_decide_on_the_pad_and_nothing_on_the_brake(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,4 @@
-"""Training: its data, splits and sweeps; the network's derivatives, noise floor, determinism, scaling; the command.
-
-Then the relaxation-aware model.
-"""
+"""Training: data, the network, the law, the commands, the relaxation-aware model."""
 
 import datetime
 import json
@@ -43,9 +40,6 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.friction import Friction
 from tormagd.physics.inserts import insert
 from tormagd.physics.relaxation import PronySeries
-
-# -- data: what is read is what was written, what is wrong is refused by row, column and value -------------------------
-
 
 HEADER = "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N"
 GOOD = "0.5,10,300,40,1.5"
@@ -139,9 +133,6 @@ def test_a_split_without_two_sides_is_refused(share: float) -> None:
         dataset().split(share, seed=0)
 
 
-# -- splits by group hold out whole groups, once each ------------------------------------------------------------------
-
-
 @pytest.fixture
 def grouped() -> Dataset:
     field, cip = np.repeat([0.0, 50.0, 99.0], 20), np.tile(np.repeat([25.0, 45.0], 10), 3)
@@ -173,20 +164,16 @@ def test_cycles_stay_whole(grouped: Dataset) -> None:
     assert not any(set(grouped.cycle[held]) & set(grouped.cycle[~held]) for held in folds)
 
 
-# -- the network and its training --------------------------------------------------------------------------------------
-
-
 NOISE_N = 0.02
 
 
 def forces_N(features: np.ndarray) -> np.ndarray:
-    """A smooth synthetic brake: saturating in displacement, rising with the field, falling a little with the rate."""
+    """Saturates in displacement, rises with the field, falls a little with the rate."""
     displacement, rate, field, _ = features.T
     return (1 - np.exp(-displacement / 0.3)) * (0.3 + 4 * (field / 800) ** 2) * (1 + 0.2 * np.exp(-rate / 20))
 
 
 def synthetic(rows: int, seed: int, noise_N: float = NOISE_N) -> Dataset:
-    """Rows of that brake with one insert, 50 in a cycle."""
     rng = np.random.default_rng(seed)
     features = np.column_stack(
         (rng.uniform(0, 1, rows), rng.uniform(0, 60, rows), rng.uniform(100, 800, rows), np.full(rows, 40.0))
@@ -235,7 +222,6 @@ def test_a_constant_column_neither_divides_by_zero_nor_matters() -> None:
 
 
 def missed_N(network: ForceNetwork, data: Dataset) -> float:
-    """RMS error of the network on these rows."""
     with torch.no_grad():
         return rms(network(torch.tensor(data.features)).numpy() - data.force_N)
 
@@ -271,15 +257,11 @@ def test_what_cannot_be_trained_is_refused() -> None:
             refused()
 
 
-# -- the law of a brake ------------------------------------------------------------------------------------------------
-
-
 LAW = Law(0.1, -0.7, 1.1, 0.05, 0.15, 2.0, 0.01, 2e-4, 1.8, 0.5)
 OF_LAW = {"insert_name": "MRE-50-40", "data_sha256": "0" * 64, "created": datetime.date(2024, 1, 1)}
 
 
 def lawful(rows: int, least_mm: float = 2.0, noise_N: float = NOISE_N) -> Dataset:
-    """A synthetic brake that keeps to the law LAW."""
     rng, fitted = np.random.default_rng(4), insert("MRE-50-40")
     rates = np.exp(rng.uniform(np.log(0.5), np.log(310.0), rows))
     features = np.column_stack(
@@ -298,7 +280,7 @@ def test_a_law_becomes_a_network_that_rises_and_is_near_it() -> None:
     data, fresh = lawful(400, least_mm=0.0), lawful(500, noise_N=0.0)
     model = fit_law_model(data, data, **OF_LAW, epochs=80)
     metrics = model.metadata.metrics
-    assert np.abs(model.predict(fresh.features) - fresh.force_N).mean() < 0.015  # of 4.3 N, the fit's own errors within
+    assert np.abs(model.predict(fresh.features) - fresh.force_N).mean() < 0.015  # of 4.3 N, within the fit's own errors
     assert metrics["law_mae_N"] < 0.04
     assert metrics["not_rising_share"] == 0.0
     assert metrics["law_exponent"] == pytest.approx(LAW.exponent, abs=0.02)
@@ -311,9 +293,6 @@ def test_a_law_of_one_field_is_refused() -> None:
     data.features[:, FIELD] = 300.0
     with pytest.raises(DomainError, match="field_mT = 300"):
         fit_law_model(data, data, **OF_LAW)
-
-
-# -- rows that a bench sweep keeps, and the memory that is taken out of them; all records are synthetic ----------------
 
 
 KINETIC_N, STIFFNESS_N_MM = 2.0, 8.0
@@ -381,9 +360,6 @@ def test_what_inserts_of_one_matrix_remember_is_found_in_all_their_records() -> 
     slid = features[:, 0] >= MOBILISED_MM
     fresh_N = 4.0 * (features[:, 2] / 800.0) ** 2
     assert free.force_N[slid] == pytest.approx(fresh_N[slid], rel=0.01)
-
-
-# -- the command -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -454,8 +430,6 @@ def test_what_was_taken_out_of_the_data_is_in_the_file(
         assert load_model(out, element="torque").metadata.memory == expected
 
 
-# -- the relaxation-aware model, on a small synthetic element with a known memory --------------------------------
-
 SERIES = PronySeries((0.02, 0.06, 0.04, 0.03), (1.2, 9.0, 120.0, 900.0))
 FIELD_SERIES = PronySeries((0.03, 0.09, 0.05, 0.02), (1.2, 9.0, 120.0, 900.0))
 
@@ -467,7 +441,6 @@ def parts(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def records(displacement: np.ndarray, time_s: np.ndarray, fields: tuple[float, ...]) -> Dataset:
-    """The element pressed alike at each field, with noise."""
     rate = np.gradient(displacement, time_s)
     pressed, field = np.column_stack((displacement, rate)), np.repeat(fields, len(time_s))
     features = np.column_stack((np.tile(pressed, (len(fields), 1)), field, np.full_like(field, 45)))
@@ -506,7 +479,7 @@ def test_a_series_is_recovered_from_holds_even_when_the_level_is_wrong(holds: Da
 
 
 def test_records_that_begin_late_were_run_before() -> None:
-    # a constant force: after n passes of 10 s it has relaxed for n * 10 s
+    # after n passes of 10 s a constant force has relaxed for n * 10 s
     for passes in (0, 3):
         data = Dataset(np.zeros((10, 4)), np.zeros(10), None, np.arange(1.0, 11.0) + 10 * passes)
         force = relaxed_N(PronySeries((0.5,), (20.0,)), np.full(10, 8.0), data)
@@ -543,7 +516,7 @@ def test_steps_and_records_agree(grey: GreyBox) -> None:
     data = Dataset(features, np.zeros(40), None, np.arange(1, 41) * 0.25 - 0.25)
     memory = GreyBoxMemory(grey, 0.25)
     stepped = [memory.advance(3.0, 0.0, field, 45.0) for field in fields.tolist()]
-    # the record begins with a jump, the steps with a ramp: what is left of the difference fades
+    # the record begins with a jump, the steps with a ramp, and the difference fades
     assert grey.predict(data)[1:] == pytest.approx(stepped[1:], rel=5e-3)
 
 

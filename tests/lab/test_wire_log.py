@@ -1,4 +1,4 @@
-"""A recorded session is read by stock CAN tools: cantools with the DBC, and python-can's own."""
+"""Stock CAN tools read a recorded session: cantools with the DBC, and python-can."""
 
 import contextlib
 import os
@@ -41,7 +41,6 @@ PATIENCE_S = 20.0
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The candump log of a session in virtual time."""
     path = tmp_path_factory.mktemp("session") / "session.log"
     assert main(["wire-log", "virtual", str(path), "--seconds", str(SECONDS)]) == 0
     return path
@@ -79,7 +78,7 @@ def test_cantools_decodes_every_frame_with_names_and_units(
     frames: list[can.Message], database: cantools.database.can.Database
 ) -> None:
     for frame in frames:
-        # that the values are alike tests/firmware_protocol/test_codec.py asserts
+        # tests/firmware_protocol/test_codec.py asserts that the values are alike
         assert set(ours(frame).__match_args__) <= set(database.decode_message(frame.arbitration_id, frame.data))
     units = {s.name: s.unit for m in database.messages for s in m.signals}
     for name, unit in units.items():
@@ -113,7 +112,7 @@ def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:
 
 
 class Tap(NamedTuple):
-    """A tap that runs on a line whose two ends the test holds: `device` is the device's, `host` the daemon's."""
+    """A tap on a line whose two ends, the device's and the daemon's, the test holds."""
 
     device: FileIO
     host: FileIO
@@ -123,7 +122,6 @@ class Tap(NamedTuple):
 
 
 def read(end: FileIO, length: int) -> bytes:
-    """The next so many bytes."""
     data = b""
     while len(data) < length:
         assert select.select([end], [], [], PATIENCE_S)[0]

@@ -1,4 +1,4 @@
-"""Types of the laboratory's figures, arrays, masks and plain data, and the root mean square."""
+"""Type aliases for arrays, masks and plain data, and the root mean square."""
 
 from typing import Any
 
@@ -11,6 +11,4 @@ Json = dict[str, Any]
 
 
 def rms(values: Array) -> float:
-    """Return the root of the mean square of `values`, of any shape; NaN, with NumPy's RuntimeWarning, where there are
-    none."""
     return float(np.sqrt(np.mean(np.square(values))))

@@ -1,4 +1,4 @@
-"""Executors for a tool's runs, processes of this machine or a Dask cluster, and the wait for the runs."""
+"""Executors for a tool's runs: processes of this machine, or a Dask cluster."""
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
@@ -17,7 +17,6 @@ ResultT = TypeVar("ResultT")
 
 
 def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> None:
-    """Add the options `--workers`, 1..1024, and `--dask ADDRESS` to `parser`; without the latter `dask` is None."""
     parser.add_argument("--workers", type=WORKERS, default=workers, help="processes on this machine (%(default)s)")
     parser.add_argument(
         "--dask", metavar="ADDRESS", help=f"scheduler of a Dask cluster instead; its workers need {needed}"
@@ -26,14 +25,13 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 
 @contextmanager
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
-    """Give the executor that `options.workers` and `options.dask` ask for, as a context: processes here, or a Dask
-    cluster."""
+    """Give the executor that the options ask for, for as long as the context lasts."""
     if options.dask is None:
-        # a fork of this process would inherit the locks of libraries' threads, but not the threads
+        # a fork would inherit the locks of libraries' threads without the threads
         with ProcessPoolExecutor(options.workers, get_context("forkserver")) as here:
             yield here
         return
-    # only a cluster needs it installed
+    # only a cluster needs this package
     from distributed import Client
 
     try:
@@ -47,8 +45,7 @@ def chosen(options: argparse.Namespace) -> Iterator[Executor]:
 def finished(
     executor: Executor, function: Callable[[ItemT], ResultT], items: Iterable[ItemT], unit: str
 ) -> Iterator[tuple[ItemT, "Future[ResultT]"]]:
-    """Run `function` on every item; yield each item with its done future, in order of completion, beside a progress
-    bar."""
+    """Run `function` on every item, and yield each item with its future when it is done, beside a progress bar."""
     pending = {executor.submit(function, item): item for item in items}
     try:
         for future in tqdm(as_completed(pending), total=len(pending), unit=unit, disable=None):

@@ -1,7 +1,7 @@
 """Carriages that lose no time: the bound of what a loop can do with the knowledge that it has.
 
-They are in the plan's gap at once, as far as their top speed lets them. Core, protocol, element and sensor stay as they
-are. So the error left with them is the plan's, and the rest is the real carriages'.
+They reach the planned gap at once, as far as their top speed allows. Core, protocol, element and sensor are the real
+ones, so the error that remains is the plan's.
 """
 
 import math
@@ -18,7 +18,7 @@ from tormagd.simulation.plant import Plant
 
 
 def put_gap(plant: Plant, gap_mm: float) -> None:
-    """Move both carriages of `plant` at once, each by half the way, to the gap `gap_mm`; screws and encoders follow."""
+    """Move both carriages at once, each by half of the way, to the gap `gap_mm`."""
     before_mm, lead_mm_rad = plant.gap_mm, plant.parameters.screw.lead_mm / math.tau
     for axis in (plant.left, plant.right):
         # the screw turns with the carriage, so the encoder sees it
@@ -39,11 +39,9 @@ class IdealCarriages(Actuator):
         self._plant: Final = plant
 
     def begin(self, gap_mm: float) -> None:
-        """Begin to move from `gap_mm`, as `Actuator.begin`."""
         self.reference = Reference(gap_mm)
 
     def resume(self, measured: Measured) -> None:
-        """Begin to move from the measured gap, as `Actuator.resume`."""
         self.begin(measured.gap_mm)
 
     def update(
@@ -55,8 +53,7 @@ class IdealCarriages(Actuator):
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """Put the gap of the simulated device where `plan` wants it at `now_s`, set `reference` to it, and return
-        duties of 0."""
+        """Move the simulated gap towards the plan's, at most at top speed, and return duties of 0."""
         before_mm = self._plant.gap_mm
         wanted_mm = self._open_mm if is_over else min(max(before_mm, self._closed_mm), self._open_mm)
         if plan is not None and not is_over:
@@ -70,5 +67,4 @@ class IdealCarriages(Actuator):
 
 
 def ideal_stepper(core: Core, plant: Plant) -> Stepper:
-    """Return a stepper of `core` whose carriages are ideal and move the gap of `plant`."""
     return Stepper(core.config, core.scene, move=IdealCarriages(core, plant))

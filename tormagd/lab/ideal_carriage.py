@@ -1,20 +1,13 @@
-"""The ideal carriages of a device, and the force that they render: the error that is left to them.
+"""The least error with which a device's carriages can render a force: without delay, and with foresight.
 
-The device is known exactly. Its drive: the motors' torque-speed line and current limit, the friction of gearbox, screw
-and guide, the magnets' pull. These are the laws of the simulated axis, `tormagd/simulation/axis.py`, both carriages
-together. Its force: the field of its gap with the lag of remanence, the relaxation of its insert, the friction of a
-handle at one speed. Left out is what only holds carriages back: windings, backlash, the bristles of friction, sensors,
-the exchange. So no controller drives this device's gap faster. The force asked is clipped to what the open gap brakes
-and to the scene's greatest. Steps are of a millisecond or less.
+The device is known exactly, by the laws of the simulated axis and element: torque-speed line, current limit, friction,
+the magnets' pull, remanence, relaxation. Windings, backlash, bristles, sensors and the exchange only hold the carriages
+back and are left out: no controller moves this gap faster. The force is clipped to what the open gap brakes and to the
+scenes' greatest. Steps are 1 ms or less.
 
-*Without delay*: a step knows the force asked at its end, and how fast it changes, but nothing of what follows. The
-carriages close up to it as fast as they can while they still can brake in time. For what repeats itself or is noise
-that is no bound. A forecast that is right misses less, down to what foresight does, and so may a gap that stands still.
-
-*With foresight* the whole signal is known, and the RMS error is the least that the drive allows. At what gap and speed
-the carriages begin is free. The optimum is found by sequential quadratic programmes (Gauss-Newton, each solved by
-Clarabel), to 2 %: carried on, the rounds found nothing better than that. Without the field's lag a search of everything
-agrees to 0.4 % (`tests/lab/test_bound.py`).
+*Without delay*, a step knows the force at its end and how fast it changes. *With foresight*, the whole signal is known,
+and the RMS error is the least that the drive allows, to 2 %. Sequential quadratic programmes find it (Gauss-Newton,
+each solved by Clarabel); without the field's lag a search of everything agrees to 0.4 %.
 """
 
 import argparse
@@ -43,26 +36,26 @@ TURNED_MM_S = 42.0
 "Speed of the roller's surface at the thesis's 20 rpm."
 STEP_S = 1e-3
 MAX_N = 2.0
-"The greatest force of the scenes."
 MAX_STEPS = 300_000
 ROUNDS = 30
 SETTLED = 1e-3
-"Relative change of the RMS error from round to round at which the rounds end."
+"The rounds end once the RMS error changes by less than this share."
 EXACT_N = 1e-6
 SECANT_MM_S = 5.0
-"Secant over which a limit is linearised: it has a kink at 0, and the carriages turn elsewhere next round."
+"A secant, as the limit has a kink at 0."
 MIN_BRAKING_MM_S2 = 50.0
 
 
 GRID_MM = 2e-3
-"Grid of the moment over the gap."
 NEWTON_STEPS = 6
 MIN_GAIN = 0.1
-"Least slope of moment and lag together over the moment, just turned round."
+"Least slope of the strength over the moment: just after a turn the lag nearly cancels the moment."
 
 
 class Drive(NamedTuple):
-    """Drive of the gap, as accelerations of the gap, mm/s^2; opening is positive."""
+    """Drive of the gap as accelerations; opening is positive. Full voltage gives `stall_mm_s2` at rest and `per_s`
+    less for each mm/s. The nut's load is the magnets' pull (`pull_mm_s2_N` for each newton) and the guides' drag, and
+    `screw_friction` of it is friction besides."""
 
     stall_mm_s2: float
     per_s: float
@@ -75,31 +68,26 @@ class Drive(NamedTuple):
     pull_N: Curve = Curve([0.0, 0.0], 0.0, 1.0)
 
     def highest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Return the largest speed `dt_s` after this gap and speed, mm/s: of opening at full voltage, against the
-        magnets' pull."""
+        """Return the speed after `dt_s` of opening at full voltage against the magnets' pull."""
         return self._sped_up(self.pull_mm_s2_N * self.pull_N.at(gap_mm), speed_mm_s, dt_s)
 
     def lowest_mm_s(self, gap_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Return the smallest speed `dt_s` after this gap and speed, mm/s: of closing at full voltage, with the
-        magnets' pull."""
+        """Return the speed after `dt_s` of closing at full voltage with the magnets' pull."""
         return -self._sped_up(-self.pull_mm_s2_N * self.pull_N.at(gap_mm), -speed_mm_s, dt_s)
 
     def _sped_up(self, pull_mm_s2: float, speed_mm_s: float, dt_s: float) -> float:
-        """Return the speed of the gap, mm/s, `dt_s` after `speed_mm_s`, at full voltage to open against the pull
-        `pull_mm_s2`."""
         if speed_mm_s < 0.0:
             braking = self._acceleration(pull_mm_s2, speed_mm_s, -1.0)
             if speed_mm_s + braking * dt_s <= 0.0:
                 return speed_mm_s + braking * dt_s
-            # the gap turns round within the step, and the rest of the step speeds it up
+            # the gap turns round within the step, and speeds up for the rest of it
             dt_s += speed_mm_s / braking
             speed_mm_s = 0.0
-        # where no force is left over to start with, friction holds the gap
+        # friction holds the gap where no force is left to start it
         return max(speed_mm_s + self._acceleration(pull_mm_s2, speed_mm_s, 1.0) * dt_s, 0.0)
 
     def _acceleration(self, pull_mm_s2: float, speed_mm_s: float, direction: float) -> float:
-        """Return the gap's acceleration, mm/s^2, at `speed_mm_s` and the full voltage that opens, within the current
-        limit."""
+        """Return the gap's acceleration at the full voltage that opens, within the current limit."""
         driving = min(self.stall_mm_s2 - self.per_s * speed_mm_s, self.most_mm_s2)
         nut = pull_mm_s2 + direction * self.drag_mm_s2
         friction = self.gear_mm_s2 + self.screw_friction * abs(nut)
@@ -108,18 +96,19 @@ class Drive(NamedTuple):
 
 
 class Lag(NamedTuple):
-    """Law of remanence: what the moment of the field lacks while it rises, and has too much while it falls."""
+    """Law of remanence: the field's moment lags by `branch_Tm` while it rises or falls, and most of the lag turns over
+    a change by `turn_Tm`."""
 
     branch_Tm: float
     turn_Tm: float
 
     def after_Tm(self, lag_Tm: float, change_Tm: float) -> float:
-        """Return the lag once the moment has changed by `change_Tm` in one direction, from the lag `lag_Tm`."""
+        """Return the lag after the moment has changed by `change_Tm` in one direction."""
         branch_Tm = math.copysign(self.branch_Tm, -change_Tm)
         return branch_Tm + (lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm)
 
     def along_Tm(self, moments_Tm: Array, lag_Tm: float, before_Tm: float) -> Array:
-        """Return the lag (n), T m, at each of `moments_Tm` (n), T m, in order."""
+        """Return the lag (n) along `moments_Tm` (n), which begin at `before_Tm` with the lag `lag_Tm`."""
         found = []
         for moment_Tm in moments_Tm.tolist():
             if moment_Tm != before_Tm:
@@ -130,13 +119,14 @@ class Lag(NamedTuple):
 
 
 def lag_of(plant: PlantParameters) -> Lag:
-    """Return the law of remanence of a plant with magnets and an insert, as the simulated device has it."""
     largest_Tm = float(radial_moment_Tm(np.array([SMALLEST_GAP_MM]), plant)[0])
     return Lag(plant.field.hysteresis_percent / 100.0 * largest_Tm, plant.assumed.hysteresis_scale * largest_Tm)
 
 
 class Brake(NamedTuple):
-    """Force of the gap while the handle slides."""
+    """Force of the gap while the handle slides. A gap gives a moment of the field, which lags. Moment and lag
+    together, the strength, give the force of the fresh insert, part of which relaxes. `sliding_N` makes the felt force
+    of a kinetic level, N, and the handle's speed, mm/s."""
 
     gap_mm: Array
     moment_Tm: Array
@@ -148,32 +138,27 @@ class Brake(NamedTuple):
     sliding_N: Callable[[float, float], float]
 
     def fresh_at_N(self, moment_Tm: float, lag_Tm: float = 0.0) -> float:
-        """Return the force, N, of the fresh insert at a moment with its lag, T m."""
         return float(np.interp(moment_Tm + lag_Tm, self.strength_Tm, self.fresh_N))
 
     def open_N(self, hand_mm_s: float) -> float:
-        """Return the felt force of the open gap with a fresh element, while the handle moves at `hand_mm_s`."""
         return self.sliding_N(self.fresh_at_N(float(self.moment_Tm[-1])), hand_mm_s)
 
     def felt(self, hand_mm_s: float) -> tuple[float, float]:
-        """Return offset, N, and scale of the felt force over the kinetic level, while the handle moves at
-        `hand_mm_s`."""
+        """Return the offset, N, and the scale that turn a kinetic level into the felt force."""
         offset_N = self.sliding_N(0.0, hand_mm_s)
         return offset_N, self.sliding_N(1.0, hand_mm_s) - offset_N
 
     def lags_Tm(self, moments_Tm: Array) -> Array:
-        """Return the lag at each moment of a series; before the first the gap had been opened, and lagged
-        `branch_Tm`."""
+        """Return the lag (n) along moments (n), of a gap that had been opened before."""
         return self.lag.along_Tm(moments_Tm, self.lag.branch_Tm, float(self.moment_Tm[-1]))
 
     def moment_for_Tm(self, strength_Tm: float, moment_Tm: float, lag_Tm: float) -> float:
-        """Return the moment, T m, that together with its lag makes `strength_Tm`, coming from `moment_Tm` with the lag
-        `lag_Tm`."""
+        """Return the moment that together with its lag makes `strength_Tm`, coming from `moment_Tm` and `lag_Tm`."""
         wanted_Tm = moment_Tm
         for _ in range(NEWTON_STEPS):
             change_Tm = wanted_Tm - moment_Tm
             short_Tm = strength_Tm - wanted_Tm - self.lag.after_Tm(lag_Tm, change_Tm)
-            # at a standstill the branch is the one that leads to the wanted strength
+            # at a standstill, take the branch that leads to the wanted strength
             branch_Tm = math.copysign(self.lag.branch_Tm, -(change_Tm or short_Tm))
             fading = abs(lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.lag.turn_Tm) / self.lag.turn_Tm
             wanted_Tm += short_Tm / max(1.0 - fading, MIN_GAIN)
@@ -181,7 +166,6 @@ class Brake(NamedTuple):
 
 
 def friction_of(plant: PlantParameters) -> Friction:
-    """Return the friction between roller and insert of a plant, as the simulated device has it."""
     return Friction(
         presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
         viscous_N_s_mm=plant.friction.viscous_N_s_mm,
@@ -191,7 +175,7 @@ def friction_of(plant: PlantParameters) -> Friction:
 
 
 def drive_of(plant: PlantParameters) -> Drive:
-    """Return the drive of a device, both carriages together; the guides' drag is the mean of both."""
+    """Return the drive of both carriages together, with the mean of the guides' drag."""
     motor, gear, screw = plant.motor, plant.gear, plant.screw
     lead_m_rad = screw.lead_mm * 1e-3 / math.tau
     coupling_Nm_A = gear.ratio * motor.back_emf_V_s_rad
@@ -212,8 +196,7 @@ def drive_of(plant: PlantParameters) -> Drive:
 
 
 def brake_of(plant: PlantParameters) -> Brake:
-    """Return the brake of a device between the plant's stops, in steps of GRID_MM at most; of a second plant an
-    approximation."""
+    """Tabulate the brake between the plant's stops."""
     assumed = plant.assumed
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
@@ -237,7 +220,7 @@ def brake_of(plant: PlantParameters) -> Brake:
 
 
 def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameters) -> Brake:
-    """Return the brake of the second plant over the gaps `gap_mm` (n, rising), mm; an approximation, see `Brake`."""
+    """Approximate the second plant: a field in T stands for the moment, exponentials for creep and play."""
     field_T = np.array([1e-3 * shaft_field_mT(gap, plant, second.concentration) for gap in gap_mm.tolist()])
     shares_T = [1e-3 * share * half_mT for share, half_mT in zip(second.play_shares, second.play_mT, strict=True)]
     branch_T = sum(shares_T, 0.0)
@@ -257,7 +240,8 @@ def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameter
 
 
 class Asked(NamedTuple):
-    """A force in even steps, clipped to what can be asked, and the field strength that gives it."""
+    """A force in even steps, clipped to what can be asked, and the field strength that gives it. `scale`, `offset_N`
+    and `relaxed_N` turn the fresh insert's force into the rendered one."""
 
     force_N: Array
     strength_Tm: Array
@@ -266,14 +250,13 @@ class Asked(NamedTuple):
     offset_N: float
 
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
-        """Return the rendered force (n), N, for the gaps `gap_mm` (n) in the steps of this force."""
         moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
         fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)
         return self.scale * (fresh_N - self.relaxed_N) + self.offset_N
 
 
 class Bound(NamedTuple):
-    """The asked force, clipped, and what ideal carriages render of it without delay and with foresight; even steps."""
+    """The asked force, clipped, and what ideal carriages render of it, in even steps."""
 
     time_s: Array
     asked_N: Array
@@ -281,8 +264,6 @@ class Bound(NamedTuple):
     foresight_N: Array
 
     def figures(self, start_s: float = -math.inf) -> Json:
-        """Return `sd_N`, the asked force's standard deviation, and the RMS errors `no_delay_rms_N` and
-        `foresight_rms_N`."""
         inside = self.time_s >= start_s
         asked_N = self.asked_N[inside]
         return {
@@ -300,8 +281,6 @@ def bound(
     is_held: bool = False,
     step_s: float = STEP_S,
 ) -> Bound:
-    """Return the bound for forces (n), N, at times (n), s, linear in between, or with `is_held` each held until the
-    next."""
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MAX_STEPS:
         raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MAX_STEPS} steps of {step_s:g} s")
@@ -317,10 +296,9 @@ def bound(
 
 
 def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, step_s: float) -> Asked:
-    """Return the force (n), N, clipped to the device's range and `most_N`, with the relaxation while exactly that is
-    rendered."""
+    """Clip the force (n) to the device's range and `most_N`, and find the relaxation while exactly that is rendered."""
     offset_N, scale = brake.felt(hand_mm_s)
-    # a gap that has been opened brakes a little more than one that was never closed
+    # a gap that was opened brakes a little more than one that was never closed
     least_N = brake.fresh_at_N(float(brake.moment_Tm[-1]), brake.lag.branch_Tm)
     greatest_N = brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.lag.branch_Tm)
     series = brake.relaxation
@@ -341,8 +319,6 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
 
 
 def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """Return the gap (n), mm, at the end of each step of `step_s`, of carriages that follow `asked` without delay or
-    foresight."""
     gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
     moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.lag.branch_Tm
 
@@ -358,7 +334,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
             lowest = drive.lowest_mm_s(gap_mm, speed_mm_s, step_s)
             target_mm = wanted_mm(before_Tm)
             moves_mm_s, behind_mm = (wanted_mm(now_Tm) - target_mm) / step_s, target_mm - gap_mm
-            # the largest speed of approach that the remaining way still brakes down to the target's own speed
+            # the fastest approach that can still brake to the target's own speed within the remaining way
             towards = math.copysign(1.0, behind_mm)
             faster_mm_s = min(max(moves_mm_s, lowest), highest) + towards * SECANT_MM_S
             slowed = drive.lowest_mm_s if behind_mm > 0.0 else drive.highest_mm_s
@@ -377,8 +353,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
 
 
 def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
-    """Return the gap (n), mm, over the steps with the least RMS error of force that the drive allows; the whole force
-    is known."""
+    """Return the gap (n) with the least RMS error of force that the drive allows."""
     steps = len(asked.force_N)
     slope_Tm_mm = np.gradient(brake.moment_Tm, brake.gap_mm)
     slope_N_Tm = asked.scale * np.gradient(brake.fresh_N, brake.strength_Tm)
@@ -394,7 +369,7 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
         limits = [
             (later - sparse.diags(highest_slope) @ earlier, (highest - speeds_mm_s[1:]) * step_s),
             (sparse.diags(lowest_slope) @ earlier - later, (speeds_mm_s[1:] - lowest) * step_s),
-            # the first speed has none before it
+            # the first speed has no predecessor
             (differ[:1], (no_load_mm_s - speeds_mm_s[:1]) * step_s),
             (-differ[:1], (no_load_mm_s + speeds_mm_s[:1]) * step_s),
             (gaps, np.minimum(brake.gap_mm[-1] - gap_mm, radius_mm)),
@@ -404,7 +379,7 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
         lag_Tm = brake.lags_Tm(moment_Tm)
         turned = np.interp(gap_mm, brake.gap_mm, slope_Tm_mm)
         felt = np.interp(moment_Tm + lag_Tm, brake.strength_Tm, slope_N_Tm)
-        # lags are counted in millimetres of gap, so that gaps and lags are of one size
+        # in millimetres of gap, so that gaps and lags are of one size
         unit_Tm = float(np.abs(turned).max())
         error_N = asked.rendered_N(brake, gap_mm) - asked.force_N
         sensed = sparse.hstack([sparse.diags(felt * turned), sparse.diags(felt * unit_Tm)], format="csc")
@@ -415,22 +390,19 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
         if abs(now_N - last_N) <= SETTLED * now_N + EXACT_N:
             return gap_mm
         if now_N > last_N:
-            # where the gap turns, one round may undo the other: the next goes less far
+            # where the gap turns, one round may undo the other, so the next goes less far
             radius_mm = 0.5 * float(np.abs(moved_mm).max())
         last_N = now_N
     raise RuntimeError(f"foresight: no end after {ROUNDS} rounds, {last_N * 1e3:.2f} mN")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab bound`."""
     parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
     parser.add_argument("--insert", default=PLANTS_INSERT, help=f"insert in it ({PLANTS_INSERT})")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return how closely ideal carriages can render the forces in the file `options.force`, on the plant
-    `options.plant`."""
     table = read_forces(options.force)
     plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
     plant = with_insert(plant, options.insert)
@@ -446,8 +418,7 @@ def run(options: argparse.Namespace) -> Found:
 def _reached(
     limit_mm_s: Callable[[float, float, float], float], gap_mm: Array, speeds_mm_s: Array, step_s: float
 ) -> tuple[Array, Array]:
-    """Return the speed limit at the end of each step but the first, mm/s, and its slope over the speed before (n - 2
-    each)."""
+    """Return the speed limit at the end of each step but the first, and its slope (n - 2 each) over the speed."""
     found = []
     for gap, speed in zip(gap_mm[1:-1].tolist(), speeds_mm_s[:-1].tolist(), strict=True):
         more, less = limit_mm_s(gap, speed + SECANT_MM_S, step_s), limit_mm_s(gap, speed - SECANT_MM_S, step_s)
@@ -457,12 +428,12 @@ def _reached(
 
 
 def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tuple[sparse.spmatrix, sparse.spmatrix]:
-    """Return the lag's law, linearised, as two matrices (n x n): one for the changes of gaps, one for those of lags."""
+    """Linearise the lag's law, and return two matrices (n x n), for the changes of gaps and of lags."""
     steps = len(moment_Tm)
     change_Tm = np.diff(moment_Tm)
     kept = np.exp(-np.abs(change_Tm) / brake.lag.turn_Tm)
     pulled = np.sign(change_Tm) * (lag_Tm[:-1] + np.sign(change_Tm) * brake.lag.branch_Tm) / brake.lag.turn_Tm * kept
-    # the first lag is what it is
+    # the first lag is given
     of_gaps = sparse.diags(
         [np.concatenate([[0.0], pulled]) * turned, -pulled * turned[:-1]], [0, -1], shape=(steps, steps)
     )
@@ -473,16 +444,16 @@ def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tu
 def _least_squares(
     matrix: sparse.spmatrix, error: Array, nothing: sparse.spmatrix, limits: list[tuple[sparse.spmatrix, Array]]
 ) -> Array:
-    """Return the x (p) with the least |matrix x + error|, subject to `nothing` x = 0 and the limits."""
+    """Return the x (p) that minimises |matrix x + error| with `nothing` x = 0 and within the limits."""
     unit = float(np.abs(matrix).max())
     below = sparse.vstack([limit for limit, _ in limits], format="csc")
     below.resize(below.shape[0], matrix.shape[1])
     bounds = np.concatenate([bound for _, bound in limits])
-    import clarabel  # only the bound needs it
+    import clarabel  # only the bound needs this package
 
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    # late rounds leave little room, and the solver takes ten times the iterations of early ones
+    # late rounds leave little room, and take ten times the iterations of early ones
     settings.max_iter = 1_000
     solver = clarabel.DefaultSolver(
         sparse.triu(matrix.T @ matrix / unit**2, format="csc"),

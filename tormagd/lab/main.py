@@ -1,8 +1,8 @@
-"""`tormag-lab NAME`: the laboratory's commands. Each is a module, loaded when asked for.
+"""`tormag-lab NAME`: the laboratory's commands, each in a module that is loaded when it is asked for.
 
-A module has `add_options(parser)` and `run(options)`, which returns a `Found`. `--json` prints its figures as one JSON
-object; otherwise they are printed for a person. The types of its options stand here: a number outside its range is
-refused with what is allowed, and exit code 2.
+A command's module has `add_options(parser)` and `run(options)`, which returns a `Found`. `--json` prints its figures as
+one JSON object; otherwise they are printed for a person. A number outside its option's range is refused with what is
+allowed, and exit code 2.
 """
 
 import argparse
@@ -26,11 +26,10 @@ from tormagd_client.printable import in_short, printable
 
 NOT_TOLD, USAGE = 1, 2
 REFUSALS = (LabError, ConfigError, ForceFileError, DomainError, PlantError)
-"Errors with which the laboratory's rooms refuse input."
 
 
 class Found(NamedTuple):
-    """Result of a command: plain data, the exit code, and lines for a person where a plain table does not do."""
+    """A command's result: plain data, the exit code, and lines for a person where a plain table will not do."""
 
     figures: Any
     lines: Iterable[str] | None = None
@@ -54,11 +53,10 @@ COMMANDS = {
     "wire-log": ("wire_log", "a session between host and device as a CAN log"),
     "fleet": ("consoles.command", "what the recordings of many consoles say of each"),
 }
-"By name, a command's module in `tormagd.lab`, and what it does."
 
 
 def whole(least: int, most: int) -> Callable[[str], int]:
-    """Return a type for argparse: it reads a whole number from `least` to `most`, as `int` does."""
+    """Return an argparse type for whole numbers in this range."""
 
     def number(text: str) -> int:
         try:
@@ -73,18 +71,16 @@ def whole(least: int, most: int) -> Callable[[str], int]:
 
 
 def within(least: float, most: float, unit: str) -> Callable[[str], float]:
-    """Return the type of a finite number in this range, of this unit."""
+    """Return an argparse type for finite numbers in this range."""
     return Within(least, most, f" {unit}").__call__
 
 
 SEED = whole(0, 2**31)
 WORKERS = whole(1, 1024)
-"Processes on one machine."
 GAP_SPEED = within(1e-6, 1e4, "mm/s")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that the first argument names and return its exit code, as `run` with the other arguments."""
     write_in_any_encoding()
     given = list(sys.argv[1:] if arguments is None else arguments)
     name = given[0] if given else "--help"
@@ -99,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
-    """Run the command `name`, a key of COMMANDS, print what it found on stdout and return its exit code."""
+    """Run a command of COMMANDS, print what it found on stdout and return its exit code."""
     try:
         module = import_module(f"tormagd.lab.{COMMANDS[name][0]}")
         parser = argparse.ArgumentParser(

@@ -1,4 +1,4 @@
-"""Generated pages and their pictures: tables in Markdown, and pictures that carry the digest of their figures."""
+"""Generated Markdown pages, and pictures that carry the digest of their figures."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -16,19 +16,18 @@ KEY = "Figures"
 
 
 def stamp(figures: object) -> dict[str, str | None]:
-    """Return the metadata of a PNG drawn from `figures`, for matplotlib's `savefig`: their SHA-256 digest, under KEY."""
+    """Return PNG metadata with the SHA-256 digest of `figures`, for matplotlib's `savefig`."""
     return {KEY: hashlib.sha256(msgspec.json.encode(figures, order="sorted")).hexdigest(), "Software": None}
 
 
 def figures_of(page: str) -> list[str]:
-    """Return the lines of a generated page's tables as they stand, heads and rules too; empty for a page without
-    tables."""
+    """Return the lines of a page that belong to tables."""
     return [line for line in page.splitlines() if line.startswith("|")]
 
 
 def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Figure", Any]:
-    """Return a new matplotlib figure of `size`, width and height in inches, and its axes."""
-    from matplotlib.figure import Figure  # not every installation draws
+    """Return a new matplotlib figure of `size`, inches, and its axes."""
+    from matplotlib.figure import Figure  # not every installation has matplotlib
 
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(*grid, **options)
@@ -44,7 +43,6 @@ def draw_beside(
     title: str,
     finer: float = 1.0,
 ) -> None:
-    """Draw `measured` and `explained` (n) over the time (n), s, and their difference times `finer`, as a picture."""
     figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
     above.plot(time_s, measured, color="#222222", linewidth=0.8, label="measured")
     above.plot(time_s, explained, color="#d1495b", linewidth=0.8, label=labels[0])
@@ -57,7 +55,6 @@ def draw_beside(
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
-    """Write a page, `sections` of Markdown with an empty line between, to `path`, and its pictures into `folder`."""
     page = "\n".join(section.rstrip() + "\n" for section in sections)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():
@@ -66,12 +63,10 @@ def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapp
 
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table in Markdown, with a line end behind each row; without rows its head and rule alone."""
     head = list(columns)
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def percent(share: float) -> str:
-    """Return a share as a percentage, to a tenth."""
     return f"{100 * share:.1f}%"

@@ -14,7 +14,7 @@ from tormagd_client.regular_file import require_regular
 
 MAX_ROWS = 5_000_000
 MAX_TABLE_BYTES = 1 << 30
-"Largest table of measurements: a day of a testing machine. It is read row by row."
+"A day of a testing machine; the table is read row by row."
 
 
 def read_columns(
@@ -26,7 +26,7 @@ def read_columns(
     allowed: Mapping[str, tuple[float, float]] | None = None,
     is_exact: bool = False,
 ) -> dict[str, Array]:
-    """Return the columns `names` of a CSV file, and those of `optional` that it has, by name, in this order."""
+    """Return the columns `names` of a CSV file, and those of `optional` that it has, within `allowed`."""
     try:
         require_regular(path, MAX_TABLE_BYTES)
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -50,7 +50,7 @@ def _columns(
     allowed: Mapping[str, tuple[float, float]],
     is_exact: bool,
 ) -> dict[str, Array]:
-    """Find the header in `rows`, pairs of line number, from 1, and cells, and return the columns below it by name."""
+    """Find the header among numbered rows, and return the columns below it."""
     header: list[str] = []
     for _, header in rows:
         if is_exact or set(names) <= set(header):
@@ -79,9 +79,8 @@ def _columns(
 
 
 def _number(where: str, text: str, bounds: tuple[float, float] | None) -> float:
-    """Return `text` as a finite number from the least to the most of `bounds`, these included; None: any."""
     try:
-        # digits grouped as 1_000 are Python's idea, not CSV's
+        # Python reads 1_000 as a number, CSV does not
         number = math.nan if "_" in text else float(text)
     except ValueError:
         number = math.nan

@@ -1,4 +1,4 @@
-"""A command's result for a person: a line for a figure or a few that belong together, a table for rows."""
+"""A command's result for a person: lines for single figures, tables for rows."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
@@ -18,7 +18,6 @@ def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the lines of a table: one with the names of all columns, then one for each of `rows`."""
     flat = [dict(_figures(row)) for row in rows]
     names = list(dict.fromkeys(name for row in flat for name in row))
     cells = [names, *([shown(row.get(name, "")) for name in names] for row in flat)]
@@ -28,7 +27,6 @@ def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of each figure in `row`, in order; lists are left out."""
     for key, value in row.items():
         if isinstance(value, Mapping):
             yield from ((f"{key} {name}", inner) for name, inner in _figures(value))
@@ -37,7 +35,6 @@ def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def shown(value: Any) -> str:
-    """Return a figure as text: a float to four digits, all else as `str` has it, None too."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {shown(inner)}" for name, inner in value.items())
     if isinstance(value, float):

@@ -18,16 +18,14 @@ from tormagd.lab.main import Found
 DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
 FILTER_TIMES_S = (0.002, 0.003, 0.004)
 INTEGRAL_TIMES_S = (0.1, 0.15, 0.2, 0.4)
-"A shorter integral time than 0.1 s fights stiction: the carriages begin to hunt by a count."
+"A shorter integral time than 0.1 s fights stiction, and the carriages begin to hunt by a count."
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab tune-position`."""
     parser.add_argument("--config", type=Path, help="whose [motor] is tuned for; the defaults otherwise")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the stiffest robust gains for the motor of `options.config`, as the fields of Tuning."""
     grid = list(itertools.product(DERIVATIVE_TIMES_S, FILTER_TIMES_S, INTEGRAL_TIMES_S))
     best = stiffest(tunings(load_config(options.config), tqdm(grid, desc="gains", disable=None)))
     if best is None:

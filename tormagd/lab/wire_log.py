@@ -1,9 +1,8 @@
-"""What was said on the wire, as a log that CAN tools read: candump (.log), Vector (.asc, .blf) and more.
+"""Log what is said on the wire, for CAN tools: candump (.log), Vector (.asc, .blf) and more.
 
-On CAN, `python -m can.logger` records the bus and nothing of ours is needed. A serial line has one owner, so `tap` goes
-between. It holds the device's port, offers the daemon a pseudo-terminal instead, passes every byte on and logs the
-frames. `virtual` logs a session in virtual time, synthetic from end to end. `viewer` prints what python-can's viewer
-needs to know of the messages.
+On CAN, `python -m can.logger` records the bus by itself. A serial port has one owner, so `tap` sits in between. It
+holds the device's port, offers the daemon a pseudo-terminal, passes every byte on and logs the frames. `virtual` logs a
+session in virtual time. `viewer` prints the message formats for python-can's viewer.
 """
 
 import argparse
@@ -41,10 +40,11 @@ MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 
 
 class WireLog:
-    """Log of both directions of one serial line, as a file that CAN tools read; to be closed."""
+    """Log of both directions of one serial line, in a file that CAN tools read. Bytes that are no frame are counted in
+    `damaged`."""
 
     def __init__(self, path: Path) -> None:
-        if path.suffix.lower() == ".db":  # python-can would add to it
+        if path.suffix.lower() == ".db":  # python-can would append to it
             path.unlink(missing_ok=True)
         self._log = can.Logger(path)
         self._decoders = {is_rx: FrameDecoder() for is_rx in (False, True)}
@@ -56,11 +56,10 @@ class WireLog:
         return self._nameless + sum(decoder.statistics.corrupt for decoder in self._decoders.values())
 
     def close(self) -> None:
-        """End the file."""
         self._log.stop()
 
     def add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
-        """Log the frames that `data` completes, each stamped with `time_s`, s by the caller's clock."""
+        """Log the frames that `data` completes, stamped with `time_s`."""
         for frame in self._decoders[is_rx].feed(data):
             if not 1 <= frame.function <= 0x7F:
                 self._nameless += 1
@@ -77,19 +76,17 @@ class WireLog:
             self.frames += 1
 
     def read(self, now_s: float, raw: Any) -> None:
-        """Log what a connection read from the device: bytes of a serial line."""
         self.add(now_s, raw, is_rx=True)
 
     def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
-        """Log what a connection wrote to the device, frames of a serial line as bytes; an empty list logs nothing."""
         self.add(now_s, b"".join(raw), is_rx=False)
 
     def connected(self, memory: Any) -> None:
-        """Do nothing: the beginning and end of a conversation are no frames."""
+        """Ignore the beginning and end of a conversation."""
 
 
 def virtual_session(seconds: float, log: WireLog) -> None:
-    """Run a session of the virtual device, sample 1, and log its frames in `log`, which is left open."""
+    """Log a session of the virtual device, sample 1, in virtual time."""
     config = load_config(None)
     core = build_core(config)
     loop = ClosedLoop(
@@ -106,7 +103,7 @@ def virtual_session(seconds: float, log: WireLog) -> None:
 
 
 def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
-    """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames in `log`."""
+    """Pass bytes between `port` and a new pseudo-terminal until `stopped()`, and log their frames."""
     with contextlib.closing(Pty()) as line:
         announce(line.address)
         poll = select.poll()
@@ -121,13 +118,13 @@ def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stop
                 if is_rx:
                     line.write(data)
                 else:
-                    with contextlib.suppress(BlockingIOError):  # what a device does not fetch is lost
+                    with contextlib.suppress(BlockingIOError):  # bytes that the device does not fetch are lost
                         os.write(port.fileno(), data)
                 log.add(time.time(), data, is_rx=is_rx)
 
 
 def viewer_formats() -> list[str]:
-    """Return a line `ID:FORMAT:DIVISOR...` for each message, as `python -m can.viewer -d FILE` reads them."""
+    """Return a line `ID:FORMAT:DIVISOR...` for each message, for `python -m can.viewer -d FILE`."""
     lines = []
     for layout in LAYOUTS:
         divisors = [repr(1.0 / signal.scale) if signal.type is float else "1" for signal in layout.signals]
@@ -137,7 +134,6 @@ def viewer_formats() -> list[str]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab wire-log`: a way, `virtual`, `tap` or `viewer`, and its own."""
     ways = parser.add_subparsers(dest="way", required=True)
     virtual = ways.add_parser("virtual", help="log a session in virtual time")
     tapped = ways.add_parser("tap", help="log what passes between the daemon and a serial device")
@@ -150,7 +146,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Log to `options.file` by the way `virtual` or `tap`, or return the lines of `viewer_formats` by `viewer`."""
     if options.way == "viewer":
         formats = viewer_formats()
         return Found(formats, formats)

@@ -1,2 +1,1 @@
-"""From a laboratory's records to the physics room's constants; needs the `lab` extra, and the daemon never imports
-it."""
+"""From a laboratory's records to the physics room's constants; needs the `lab` extra."""

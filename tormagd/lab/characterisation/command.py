@@ -28,7 +28,6 @@ from tormagd.lab.tables import read_columns
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab characterise`: a kind of record, and for each kind its own."""
     kinds = parser.add_subparsers(required=True)
     pressed, pulled, held = (kinds.add_parser(name) for name in ("compression", "tension", "relaxation"))
     for kind, handle in ((pressed, compression), (pulled, tension), (held, relaxation)):
@@ -48,19 +47,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the constants of one record, by the function for its kind."""
     return Found(options.handle(options))
 
 
 def compression(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the keys of `moduli` for the evaluated cycle of a compression test, its number `cycle`, and `deviations`."""
     record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
     curve = evaluated_cycle(record, sample, options.cycle)
     return {"cycle": options.cycle, "deviations": deviations(record, sample), **moduli(curve, options.terms)}
 
 
 def tension(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the keys of `moduli` for the rows of a tension test from `from_strain` to `to_strain`, these included."""
     names = (options.strain, options.stress_mpa)
     columns = read_columns(options.file, names, delimiter=options.delimiter)
     strain, stress_MPa = (columns[name] for name in names)
@@ -69,7 +65,7 @@ def tension(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
-    """Fit three laws to a curve and return each one's shear modulus, `shear_modulus_kPa`, and R2, `r2`."""
+    """Fit three laws to a curve, and return the shear modulus and R2 of each."""
     neo_hookean, ogden = fit_neo_hookean(*curve), fit_ogden(*curve, terms=terms)
     thesis = fit_thesis_ogden(*curve)
     return {
@@ -92,7 +88,6 @@ def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
 
 
 def relaxation(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the fit of the relaxation record in `options.file`, with up to `options.branches` time constants."""
     record = RelaxationRecord(**read_columns(options.file, RelaxationRecord._fields))
     fit = fit_relaxation(record, options.branches)
     return {

@@ -1,8 +1,7 @@
 """A cyclic compression test after ISO 7743: from force and displacement to stress and stretch.
 
 Eq. 1 and 2 of the thesis: sigma = force / area and lambda = 1 + displacement / height, with compression negative in
-both. A fresh filled rubber softens over its first cycles, so three cycles condition it and the loading half of the
-fourth is evaluated.
+both. A fresh filled rubber softens over its first cycles, so the loading half of the fourth is evaluated.
 """
 
 import math
@@ -18,18 +17,18 @@ from tormagd.lab.tables import read_columns
 from tormagd.physics.errors import require
 
 CYCLES = 4
-"""Three conditioning cycles and the one that counts."""
+"Three conditioning cycles and the evaluated one."
 
 STRAIN, RATE_MM_MIN = 0.25, 10.0
-"""Engineering strain that each cycle goes to, and how fast."""
+"Engineering strain of each cycle, and its speed."
 
 STRAIN_TOLERANCE, RATE_TOLERANCE = 0.02, 0.25
-"""How far strain (absolute) and rate (relative) may be off before `deviations` says so."""
+"Deviations of strain (absolute) and rate (relative) beyond these are reported."
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A cylinder, mm; `DomainError` unless both lengths are 1..200 mm. The thesis tested 30 mm by 12.5 mm."""
+    """A cylinder of 1..200 mm; the thesis tested 30 mm by 12.5 mm."""
 
     diameter_mm: float = 30.0
     height_mm: float = 12.5
@@ -44,7 +43,7 @@ class Sample:
 
 
 class CompressionRecord(NamedTuple):
-    """Time, s; displacement of the plates, mm, and force, N, both positive in compression."""
+    """Displacement of the plates and force are positive in compression."""
 
     time_s: Array
     displacement_mm: Array
@@ -52,8 +51,6 @@ class CompressionRecord(NamedTuple):
 
 
 class StressStretch(NamedTuple):
-    """Stretch and engineering stress (Pa) that a law is fitted to, both in loading order."""
-
     stretch: Array
     stress_Pa: Array
 
@@ -67,12 +64,12 @@ def read_compression(path: Path) -> CompressionRecord:
 
 
 def loading_halves(record: CompressionRecord) -> list[slice]:
-    """Return the loading half of each cycle, in order, as a slice of rows; empty where the plates only opened."""
+    """Return the rows of each cycle's loading half, in order."""
     displacement = record.displacement_mm
     low, high = float(displacement.min()), float(displacement.max())
     if not high - low > 1e-3:
         raise LabError(f"displacement_mm goes from {low:g} to {high:g}: that is no cycle")
-    # so noise and a set make no cycle
+    # so that noise and a set make no cycle
     quarter = 0.25 * (high - low)
     compressed = _latched(displacement, low + quarter, high - quarter).astype(np.int8)
     turns = np.diff(compressed, prepend=compressed[0], append=0)
@@ -88,7 +85,7 @@ def loading_halves(record: CompressionRecord) -> list[slice]:
 
 
 def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCLES) -> StressStretch:
-    """Return stretch and stress in the loading half of `cycle`, counted from 1: under 1 and negative in compression."""
+    """Return stretch, under 1, and stress, negative, in the loading half of `cycle`, counted from 1."""
     halves = loading_halves(record)
     if not 1 <= cycle <= len(halves):
         raise LabError(f"cycle {cycle} of {len(halves)}: the record holds no such cycle")
@@ -100,7 +97,7 @@ def evaluated_cycle(record: CompressionRecord, sample: Sample, cycle: int = CYCL
 
 
 def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
-    """Return where a test differs from ISO 7743 with lubricated plates, one sentence each; empty if nowhere."""
+    """Return a sentence for each deviation from ISO 7743 with lubricated plates."""
     halves = loading_halves(record)
     found = []
     for name, value, nominal in (("diameter", sample.diameter_mm, 29.0), ("height", sample.height_mm, 12.5)):
@@ -119,7 +116,7 @@ def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
 
 
 def _latched(values: Array, low: float, high: float) -> Mask:
-    """Return a mask: True from where values pass `high` until they pass `low`, False before either."""
+    """Return a mask that is set once values pass `high`, until they fall below `low`."""
     decided = np.where(values >= high, 1, np.where(values <= low, 0, -1))
     known = np.maximum.accumulate(np.where(decided >= 0, np.arange(len(values)), -1))
     return np.where(known >= 0, decided[known], 0).astype(np.bool_)

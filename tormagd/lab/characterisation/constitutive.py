@@ -1,16 +1,11 @@
-"""Stress in the elastomer by the thesis's magnetoelastic model (Eq. 25 and 27), for the entry of the errata.
+"""Stress in the elastomer by the thesis's magnetoelastic model (Eq. 25 and 27), in SI units, for the errata.
 
 The deformation is F = diag(lambda_1, lambda_2, lambda_3) in the cylinder's radial, circumferential and axial directions
-and keeps the volume. Vectors and tensors stand in that order, in SI units. The field b is the thesis's a / R e_R with
-an axial part. Eq. 19..21 contract it with C = F^T F, so there it is the field per area of the *undeformed* elastomer
-(Lagrangian).
+and keeps the volume. The field b is the thesis's a / R e_R with an axial part, per area of the *undeformed* elastomer.
 
-Two readings are needed to make the printed equations agree with each other. The tests hold both against the energy by
-automatic differentiation:
-
-- Eq. 25 is called the nominal stress. With Lambda = F F^T it is the derivative of the energy only as the *true*
-  (Cauchy) stress, force per deformed area. `nominal_stress_Pa` is that stress per undeformed area.
-- The b of its Maxwell term is then the field in the deformed elastomer, F b, not the b of Eq. 19..21.
+The printed equations agree with each other only in two readings, which the tests confirm by differentiating the energy.
+What Eq. 25 calls the nominal stress is the *true* (Cauchy) stress, force per deformed area. The b of its Maxwell term
+is the field in the deformed elastomer, F b.
 """
 
 from typing import NamedTuple
@@ -30,12 +25,12 @@ class MooneyRivlin(NamedTuple):
 
 
 def stretches(radial: float, circumferential: float) -> Array:
-    """Return the principal stretches (3) with these two; incompressibility gives the axial one (Eq."""
+    """Return the principal stretches (3) of an incompressible elastomer (Eq. 14)."""
     return np.array([radial, circumferential, 1.0 / (radial * circumferential)])
 
 
 def cauchy_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressure_Pa: float) -> Array:
-    """Return the true stress T, Pa (3 x 3), of a stretch (3) and a field b (3), T (Eq."""
+    """Return the true stress (3 x 3) at a stretch (3) and a field (3) (Eq. 25 and 27); tension is positive."""
     square, flux_T = stretch**2, stretch * b_T
     # I1 - lambda_i^2 is the sum of the two other squares
     elastic = 2.0 * square * (material.c10_Pa + material.c01_Pa * (np.roll(square, 1) + np.roll(square, 2)))
@@ -44,10 +39,10 @@ def cauchy_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressur
 
 
 def nominal_stress_Pa(stretch: Array, b_T: Array, material: MooneyRivlin, pressure_Pa: float) -> Array:
-    """Return the force per *undeformed* area, Pa (3 x 3): P = T F^-T, d Omega* / dF less p F^-T."""
+    """Return the force per *undeformed* area (3 x 3), P = T F^-T."""
     return cauchy_stress_Pa(stretch, b_T, material, pressure_Pa) / stretch
 
 
 def pressure_for_free_ends_Pa(stretch: Array, b_T: Array, material: MooneyRivlin) -> float:
-    """Return the multiplier p, Pa, that leaves the end faces without axial stress, T_zz = 0."""
+    """Return the multiplier p that leaves the end faces without axial stress."""
     return float(cauchy_stress_Pa(stretch, b_T, material, 0.0)[2, 2])

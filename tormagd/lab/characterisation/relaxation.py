@@ -1,12 +1,12 @@
 """A relaxation spectrum from a record: the `PronySeries` that turns the driving force into the measured one.
 
-The record may hold steps, ramps or anything else. The driving force is what the elastomer would give without memory, in
-any unit, because its scale is fitted too. With branch responses h_i the model is linear,
+The driving force is what the elastomer would give without memory, of any course and in any unit, because its scale is
+fitted too. With branch responses h_i the model is linear,
 
     F = c_0 F0 + sum c_i h_i          g_i = c_i / (c_0 + sum c_i)
 
-so only the time constants are searched; the c are the non-negative least-squares solution for each trial. That keeps
-every fraction at or above zero and their sum at or below one, whatever the noise.
+so only the time constants are searched. Non-negative least squares finds the c of each trial. So every fraction stays
+at or above zero and their sum at or below one, whatever the noise.
 """
 
 import math
@@ -24,13 +24,13 @@ from tormagd.physics.relaxation import MAX_FORCE_N, PronySeries
 
 MAX_BRANCHES = 6
 MIN_FRACTION = 1e-6
-"""A branch under this share of the force is noise, and left out of the series."""
+"A branch with a smaller share of the force is noise."
 
 _STARTS = 3
 
 
 class RelaxationRecord(NamedTuple):
-    """Time, s; driving force in any unit; measured force, N. The first row is the state before, at rest."""
+    """Times, driving force in any unit, and measured force; the first row is the state at rest before."""
 
     time_s: Array
     driving: Array
@@ -39,7 +39,7 @@ class RelaxationRecord(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RelaxationFit:
-    """A fitted series; `scale_N`, the instant force per unit of driving force; r2; RMS of the residual, N."""
+    """A fitted series, its instant force per unit of driving force, R2, and the residual's RMS."""
 
     series: PronySeries
     scale_N: float
@@ -48,7 +48,7 @@ class RelaxationFit:
 
 
 def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit:
-    """Fit a series of up to `branches` (1..6) time constants; the fit has them in rising order."""
+    """Fit a series of up to `branches` (1..6) time constants, in rising order."""
     _check(record, branches)
     span = float(record.time_s[-1] - record.time_s[0])
     low, high = math.log(float(np.diff(record.time_s).min()) / 3.0), math.log(3.0 * span)
@@ -81,7 +81,7 @@ def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit
 
 
 def _columns(record: RelaxationRecord, times_s: Array) -> Array:
-    """Return an array (n, 1 + branches) for the n rows of `record`: the driving force, then each branch's response."""
+    """Return the driving force and each branch's response as columns (n x 1 + branches)."""
     ratios = np.diff(record.time_s)[:, None] / times_s
     changes = np.diff(record.driving)[:, None] * -np.expm1(-ratios) / ratios
     decays = np.exp(-ratios)
@@ -99,14 +99,12 @@ def _responded(response: float, step: tuple[float, float]) -> float:
 
 
 def _fitted(record: RelaxationRecord, times_s: Array) -> tuple[Array, Array]:
-    """Return the coefficients (1 + branches) for the time constants `times_s`, s, and the residual (n), N."""
     columns = _columns(record, times_s)
     coefficients, _ = nnls(columns, record.force_N)
     return coefficients, columns @ coefficients - record.force_N
 
 
 def _check(record: RelaxationRecord, branches: int) -> None:
-    """Refuse a record that is not fit for so many branches, or a wrong number of them; else do nothing."""
     if not 1 <= branches <= MAX_BRANCHES:
         raise LabError(f"branches = {branches}: allowed is 1..{MAX_BRANCHES}")
     rows = len(record.time_s)

@@ -1,9 +1,8 @@
-"""Recordings of many consoles at once: how well each followed, what held it back, and how its device drifts.
+"""How well many consoles followed, what held them back, and how their devices drift, from their recordings.
 
-Every `.mcap` in the folder, or under a URL that fsspec knows (`s3://bucket/recordings` takes the package s3fs), is read
-by one of the workers. It is summed up as `summary.py` says; `--out` keeps one row of a recording. The table has one
-line for each device and insert. A file that cannot be read is named and left out. The findings of `tormagctl
-commission`, `SERIAL.json` in the same place, give their device the day and the rows that did not pass.
+Workers read every `.mcap` in the folder, or under a URL that fsspec knows (`s3://bucket/recordings` takes the package
+s3fs). Files that they cannot read are named. The table has a line for each device and insert; `--out` keeps a row for
+each recording. `SERIAL.json` of `tormagctl commission` in the same place adds the day and what failed there.
 """
 
 import argparse
@@ -38,7 +37,7 @@ HEADINGS = (
     "held back by",
 )
 MIN_SHARE, MAX_LIMITS = 0.001, 3
-"Least share of the time, and most limits, that are shown to a person."
+"A person is shown at most so many limits, and none with a smaller share of the time."
 KINDS = {
     str: pyarrow.string(),
     bool: pyarrow.bool_(),
@@ -47,11 +46,10 @@ KINDS = {
     float | None: pyarrow.float64(),
     dict[str, float]: pyarrow.map_(pyarrow.string(), pyarrow.float64()),
 }
-"By the type of a figure, the type of its column."
+"Parquet type of a column, by the type of its figure."
 
 
 def write_parquet(summaries: dict[str, Summary], url: str) -> None:
-    """Write `summaries`, by file name, as Parquet to `url`, a file or a URL; what is there is replaced."""
     fields = msgspec.structs.fields(Summary)
     columns = [("file", pyarrow.string()), *((field.name, KINDS[field.type]) for field in fields)]
     rows = [{"file": name, **msgspec.structs.asdict(each)} for name, each in summaries.items()]
@@ -61,7 +59,6 @@ def write_parquet(summaries: dict[str, Summary], url: str) -> None:
 
 
 def _cells(console: Console) -> tuple[str, ...]:
-    """Return a console's texts for a person, one under each of HEADINGS."""
     errors_N = (console.tracking_rms_N, console.worst_rms_N)
     held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= MIN_SHARE][:MAX_LIMITS]
     faults = [f"{code} in {count}" for code, count in console.faults.items()]
@@ -80,7 +77,6 @@ def _cells(console: Console) -> tuple[str, ...]:
 
 
 def _shown(drift: Drift | None, form: str) -> str:
-    """Return the first and newest value in `form`, a format of floats, and the change per day where it is known."""
     if drift is None:
         return "unknown"
     first, newest = f"{drift.first:{form}}", f"{drift.newest:{form}}"
@@ -90,21 +86,18 @@ def _shown(drift: Drift | None, form: str) -> str:
 
 
 def _judged(report: Report) -> str:
-    """Return the day of a commissioning, UTC, and what did not pass of it."""
     day = datetime.datetime.fromtimestamp(report.began_ns * 1e-9, datetime.UTC).date()
     short = [] if report.is_whole else ["not whole"]
     return ", ".join([f"{day}", *short, *(f"{each.name} {each.shown}" for each in report.failed)])
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab fleet`."""
     parser.add_argument("recordings", metavar="FOLDER|URL", help="where they are, in folders of their own or not")
     parser.add_argument("--out", metavar="FILE|URL", help="Parquet: one row of a recording")
     executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[lab], and to reach the recordings")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Sum up all recordings in `options.recordings`, a folder or a URL; for a person as a table of consoles."""
     try:
         urls = files(options.recordings)
     except (ValueError, ImportError) as error:
@@ -119,7 +112,7 @@ def run(options: argparse.Namespace) -> Found:
     try:
         if options.out is not None:
             write_parquet(summaries, options.out)
-    except (OSError, ValueError, ImportError) as error:  # the consoles are told all the same
+    except (OSError, ValueError, ImportError) as error:
         write_line(f"tormag-lab fleet: {printable(str(error))}", sys.stderr)
         exit_code = 2
     found = consoles(summaries.values(), reports.values())

@@ -1,7 +1,6 @@
-"""What each recording in a folder or bucket says of its console, then all recordings of a device: how it drifts.
+"""What each recording in a folder or bucket says of its console, and how each device drifts.
 
-Workers of this machine or of a cluster read them: how well forces were followed, what held them back, and how the
-device is. Commissionings are read, too.
+Workers of this machine or of a cluster read recordings and the reports of commissionings.
 """
 
 import re
@@ -23,19 +22,17 @@ from tormagd.recording.reader import Seen, read_open
 
 DAY_S = 86_400.0
 MIN_DAYS, MIN_RECORDINGS = 1.0, 3
-"Fewest days and recordings of which a drift per day is told."
+"Least days and recordings for a drift per day."
 SUFFIX = ".mcap"
 READ = re.compile(r"(.*\.mcap|(.*/)?[0-9a-f]{8}\.json)", re.IGNORECASE)
-"Recordings, and the findings of `tormagctl commission`, which a serial number names."
+"Recordings, and the reports of `tormagctl commission` by serial number."
 FIGURES = (
     "trim", "device_clock_drift", "device_temperature_C", "left_current_A", "right_current_A", "lateness_us",
 )  # fmt: skip
-"Of a tick, the numbers that a summary has figures of."
+"Numbers of a tick that a summary covers."
 
 
 class Wanted(Glance, total=False):
-    """What a summary takes of a message."""
-
     trim: float | None
     device_clock_drift: float | None
     device_temperature_C: float | None
@@ -44,14 +41,16 @@ class Wanted(Glance, total=False):
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of one recording; what was not recorded is null, or an empty text."""
+    """Figures of one recording; what was not recorded is null or an empty text. `trim` is the device's force over its
+    model's, `current_A` the RMS of the motor that needed more. `trim`, clock drift and temperature are medians while
+    ENABLED."""
 
     serial_number: int | None
     insert: str
     scene: str
     version: str
     start_s: float
-    "Time of the first message, since 1970."
+    "Since 1970."
     duration_s: float
     enabled_s: float
     is_complete: bool
@@ -68,7 +67,6 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(file: BinaryIO, name: str) -> Summary:
-    """Return the summary of the recording in `file`, open and seekable, which errors call `name`."""
     builder, enabled = OverviewBuilder(), {name: array("d") for name in FIGURES}
 
     def take(seen: Seen) -> None:
@@ -112,7 +110,7 @@ def summarise(file: BinaryIO, name: str) -> Summary:
 
 
 def files(url: str) -> dict[str, str]:
-    """Return the full address of every file of READ in and under a folder or URL, by its path there, sorted by that."""
+    """Return the full address of each file that matches READ, sorted by its path under the folder or URL."""
     system, root = fsspec.core.url_to_fs(url)
     if not system.exists(root):
         raise FileNotFoundError(f"{url}: no such folder or file")
@@ -122,7 +120,7 @@ def files(url: str) -> dict[str, str]:
 
 
 def read(url: str) -> Summary | Report | str:
-    """Read the file at `url`; return a recording's summary, a commissioning's report, or the reason why there is none."""
+    """Return a recording's summary, a commissioning's report, or the reason why there is neither."""
     name = url.rpartition("/")[2]
     try:
         system, path = fsspec.core.url_to_fs(url)
@@ -137,7 +135,7 @@ def read(url: str) -> Summary | Report | str:
 
 
 def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summary], dict[str, Report], dict[str, str]]:
-    """Read all files of `urls`, addresses by name, by `executor`; return summaries, reports and reasons, each by name."""
+    """Read all files, and return summaries, reports and reasons for failure, each by name."""
     found: dict[str, Summary | Report | str] = {}
     for url, future in finished(executor, read, urls.values(), "recording"):
         error = future.exception()
@@ -151,7 +149,7 @@ def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summar
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """A quantity of a device in its first and newest recording, and its change per day by a straight line through all."""
+    """A quantity of a device, first and newest, and its change per day along a fitted line."""
 
     first: float
     newest: float
@@ -159,7 +157,7 @@ class Drift(msgspec.Struct, frozen=True):
 
 
 class Console(msgspec.Struct, frozen=True, kw_only=True):
-    """All recordings of one device with one insert; unknown is None, or an empty text for the insert."""
+    """All recordings of one device with one insert; unknown is None or an empty text."""
 
     serial_number: int | None
     insert: str
@@ -168,18 +166,17 @@ class Console(msgspec.Struct, frozen=True, kw_only=True):
     tracking_rms_N: float | None
     worst_rms_N: float | None
     limits: dict[str, float]
-    "Each limit's share of the time ENABLED."
+    "Share of the time ENABLED."
     faults: dict[str, int]
-    "In how many recordings each fault came."
+    "Number of recordings with each fault."
     trim: Drift | None
     current_A: Drift | None
     clock_drift_ppm: Drift | None
     commissioned: Report | None
-    "The device's newest commissioning, whatever its insert was."
+    "The device's newest, with whatever insert."
 
 
 def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Console]:
-    """Return one console for each device and insert, sorted by serial number and insert."""
     groups: dict[tuple[int, str], list[Summary]] = defaultdict(list)
     for each in summaries:
         groups[-1 if each.serial_number is None else each.serial_number, each.insert].append(each)
@@ -193,7 +190,6 @@ def consoles(summaries: Iterable[Summary], reports: Iterable[Report]) -> list[Co
 
 
 def _console(serial_number: int, insert: str, group: list[Summary], commissioned: Report | None) -> Console:
-    """Return the console of a group of recordings; what none of them says is None."""
     enabled_s = sum(each.enabled_s for each in group)
     errors = [(each.enabled_s, each.tracking_rms_N) for each in group if each.tracking_rms_N is not None]
     limits_s: Counter[str] = Counter()
@@ -216,7 +212,7 @@ def _console(serial_number: int, insert: str, group: list[Summary], commissioned
 
 
 def _pooled(errors: list[tuple[float, float]]) -> float | None:
-    """Return the RMS over all parts from (duration, RMS) of each, weighted by duration; None without parts."""
+    """Return the RMS over all parts, each a duration and its RMS."""
     if not errors:
         return None
     weights, rms_N = np.array(errors).T
@@ -224,7 +220,6 @@ def _pooled(errors: list[tuple[float, float]]) -> float | None:
 
 
 def _drift(values: list[tuple[float, float | None]]) -> Drift | None:
-    """Return the drift of (start, s, value) pairs in order of time, ignoring None; None where no value is known."""
     known = [(start_s, value) for start_s, value in values if value is not None]
     if not known:
         return None

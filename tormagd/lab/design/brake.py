@@ -1,4 +1,4 @@
-"""One brake as a designer sees it: force over gap between two end positions, its slope and its inverse."""
+"""A brake as a designer sees it: force over gap between two end positions, its slope and its inverse."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,6 @@ class Brake:
 
     @classmethod
     def as_built(cls, elastomer: Elastomer, field: FieldLaw | None = None) -> "Brake":
-        """Return the thesis's device with this elastomer: geometry TORMAG, gaps CLOSED_MM to OPEN_MM."""
         return cls(field or PowerFieldLaw(), elastomer, TORMAG, CLOSED_MM, OPEN_MM)
 
     @property
@@ -48,18 +47,16 @@ class Brake:
         return self.force_N(self.closed_mm)
 
     def force_N(self, gap_mm: Real) -> Real:
-        """Return the brake force at a gap; it falls as the gap opens."""
         return brake_force_N(self.field.radial_moment_Tm(gap_mm), self.elastomer, self.geometry)
 
     def slope_N_mm(self, gap_mm: Real) -> Real:
-        """Return |dF/dgap|, N per mm of gap (the bracket of Eq."""
+        """Return |dF/dgap|, the bracket of Eq. 36."""
         return abs(d_force_d_gap(gap_mm, self.field, self.elastomer, self.geometry))
 
     def gap_mm(self, force_N: Real) -> Real:
-        """Return the gap, mm, within the end positions, that gives `force_N`; a float or an array as `force_N` is."""
         require("force_N", force_N, self.least_N, self.most_N)
         moment_Tm = radial_moment_for_force_Tm(force_N, self.elastomer, self.geometry)
-        # the forces of the end positions must come back as those, not as a rounding beyond them
+        # the forces of the end positions must not round to gaps beyond them
         weakest_Tm, strongest_Tm = (self.field.radial_moment_Tm(gap_mm) for gap_mm in (self.open_mm, self.closed_mm))
         gap_mm = self.field.gap_mm(np.clip(moment_Tm, weakest_Tm, strongest_Tm))
         found: Real = np.clip(gap_mm, self.closed_mm, self.open_mm)

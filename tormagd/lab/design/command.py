@@ -1,4 +1,4 @@
-"""Finds the brake's geometry for a task: outer radius, thickness and open gap (Eq. 40-42), from several starts.
+"""Find the brake's geometry for a task: outer radius, thickness and open gap (Eq. 40-42), from several starts.
 
 Runs on this machine's cores or, with --dask, on a cluster.
 """
@@ -17,7 +17,6 @@ from tormagd.lab.main import GAP_SPEED, SEED, Found, whole, within
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab optimise-design`; numbers outside their ranges are refused with exit code 2."""
     parser.add_argument(
         "--region",
         required=True,
@@ -46,7 +45,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Find the best design from each random start that `options` ask for, and return all, best first."""
     with executors.chosen(options) as executor:
         outcomes = sweep(_runs(options), executor)
     by_cost = options.measure == "corners"
@@ -59,7 +57,6 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _runs(options: argparse.Namespace) -> list[Run]:
-    """Return `options.starts` runs on one problem, each from a random start between the problem's bounds."""
     problem = Problem(Region(*options.region), options.measure, options.gap_speed)
     low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
     drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))

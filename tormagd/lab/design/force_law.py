@@ -1,8 +1,4 @@
-"""The force law's stretch, slopes and inverse, for design and for the thesis's numbers.
-
-Every function takes a float or an array. All raise `DomainError`, as in `tormagd.physics.force`, but `force_slope` and
-`compression_for_force`, which check nothing.
-"""
+"""The force law's stretch, slopes and inverse, for design and for the thesis's numbers; of floats or arrays."""
 
 import sys
 
@@ -14,18 +10,18 @@ from tormagd.physics.field import FieldLaw
 from tormagd.physics.force import Elastomer, Geometry, reduced
 
 _NEWTON_STEPS = 100
-"""Enough for bisection alone; Newton's method takes at most 8 or so (see the tests)."""
+"Enough for bisection alone; Newton's method takes at most about 8."
 
 
 def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq."""
+    """Return lambda1 - 1 at the shaft (Eq. 29), from -0.95 to 0."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return -law.curve.compression(law.load(radial_moment_Tm))
 
 
 def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the slope of the brake force over the radial moment, N / (T m), >= 0; 0 without field."""
+    """Return the slope of the brake force over the radial moment, N / (T m)."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     load = law.load(radial_moment_Tm)
@@ -34,14 +30,14 @@ def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geo
 
 
 def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the slope of the force over the gap, N/mm, <= 0 (the bracket of Eq."""
+    """Return the slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
     return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
 
 
 def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the radial moment, T m, that gives the force: inverse of `brake_force_N`; 0 for 0 N."""
+    """Return the radial moment that gives the force: the inverse of `brake_force_N`."""
     law = reduced(elastomer, geometry)
-    # evaluated as any other force, so that the force of the largest moment is admitted to the last digit
+    # so that the force of the largest moment is admitted to the last digit
     require("force_N", force_N, 0.0, law.force(law.max_moment_Tm))
     load = law.curve.load(compression_for_force(law.curve, force_N / law.force_scale_N))
     root: Real = load**0.5
@@ -49,7 +45,7 @@ def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Ge
 
 
 def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
-    """Return d phi / d y, the slope of the reduced force phi over the load y, both without unit; it is above 0."""
+    """Return d phi / d y, the slope of the reduced force phi over the load y."""
     stretch, w = 1.0 - compression, curve.wall
     # d phi / d eps at constant load, then d phi / d y at constant stretch
     elastic, magnetic = 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + w) * load / stretch**4
@@ -57,7 +53,7 @@ def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
 
 
 def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
-    """Return the compression eps = 1 - lambda1, from 0 to 0.95, at which the reduced force phi(eps) is `force`."""
+    """Return the compression eps = 1 - lambda1, 0..0.95, at which the reduced force is `force`."""
     fn = functions(force)
     rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)
     wanted = fn.where(force > 0.0, force, 1.0)
@@ -76,7 +72,7 @@ def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
         odds = fn.where(above, odds / (1.0 + abs(step)), odds * (1.0 + abs(step)))
         trial = odds / (1.0 + odds)
         settled = abs(trial - compression) <= rounding * compression
-        # a step down to rounding is taken as it is: noise may put it just outside the bracket
+        # a step at rounding level is taken as it is: noise may put it just outside the bracket
         good = settled | ((trial > low) & (trial < high))
         compression = fn.where(good, trial, 0.5 * (low + high))
         if fn.all(settled):

@@ -1,15 +1,12 @@
 """Structural optimisation (Eq. 39-42, table 3.2): outer radius, thickness and open gap for the portrait of a task.
 
-Two questions can be asked of a design. The thesis's cost (Eq. 39) adds the squared distances of the portrait's four
-corners from those of the task. It mixes newtons with newtons per second, and a portrait larger than the task costs as
-much as a smaller one. Ours is coverage of the required region. Among designs that cover as much, it takes the least
-volume of elastomer, then the smallest open gap. `SLACK` is the coverage that may be given up for that.
+The thesis's cost (Eq. 39) adds the squared distances of the portrait's four corners from the task's. It mixes newtons
+with newtons per second, and punishes a portrait larger than the task. Ours is coverage of the required region, then the
+least volume of elastomer, then the smallest open gap, which may cost `SLACK` of coverage. The elastomer must bear the
+field of the closed gap (lambda1 >= 0.05).
 
-Two solvers, both scipy's. "local" follows the slopes from the start (SLSQP), as the thesis's fmincon did, and ends in
-whatever minimum that start leads to. "global" is differential evolution, with the start as one member of its first
-generation, followed by a derivative-free local search (COBYQA).
-
-A constraint is told to the solvers as one: the elastomer must bear the field of the closed gap (lambda1 >= 0.05).
+Both solvers are scipy's. "local" is SLSQP, like the thesis's fmincon, and ends in the minimum that the start leads to.
+"global" is differential evolution, with the start in its first generation, followed by COBYQA.
 """
 
 import itertools
@@ -32,18 +29,18 @@ from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
 Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
-"""Coverage by the thesis's trapezoid, coverage by the true boundary, or the thesis's cost of corner distances."""
+"Coverage by the trapezoid or the true boundary, or the thesis's cost."
 Solver: TypeAlias = Literal["local", "global"]
 
 SLACK = 1e-4
-"""Coverage that a smaller elastomer may cost: a hundredth of a percent."""
+"Coverage that a smaller elastomer may cost."
 _GAP_WEIGHT = 1e-4
-"""Weight of the open gap beside the volume: it decides only between volumes that are as good as equal."""
+"So small that the open gap decides only between nearly equal volumes."
 _GENERATIONS = 50
 
 
 class Design(msgspec.Struct, frozen=True):
-    """A design in mm: outer radius R_o, thickness t and open gap s_max."""
+    """Outer radius R_o, thickness t and open gap s_max."""
 
     outer_radius_mm: float
     thickness_mm: float
@@ -51,7 +48,7 @@ class Design(msgspec.Struct, frozen=True):
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """A task's region, the measure of success, and everything that is given; defaults are the thesis's (appendix B)."""
+    """A task's region, the measure of success, and all that is given; defaults are the thesis's (appendix B)."""
 
     region: Region
     measure: Measure
@@ -66,7 +63,6 @@ class Problem(msgspec.Struct, frozen=True):
     friction_coefficient: float = 0.2
 
     def geometry(self, design: Design) -> Geometry:
-        """Return the geometry of a design, m; the open gap does not count."""
         return Geometry(
             inner_radius_m=1e-3 * self.inner_radius_mm,
             outer_radius_m=1e-3 * design.outer_radius_mm,
@@ -79,23 +75,20 @@ class Problem(msgspec.Struct, frozen=True):
         return Elastomer(self.shear_modulus_Pa, self.relative_permeability, self.friction_coefficient)
 
     def portrait(self, design: Design) -> PhasePortrait:
-        """Return the phase portrait of a design."""
         brake = Brake(PowerFieldLaw(), self.elastomer, self.geometry(design), self.closed_mm, design.open_mm)
         return PhasePortrait(brake, self.gap_speed_mm_s)
 
     def load_margin(self, design: Design) -> float:
-        """Return 1 - the closed gap's field over the largest that the elastomer bears: under 0 it does not bear it."""
+        """Return 1 - the closed gap's field over the largest that the elastomer bears."""
         moment_Tm = PowerFieldLaw().radial_moment_Tm(self.closed_mm)
         return 1.0 - moment_Tm / max_radial_moment_Tm(self.elastomer, self.geometry(design))
 
     def volume_mm3(self, design: Design) -> float:
-        """Return the volume of elastomer in a design; lengths are not checked, and it is below 0 where the radii are
-        exchanged."""
         return math.pi * (design.outer_radius_mm**2 - self.inner_radius_mm**2) * design.thickness_mm
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """Design that a solver found. `coverage` is by the true boundary where that was the measure, else by the
+    """A design that a solver found. `coverage` is by the true boundary where that was the measure, else by the
     trapezoid."""
 
     design: Design
@@ -108,7 +101,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class Run(msgspec.Struct, frozen=True):
-    """One start of one solver on one problem: all that its outcome depends on. The seed is 0 or more."""
+    """One start of one solver on one problem: all that its outcome depends on."""
 
     problem: Problem
     start: Design
@@ -117,7 +110,6 @@ class Run(msgspec.Struct, frozen=True):
 
 
 def coverage(problem: Problem, design: Design) -> float:
-    """Return the share of the problem's region, by area, that the design covers, 0..1."""
     portrait = problem.portrait(design)
     if problem.measure == "true":
         return portrait.true_coverage(problem.region)
@@ -125,7 +117,7 @@ def coverage(problem: Problem, design: Design) -> float:
 
 
 def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
-    """Return the least coverage of the design, 0..1, where each dimension may be off by `share` of it, or not at all."""
+    """Return the least coverage where each dimension may be off by `share` of it."""
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
     made = [
         Design(*(value * factor for value, factor in zip(msgspec.structs.astuple(design), each, strict=True)))
@@ -135,7 +127,7 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
 
 
 def corner_cost(problem: Problem, design: Design) -> float:
-    """Return the thesis's cost, Eq."""
+    """Return Eq. 39: the sum of squared distances of the trapezoid's corners from the region's."""
     offered, wanted = problem.portrait(design).trapezoid(), problem.region
     # the lower corners mirror the upper ones
     return 2.0 * (
@@ -147,7 +139,6 @@ def corner_cost(problem: Problem, design: Design) -> float:
 
 
 def solve(run: Run) -> Outcome:
-    """Return the design that the run's solver finds from its start, with its figures."""
     began_s = time.thread_time()
     search = _Search(run.problem)
     cost = search.corner_cost if run.problem.measure == "corners" else search.miss
@@ -169,7 +160,7 @@ def solve(run: Run) -> Outcome:
 
 
 class _Search:
-    """A problem in coordinates from 0 to 1 between the bounds, as the solvers need; counts its evaluations."""
+    """A problem in coordinates from 0 to 1 between the bounds; counts its evaluations."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -183,7 +174,7 @@ class _Search:
         return np.asarray((np.array(msgspec.structs.astuple(design)) - self._low) / self._span)
 
     def design(self, x: Array) -> Design:
-        # a solver may step a rounding outside its bounds
+        # a solver may step a rounding error outside its bounds
         return Design(*(float(value) for value in self._low + self._span * np.clip(x, 0.0, 1.0)))
 
     def miss(self, x: Array) -> float:
@@ -199,7 +190,7 @@ class _Search:
     def global_minimum(
         self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
     ) -> Array:
-        """Return the point (3) of least `cost` by differential evolution, which `start` takes part in, then COBYQA."""
+        """Return the point (3) of least `cost`, by differential evolution with `start` in it, then COBYQA."""
         limits = [*also, self._margin]
         result = differential_evolution(
             cost,
@@ -222,20 +213,19 @@ class _Search:
         return _better(cost, start, result)
 
     def smallest(self, best: Array, seed: int) -> Array:
-        """Return the smallest design that covers as much as `best`, less SLACK; `best` where none is found."""
+        """Return the smallest design that covers as much as `best` less SLACK, or `best` itself."""
         allowed = self.miss(best) + SLACK
         found = self.global_minimum(self.size, best, seed, NonlinearConstraint(self.miss, -np.inf, allowed))
         return found if self.miss(found) <= allowed else best
 
     def _refine(self, cost: Callable[[Array], float], start: Array, limits: list[Any]) -> Array:
-        """Return the result of COBYQA from `start`, or `start` where it is no better or breaks a limit."""
         options = {"initial_tr_radius": 0.05, "final_tr_radius": 1e-5, "maxfev": 100}
         result = minimize(cost, start, method="COBYQA", bounds=self._bounds, constraints=limits, options=options)
         is_kept = all(limit.lb <= limit.fun(result.x) <= limit.ub for limit in limits)
         return _better(cost, start, result) if is_kept else start
 
     def _at(self, function: Callable[[Problem, Design], float], x: Array, impossible: float) -> float:
-        """Return and count a function of the design; `impossible` where the elastomer would not bear the field."""
+        """Return a function of the design, or `impossible` where the elastomer would not bear the field."""
         self.evaluations += 1
         design = self.design(x)
         return function(self.problem, design) if self.problem.load_margin(design) >= 0.0 else impossible
@@ -246,7 +236,6 @@ def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult
 
 
 def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
-    """Solve every run on `executor` and return the outcomes by run, in the order of the runs."""
     wanted = list(dict.fromkeys(runs))
     outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}
     return {run: outcomes[run] for run in wanted}

@@ -1,11 +1,11 @@
 """The phase portrait: which (force, force rate) points a brake renders at a gap speed, and how much of a task that is.
 
-At the gap g the brake gives F(g) and |dF/dt| <= |dF/dg| * gap speed (Eq. 36). That is the *true* boundary. The thesis
-joins the two end points by straight lines, a *trapezoid*. F falls about as gap^-2.6, so the true boundary lies below
-the straight line in between. Both are kept: the trapezoid to compare with the thesis, the true one to decide with.
+At the gap g the brake gives F(g) and |dF/dt| <= |dF/dg| * gap speed (Eq. 36), the *true* boundary. The thesis joins its
+two end points by straight lines, a *trapezoid* that lies above it, as F falls about as gap^-2.6. The trapezoid serves
+to compare with the thesis, the true boundary to decide.
 
-Coverage of a region is a ratio of areas, exact for the trapezoid and a one-dimensional integral over the gap for the
-true boundary. Coverage of a point cloud is a share of its points.
+Coverage of a region is a ratio of areas, exact for the trapezoid and an integral over the gap for the true boundary.
+Coverage of a point cloud is a share of its points.
 """
 
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ MAX_FORCE_N = 1e6
 MAX_RATE_N_S = 1e9
 MAX_GAP_SPEED_MM_S = 1e4
 _PANELS = 256
-"""Panels of the integral: a region's coverage is then good to 1e-5 (see the tests)."""
+"Enough for a coverage good to 1e-5 (see the tests)."
 
 
 class Region(msgspec.Struct, frozen=True):
-    """Task's requirement: |dF/dt| up to a rate that is linear in the force, from the least to the greatest force."""
+    """A task's demand: |dF/dt| up to a rate that is linear in the force."""
 
     least_N: float
     least_rate_N_s: float
@@ -45,13 +45,12 @@ class Region(msgspec.Struct, frozen=True):
         return 0.5 * (self.least_rate_N_s + self.most_rate_N_s) * (self.most_N - self.least_N)
 
     def rate_N_s(self, force_N: FloatArray) -> FloatArray:
-        """Return the greatest rate, N/s, that the region requires at each force (n): its upper edge."""
         share = (force_N - self.least_N) / (self.most_N - self.least_N)
         return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
 
 
 class CloudCoverage(NamedTuple):
-    """Which points of a recorded task a brake renders, and why not the others; masks in the order of the points."""
+    """Which points of a recorded task a brake renders, and why not the others."""
 
     covered: Mask
     below_least_force: Mask
@@ -82,7 +81,7 @@ class PhasePortrait:
         return self.brake.force_N(gap_mm), self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)
 
     def trapezoid(self) -> Region:
-        """Return the thesis's portrait: the end points of the true boundary, joined by a straight line."""
+        """Return the thesis's portrait, a straight line between the end points."""
         speed, brake = self.gap_speed_mm_s, self.brake
         return Region(
             brake.least_N,
@@ -92,7 +91,6 @@ class PhasePortrait:
         )
 
     def true_coverage(self, region: Region) -> float:
-        """Return the share of the region's area inside the true boundary, 0..1, good to 1e-5."""
         brake = self.brake
         least, most = brake.least_N, brake.most_N
         low, high = max(region.least_N, least), min(region.most_N, most)
@@ -106,12 +104,11 @@ class PhasePortrait:
         slope = brake.slope_N_mm(gap_mm)
         force = np.clip(brake.force_N(gap_mm), low, high)
         rendered = np.minimum(region.rate_N_s(force), self.gap_speed_mm_s * slope)
-        # over the force, whose differences sum to the overlap exactly: full coverage is 1, not 1 give or take
+        # summed over the force's differences, full coverage is exactly 1
         area = -float(np.trapezoid(rendered, force))
         return min(area / region.half_area, 1.0)
 
     def trapezoid_coverage(self, region: Region) -> float:
-        """Return the share of the region's area inside the thesis's trapezoid, 0..1; exact."""
         offered = self.trapezoid()
         low, high = max(region.least_N, offered.least_N), min(region.most_N, offered.most_N)
         if low >= high:
@@ -124,18 +121,16 @@ class PhasePortrait:
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge the points of a task, force, N, and force rate, N/s, of either sign (n each), by the true boundary."""
+        """Judge a task's points, force and rate (n each), by the true boundary."""
         inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
         limit = np.zeros_like(force_N)
         limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
         return self._judge(force_N, rate_N_s, limit)
 
     def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge points of a task, force and force rate (n), by the thesis's trapezoid."""
         return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
 
     def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:
-        """Judge points by the brake's forces, and by the greatest rate at each point's force."""
         below, above = force_N < self.brake.least_N, force_N > self.brake.most_N
         fast = ~below & ~above & (np.abs(rate_N_s) > limit_N_s)
         return CloudCoverage(~(below | above | fast), below, above, fast)

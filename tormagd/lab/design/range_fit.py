@@ -1,10 +1,8 @@
 """Table 2.4: friction fitted to the measured force ranges of the inserts, and how far the force law then errs.
 
-Compared are *ranges*, F(45 mm) - F(95 mm): the table gives no single forces. The law's range is proportional to the
-friction coefficient. So the coefficient of a matrix with the least mean relative error over its inserts is a weighted
-median, found exactly. A least-squares fit answers another question.
-
-The one further parameter is the exponent n of the field's growth with permeability, b ~ (mu_r / 4)^n, 1 in the thesis.
+The table gives only *ranges*, F(45 mm) - F(95 mm), to which friction is proportional. So the coefficient of a matrix
+with the least mean relative error is a weighted median, found exactly. The one further parameter is the exponent n of
+the field's growth with permeability, b ~ (mu_r / 4)^n, 1 in the thesis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,33 +20,31 @@ _GRID = 61
 
 
 class RangeFit(NamedTuple):
-    """Fitted friction coefficient by the matrix's Shore 00 hardness, with its permeability exponent."""
+    """Friction coefficient by the matrix's Shore 00 hardness, and the permeability exponent."""
 
     field: FieldLaw
     friction: Mapping[int, float]
     exponent: float
 
     def range_N(self, insert: Insert) -> float:
-        """Return the force range of an insert by this fit, N."""
         return self.friction[insert.shore_hardness] * frictionless_range_N(insert, self.field, self.exponent)
 
     def relative_error(self, insert: Insert) -> float:
-        """Return |range / measured range - 1| of an insert."""
         return abs(self.range_N(insert) / insert.force_range.measured_N - 1.0)
 
 
 def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0) -> float:
-    """Return F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N."""
+    """Return an insert's F(45 mm) - F(95 mm) for a friction coefficient of one."""
     mu_r = relative_permeability(insert.cip_fraction)
     elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
-    # the force law takes b ~ (mu_r / 4) a: another exponent is another moment
+    # the force law takes b ~ (mu_r / 4) a, so another exponent is another moment
     scale: float = (mu_r / REFERENCE_PERMEABILITY) ** (exponent - 1.0)
     most_N = brake_force_N(scale * field.radial_moment_Tm(CLOSED_MM), elastomer, TORMAG)
     return most_N - brake_force_N(scale * field.radial_moment_Tm(OPEN_MM), elastomer, TORMAG)
 
 
 def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
-    """Fit one friction coefficient for each matrix (Shore 00 hardness), for the least mean relative error of range."""
+    """Fit each matrix's friction for the least mean relative error of range."""
     ratios: dict[int, list[float]] = {}
     for item in inserts:
         ratio = frictionless_range_N(item, field, exponent) / item.force_range.measured_N
@@ -57,8 +53,8 @@ def fit_friction(inserts: Sequence[Insert], field: FieldLaw, exponent: float = 1
 
 
 def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
-    """Fit the friction of each matrix, as `fit_friction`, and one permeability exponent, from 0 to 3, to 1e-4."""
-    # the mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point
+    """Fit each matrix's friction and one permeability exponent, 0..3, to 1e-4."""
+    # the mean error has many kinks, hence a grid, then finer grids about its best point
     low, high = MIN_EXPONENT, MAX_EXPONENT
     while True:
         exponents = np.linspace(low, high, _GRID)
@@ -71,12 +67,11 @@ def fit_exponent(inserts: Sequence[Insert], field: FieldLaw) -> RangeFit:
 
 
 def mean_relative_error(fit: RangeFit, inserts: Sequence[Insert]) -> float:
-    """Return the mean over the inserts of `RangeFit.relative_error`; NaN without inserts."""
     return float(np.mean([fit.relative_error(item) for item in inserts]))
 
 
 def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
-    """Return each insert's relative error, as `RangeFit.relative_error`, under the fit to all the others, by name."""
+    """Return each insert's relative error under the fit to all the others, by name."""
     fit = fit_exponent if free_exponent else fit_friction
     return {
         left_out.name: fit([item for item in inserts if item is not left_out], field).relative_error(left_out)
@@ -85,7 +80,6 @@ def leave_one_out(inserts: Sequence[Insert], field: FieldLaw, *, free_exponent: 
 
 
 def _friction(ratios: list[float]) -> float:
-    """Return the friction coefficient with the least mean relative error of range over the inserts of one matrix."""
     # the minimum of sum |mu r - 1| = sum r |mu - 1/r| is the median of 1/r, weighted by r
     ordered = sorted(ratios, reverse=True)
     reached = np.cumsum(ordered)

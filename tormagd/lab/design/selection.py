@@ -1,4 +1,4 @@
-"""Table 2.5 as a method: which inserts serve a task's force range and resolution, and why the others do not."""
+"""Table 2.5 as a method: which inserts serve a task's forces and resolution, and why the others do not."""
 
 import math
 from collections.abc import Mapping
@@ -14,8 +14,6 @@ _POINTS = 201
 
 @dataclass(frozen=True, slots=True)
 class ForceTask:
-    """Task's demand on a brake: forces from `least_N` to `most_N`, in steps of `resolution_N`."""
-
     name: str
     least_N: float
     most_N: float
@@ -24,22 +22,22 @@ class ForceTask:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether one insert serves one task. `reasons` says why it does not; empty means that it does."""
+    """Whether one insert serves one task, and the `reasons` why it does not."""
 
     insert: str
     least_N: float
     most_N: float
     resolution_N: float
-    """Largest force change that one gap step makes within the part of the task's range that the insert reaches."""
+    "Largest force change of one gap step, where the insert reaches the task's forces."
     served_share: float
-    """Share of the task's force range between the insert's least and most force."""
+    "Share of the task's range that the insert reaches."
     sufficient_gap_mm: float
-    """Gap at which the force is as low as the task tolerates, its least and resolution: at least the open gap."""
+    "Gap, the open one or wider, that gives the task's least force plus its resolution."
     reasons: tuple[str, ...]
 
 
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
-    """Return the verdict on one insert, a name, in its brake, for a task; the gap goes in steps of `gap_resolution_mm`."""
+    """Judge an insert for a task, with a gap that moves in steps of `gap_resolution_mm`."""
     least, most = brake.least_N, brake.most_N
     low, high = max(least, task.least_N), min(most, task.most_N)
     reasons = []
@@ -48,7 +46,7 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
     if most < task.most_N:
         reasons.append(f"most force {most:.2f} N is below {task.most_N:g} N")
     if low >= high:
-        # no gap gives any force of the task; the finest step the insert has is the fairest figure left
+        # no gap gives any force of the task, so the insert's finest step is the fairest figure left
         resolution = gap_resolution_mm * brake.slope_N_mm(brake.open_mm)
         share = 0.0
     else:
@@ -61,13 +59,11 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
 
 
 def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
-    """Judge all inserts, brakes by name, and return the verdicts, best first; empty without any."""
     verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
     return sorted(verdicts, key=lambda v: (bool(v.reasons), -v.served_share if v.reasons else 0.0, v.resolution_N))
 
 
 def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:
-    """Return the gap, mm, at which the brake's force is as low as the task tolerates, at least the open gap."""
     tolerated_N = task.least_N + task.resolution_N
     if tolerated_N >= brake.least_N:
         return brake.open_mm

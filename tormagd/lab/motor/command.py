@@ -1,10 +1,8 @@
-"""Identifies a motor and its screw from a log: mass, friction, offset, delay, with 95% confidence.
+"""Identify a motor and its screw from a log: mass, friction, offset, delay, with 95% confidence.
 
-Reads the motor log CSV (`t_s,input_V,position_mm`, optionally `current_A`) that `tormagctl calibrate --motors` writes,
-or the EMPS benchmark's .mat file, which states its own gain. `motor.fit` says with which models, and what the intervals
-cover. Volts and position alone fix only ratios to the gain: without `--gain-N-V` or a current the physical values are
-null. Everything is referred to the carriage; `viscous_N_s_m` is the slope of gain times voltage over speed, the
-back-EMF's part included.
+Reads the CSV (`t_s,input_V,position_mm`, optionally `current_A`) that `tormagctl calibrate --motors` writes, or the
+EMPS benchmark's .mat file. Volts and position alone fix only ratios to the gain: without `--gain-N-V` or a current the
+physical values are null. All are referred to the carriage; `viscous_N_s_m` includes the back-EMF's part.
 
 The first half of the log is fitted and the second half judged; the parameters come from all of it.
 """
@@ -28,7 +26,6 @@ VAGUE_SHARE = 0.5
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab identify-motor`: the log, and what to write of it."""
     parser.add_argument("log", type=Path, help="motor log CSV, or DATA_EMPS.mat")
     parser.add_argument("--gain-N-V", type=float, dest="gain", help="force per volt, N/V; replaces a current")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="measured against simulated voltage")
@@ -37,7 +34,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Identify the motor from the log `options.log` and return the dict of `identify`; write what is asked for."""
     if options.plot is not None and options.plot.suffix != ".png":
         raise LabError(f"--plot {options.plot}: allowed is a name that ends with .png")
     log = read_log(options.log)
@@ -50,7 +46,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
-    """Write a new file with the table `[motor]`: the identified values, to four digits, the others as in `config`."""
+    """Write a new file with `[motor]`: the identified values, and the others from `config`."""
     found = result["motor"]
     if found is None:
         raise LabError("--write-config: needs a log with current_A, and no --gain-N-V")
@@ -80,7 +76,6 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
 
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
-    """Draw measured and predicted voltage, and their difference, over the log's second half, as a picture at `path`."""
     half = len(log.t_s) // 2
     fitted = fit_volts(log.part(slice(None, half)))
     time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))

@@ -1,23 +1,14 @@
-"""What a motor log says of motor and screw, with 95% intervals that include what the model leaves out.
-
-Three models, each linear, in the units of the carriage (m, N):
+"""What a motor log says of motor and screw: three linear models in units of the carriage (m, N), with 95% intervals.
 
     volts      gain V(t - delay) = mass a + viscous v + coulomb sign(v) + offset        (Gautier and Khalil)
     windings   V(t - delay) = R i + L di/dt + K v
     gearbox    K i = mass a + viscous v + p(x) + sign(v) (q(x) + (1 - efficiency) |K i|)
 
-`volts` needs nothing but voltage and position. A current in the log gives the other two models, and the gain, K / R. K
-is one number: the force for each ampere and the voltage for each m/s. Polynomials p and q of the position say that the
-magnets pull, and load what rubs, more at a small gap. The gears lose a share of what they transmit.
-
-Position is low-passed without lag and differentiated centrally; both sides of an equation are filtered alike. Where the
-carriage stands, friction is whatever it has to be, so such rows are left out.
-
-Intervals. The covariance is the sandwich over blocks of a second (Liang and Zeger 1986): residuals inside a block may
-be correlated in any way. That covers noise, not a wrong model. So each model is fitted again in ways that should make
-no difference: with left-out terms, with the rows about turns, in a wider band. The current is taken half a period
-earlier or later, or only every second one. Every parameter's interval grows by how far these fits move it, and by how
-much new terms let it vary within the log.
+`volts` needs only voltage and position; a current gives the others, and the gain K / R. Polynomials p and q of the
+position are the magnets' pull and the friction that it loads. Both sides are filtered alike without lag, and rows at
+rest left out. Covariances are sandwiches over blocks of a second (Liang and Zeger 1986), for correlated noise. To cover
+a wrong model, each is fitted again in ways that should not matter. These are more terms, other rows, a wider band, and
+shifted or thinned currents. Intervals grow by how far these move the values.
 """
 
 from collections.abc import Callable
@@ -35,19 +26,18 @@ from tormagd.lab.motor.log import Log
 CUTOFF_HZ = 100.0
 THINNED_HZ = 40.0
 SLOW_M_S = 1e-3
-"Slower than this the sign of the speed is noise, and friction may be static."
+"At a lower speed its sign is noise, and friction may be static."
 MOSTLY, THROUGHOUT = 0.5, 0.98
-"Shares of moving rows. Without a current, turns tell friction from drag; with one they only blur it."
+"Least share of a row in motion. Without a current, turns tell friction from drag; with one they only blur it."
 BLOCK_S = 1.0
 MIN_BLOCKS = 8
 EDGE = 4
 "Rows at both ends that carry the filters' guesses."
 SPREAD = 2.0
-"Spread of a parameter over the log, in standard deviations of the position: 95%."
+"Standard deviations of the position within which a parameter varies over the log."
 LONGEST_DELAY_S = 0.02
 DELAY_TURNS = 4
 WIDER_HZ = 100.0
-"Rate of the wider band; THINNED_HZ is the usual one."
 SETTLING_TURNS = 60
 
 
@@ -58,12 +48,12 @@ class Estimate(NamedTuple):
     ci95: float
 
     def scaled(self, factor: float) -> "Estimate":
-        """Return value and half width times `factor`, as in another unit."""
         return Estimate(self.value * factor, self.ci95 * abs(factor))
 
 
 class Motion(NamedTuple):
-    """Motion of a log at its own rate: position from its mean, m; speed, m/s; acceleration, m/s^2; sign of the speed."""
+    """Motion of a log: position from its mean, m, speed, acceleration, and the sign of the speed, 0 at rest. `factor`
+    rows make one thinned row."""
 
     x: Array
     v: Array
@@ -72,13 +62,13 @@ class Motion(NamedTuple):
     factor: int
 
     def thin(self, column: Array) -> Array:
-        """Return a column (n) as the equations use it: low-passed, thinned by `factor`, without EDGE rows at both ends."""
+        """Return a column low-passed, thinned by `factor`, and without EDGE rows at both ends."""
         thinned = decimate(column, self.factor, ftype="fir", zero_phase=True) if self.factor > 1 else column
         return np.asarray(thinned[EDGE:-EDGE])
 
 
 class Fit(NamedTuple):
-    """A least-squares fit: values, their covariance, how many deviations make 95%, and the relative residual."""
+    """A least-squares fit, and how many standard deviations make 95%."""
 
     values: Array
     covariance: Array
@@ -90,7 +80,7 @@ class Fit(NamedTuple):
         return np.asarray(self.deviations * np.sqrt(np.diag(self.covariance)))
 
     def half_widths_of(self, function: Callable[[Array], Array]) -> Array:
-        """Return the half widths (m) of the 95% intervals of m functions of the values, linearised about these."""
+        """Return the half widths of the 95% intervals of m functions of the values, linearised about these."""
         steps = np.maximum(1e-3 * np.sqrt(np.diag(self.covariance)), np.finfo(np.float64).tiny)
         rises = [function(self.values + shift) - function(self.values - shift) for shift in np.diag(steps)]
         slopes = np.array(rises) / (2.0 * steps[:, None])
@@ -98,7 +88,6 @@ class Fit(NamedTuple):
 
 
 def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
-    """Return the motion of a log, low-passed at CUTOFF_HZ without lag, at the log's own rate."""
     smooth = _low_pass(log)
     position = smooth(log.position_m)
     speed = np.gradient(position, log.period_s)
@@ -111,7 +100,6 @@ def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
 
 
 def moving(seen: Motion, share: float) -> Array:
-    """Return a mask of the thinned rows during which the carriage moved for more than `share` of the time."""
     return np.asarray(seen.thin(np.abs(seen.sign)) > share)
 
 
@@ -121,13 +109,11 @@ def _low_pass(log: Log) -> Callable[[Array], Array]:
 
 
 def block_numbers(seen: Motion, period_s: float) -> Array:
-    """Return the number, from 0, of the block of BLOCK_S that each thinned row is in; `period_s` is the log's."""
     rows = len(seen.thin(seen.v))
     return (np.arange(rows) * seen.factor * period_s / BLOCK_S).astype(np.int64)
 
 
 def linear(rows: Array, target: Array, blocks: Array) -> Fit:
-    """Fit `target` (n) by `rows` (n, k) in least squares; the fit has k values, in the order of the columns."""
     values, covariance = solved(rows, target, blocks)
     count = len(np.unique(blocks))
     if count < MIN_BLOCKS or not np.isfinite(values).all():
@@ -138,7 +124,7 @@ def linear(rows: Array, target: Array, blocks: Array) -> Fit:
 
 
 class Volts(NamedTuple):
-    """The fitted model `volts`: coefficients in V for m/s2, for m/s and for 1; delay in s; the relative residual."""
+    """The fitted model `volts`: coefficients in V for m/s2, for m/s and for 1, and a delay in s."""
 
     mass: Estimate
     viscous: Estimate
@@ -148,13 +134,12 @@ class Volts(NamedTuple):
     relative_residual: float
 
     def voltage(self, log: Log) -> tuple[Array, Array]:
-        """Return the applied and the predicted voltage, V (n each), for the thinned rows of `log` in motion."""
         _, measured, predicted = self.over_time(log)
         known = np.isfinite(measured)
         return measured[known], predicted[known]
 
     def over_time(self, log: Log) -> tuple[Array, Array, Array]:
-        """Return the thinned times of `log`, s by its clock, and applied and predicted voltage, V (n each)."""
+        """Return the thinned times, s, and applied and predicted voltage, V (n each)."""
         seen = motion(log)
         values = np.array([self.mass.value, self.viscous.value, self.coulomb.value, self.offset.value])
         measured, _ = _voltage(log, seen, self.delay.value)
@@ -173,13 +158,12 @@ def _voltage(log: Log, seen: Motion, delay_s: float) -> tuple[Array, Array]:
 
 
 def fit_volts(log: Log) -> Volts:
-    """Fit mass, friction, offset and delay in volts, from the log's voltage and position alone; a current is not used."""
     seen = motion(log)
     kept = moving(seen, MOSTLY)
     blocks = block_numbers(seen, log.period_s)[kept]
     rows = _volts_rows(seen)[kept]
-    # gears pass less on than they take in, so that mass shows otherwise when speeding up than when braking; friction
-    # and offset vary along the stroke
+    # gears pass on less than they take in, so mass differs between speeding up and braking; friction and offset vary
+    # along the stroke
     left_out = (seen.a * np.sign(seen.a * seen.v), seen.sign * seen.x, seen.x)
     largest = (1.0, SPREAD * float(seen.x.std()), SPREAD * float(seen.x.std()))
     more = np.column_stack([rows, *(seen.thin(column)[kept] for column in left_out)])
@@ -197,7 +181,6 @@ def fit_volts(log: Log) -> Volts:
 
 
 def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array) -> tuple[Fit, float]:
-    """Fit the delayed voltage by `rows` (n, k); return the fit, and the delay, s, which DELAY_TURNS steps find."""
     delay_s = 0.0
     for _ in range(DELAY_TURNS):
         target, slope = _voltage(log, seen, delay_s)
@@ -209,7 +192,7 @@ def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array)
 
 
 class Variant(NamedTuple):
-    """One way to fit a model: with terms usually left out, with other rows, other currents, in another band."""
+    """One way to fit a model: with more terms, other rows, other currents, or in a wider band."""
 
     is_full: bool = False
     moving_share: float = THROUGHOUT
@@ -221,15 +204,15 @@ class Variant(NamedTuple):
 OTHER_WAYS = (
     (Variant(is_full=True), Variant(is_full=True, moving_share=MOSTLY)),
     (Variant(current_shift=-0.5), Variant(current_shift=0.5)),
-    # a sample a millisecond is not the current's mean; every second sample shows by how much that matters
+    # a sample a millisecond is not the current's mean; every second sample shows how much that matters
     (Variant(currents=slice(0, None, 2)), Variant(currents=slice(1, None, 2))),
     (Variant(thinned_Hz=WIDER_HZ),),
 )
-"Groups of ways; of each group the way that differs most counts."
+"Groups of ways, of which the one that differs most counts."
 
 
 def _estimates(fit_in: Callable[[Variant], tuple[Array, Array]]) -> list[Estimate]:
-    """Return n estimates: the values of the plain way to fit, with intervals that cover what OTHER_WAYS make of them."""
+    """Return the plain fit's values, with intervals that cover what OTHER_WAYS make of them."""
     values, widths = fit_in(Variant())
     apart = [np.max([np.abs(fit_in(variant)[0] - values) for variant in group], axis=0) for group in OTHER_WAYS]
     widths = np.sum([widths, *apart], axis=0)
@@ -246,14 +229,13 @@ class Windings(NamedTuple):
 
 
 def fit_windings(log: Log) -> Windings:
-    """Fit resistance, inductance, back-EMF and delay from voltage, current and position."""
 
     def fit_in(variant: Variant) -> tuple[Array, Array]:
         seen = motion(log, variant.thinned_Hz)
         kept = moving(seen, variant.moving_share)
         current = _low_pass(log)(_current(log, variant))
         terms = [current, np.gradient(current, log.period_s), seen.v]
-        if variant.is_full:  # brushes that take a voltage of their own, and a meter with an offset
+        if variant.is_full:  # brushes drop a voltage of their own, and a meter has an offset
             terms += [seen.sign, np.ones_like(seen.v)]
         rows = np.column_stack([seen.thin(term)[kept] for term in terms])
         fitted, delay_s = _with_delay(log, seen, rows, kept, block_numbers(seen, log.period_s)[kept])
@@ -263,7 +245,8 @@ def fit_windings(log: Log) -> Windings:
 
 
 class Gearbox(NamedTuple):
-    """The fitted model `gearbox`: kg, N s/m, the gears' efficiency, and two forces in N."""
+    """The fitted model `gearbox`: kg, N s/m, the gears' efficiency, and N. `coulomb` is half the difference and
+    `offset` half the sum of the forces for slow opening and closing, as means over the stroke."""
 
     mass: Estimate
     viscous: Estimate
@@ -273,7 +256,6 @@ class Gearbox(NamedTuple):
 
 
 def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
-    """Fit inertia, friction and gear losses from current and position; the voltage is not used."""
 
     def fit_in(variant: Variant) -> tuple[Array, Array]:
         seen = motion(log, variant.thinned_Hz)
@@ -286,7 +268,7 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
         fitted = linear(np.column_stack([seen.thin(term)[kept] for term in terms]), target, blocks)
         idle_N = 0.0
         if variant.is_full:
-            # the force that the gears take idling is not transmitted, so no share of it is lost; `fit_volts` on mass
+            # the force that turns the idle gears is not transmitted, so no share of it is lost
             idle_N = abs(float(fitted.values[6]))
             terms += [seen.sign * np.minimum(np.abs(force), idle_N), seen.a * np.sign(seen.a * seen.v)]
             fitted = linear(np.column_stack([seen.thin(term)[kept] for term in terms]), target, blocks)
@@ -303,7 +285,6 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
 
 
 def _current(log: Log, variant: Variant) -> Array:
-    """Return the log's current at its times, shifted and thinned by `variant`."""
     if log.current_A is None:
         raise LabError("current_A: needed to tell the motor's windings from its load")
     times = log.t_s + variant.current_shift * log.period_s
@@ -311,7 +292,7 @@ def _current(log: Log, variant: Variant) -> Array:
 
 
 def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
-    """Return the force, N (n), with which the motor moves the carriage slowly at positions `x` (n); positive opens."""
+    """Return the motor's force (n) that moves the carriage slowly at positions `x` (n)."""
     lost = float(values[2])
     idling = float(values[8]) if len(values) > 8 else 0.0
     load: Array = values[3] + values[4] * x + values[5] * x**2 + direction * (values[6] + values[7] * x)

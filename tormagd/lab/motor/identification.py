@@ -1,4 +1,4 @@
-"""Identification of a motor from its log: the object that `tormag-lab identify-motor` prints."""
+"""Identifies a motor from its log: the object that `tormag-lab identify-motor` prints."""
 
 import math
 from typing import Any
@@ -15,7 +15,7 @@ BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 
 
 def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
-    """Identify a motor from its log; return estimates, residuals and notes as plain data."""
+    """Return estimates (`value` and `ci95`), residuals and notes as plain data."""
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
     half = len(log.t_s) // 2
@@ -52,15 +52,14 @@ def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
 
 
 def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
-    """Return mass, kg, viscous friction, N s/m, Coulomb friction and offset, N; viscous includes the back-EMF's drag,
-    K^2 / R."""
+    """Return mass, kg, viscous friction with the back-EMF's drag, N s/m, Coulomb friction and offset, N."""
     braking = _product((windings.back_emf, 2), (windings.resistance, -1))
     viscous = Estimate(braking.value + gearbox.viscous.value, braking.ci95 + gearbox.viscous.ci95)
     return gearbox.mass, viscous, gearbox.coulomb, gearbox.offset
 
 
 def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
-    """Return by name what only a log with a current shows of windings and gearbox; all are referred to the carriage."""
+    """Return what only a log with a current shows, by name, referred to the carriage."""
     return {
         "gain_N_V": _product((windings.back_emf, 1), (windings.resistance, -1)),
         "resistance_ohm": windings.resistance,
@@ -74,14 +73,13 @@ def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate
 
 
 def _time_constant(volts: Volts, motor: dict[str, Estimate] | None) -> Estimate:
-    """Return the time constant of the speed after a voltage step: mass R / K^2, or mass over drag without a current."""
+    """Return the speed's time constant: mass R / K^2, or mass over drag without a current."""
     if motor is None:
         return _product((volts.mass, 1), (volts.viscous, -1))
     return _product((motor["mass_kg"], 1), (motor["resistance_ohm"], 1), (motor["back_emf_V_s_m"], -2))
 
 
 def _product(*factors: tuple[Estimate, int]) -> Estimate:
-    """Return the product of powers of estimates with independent errors."""
     value = math.prod(estimate.value**power for estimate, power in factors)
     width = math.hypot(*(power * estimate.ci95 / estimate.value for estimate, power in factors))
     return Estimate(value, abs(value) * width)

@@ -1,4 +1,4 @@
-"""Reading a motor log: a CSV file of `tormagctl calibrate --motors`, or the EMPS benchmark's .mat file."""
+"""Reads motor logs: the CSV of `tormagctl calibrate --motors`, or the EMPS benchmark's .mat file."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +19,7 @@ MIN_RATE_HZ = 400.0
 
 
 class Log(NamedTuple):
-    """A motor log in even time steps: s, V, m. `gain_N_V` and `current_A` are None where the file has none."""
+    """A motor log in even time steps; `gain_N_V` and `current_A` are None where the file has none."""
 
     t_s: Array
     input_V: Array
@@ -32,13 +32,11 @@ class Log(NamedTuple):
         return float(np.median(np.diff(self.t_s)))
 
     def part(self, rows: slice) -> "Log":
-        """Return the log of the rows in a slice, with the same gain; its columns are views of this one's."""
         current = None if self.current_A is None else self.current_A[rows]
         return Log(self.t_s[rows], self.input_V[rows], self.position_m[rows], self.gain_N_V, current)
 
 
 def read_log(path: Path) -> Log:
-    """Read the log in an EMPS .mat file, or for any other ending in a CSV file."""
     log = _read_mat(path) if path.suffix == ".mat" else _read_csv(path)
     if len(log.t_s) < MIN_ROWS:
         raise LabError(f"{path}: {len(log.t_s)} rows: allowed are at least {MIN_ROWS}")
@@ -58,7 +56,7 @@ def read_log(path: Path) -> Log:
 
 
 def _read_mat(path: Path) -> Log:
-    """Read an EMPS .mat file: t, s, vir, V, qm, m, and its gain gtau, N/V."""
+    """Read an EMPS .mat file: t, s, vir, V, qm, m, and the gain gtau, N/V."""
     try:
         require_regular(path, MAX_TABLE_BYTES)
         data = loadmat(path)
@@ -75,7 +73,6 @@ def _read_mat(path: Path) -> Log:
 
 
 def _read_csv(path: Path) -> Log:
-    """Read a CSV file, with its current if it has one."""
     named = read_columns(path, COLUMNS, (CURRENT_COLUMN,))
     t_s, input_V, position_mm = (named[name] for name in COLUMNS)
     return Log(t_s, input_V, position_mm * 1e-3, None, named.get(CURRENT_COLUMN))

@@ -1,10 +1,8 @@
-"""What the neighbours of the k-nearest search decide: on the tactile pad, whose force falls somewhere, and on the
-brake.
+"""What the number of neighbours in the k-nearest search decides, on the tactile pad and on the brake.
 
-Contacts are drawn from the model's box; of the pad only those at which its force falls with the field somewhere. At
-each the field goes smoothly up and down again, and the search is asked for the model's force there, answer by answer. A
-*jump* is an answer further than JUMP_MT from the last. *Travel* is the answers' way over the field's own. Where the
-force rises everywhere there are no jumps, however few neighbours.
+Contacts are drawn from the model's box, and on the pad only where its force falls with the field somewhere. At each,
+the field goes smoothly up and down, and the search is asked for the model's force, answer by answer. A *jump* is an
+answer further than JUMP_MT from the last; *travel* is the answers' way over the field's own.
 """
 
 from typing import Any
@@ -20,16 +18,16 @@ from tormagd.scenes.scene import scene_path
 
 NEIGHBOURS = (1, 2, 4, 8, 16, 64)
 SHALLOW_MM = 1.0
-"Depth beyond which the pad's force rises, but for fractions of a millinewton."
+"Deeper than this, the pad's force rises with the field but for fractions of a millinewton."
 CONTACTS, STEPS, SEED = 60, 400, 3
 MAX_DRAWS = 6_000
-"Of contacts, before a model counts as one whose force rises with the field everywhere."
+"Contacts drawn before a model's force counts as rising everywhere."
 JUMP_MT = 20.0
 MODELS = {"pad": ("tactile_mre_c", "tactile", (0.0, 365.0)), "brake": ("torque_mre_50_40", "torque", (330.0, 740.0))}
 
 
 def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float | None) -> list[tuple[float, float]]:
-    """Draw CONTACTS contacts from the model's box, the same each time: displacement, mm, and rate, mm/s."""
+    """Draw CONTACTS contacts, displacement, mm, and rate, mm/s, from the model's box, always the same."""
     draw, fields = np.random.default_rng(SEED), np.linspace(*range_mT, 366)
     (low_mm, high_mm), rates, _, (cip_percent, _) = model.feature_ranges
     found: list[tuple[float, float]] = []
@@ -46,7 +44,7 @@ def contacts(model: ForceModel, range_mT: tuple[float, float], shallow_mm: float
 def followed(
     search: NearestFieldSearch, model: ForceModel, at: list[tuple[float, float]], path_mT: list[float]
 ) -> dict[str, Any]:
-    """Let `search` follow the fields `path_mT` at every contact of `at`, each answer from the last; return how it went."""
+    """Let `search` follow the fields `path_mT` at every contact, and return its jumps, travel and errors."""
     cip_percent = model.feature_ranges[3][0]
     travels_mT, worst_N, answers = [], 0.0, []
     for contact in at:
@@ -68,13 +66,11 @@ def followed(
 
 
 def measured() -> dict[str, Any]:
-    """Return what every number of neighbours decides on two shipped models: by the names of MODELS, as `measured_on`."""
     return {"synthetic": True, "jump_mT": JUMP_MT} | {name: measured_on(*MODELS[name]) for name in MODELS}
 
 
 def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) -> dict[str, Any]:
-    """Return what every number of NEIGHBOURS decides on one shipped model: `model`, `not_rising_share_of_box` and
-    `rows`."""
+    """Return what every number of NEIGHBOURS decides on one shipped model."""
     model = load_model(model_path(model_name, scene_path("pulse").parent), element=element)
     low_mT, high_mT = range_mT
     middle_mT, swing_mT = (low_mT + high_mT) / 2.0, 0.48 * (high_mT - low_mT)

@@ -1,7 +1,6 @@
 """Chapter 4 on a synthetic tactile pad: table 4.1, the pulse experiment of section 4.3, holds.
 
-All data are synthetic: made by `tormagd.simulation.tactile_pad`. `--branches` measures instead what the neighbours of
-the k-nearest search decide, on the shipped models.
+`--branches` measures instead what the neighbours of the k-nearest search decide, on the shipped models.
 """
 
 import argparse
@@ -20,12 +19,11 @@ from tormagd.lab.tactile.pulse import hold, pulse
 from tormagd.lab.tactile.report import sections, write_report
 
 NOISES_N = (0.05, 0.5)
-"Sensor noise of each training; table 4.1 is made with the last."
+"Sensor noise of each training; table 4.1 uses the last."
 
 
 def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]:
-    """Run the experiment; return its figures as plain data, what table 4.1 was trained on, and the pulse's traces by
-    name."""
+    """Run the experiment, and return its figures, table 4.1's training, and the pulse's traces by name."""
     torch.set_num_threads(1)
     trained = [train(noise_N, effort) for noise_N in tqdm(NOISES_N, desc="training", disable=None, leave=False)]
     tabled = trained[-1]
@@ -44,15 +42,12 @@ def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab tactile-experiment`."""
     parser.add_argument("--quick", action="store_true", help="few rows and epochs: shows that it runs, not how well")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write learned_inverse.md and images/ there")
     parser.add_argument("--branches", action="store_true", help="what neighbours decide, on the shipped models")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return the experiment's figures, for a person as the page; with `options.out` also write it there with its
-    pictures."""
     if options.branches:
         return Found(branches.measured())
     if options.out is not None and not options.out.is_dir():

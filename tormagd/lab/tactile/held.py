@@ -1,10 +1,8 @@
-"""A force held on the tactile pad for an hour, in virtual time: with relaxation and without.
+"""Hold a force on the synthetic tactile pad for an hour of virtual time, with relaxation and without.
 
-A constant force is asked for; the finger presses, and the device is learned for some seconds. From then on the error of
-the pad's true force counts, as a share of the force asked, and frozen runs learn no more. It is the daemon's own loop
-with the whole device, at the scene's own rates. With --coarse the plans alone run, fifty a second, and the gap is where
-they lead, which takes a tenth of the time. The two differ by less than 0.1 % of the force, as a test holds. A hold that
-latches a fault ends there. All pads are synthetic.
+The finger presses, and the device is learned for some seconds. From then on the error of the pad's true force counts,
+as a share of the force asked; frozen runs learn no more. With --coarse only the plans run, fifty a second, and the gap
+is where they lead. That takes a tenth of the time and is within 0.1 % of the force. A fault ends its hold.
 """
 
 import argparse
@@ -47,8 +45,6 @@ MODES = ((True, False), (False, False), (True, True), (False, True))
 
 
 class Case(NamedTuple):
-    """One hold."""
-
     plant: str
     relaxation: bool
     is_learning: bool
@@ -57,11 +53,10 @@ class Case(NamedTuple):
 
 
 Moment = tuple[float, float, Plan, str]
-"Once a second: the pad's true force, N, the gap, mm, what was planned, and the fault that ends the hold."
+"Once a second: the pad's true force, N, the gap, mm, the plan, and the fault that ends the hold."
 
 
 def hold(case: Case) -> dict[str, Any]:
-    """Hold a force on the pad of `case` and return how well it was held, as plain data beside the case's own fields."""
     shares, limits, last_mm, fault = [], Counter[str](), math.nan, ""
     for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
         if fault:
@@ -86,7 +81,7 @@ def hold(case: Case) -> dict[str, Any]:
 
 
 class _Prepared:
-    """What both ways to hold need: configuration, core, finger, pad, and `begins_s`, when learning is over."""
+    """What both ways to hold need; learning is over at `begins_s`."""
 
     def __init__(self, case: Case) -> None:
         stated = load_scene(SCENE)
@@ -102,8 +97,6 @@ class _Prepared:
 
 
 def _whole(case: Case) -> Iterator[Moment]:
-    """Yield the moments of a hold by the daemon's loop with the whole device, once a second from the end of learning
-    on."""
     made = _Prepared(case)
     planner, device = made.core.planner(), VirtualDevice(made.plant, made.hand, seed=1)
     loop = ClosedLoop(made.config, made.core.stepper(), planner, device)
@@ -123,7 +116,7 @@ def _whole(case: Case) -> Iterator[Moment]:
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
-    """Yield the moments of a hold by the plans alone: one plan each COARSE_S, and the gap is where the last one leads."""
+    """Yield a hold by the plans alone, one each COARSE_S."""
     made = _Prepared(case)
     planner = made.core.planner()
     element = PressedPad(made.plant, planner.planned.gap_mm, COARSE_S)
@@ -148,7 +141,6 @@ def _coarse(case: Case) -> Iterator[Moment]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab tactile-hold`: `--seconds`, 1..1e6, `--plant`, `--coarse` and `--workers`."""
     seconds = within(1.0, 1e6, "s")
     parser.add_argument("--seconds", type=seconds, default=3600.0, help="of each hold, virtual (default: 3600)")
     parser.add_argument("--plant", nargs="+", default=PLANTS, metavar="PLANT", help="default: pad_1 pad_2 pad_3")
@@ -157,8 +149,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Hold a force on every plant of `options.plant`, with relaxation and without, learning and frozen, and return all
-    holds."""
     cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
     with ProcessPoolExecutor(options.workers) as pool:
         holds = list(tqdm(pool.map(hold, cases), total=len(cases), desc="holds", disable=None))

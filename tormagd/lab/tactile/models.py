@@ -25,16 +25,15 @@ from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, RATES_MM_S, TOUCHING_MM, worked_pad
 
 SCORED_SLOPE_N_MT = 0.03
-"""Least slope at which a field error is scored: where the force depends less on the field, the force error counts."""
+"Least slope at which the field's error is scored; below it, the force's error is."
 SPLIT_SEED = 1
 CYCLE_FOLDS = 4
 PAD_IN_USE = "MRE-C"
-"""Class of the pad in the pulse experiment."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Size of an experiment: rows, epochs and durations. Grouped splits use every `thin`-th row."""
+    """Size of an experiment; grouped splits use every `thin`-th row."""
 
     samples_per_cycle: int
     hold_samples: int
@@ -53,7 +52,8 @@ QUICK = Effort(24, 280, 15, 12, 4, 4, 5, 60.0, 24)
 
 @dataclass(frozen=True)
 class Trained:
-    """Models trained on cycles with sensor noise `noise_N`: the thesis's network, and a model of the pad in use."""
+    """Models trained with sensor noise `noise_N`: the thesis's network on three classes, and a relaxation-aware model
+    of the pad in use."""
 
     noise_N: float
     cycles: PadRecord
@@ -80,7 +80,7 @@ def train(noise_N: float, effort: Effort) -> Trained:
 
 
 def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
-    """Return table 4.1 per class on the random split, with the noise floor, whole groups left out, and monotonicity."""
+    """Return table 4.1 by class, with the noise floor, whole groups left out, and monotonicity."""
     data = trained.cycles.data
     held = random_split(len(data), SPLIT_SEED)
     predicted = trained.model.predict(data.features)
@@ -120,7 +120,7 @@ def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
 
 
 def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) -> dict[str, Any]:
-    """Train a network without the rows of each fold, judge it on them, and return the errors, N."""
+    """Train a network without the rows of each fold, and return its errors on them."""
     predicted = np.empty(len(data))
     judged = np.zeros(len(data), dtype=np.bool_)
     each = []
@@ -134,7 +134,7 @@ def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) ->
 
 
 def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, float]:
-    """Return two shares, 0..1, of places where the model's dF/dB <= 0."""
+    """Return the shares of the box, and of its scored places, where the model's dF/dB <= 0."""
     places = np.meshgrid(
         np.linspace(TOUCHING_MM, FULL_INDENTATION_MM, 18),
         np.sort([*RATES_MM_S, *(-rate for rate in RATES_MM_S)]),
@@ -152,8 +152,7 @@ def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, 
 
 
 def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
-    """Return dF/dB, N/mT (n), of a worked pad at places (n x 3), without relaxation: a secant over 0.5 mT to either
-    side."""
+    """Return dF/dB, N/mT (n), of a pad at places (n x 3) without relaxation, as a secant over +-0.5 mT."""
     pad = worked_pad(parameters)
     displacement, rate, field = places.T
     low, high = np.maximum(field - 0.5, 0.0), field + 0.5
@@ -163,5 +162,4 @@ def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
 
 
 def plant_force_N(pad: Any, places: Array) -> Array:
-    """Return the force, N (n), of a pad at places (n x 3), without relaxation; its state stays."""
     return np.array([sum(pad.elastic_parts_N(*place)) for place in places.tolist()])

@@ -1,8 +1,8 @@
-"""The thesis's pads of chapter 4, and records of what is done to them.
+"""The thesis's pads of chapter 4, and synthetic records of what is done to them.
 
-The data of the thesis are not public. What is printed of them is met: pad size, classes, moduli at 0 and 365 mT, force
-at full indentation. The rest (shape of the stiffening, relaxing fractions and times, conditioning, rates) is assumed,
-with sizes that the literature gives for such elastomers. `TactilePad` is the pad's law. All of it is synthetic.
+The data of the thesis are not public. `TactilePad` meets what is printed of them: pad size, classes, moduli without and
+with field, force at full indentation. The rest (shape of the stiffening, relaxation, conditioning, rates) is assumed,
+with sizes that the literature gives for such elastomers.
 """
 
 from collections.abc import Iterable
@@ -27,9 +27,8 @@ from tormagd.simulation.tactile_pad import (
 
 FIELDS_MT = tuple(float(value) for value in np.linspace(0.0, FULL_FIELD_MT, 11))
 RISE_SAMPLES = 46
-"""Samples of a relaxation test until the depth is reached."""
 PASSES_BEFORE = 3
-"""Unrecorded passes of the same program before each record: 5 minutes, after which the peaks repeat."""
+"Unrecorded passes before each record: 5 minutes, after which the peaks repeat."
 HOLD_S = 3600.0
 
 
@@ -40,11 +39,11 @@ PADS = MappingProxyType(
         "MRE-C": PadParameters(45.0, 281.0, 592.0, 0.85),
     }
 )
-"""Moduli from section 4.2.3."""
+"Moduli from section 4.2.3; the breakdown puts the greatest forces near 65, 141 and 186 N, as table 4.1 implies."
 
 
 def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
-    """Draw another pad of the same recipe: moduli, saturation, relaxation and rate gain 3..15 % about `parameters`."""
+    """Draw another pad of the same recipe, with each property 3..15 % off."""
     draw = np.random.default_rng(seed)
 
     def about(value: float, spread: float) -> float:
@@ -66,7 +65,7 @@ def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
 
 
 class Program(NamedTuple):
-    """What is done to a pad, sample by sample (n each): time, s, displacement, mm, its rate, mm/s, and field, mT."""
+    """What is done to a pad, sample by sample."""
 
     time_s: Array
     displacement_mm: Array
@@ -80,15 +79,14 @@ class Program(NamedTuple):
 
 
 class PadRecord(NamedTuple):
-    """Measured rows, record after record, and the force without the sensor's noise; `cycle` counts through all
-    records."""
+    """Measured rows, and the force without the sensor's noise; `cycle` counts through all records."""
 
     data: Dataset
     true_force_N: Array
 
 
 Pass = tuple[PadParameters, Program, Array]
-"One recorded pass: the pad, its program, and its force, N."
+"Pad, program and force, N, of one recorded pass."
 
 
 def cyclic_records(
@@ -98,8 +96,7 @@ def cyclic_records(
     samples_per_cycle: int = SAMPLES_PER_CYCLE,
     pads: Iterable[PadParameters] = tuple(PADS.values()),
 ) -> PadRecord:
-    """Return the data of figure 4.3: eleven fields, twelve cycles of `samples_per_cycle` rows at four rates, without
-    holds."""
+    """Make the data of figure 4.3: eleven fields, twelve cycles at four rates, without holds."""
     time_s, displacement_mm, rate_mm_s, cycle = cycling_program(samples_per_cycle)
     passes: list[Pass] = []
     for parameters in pads:
@@ -122,7 +119,7 @@ def holding_records(
     fields_mT: tuple[float, ...] = (0.0, 91.25, 182.5, 273.75, 365.0),
     samples: int = 500,
 ) -> PadRecord:
-    """Return relaxation tests, one at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely."""
+    """Make a relaxation test at each field: to 4.5 mm at 1 mm/s, then held for an hour, sampled ever more rarely."""
     rise_s = FULL_INDENTATION_MM
     held_s = np.geomspace(0.05, HOLD_S, samples - RISE_SAMPLES)
     time_s = np.concatenate((np.linspace(0.0, rise_s, RISE_SAMPLES), rise_s + held_s))
@@ -133,7 +130,6 @@ def holding_records(
 
 
 def _recorded(passes: list[Pass], cycle: NDArray[np.int64], noise_N: float, seed: int) -> PadRecord:
-    """Return the passes one after the other as a record, with the sensor's noise `noise_N`, N, drawn by `seed`."""
     features = np.concatenate([program.features(pad.cip_percent) for pad, program, _ in passes])
     true_N = np.concatenate([force_N for *_, force_N in passes])
     noisy_N = true_N + np.random.default_rng(seed).normal(0.0, noise_N, len(true_N))

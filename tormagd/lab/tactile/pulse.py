@@ -19,29 +19,29 @@ from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, w
 
 SAMPLES = 4322
 RATE_HZ = 160
-"""As many samples as the thesis has, so dense that the 25 s of measured pulse suffice."""
+"Gives as many samples as the thesis has, from the 25 s of measured pulse."
 REFERENCE_FIELDS_MT = (100.0, 200.0)
 FIELDS_MT = (0.0, FULL_FIELD_MT)
 THESIS_EPSILON_N = 1.26
-"Radius of the neighbourhood in the thesis: the mean error of its network."
+"The thesis's neighbourhood: the mean error of its network."
 OTHER_PADS = (1, 2)
 SENSOR_SEED = 7
 SHAPE = "measured photoplethysmogram (heartpy)"
 
 HOLD_RATE_HZ = 10
 HOLD_FORCES_N = (148.0, 154.0)
-"""Forces that the field reaches at the beginning and after an hour of relaxation."""
+"Forces that the field reaches both at first and after an hour of relaxation."
 HELD_PULSE_S = 20.0
 TEN_MINUTES_S = 600.0
 
 
 def pulse_shape(duration_s: float, rate_hz: int) -> Array:
-    """Return a measured pulse between 0 and 1."""
+    """Return a measured pulse (n) between 0 and 1."""
     return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1]
 
 
 def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
-    """Return measured arterial pulses (n) between 0 and 1 by file name, repeated to `duration_s` at `rate_hz`."""
+    """Return measured arterial pulses (n) between 0 and 1 by file name, repeated to `duration_s`."""
     shapes = {}
     for path in recorded("aac_nibp_pulse"):
         time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
@@ -52,7 +52,7 @@ def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
 
 
 def program(shape: Array) -> Program:
-    """Return the experiment's program: indentation to 4.5 mm at 1 mm/s, then a hold while the field follows `shape`."""
+    """Return the experiment's program: indentation to 4.5 mm at 1 mm/s, then a hold under the field `shape`."""
     time_s = np.arange(1, SAMPLES + 1) / RATE_HZ
     displacement_mm = np.minimum(time_s, FULL_INDENTATION_MM)
     rate_mm_s = np.diff(displacement_mm, prepend=0.0) * RATE_HZ
@@ -69,7 +69,7 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 def solve_all(
     solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
 ) -> list[FieldSolution]:
-    """Find the field for each of `force_N` (n), N, in turn, from the last answer on; return the answers (n)."""
+    """Find the field for each force (n) in turn, each search from the last answer on."""
     answers: list[FieldSolution] = []
     for row, wanted_N in zip(features.tolist(), force_N.tolist(), strict=True):
         displacement_mm, rate_mm_s, _, cip_percent = row
@@ -78,13 +78,12 @@ def solve_all(
         curve = model.curve(displacement_mm, rate_mm_s, cip_percent)
         answers.append(solver.solve(curve, wanted_N, answers[-1].field_mT if answers else None))
         if memory is not None:
-            # what the field found can give, not what was wished
+            # the pad feels the field that was found, not the wish
             memory.advance(displacement_mm, rate_mm_s, answers[-1].field_mT, cip_percent)
     return answers
 
 
 def fields_of(answers: list[FieldSolution]) -> Array:
-    """Return the fields of the answers, mT."""
     return np.array([answer.field_mT for answer in answers])
 
 
@@ -103,7 +102,7 @@ class Course(NamedTuple):
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 
     def scores(self, fields_mT: Array) -> dict[str, float]:
-        """Return how far `fields_mT` (n) are off: the field over the scored rows, mT, over the others the force, N."""
+        """Return the field error over the scored rows, mT, and the force error over the others, N."""
         absolute = np.abs(fields_mT - self.features[:, 2])[self.scored]
         pad, places = worked_pad(self.pad), self.features[~self.scored, :3].copy()
         right_N = plant_force_N(pad, places)
@@ -117,7 +116,6 @@ class Course(NamedTuple):
 
 
 def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
-    """Run the experiment on one pad with the pulse `shape`, and return every `every`-th of its samples, to be solved."""
     done = program(shape)
     force_N = worked_pad(pad).run(*done)
     features = done.features(pad.cip_percent)[::every]
@@ -127,19 +125,17 @@ def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
 
 
 def nearest() -> NearestFieldSearch:
-    """Return the experiment's search, with its default number of neighbours."""
     return NearestFieldSearch(field_grid(FIELDS_MT, 2.0))
 
 
 def aware_fields(trained: Trained, along: Course, noise_N: float = 0.0) -> Array:
-    """Return the fields (n), mT, that the relaxation-aware model finds for the forces of `along`, from a rested pad on."""
     noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
     memory = GreyBoxMemory(trained.grey, along.dt_s)
     return fields_of(solve_all(nearest(), trained.grey.model, along.features, noisy_N, memory))
 
 
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return the scores of each way from force to field by name, and the traces over time by name (n each)."""
+    """Return scores and traces (n each) of each way from force to field, by name."""
     linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
         "mlp": fields_of(solve_all(nearest(), trained.model, along.features, along.force_N, None)),
@@ -156,7 +152,6 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 
 
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Run the pulse experiment with each of `trainings`, and return its figures and the traces of the first training."""
     shape = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
@@ -173,7 +168,7 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
 
 
 def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
-    """Render pulses by feed-forward on a pad held at 4.5 mm for `duration_s` of virtual time, and return the errors."""
+    """Render pulses by feed-forward on a pad held at 4.5 mm, and return the errors."""
     dt_s = 1.0 / HOLD_RATE_HZ
     rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)
     count = rising + round(duration_s * HOLD_RATE_HZ)

@@ -1,7 +1,7 @@
 """Train the shipped tactile model: a pad is cycled and held on the bench, its relaxation-aware model becomes a file.
 
 The bench gives the plant's pad eleven fields, twelve cycles each at four rates, and an hour's hold at each of five
-fields. Its force sensor has the noise of the plant's. Synthetic.
+fields. Synthetic, with the noise of the plant's force sensor.
 """
 
 import argparse
@@ -28,7 +28,7 @@ UNSEEN_FIELDS_MT = (130.0, 230.0)
 
 
 def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceModel:
-    """Train the model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen; return it."""
+    """Train the model of a plant's pad, judged on unseen rows of the cycles and on two unseen holds."""
     plant = load_plant(plant_name)
     if plant.pad is None:
         raise PlantError(f"plant {plant_name}: allowed is one with a [pad]")
@@ -61,14 +61,12 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab tactile-model`."""
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
     parser.add_argument("--plant", default="pad_1", help="whose pad is on the bench (default: pad_1)")
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Train the model of the pad of `options.plant`, write it to `options.out` and return `out` and its metrics."""
     torch.set_num_threads(1)
     model = trained(options.plant, FULL, options.created or datetime.date.today())
     save_model(options.out, model)

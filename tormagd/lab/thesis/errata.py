@@ -1,4 +1,4 @@
-"""Where the thesis contradicts itself or its own tables. Every figure is computed here from what the thesis prints."""
+"""Where the thesis contradicts itself or its own tables, with every figure computed from what it prints."""
 
 import math
 
@@ -24,17 +24,15 @@ APPENDIX_MU_R = 3.8
 
 
 KEYS = ("place", "printed", "found", "used")
-"Place in the thesis, what is printed, what was found, and the reading used here."
 
 
 def errata() -> list[dict[str, str]]:
-    """Return all errata in the order of the thesis: a dict of plain text for each."""
     found = (*_chapter_2(), _eq_25(), *_chapter_3(), *_appendices(), *_chapter_4())
     return [dict(zip(KEYS, row, strict=True)) for row in found]
 
 
 def table_2_4_errors() -> list[dict[str, object]]:
-    """Return the lines of table 2.4 whose printed error does not follow from the printed ranges, within their rounding."""
+    """Return the lines of table 2.4 whose printed error contradicts the printed ranges by more than rounding."""
     wrong = []
     for name, (printed_N, printed_percent) in TABLE_2_4_ERRORS.items():
         ranges = INSERTS[name].force_range
@@ -59,7 +57,6 @@ Row = tuple[str, str, str, str]
 
 
 def _chapter_2() -> list[Row]:
-    """Return the errata of chapter 2 but for Eq."""
     eq7, power = ThesisFieldLaw(), PowerFieldLaw()
     closed_Tm, open_Tm = eq7.radial_moment_Tm(CLOSED_MM), eq7.radial_moment_Tm(OPEN_MM)
     stretched = (1.206 * (200.0 - CLOSED_MM) ** 1.867 + 1256.0) * 1e-6
@@ -160,7 +157,7 @@ def _chapter_2() -> list[Row]:
 
 
 def _eq_25() -> Row:
-    """Return the erratum of Eq."""
+    """Return the erratum of Eq. 25: true and nominal stress of SAMPLE at the closed gap, with free ends."""
     moment_Tm = ThesisFieldLaw().radial_moment_Tm(CLOSED_MM)
     radial = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     stretch = constitutive.stretches(radial, 1.0)
@@ -179,7 +176,6 @@ def _eq_25() -> Row:
 
 
 def _chapter_3() -> list[Row]:
-    """Return the errata of chapter 3, in order: place, what is printed, what was found, and the reading used."""
     low, high = APPENDIX_B_BOUNDS
     lines = [line for case in USE_CASES.values() for line in case.starts]
     outside = [f"R_o {line.start.outer_radius_mm:g}" for line in lines if not _inside(line.start, low, high)]
@@ -208,7 +204,6 @@ def _chapter_3() -> list[Row]:
 
 
 def _appendices() -> list[Row]:
-    """Return the errata of the appendices: place, what is printed, what was found, and the reading used."""
     exponent_T = 0.44 * CLOSED_MM ** (-1.3 / 6.0 * APPENDIX_MU_R) / 0.004
     sixth_T = 0.44 * CLOSED_MM**-1.3 / 6.0 * APPENDIX_MU_R / 0.004
     used_T = 0.44 * CLOSED_MM**-1.3 / 4.0 * APPENDIX_MU_R / 0.004
@@ -269,7 +264,6 @@ def _chapter_4() -> list[Row]:
 
 
 def _eq_28(moment_Tm: float) -> float:
-    """Return the force, N, by Eq."""
     stretch = 1.0 + stretch_minus_one(moment_Tm, SAMPLE, TORMAG)
     magnetic = MU0_H_M * SAMPLE.relative_permeability * (moment_Tm / TORMAG.inner_radius_m) ** 2 / stretch**2
     area = 2.0 * math.pi * TORMAG.thickness_m * TORMAG.inner_radius_m**2 * SAMPLE.friction_coefficient
@@ -277,7 +271,7 @@ def _eq_28(moment_Tm: float) -> float:
 
 
 def _literal_stretch(moment_Tm: float, *, appendix: bool = False) -> float:
-    """Return lambda1 of SAMPLE in TORMAG by Eq."""
+    """Return lambda1 of SAMPLE in TORMAG by Eq. 29 as printed; NaN where the root is not real."""
     inner, outer, t = TORMAG.inner_radius_m, TORMAG.outer_radius_m, TORMAG.thickness_m
     mu_r, g0 = SAMPLE.relative_permeability, SAMPLE.shear_modulus_Pa
     over = moment_Tm**2 / (MU0_H_M * mu_r)

@@ -18,7 +18,6 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
-    """Draw every picture of the page, and return figures by the names of files, without an ending; nothing is written."""
     return {
         "table_2_4": _table_2_4(result["table_2_4"]),
         "figure_2_5": _figure_2_5(result["figure_2_5"]),
@@ -29,8 +28,7 @@ def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
 
 
 def _table_2_4(table: Json) -> Figure:
-    """Draw the force range of each insert, F(45 mm) less F(95 mm): measured with deviation, the thesis's, and ours
-    twice."""
+    """Draw each insert's force range: measured, the thesis's, and ours in two fits."""
     figure, axes = subplots((9.5, 4.2))
     rows = table["rows"]
     place = np.arange(len(rows))
@@ -51,7 +49,7 @@ def _table_2_4(table: Json) -> Figure:
 
 
 def _figure_2_5(data: Json) -> Figure:
-    """Draw the least and greatest force, by Eq."""
+    """Draw the least and greatest force by Eq. 7 over shear modulus and permeability."""
     figure = Figure(figsize=(7.5, 5.4), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
     moduli, permeabilities = np.meshgrid(data["shear_modulus_kPa"], data["relative_permeability"])
@@ -67,7 +65,7 @@ def _figure_2_5(data: Json) -> Figure:
 
 
 def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
-    """Draw the step tests over time beside the force law, and on a second axis the force ranges of all inserts."""
+    """Draw the step tests beside the force law, and the force ranges of all inserts."""
     figure, (axes, ranges) = subplots((12.0, 4.2), 1, 2)
     for test, row, colour in zip(tests, data["rows"], (OURS, FREE, THESIS), strict=True):
         axes.plot(test.time_s, test.force_N, color=colour, linewidth=0.9, label=f"{test.insert}, simulated device")
@@ -84,7 +82,6 @@ def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
 
 
 def _force_ranges(axes: Axes, rows: list[Json]) -> None:
-    """Draw on `axes` each insert's least and greatest force over its share of iron, one colour a matrix."""
     for place, (matrix, colour) in enumerate(
         zip(dict.fromkeys(row["matrix"] for row in rows), (OURS, FREE, THESIS), strict=True)
     ):
@@ -99,8 +96,7 @@ def _force_ranges(axes: Axes, rows: list[Json]) -> None:
 
 
 def _figure_3_2(table: Json) -> Figure:
-    """Draw the portrait of the device as built over both use cases, an axis each, at the thesis's gap speed and the
-    controller's."""
+    """Draw the portrait of the device as built over both use cases, at both gap speeds."""
     figure, axes = subplots((9.5, 4.0), 1, 2)
     speeds = (table["gap_speed_mm_s"]["true_thesis_speed"], table["gap_speed_mm_s"]["true"])
     for axis, (number, case) in zip(axes, USE_CASES.items(), strict=True):
@@ -112,7 +108,7 @@ def _figure_3_2(table: Json) -> Figure:
 
 
 def _figure_3_4(table: Json) -> Figure:
-    """Draw our best and the thesis's best portrait: a row for each use case, a column for each gap speed."""
+    """Draw our best and the thesis's best portrait for each use case and gap speed."""
     figure, axes = subplots((9.5, 7.6), 2, 2)
     for row, (number, case) in zip(axes, USE_CASES.items(), strict=True):
         for axis, objective in zip(row, ("true_thesis_speed", "true"), strict=True):
@@ -135,8 +131,6 @@ def _region(axis: Axes, region: Region) -> None:
 
 
 def _portrait(axis: Axes, problem: Problem, design: Design, colour: str, label: str) -> None:
-    """Draw on `axis` a design's true boundary solid, labelled `label`, and its trapezoid's upper and lower edge
-    dotted."""
     portrait = problem.portrait(design)
     force, rate = portrait.outline()
     axis.plot([*force, *force[::-1], force[0]], [*rate, *-rate[::-1], rate[0]], color=colour, label=label)

@@ -1,7 +1,7 @@
-"""Recomputes the thesis's tables and figures: thesis value, ours, error, note.
+"""Recompute the thesis's tables and figures: thesis value, ours, error, note.
 
-Runs without the laboratory: where the thesis measured, its printed measurements are the reference. The step test runs
-on the simulated device, and table 4.1 and the pulse on a simulated pad (synthetic).
+Where the thesis measured, its printed measurements are the reference. The step test runs on the simulated device, and
+table 4.1 and the pulse on a simulated pad (synthetic).
 """
 
 import argparse
@@ -39,14 +39,13 @@ from tormagd.physics.force import Elastomer
 from tormagd.physics.inserts import INSERTS, Insert, insert
 
 CONTROLLER_SPEED_MM_S = 40.0
-"Gap speed of two carriages at 150 rpm on 8 mm screws; the controller's own, once measured, goes in with --gap-speed."
+"Two carriages at 150 rpm on 8 mm screws; a measured speed goes in with --gap-speed."
 STEP_INSERTS = ("MRE-50-40", "MRE-30-30", "MRE-10-20")
 PULSE_N = (1.4, 1.7)
 PULSE_S, PULSE_HZ = 20.0, 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab reproduce-thesis`: out, gap speed, workers, seed, quick, and table 2.5 alone."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="write reproduction.md and its pictures there")
     parser.add_argument("--gap-speed", type=GAP_SPEED, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=WORKERS, default=os.cpu_count() or 1)
@@ -56,7 +55,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Return all tables and figures of the reproduction by name, for a person as the page."""
     if options.table_2_5:
         found = table_2_5()
         return Found(found, table(dict(zip(COLUMNS, row, strict=True)) for row in readings(found)))
@@ -88,7 +86,6 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def chapter_4(is_quick: bool) -> Json:
-    """Run chapter 4's experiment and return its figures, as `experiment.contract`; none of what was trained is pickled."""
     from tormagd.lab.tactile.experiment import contract
     from tormagd.lab.tactile.models import FULL, QUICK
 
@@ -97,7 +94,7 @@ def chapter_4(is_quick: bool) -> Json:
 
 
 def table_2_3() -> Json:
-    """Return each insert's masses, g in 100 cc, from volume fractions and densities, beside the printed ones."""
+    """Return each insert's masses, g in 100 cc, from volume fractions, beside the printed ones."""
     rows: list[Json] = []
     for item in INSERTS.values():
         printed = TABLE_2_3_MASSES_G[round(100 * item.cip_fraction)]
@@ -118,7 +115,7 @@ def table_2_3() -> Json:
 
 
 def table_2_4() -> Json:
-    """Return friction per matrix fitted to the measured ranges, with Eq."""
+    """Return friction fitted to the measured ranges, with Eq. 7 and with the power law."""
     ours, beside = _range_fit(ThesisFieldLaw()), _range_fit(PowerFieldLaw())
     return {
         **ours,
@@ -132,7 +129,6 @@ def table_2_4() -> Json:
 
 
 def _range_fit(law: FieldLaw) -> Json:
-    """Return the fits of friction under one field law, with a fixed and a free exponent, and their relative errors."""
     known = list(INSERTS.values())
     fixed, free = fit_friction(known, law), fit_exponent(known, law)
     left_out = leave_one_out(known, law, free_exponent=False)
@@ -152,7 +148,7 @@ def _range_fit(law: FieldLaw) -> Json:
 
 
 def _registry_errors() -> Json:
-    """Return the errors of range with the registry's friction, the one that inserts and simulated device have."""
+    """Return the errors of range with the registry's friction, which the simulated device has."""
     known = list(INSERTS.values())
     friction = {item.shore_hardness: item.elastomer.friction_coefficient for item in known}
     used = RangeFit(ThesisFieldLaw(), friction, exponent=1.0)
@@ -180,7 +176,7 @@ def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -
 
 
 def figure_2_5() -> Json:
-    """Return the least and greatest force, N, over permeability and shear modulus, with mu_d = 0.2, by both field laws."""
+    """Return the least and greatest force over permeability and shear modulus, by both field laws."""
     permeabilities = np.linspace(2.0, 4.0, 9)
     moduli_kPa = np.linspace(80.0, 280.0, 11)
     result: Json = {}
@@ -209,7 +205,7 @@ def figure_2_5() -> Json:
 
 
 def figure_2_7(tests: list[StepTest]) -> Json:
-    """Return the settled force at each gap on the simulated device, beside the force law, and all inserts' ranges."""
+    """Return the simulated device's settled forces beside the force law, and all inserts' ranges."""
     rows = []
     for test in tests:
         brake = Brake.as_built(insert(test.insert).elastomer)
@@ -249,7 +245,7 @@ def figure_2_7(tests: list[StepTest]) -> Json:
 
 
 def phase_portrait(*gap_speeds_mm_s: float) -> Json:
-    """Return how much of both use cases, and of a measured pulse's points, the device as built covers."""
+    """Return how much of both use cases and of a measured pulse the device as built covers."""
     rows = []
     for number, case in USE_CASES.items():
         for speed in gap_speeds_mm_s:
@@ -273,7 +269,7 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
 
 
 def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
-    """Return how many points of a measured pulse MRE-50-40 renders at each gap speed; a point is force and force rate."""
+    """Return how many (force, rate) points of a measured pulse MRE-50-40 renders at each gap speed."""
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
     rates_N_s = np.gradient(forces_N, times_s)
     brake = Brake.as_built(insert("MRE-50-40").elastomer)
@@ -311,7 +307,6 @@ RunKey = tuple[int, int, str, str]
 
 
 def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
-    """Return the runs of table 3.2 by use case, start from 1, objective and solver, which is `global` and `local`."""
     runs = {}
     for number, case in USE_CASES.items():
         for objective, problem in _problems(number, gap_speed_mm_s).items():
@@ -332,7 +327,7 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
 
 
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
-    """Return the optima by the global solver, by the local one and by the thesis's cost, beside the thesis's designs."""
+    """Return the optima by each solver and by the thesis's cost, beside the thesis's designs."""
     rows: dict[RunKey, Json] = {}
     for (use_case, start, objective, solver), run in runs.items():
         outcome = outcomes[run]

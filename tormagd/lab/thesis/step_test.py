@@ -1,7 +1,7 @@
 """Figure 2.7: the gap goes down in steps while the handle turns at 20 rpm, on the simulated device in virtual time.
 
-Force and gap are what the host measures through the protocol. Synthetic data: the device is the simulator's plant
-sample 1, with the insert's modulus, permeability and friction in place of its own.
+Force and gap are what the host measures through the protocol. The device is plant sample 1 with the insert's modulus,
+permeability and friction.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
 
 GAPS_MM = (94.5, 85.0, 75.0, 65.0, 55.0, 45.5)
-"The thesis's steps; the first and the last stay half a millimetre clear of the end stops."
+"The thesis's steps, half a millimetre clear of the end stops."
 HOLD_S = 5.0
 SETTLED_S = 1.0
 "The last second of each step is its level."
@@ -29,7 +29,7 @@ EVERY = 10
 
 
 class StepTest(NamedTuple):
-    """Step test of one insert: its record, thinned, and the settled gap and force of each step."""
+    """One insert's record, thinned, and the settled gap and force of each step."""
 
     insert: str
     time_s: Array
@@ -37,7 +37,7 @@ class StepTest(NamedTuple):
     level_gap_mm: Array
     level_force_N: Array
     rise_s: float
-    "Median time from 10 to 90% of a step of the gap."
+    "Median time from 10 to 90% of a step."
 
     @property
     def gap_speed_mm_s(self) -> float:
@@ -45,7 +45,6 @@ class StepTest(NamedTuple):
 
 
 def step_test(fitted: Insert, seed: int) -> StepTest:
-    """Run one insert through GAPS_MM in virtual time, HOLD_S each, and return the record; times count from its start."""
     config, scene = load_config(None), load_scene("coronary")
     scene = msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N))
     plant = load_plant("sample_1")

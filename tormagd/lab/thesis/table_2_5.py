@@ -1,7 +1,7 @@
 """Table 2.5, which insert serves which task: as the thesis meant it, and strictly.
 
-The thesis names inserts whose force *range*, most less least, is comparable to the task's, wherever it begins. Strictly
-a task is served from its own least force on, and a passive brake does not reach 0 N.
+The thesis matches the width of an insert's force *range* to the task's, wherever it begins. Strictly, a task is served
+from its own least force on, and a passive brake does not reach 0 N.
 """
 
 import math
@@ -13,7 +13,7 @@ from tormagd.lab.thesis.values import TABLE_2_5
 from tormagd.physics.inserts import INSERTS
 
 GAP_RESOLUTION_MM = 0.1
-"What a plain position loop reaches against the screws' backlash; table 2.5 of the thesis implies a little less."
+"Reach of a plain position loop against the screws' backlash; the thesis's table implies a little less."
 COLUMNS = (
     "task",
     "insert the thesis names",
@@ -27,8 +27,8 @@ COLUMNS = (
 
 
 def table_2_5() -> Json:
-    """Judge every insert for every task; return the verdicts, best first by the strict reading."""
-    # the open gap is that of the device, but the law must hold beyond it where a task asks for less force
+    """Judge every insert for every task, the best first by the strict reading."""
+    # the law must hold beyond the device's open gap
     brakes = {item.name: Brake.as_built(item.elastomer) for item in INSERTS.values()}
     steps = [
         1e-3 * resolution_mN / brakes[name].slope_N_mm(CLOSED_MM)
@@ -70,8 +70,7 @@ def _row(verdict: Verdict, task: ForceTask) -> Json:
 
 
 def readings(table: Json) -> list[tuple[str, ...]]:
-    """Return one row of text for each insert that the thesis names, in the order of `COLUMNS`; `table` is of
-    `table_2_5`."""
+    """Return a row of text, as COLUMNS, for each insert that the thesis names."""
     return [
         (
             f"{task['task']}, {task['range_N'][0]:g}..{task['range_N'][1]:g} N",
@@ -90,7 +89,6 @@ def readings(table: Json) -> list[tuple[str, ...]]:
 
 
 def _missed(row: Json, task: Json) -> str:
-    """Return in words the forces under its least that the insert misses, and by what its measured range is too narrow."""
     (least_N, most_N), given_N = task["range_N"], row["force_N"][0]
     missed = [f"{least_N:g}..{given_N:.2f} N"] if given_N > least_N else []
     if row["matched_share"] < 1.0:

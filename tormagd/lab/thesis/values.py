@@ -1,4 +1,4 @@
-"""What the thesis prints, as it prints it: the tables that `reproduction.py` compares its own figures with."""
+"""What the thesis prints: the tables with which `reproduction.py` compares its own figures."""
 
 from typing import NamedTuple
 
@@ -41,10 +41,11 @@ TABLE_2_5 = (
         {"MRE-30-30": 15.0, "MRE-50-30": 20.0, "MRE-50-40": 29.0},
     ),
 )
-"""Tasks, and the inserts the thesis names for each with the resolution it states, mN."""
+"""Tasks, and the inserts named for each with their resolution, mN. Where the thesis requires no resolution, a tenth of
+the range is taken, about the JND of force."""
 
 FIGURE_2_5_N = (0.46, 5.4)
-"Least and most force at mu_r = 4, G0 = 277 kPa, read off the surfaces; an earlier prototype measured the second pair."
+"Least and most force at mu_r = 4, G0 = 277 kPa, read off the surfaces, and those of an earlier prototype."
 FIGURE_2_5_MEASURED_N = (0.5, 5.7)
 
 GAP_SPEED_MM_S = 1.0 / 0.12
@@ -52,7 +53,7 @@ GAP_SPEED_MM_S = 1.0 / 0.12
 
 
 class Start(NamedTuple):
-    """A line of table 3.2: the initial guess, the thesis's optimum and its coverage in percent."""
+    """A line of table 3.2: initial guess, optimum, and its coverage in percent."""
 
     start: Design
     thesis: Design
@@ -60,7 +61,7 @@ class Start(NamedTuple):
 
 
 class UseCase(NamedTuple):
-    """A required region, the thesis's coverage of it by the device as built, in percent, and its five starts."""
+    """A required region, the thesis's coverage of it as built, in percent, and its five starts."""
 
     region: Region
     initial_percent: float
@@ -69,7 +70,7 @@ class UseCase(NamedTuple):
 
 USE_CASES = {
     1: UseCase(
-        # the thesis gives only the forces; a passive brake changes no zero force, so the rate there is taken as zero
+        # the thesis gives only the forces, and a passive brake cannot change zero force
         Region(0.0, 0.0, 2.5, 1.0),
         88.0,
         (
@@ -98,7 +99,7 @@ APPENDIX_B_BOUNDS = (Design(8.0, 10.0, 50.0), Design(15.0, 50.0, 200.0))
 
 
 class FitScore(NamedTuple):
-    """A row of table 4.1, of the rows held out: mean absolute error with its deviation, N, and R2."""
+    """A row of table 4.1, of held-out rows: mean absolute error with its deviation, and R2."""
 
     mae_N: float
     sd_N: float
@@ -112,4 +113,4 @@ TABLE_4_1 = {
     "All": FitScore(1.26, 1.05, 0.97),
 }
 PULSE_MAE_MT, PULSE_SD_MT, PULSE_MAX_MT = 1.14, 1.48, 3.64
-"Field error of section 4.3."
+"Field errors of section 4.3."

@@ -1,1 +1,1 @@
-"""Learning of force models: data sets, networks, fits, splits and their metrics. Nothing here runs in the daemon."""
+"""Learning of force models: data sets, networks, fits, splits and their metrics."""

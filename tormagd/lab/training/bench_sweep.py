@@ -1,14 +1,12 @@
-"""Records bench sweeps of the simulated device through the protocol: the training data of the shipped model.
+"""Record bench sweeps of the simulated device through the protocol: the shipped model's training data. Synthetic.
 
-Like figure 2.7 of the thesis: the gap goes down in steps and up again while the handle moves. It moves as hands do:
-both ways, from a creep of 0.5 mm/s to 300 mm/s, with stops and reversals. Each sweep is a record of its own, from a
-long rest at the open gap on, and has a number (`cycle`). Record 0 is a hold of the last insert, which shows how
-the elastomer relaxes. Every figure in the file passed the wire as protocol bytes: gap from the encoders, force from the
-force sensor, motion from the handle's encoder. Two kinds of rows are kept. Where the handle slides steadily, the
-displacement is that of full mobilisation. After a turn, while the force rises towards it, the displacement counts from
-where the elastomer bears no force, between the two ways. Counted from the turn, more field would at first mean less
-force. Synthetic data: the device is the simulator's. The stops of its bench stand 2.5 mm beyond the stroke at either
-end: the model knows what lies behind the ends of the scenes.
+As in figure 2.7 of the thesis, the gap goes down in steps and up again while the handle moves. It moves as hands do:
+both ways, from 0.5 mm/s to 300 mm/s, with stops and reversals. Each sweep is a record (`cycle`) that begins after a
+long rest at the open gap. Record 0 is a hold of the last insert, which shows relaxation.
+
+Two kinds of rows are kept. Where the handle slides steadily, the displacement is that of full mobilisation. After a
+turn, it counts from where the elastomer bears no force: counted from the turn, more field would at first mean less
+force. The bench's stops are 2.5 mm beyond the stroke, so the model knows what lies behind the scenes' ends.
 """
 
 import argparse
@@ -41,39 +39,37 @@ from tormagd.simulation.parameters import PlantParameters, load_plant, with_inse
 
 SWEEPS = 4
 BEYOND_MM = 2.0
-"How far the sweeps go beyond the scene's gaps."
 STOPS_MM = 2.5
-"How far the bench's switches stand beyond the scene's gaps."
+"The bench's switches are this far beyond the scene's gaps."
 BENCH_MOST_N = 20.0
-"Greatest force of the bench's scene: none that the closed gap gives is a fault."
+"So great that no force of the closed gap is a fault."
 GAP_STEP_MM = 3.0
 HOLD_GAP_MM, HOLD_STROKES = 46.0, 100
 BEGIN_S = 8.0
-"Connecting, homing and enabling are over by then; the handle begins to move."
+"Connecting, homing and enabling are over by then."
 CREEP_MM_S, FASTEST_MM_S = 0.5, 310.0
 EVEN_S, EVEN_MM = 0.3, 4.0
-"Least time and travel at one speed: at a creep friction takes millimetres to settle."
+"Least time and travel at one speed: at a creep, friction takes millimetres to settle."
 SPEEDS = 3
-"Speeds of each way of a stroke after its first."
+"Speeds of each way after its first."
 STOP_S = 0.3
-"Rest after each way; in the last of a stroke the gap arrives."
+"Rest after each way, long enough for the gap to arrive."
 RATE_TICKS = 50
-"Ticks on either side over which a rate is taken: one count of the handle's encoder is 8 um."
+"Half of the window of a rate: one count of the handle's encoder is 8 um."
 STEADY_SHARE, STEADY_MM_S = 0.02, 0.2
 SETTLED_MM, MOBILISED_AFTER_MM = 3.0, 6.0
-"Travel needed after a change of speed or gap, and after the handle has turned, which bends every bristle over."
+"Travel needed after a change of speed or gap, and after a turn, which bends every bristle over."
 LOADING_MM = 3.0
-"Travel at a stroke's first speed: the way back to no force, and on through mobilisation."
+"Travel at a way's first speed: back to no force, and on through mobilisation."
 LOADED_MM, LOADED_STEP_MM = 1.5, 0.15
-"End and spacing of the rows before mobilisation: on to 2 mm the greatest forces still rise by a tenth."
+"End and spacing of rows before mobilisation: from there to 2 mm the greatest forces still rise by a tenth."
 RESTING_GAP_MM_S = 0.5
 EVERY, LOADED_EVERY = 90, 7
-"Every how many ticks of steady sliding, and rows before mobilisation, are kept: neighbours are nearly equal."
+"One in so many is kept, of steady ticks and of rows before mobilisation: neighbours are nearly equal."
 
 
 class Course(NamedTuple):
-    """One record to make: the insert, the gap of each stroke of the handle there and back, mm, and the seed of hand and
-    noise."""
+    """One record to make: the insert, the gap of each stroke there and back, and the seed of hand and noise."""
 
     insert: str
     gaps_mm: tuple[float, ...]
@@ -81,8 +77,6 @@ class Course(NamedTuple):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab bench-sweep`: plant, scene, inserts, the file to write, which is needed, and the
-    seed."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
     parser.add_argument("--scene", default="coronary", help="whose insert and gap range are swept")
     parser.add_argument("--insert", nargs="+", metavar="NAME", help="other inserts, one after the other")
@@ -91,7 +85,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Record all sweeps, write the training CSV `options.out`, and return `out`, `rows` (their number) and `synthetic`."""
     data = record(options.plant, options.scene, options.insert, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_csv(options.out, data)
@@ -99,7 +92,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int) -> Dataset:
-    """Record a hold of the last insert and SWEEPS sweeps of each, in processes, and return the rows of all."""
+    """Record a hold of the last insert and SWEEPS sweeps of each, in parallel."""
     scene = load_scene(scene_name)
     names = inserts or [scene.insert.name]
     courses = [Course(names[-1], (HOLD_GAP_MM,) * HOLD_STROKES, seed + SWEEPS)]  # the longest first
@@ -113,7 +106,7 @@ def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int
 
 
 def sweep_course(scene: Scene, name: str, seed: int) -> Course:
-    """Return the course of a sweep of the insert `name`, from the open gap down and up again, in steps of GAP_STEP_MM."""
+    """Return a sweep from the open gap down and up again, in steps of GAP_STEP_MM."""
     closed_mm, open_mm = scene.insert.gap_closed_mm - BEYOND_MM, scene.insert.gap_open_mm + BEYOND_MM
     offset_mm = np.random.default_rng(seed).uniform(0.0, GAP_STEP_MM)
     between = np.arange(open_mm - offset_mm, closed_mm, -GAP_STEP_MM)
@@ -122,7 +115,7 @@ def sweep_course(scene: Scene, name: str, seed: int) -> Course:
 
 
 def swept(plant: str, scene_name: str, course: Course) -> Array:
-    """Record one course in virtual time and return its rows (n x 6): time_s, the features, force_N along the motion."""
+    """Record one course in virtual time, and return rows (n x 6): time_s, the features, force_N along the motion."""
     scene = bench_scene(load_scene(scene_name), course.insert)
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
     device = VirtualDevice(bench(with_insert(load_plant(plant), course.insert), scene), hand, seed=course.seed)
@@ -144,7 +137,7 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
 
 
 def rows_of(ticks: Array, scene: Scene) -> Array:
-    """Return the training rows (n x 6) that are kept of all ticks (m x 4, 1 ms apart), in order of time."""
+    """Return the training rows (n x 6) of ticks (m x 4, 1 ms apart): time_s, handle_mm, gap_mm, signed force."""
     _, handle_mm, gap_mm, signed_N = ticks.T
     sliding_mm_s, slides = sliding(handle_mm, gap_mm)
     loading_mm_s, loading_mm = loading(handle_mm, gap_mm, signed_N)
@@ -161,7 +154,7 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
 
 
 def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Array]:
-    """Return the handle's rate, mm/s, and its way, mm, since the elastomer bore no force, at each tick (n) of 1 ms."""
+    """Return rate, mm/s, and travel since no force, mm (NaN where no row is due), at each 1 ms tick."""
     gap_mm_s, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     is_resting &= np.abs(gap_mm_s) <= RESTING_GAP_MM_S
     gone = (handle_mm[RATE_TICKS:] - handle_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
@@ -188,7 +181,7 @@ def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Ar
 
 
 def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
-    """Return the handle's rate, mm/s with its sign, at each tick (n) of 1 ms, and a mask (n) of steady sliding."""
+    """Return the handle's signed rate, mm/s, and a mask of steady sliding, at each 1 ms tick."""
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
     slides = np.zeros(len(handle_mm), dtype=np.bool_)
@@ -207,7 +200,6 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
 
 
 def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
-    """Return the rate at each tick of 1 ms over a window around it, mm/s (n), and a mask (n) of where it is even."""
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)
     before, after = np.concatenate((edge, gone)), np.concatenate((gone, edge))
@@ -216,21 +208,20 @@ def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array,
 
 
 def bench_scene(scene: Scene, name: str) -> Scene:
-    """Return `scene` for the bench: with the insert called `name`, wider gaps and a greater force allowed."""
     stroke = msgspec.structs.replace(
         scene.insert,
         name=name,
         gap_closed_mm=scene.insert.gap_closed_mm - BEYOND_MM,
         gap_open_mm=scene.insert.gap_open_mm + STOPS_MM,
     )
-    # no force that these gaps give is a fault on the bench
+    # no force of these gaps is a fault on the bench
     return msgspec.structs.replace(
         scene, insert=stroke, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N)
     )
 
 
 def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
-    """Return `plant` on the bench of `scene`, which `bench_scene` made: with its switches at that scene's gaps."""
+    """Return `plant` with its switches at the gaps of a bench scene."""
     home_mm = scene.insert.gap_open_mm / 2.0
     stops = msgspec.structs.replace(
         plant.assumed,
@@ -243,12 +234,11 @@ def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
 
 
 def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
-    """Return a plan that asks for a gap and nothing else."""
     return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
 
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:
-    """Return the hand's motion from BEGIN_S on, and when each of its `count` strokes ends, s."""
+    """Return the hand's motion from BEGIN_S on, and the end of each of its `count` strokes, s."""
     random = np.random.default_rng(seed)
     times, positions, ends_s = [BEGIN_S], [0.0], []
     for _ in range(count):

@@ -3,8 +3,8 @@
     python -m tormagd.lab.training.calibration SWEEP.csv --insert NAME --out MODEL.safetensors [--csv TRAINING.csv]
     python -m tormagd.lab.training.calibration --insert NAME     only says whether a fit can be made of that insert
 
-A process of its own, so that neither the daemon nor `tormagctl`, which starts it, carries a training. Prints one JSON
-object: `{"result": {...}}`, or `{"error": {"code", "message", "hint"}}` with exit code 1 and no model file.
+It is a process of its own, so that `tormagctl` carries no training. It prints one JSON object: `{"result": {...}}`, or
+`{"error": {"code", "message", "hint"}}` with exit code 1 and no model file.
 """
 
 import argparse
@@ -35,36 +35,35 @@ from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.inserts import Insert, insert
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
-"""Columns of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the
-roller."""
+"The handle's travel is at the roller; rate and force are positive in the direction of motion."
 
 MIN_MOVING_SHARE = 0.3
-"Least share of every sweep in motion. Turning to and fro with rests keeps over half of it."
+"Turning to and fro with rests keeps over half of a sweep in motion."
 MIN_FIELD_SPAN = 0.2
-"Least span of the field, as a share of the greatest."
+"Share of the greatest field."
 MIN_SWEEPS = 3
 JUDGING = (3, 1)
-"Every third sweep, from the second on, is kept from the fit to judge the model."
+"Every third sweep, from the second on, judges the model instead of teaching it."
 VALIDATION_SHARE = 0.3
 STEADY_MM_S = 10.0
-"A handle whose rate stays within this (5th to 95th percentile) teaches nothing about the rate."
+"A handle within this (5th to 95th percentile of its rate) teaches nothing about the rate."
 RARE_SHARE = 0.01
 
 NEEDED = ("torch", "tqdm")
-"Packages that a network needs and not every installation has: checked before anybody turns a handle."
+"Packages that a network needs, checked before anybody turns a handle."
 NEEDED_BY_LAW = ("scipy",)
 
 MIN_R2 = 0.97
 "R2 of the thesis's own network, table 4.1."
 MAX_MAE_SHARE = 0.02
-"As a share of the greatest force: relaxation and temperature, which the model has not, take one to two percent."
+"Of the greatest force: relaxation and temperature, which the model lacks, take one to two percent."
 MAX_MAE_OVER_NOISE = 3.0
 MEAN_OVER_SIGMA = math.sqrt(2.0 / math.pi)
 "Mean absolute value of Gaussian noise over its standard deviation."
 
 
 class CalibrationError(ValueError):
-    """Sweep that gives no model: a stable code, what was found beside what is needed, and what to do."""
+    """A sweep that gives no model: a stable code, what was found beside what is needed, and what to do."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(message)
@@ -72,7 +71,7 @@ class CalibrationError(ValueError):
 
 
 def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
-    """Return the training rows of sweeps (n x 6, order of COLUMNS, sweep by sweep) in which the handle moves."""
+    """Return the rows of sweeps (n x 6, as COLUMNS) in which the handle moves."""
     _, sweep, _, handle_mm, rate_mm_s, _ = table.T
     rate_mm_s = np.abs(rate_mm_s)
     is_moving = rate_mm_s >= MOVING_MM_S
@@ -108,13 +107,13 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
 
 
 def displacement(handle_mm: Array) -> Array:
-    """Return the displacement at each of the handle's positions `handle_mm` (n, in order of time), mm."""
+    """Return the distance from the last turn (n), at most MOBILISED_MM, and NaN before the first."""
     found = np.full_like(handle_mm, np.nan)
     start_mm = float(handle_mm[0])
     turn, is_known = Turn(1.0, start_mm, start_mm), False
     for index, position_mm in enumerate(handle_mm.tolist()):
         last, turn = turn, turn.moved_to(position_mm)
-        # the first reversal may be no turn, but a handle that came this way all the time
+        # at the first reversal the handle may have come this way all the time
         has_turned = turn.direction != last.direction and last.turned_mm != last.furthest_mm
         is_known = is_known or has_turned or abs(position_mm - start_mm) >= MOBILISED_MM
         if is_known:
@@ -123,7 +122,7 @@ def displacement(handle_mm: Array) -> Array:
 
 
 def require_usable(data: Dataset) -> None:
-    """Raise CalibrationError for data of `training_rows` that no fit can make a model of; else do nothing."""
+    """Refuse data that no fit can make a model of."""
     assert data.cycle is not None  # training_rows sets it
     sweeps = len(np.unique(data.cycle))
     if sweeps < MIN_SWEEPS:
@@ -152,12 +151,12 @@ def require_usable(data: Dataset) -> None:
 
 
 def noise_sd_N(data: Dataset) -> float:
-    """Return the standard deviation of the force sensor's noise, N, from third differences of neighbouring rows."""
+    """Return the force sensor's noise from third differences of neighbouring rows."""
     assert data.time_s is not None  # training_rows sets it
     steps = np.diff(data.time_s)
     third = np.diff(data.force_N, 3)
     together = np.convolve(steps < 2.0 * np.median(steps), np.ones(3), "valid") == 3.0
-    # 1.4826 turns a Gaussian's median deviation into its standard deviation, sqrt(20) a third difference's into a row's
+    # 1.4826 turns a Gaussian's median deviation into a standard one, sqrt(20) a third difference's into a row's
     return float(1.4826 * np.median(np.abs(third[together])) / math.sqrt(20.0)) if together.any() else 0.0
 
 
@@ -170,14 +169,14 @@ def fit(
     epochs: int = 200,
     by_law: bool = False,
 ) -> ForceModel:
-    """Train a model on all sweeps but the judging ones, and return it with the judgement in its metrics."""
+    """Train on all sweeps but the judging ones, and return the model with the judgement in its metrics."""
     assert data.cycle is not None  # training_rows sets it
     numbers = np.unique(data.cycle)
     is_judging = np.isin(data.cycle, numbers[JUDGING[1] :: JUDGING[0]])
     training, validation = data.subset(~is_judging).split(VALIDATION_SHARE, seed=0)
     shared: dict[str, Any] = {"created": created, "hidden": hidden, "epochs": epochs, "data_sha256": data.sha256()}
     if by_law:
-        from tormagd.lab.training.law import fit_law_model  # SciPy, and torch below, take seconds to load
+        from tormagd.lab.training.law import fit_law_model  # SciPy and torch take seconds to load
 
         model = fit_law_model(training, validation, insert_name=insert_name, **shared)
     else:
@@ -209,7 +208,7 @@ def fit(
 
 
 def require_rising(model: ForceModel) -> None:
-    """Raise CalibrationError (not_rising) where the fully mobilised force falls with the field by over 1 % of its span."""
+    """Refuse a model whose mobilised force falls with the field by over 1 % of its span."""
     ranges = dict(zip(FEATURES, model.feature_ranges, strict=True))
     rate_mm_s = sum(ranges["rate_mm_s"]) / 2.0
     rows = np.array(
@@ -238,7 +237,6 @@ def calibrate(
     created: datetime.date,
     by_law: bool = False,
 ) -> dict[str, Any]:
-    """Make the model file `out` from the file `sweep`, and the training data `training_csv` (None: no such file)."""
     data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
     require_usable(data)
     model = fit(data, insert_name, created, by_law=by_law)
@@ -258,12 +256,10 @@ def calibrate(
 
 
 def read_sweep(path: Path) -> Array:
-    """Read a sweep file and return its rows (n x 6), in the order of COLUMNS."""
     return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED, is_exact=True).values()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the calibration from the command line, print one JSON object on stdout and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(
         "sweep", type=Path, nargs="?", metavar="SWEEP.csv", help=f"columns {','.join(COLUMNS)}; none: check the insert"

@@ -1,6 +1,6 @@
-"""Training data: what was measured, as arrays, and the CSV file that carries it; how a model is judged on it.
+"""Training data as arrays, the CSV file that carries it, and how a model is judged on it.
 
-Rows judge a model that did not learn from them: those are drawn at random, or are whole groups.
+A model is judged on rows that it did not learn from, drawn at random or in whole groups.
 """
 
 import csv
@@ -33,12 +33,14 @@ ALLOWED = {
     "cycle": (0.0, 1e9),
     "time_s": (0.0, 1e9),
 }
-"""Wider than any device this program drives, and narrow enough to catch a wrong unit or a shifted column."""
+"""Wider than any device, and narrow enough to catch a wrong unit or a shifted column. Rates are negative while the
+element is unloaded."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Measured rows: features (n x 4, order of `FEATURES`), force_N (n), and optionally cycle (n) and time_s (n)."""
+    """Measured rows: features (n x 4, order of `FEATURES`), forces (n), and optionally times and `cycle`, which labels
+    rows that a split keeps together."""
 
     features: Array
     force_N: Array
@@ -47,7 +49,6 @@ class Dataset:
 
     @classmethod
     def of(cls, columns: Mapping[str, NDArray[Any]]) -> "Dataset":
-        """Return the data of columns by name, as the method `columns` gives them; `cycle` is cut to whole numbers."""
         cycle = columns["cycle"].astype(np.int64) if "cycle" in columns else None
         features = np.column_stack([columns[name] for name in FEATURES])
         return cls(features, columns["force_N"], cycle, columns.get("time_s"))
@@ -57,7 +58,6 @@ class Dataset:
             raise LabError(f"{len(self.force_N)} rows; at least 2 are needed")
 
     def columns(self) -> dict[str, Array | NDArray[np.int64]]:
-        """Return each column by its name, as in the file; the optional ones only where they exist."""
         columns = (*self.features.T, self.force_N, self.cycle, self.time_s)
         named = zip((*COLUMNS, *OPTIONAL_COLUMNS), columns, strict=True)
         return {name: column for name, column in named if column is not None}
@@ -66,12 +66,10 @@ class Dataset:
         return len(self.force_N)
 
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Return the least and the greatest value of each feature and of force_N."""
         columns = self.columns()
         return {name: (float(columns[name].min()), float(columns[name].max())) for name in COLUMNS}
 
     def scaling(self) -> Scaling:
-        """Return the scaling that maps each feature's range, and the force's, onto -1..1."""
         low, high = self.features.min(axis=0), self.features.max(axis=0)
         span = high - low
         gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
@@ -88,8 +86,7 @@ class Dataset:
         )
 
     def sha256(self) -> str:
-        """Return the digest, in hexadecimal, of names and values: the same whatever the file's number format or line
-        ends."""
+        """Return the digest of names and values, whatever the file's number format or line ends."""
         digest = hashlib.sha256()
         for name, column in self.columns().items():
             digest.update(f"{name} {len(column)} ".encode())
@@ -97,11 +94,10 @@ class Dataset:
         return digest.hexdigest()
 
     def subset(self, rows: NDArray[np.integer] | Mask) -> "Dataset":
-        """Return the chosen `rows`, indices or a mask (n), as data of their own, in the order of the indices."""
         return Dataset.of({name: column[rows] for name, column in self.columns().items()})
 
     def split(self, validation_share: float, seed: int) -> tuple["Dataset", "Dataset"]:
-        """Split at random into (training, validation), the same way for the same seed; rows keep their order."""
+        """Split into training and validation at random, by `seed`; rows keep their order."""
         if not 0 < validation_share < 1:
             raise LabError(f"validation_share = {validation_share} is not allowed, only between 0 and 1")
         groups = np.arange(len(self)) if self.cycle is None else self.cycle
@@ -118,21 +114,19 @@ class Dataset:
 
 
 def records(time_s: Array) -> list[slice]:
-    """Return the rows of each record in times (n), in order: a new one begins wherever time goes back."""
+    """Return the rows of each record: a new one begins wherever time goes back."""
     starts = [0, *(np.flatnonzero(np.diff(time_s) < 0) + 1).tolist(), len(time_s)]
     return [slice(first, last) for first, last in itertools.pairwise(starts)]
 
 
 def times_of(data: Dataset) -> Array:
-    """Return `time_s` of the data."""
     if data.time_s is None:
         raise DomainError("time_s", None, "a column of the data: a model with memory needs it")
     return data.time_s
 
 
 def read_csv(path: Path) -> Dataset:
-    """Read training data: header `displacement_mm,rate_mm_s,field_mT,cip_percent,force_N` (+ `cycle`, `time_s`), in any
-    order."""
+    """Read training data, with its columns in any order; `cycle` and `time_s` are optional."""
     named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, allowed=ALLOWED, is_exact=True)
     cycle = named.get("cycle", np.zeros(0))
     for row in np.flatnonzero(cycle != np.floor(cycle))[:1].tolist():
@@ -141,7 +135,7 @@ def read_csv(path: Path) -> Dataset:
 
 
 def write_csv(path: Path | str, dataset: Dataset) -> None:
-    """Write `dataset` to `path`, replacing a file, so that `read_csv` gives back the same numbers to the last bit."""
+    """Write `dataset` so that `read_csv` gives back the same numbers to the last bit."""
     columns = dataset.columns()
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -150,21 +144,20 @@ def write_csv(path: Path | str, dataset: Dataset) -> None:
 
 
 def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
-    """Return a mask (rows), True for the rows held out: `share` of them, rounded, drawn by `seed`."""
+    """Return a mask of the held-out `share` of so many rows, drawn by `seed`."""
     held = np.zeros(rows, dtype=np.bool_)
     held[np.random.default_rng(seed).permutation(rows)[: round(share * rows)]] = True
     return held
 
 
 def leave_one_out(dataset: Dataset, feature: str) -> Iterator[tuple[float, Mask]]:
-    """Yield each value of `feature` (whole fields, whole classes) with the mask of the rows that have it."""
     column = dataset.features[:, FEATURES.index(feature)]
     for value in np.unique(column):
         yield float(value), column == value
 
 
 def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[int, Mask]]:
-    """Yield the number of each of `folds` folds, from 0, and the mask (n) of its rows, True for those held out."""
+    """Yield the number of each fold, and the mask of the whole cycles that it holds out."""
     assert dataset.cycle is not None
     parts = np.array_split(np.random.default_rng(seed).permutation(np.unique(dataset.cycle)), folds)
     for fold, part in enumerate(parts):
@@ -172,7 +165,7 @@ def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[
 
 
 def trained_metrics(model: ForceModel, training: Dataset, validation: Dataset) -> dict[str, float]:
-    """Return what a model file says of its training: errors on both data sets, their rows, and `not_rising_share`."""
+    """Return a model file's metrics: errors on both data sets, their rows, and `not_rising_share`."""
     return {
         **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},
         **{f"validation_{name}": value for name, value in fit_metrics(model, validation).items()},
@@ -183,12 +176,11 @@ def trained_metrics(model: ForceModel, training: Dataset, validation: Dataset) -
 
 
 def fit_metrics(model: ForceModel, dataset: Dataset) -> dict[str, float]:
-    """Return a model's errors on a data set as `force_metrics` does; percents are of the training force span."""
     return force_metrics(model.predict(dataset.features), dataset.force_N, model.force_span_N)
 
 
 def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str, float]:
-    """Return mae_N, rmse_N, max_N, mae_percent (of `span_N`) and r2 of forces (n), N, predicted by any model."""
+    """Return mae_N, rmse_N, max_N, mae_percent (of `span_N`) and r2 of predicted forces."""
     error_N = predicted_N - force_N
     variance = float(np.var(force_N))
     mae_N = float(np.abs(error_N).mean())
@@ -199,13 +191,13 @@ def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str
         "rmse_N": float(np.sqrt(mean_square)),
         "max_N": float(np.abs(error_N).max()),
     }
-    if variance > 0:  # a subset of equal forces has no variance to explain
+    if variance > 0:  # equal forces have no variance to explain
         metrics["r2"] = 1 - mean_square / variance
     return metrics
 
 
 def not_rising_share(model: ForceModel, points: int = 17) -> float:
-    """Return the share, 0..1, of a grid over the training box (`points` per feature that varies) where dF/dB <= 0."""
+    """Return the share of a grid over the training box where dF/dB <= 0."""
     if model.metadata.boxes:
         return max(not_rising_share(model.of(name), points) for name in model.metadata.boxes)
     axes = [np.linspace(low, high, points if high > low else 1) for low, high in model.feature_ranges]

@@ -18,7 +18,7 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.inserts import insert
 
 VALIDATION_SHARE = 0.1
-"""Share of the training rows that says when the training stops; the test rows have no part in that."""
+"Share of the training rows that decides when training stops; test rows have no part in that."
 
 
 def fit_model(
@@ -37,13 +37,13 @@ def fit_model(
     start: ForceModel | None = None,
     rising: bool = False,
 ) -> tuple[ForceModel, Training]:
-    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went."""
+    """Train on `training`, stop by `validation`, and return the model with its metrics, and how it went."""
     ranging = scaled_by or training
     scaling = ranging.scaling()
     network = ForceNetwork(scaling, hidden, seed=seed)
     if start is not None:
         _begin_with(network, scaling, start)
-    metadata = ModelMetadata(  # before the training, which a wrong name should not have to wait for
+    metadata = ModelMetadata(  # first, so that a wrong name does not wait for the training
         element=element,
         insert=inserts[0] if len(inserts) == 1 else inserts[0].rpartition("-")[0],
         hidden=hidden,
@@ -68,7 +68,7 @@ def fit_model(
 def fit_network(
     data: Dataset, known: Mask, hidden: int = 50, epochs: int = 162, start: ForceModel | None = None
 ) -> tuple[ForceModel, Training]:
-    """Train the thesis's network (section 4.2.5) for the tactile element on the rows of `data` in the mask `known` (n)."""
+    """Train the thesis's network (section 4.2.5) for the tactile element on the rows `known`."""
     rows = data.subset(known)
     stop = random_split(len(rows), 0, VALIDATION_SHARE)
     return fit_model(
@@ -86,7 +86,6 @@ def fit_network(
 
 
 def _box(data: Dataset, name: str) -> Ranges:
-    """Return the ranges of an insert's own rows."""
     is_own = data.features[:, CIP] == 100.0 * insert(name).cip_fraction
     if is_own.sum() < 2:
         raise DomainError("insert", name, "one that there are rows of, by cip_percent")
@@ -95,7 +94,7 @@ def _box(data: Dataset, name: str) -> Ranges:
 
 @torch.no_grad()
 def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> None:
-    """Give `network`, in place, the weights of `start`, folded from its scaling into `scaling`, that of `network`."""
+    """Give `network` the weights of `start`, converted to the network's own scaling."""
     weight, bias, output, constant = start.physical
     gain = np.array(scaling.input_gain)
     network.hidden_weight.copy_(torch.tensor(np.divide(weight, gain, out=np.zeros_like(weight), where=gain != 0)))

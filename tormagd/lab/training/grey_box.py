@@ -1,9 +1,8 @@
 """The relaxation-aware model: a network for the force without memory, and Prony series for the stress's relaxation.
 
-F0 = NN(displacement, rate, field, CIP) is the force without memory. Its part without field, NN(.., 0, ..), and what the
-field adds relax each by fractions of their own, with the same times (see `tormagd.physics.relaxation`). The memory
-enters an inverse as a shift: `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now. Any search
-through the network finds the field for that F0.
+F0 = NN(displacement, rate, field, CIP) is the force without memory. Its part without field and what the field adds
+relax by fractions of their own, with the same times (see `tormagd.physics.relaxation`). For an inverse, the memory is a
+shift. `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now, and any search finds the field for it.
 """
 
 import functools
@@ -23,7 +22,7 @@ START_FRACTION = 0.03
 TIME_SPREAD = 3.0
 """Fitted times stay within this factor of their starts, so that they cannot change places."""
 ROUNDS = 4
-"""Rounds of fitting: the network learns from forces freed of memory, which it predicts itself, and has to settle."""
+"The network learns from forces freed of memory, which it predicts itself, and so has to settle."
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,6 @@ class GreyBox:
     field_series: PronySeries
 
     def predict(self, data: Dataset) -> Array:
-        """Return the force (n), N, along the records of `data`."""
         return _with_memory((self.series, self.field_series), elastic_parts_N(self.model, data), data)
 
 
@@ -48,18 +46,17 @@ class GreyBoxMemory:
         self._state, self._field_state = grey.series.relaxed(0.0), grey.field_series.relaxed(0.0)
 
     def elastic_N(self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float) -> float:
-        """Return the force without memory, N, at which the pad gives `force_N` at the end of the next step."""
+        """Return the force without memory that gives `force_N` at the end of the next step."""
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         rest_N, _ = self._step.advance(self._state, free_N)
-        # the force is affine in the driving one: its value at 0 and its slope
+        # the force is affine in the driving one: take its value at 0 and its slope
         step, state = self._field_step, self._field_state
         past_N, _ = step.advance(state, 0.0)
         gain = step.equilibrium_fraction + sum(g * k for g, k in zip(step.fractions, step.gains, strict=True))
         return free_N + (force_N - rest_N - past_N) / gain
 
     def advance(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Take one step, which ends at this motion and field, and return the force, N, that the model expects at its
-        end."""
+        """Take one step to this motion and field, and return the force expected at its end."""
         free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
         whole_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
         rest_N, self._state = self._step.advance(self._state, free_N)
@@ -68,7 +65,7 @@ class GreyBoxMemory:
 
 
 def elastic_parts_N(model: ForceModel, data: Dataset) -> tuple[Array, Array]:
-    """Return the two parts (n each), N, of the force without memory in `data`: without field, and what a field adds."""
+    """Return both parts (n each) of the force without memory: without field, and what the field adds."""
     fieldless = data.features.copy()
     fieldless[:, FIELD] = 0.0
     free_N = model.predict(fieldless)
@@ -80,9 +77,9 @@ def _with_memory(series: tuple[PronySeries, PronySeries], parts: tuple[Array, Ar
 
 
 def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
-    """Return the force with memory (n), N, from the force without, `elastic_N` (n), along the records of `data`."""
+    """Return the force with memory (n) from the force without, along the records."""
     times = times_of(data)
-    # records with the same times run side by side: a laboratory repeats one program, and rows are slow one by one
+    # records with equal times run side by side, as rows are slow one by one
     alike: dict[bytes, list[slice]] = {}
     for rows in records(times):
         alike.setdefault(times[rows].tobytes(), []).append(rows)
@@ -95,9 +92,9 @@ def relaxed_N(series: PronySeries, elastic_N: Array, data: Dataset) -> Array:
 
 
 def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
-    """Return the force with memory (n x r), N, of r records with the same times `time_s` (n), s from the last rest."""
+    """Return the force with memory (n x r) of r records with equal times (n)."""
     first_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 and time_s[0] > 0 else 0.0
-    # rounded, so that steps that are equal but for the rounding of the time share one update
+    # rounded, so that steps that are equal but for rounding share one update
     steps_s = np.round(np.diff(time_s, prepend=time_s[0] - first_s), 9).tolist()
     known = {dt_s: series.discretise(dt_s) for dt_s in set(steps_s)}
     decays = np.array([known[dt_s].decays for dt_s in steps_s])[:, :, np.newaxis]
@@ -117,7 +114,7 @@ def _relax_alike(series: PronySeries, driving_N: Array, time_s: Array) -> Array:
 
 
 def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries, PronySeries]:
-    """Fit the relaxation of two parts of the force to `holds`, and return a series for each part, with the same times."""
+    """Fit the relaxation of both parts of the force to `holds`, a series each with the same times."""
     at_rest = holds.features[:, RATE] == 0.0
     still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(times_of(holds))]
     terms = len(START_TIMES_S)
@@ -129,7 +126,7 @@ def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries,
 
     @functools.cache
     def branches(time_s: float) -> tuple[Array, Array]:
-        # the force of one branch: the fractions enter linearly, so only a changed time costs a run along the records
+        # fractions enter linearly, so only a changed time costs a run along the records
         single = PronySeries((0.5,), (time_s,))
         return 2 * relaxed_N(single, parts[0], holds) - parts[0], 2 * relaxed_N(single, parts[1], holds) - parts[1]
 
@@ -155,9 +152,8 @@ def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries,
 def fit_grey_box(
     data: Dataset, known: Mask, holds: Dataset, *, hidden: int = 30, epochs: int = 100, settling_epochs: int = 30
 ) -> GreyBox:
-    """Fit the model to the rows of cycles, `data`, in the mask `known` (n), and to relaxation tests, `holds`; return
-    it."""
-    from tormagd.lab.training.fitting import fit_network  # with torch, which a fitted model does without
+    """Fit the model to the rows `known` of `data`, and to the relaxation tests `holds`."""
+    from tormagd.lab.training.fitting import fit_network  # loads torch, which a fitted model does without
 
     model, _ = fit_network(data, known, hidden, epochs)
     for _ in range(ROUNDS):

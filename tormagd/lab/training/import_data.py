@@ -3,8 +3,8 @@
 tormag-lab import-data FILE.csv ... --cip 40 --out rows.csv
 
 Needed are force, field, and the rate, or time and displacement. Comments, a preamble, decimal commas and a row of units
-are understood. The force is the brake's: positive, against the motion. A force that changes its sign with the rate's
-becomes so. The displacement is the travel since the handle turned, up to 2 mm.
+are understood. The force becomes positive against the motion, and the displacement the travel since the handle turned,
+up to 2 mm.
 """
 
 import argparse
@@ -35,7 +35,7 @@ UNITS = {
     "cip_percent": {"%": 1.0, "percent": 1.0},
     "cycle": {"": 1.0},
 }
-"The first unit of each quantity is taken where the file states none."
+"Factors to our units; a file that states no unit has the first."
 NAMES = {
     "force_N": ("force", "load", "f"),
     "field_mT": ("field", "flux density", "b"),
@@ -46,54 +46,48 @@ NAMES = {
     "cycle": ("cycle", "run", "sweep"),
 }
 MIN_NAMED = 2
-"Columns with a known name that make a row the header."
+"A row with so many known names is the header."
 ABSENT = ("", "nan", "-")
-"Cells without a value, in small letters."
+"Cells without a value, in lower case."
 MIN_ROWS = 2
 MIN_FIELD_MT = 5.0
-"A greatest field below this, of no stated unit, is more likely in tesla."
+"A smaller maximum without a stated unit is more likely in tesla."
 SIGN_SHARE = 0.95
-"Least share of the rows beyond the noise that have to agree on how the sign of the force goes."
+"Least share of the rows beyond the noise that agree on the force's sign."
 QUIET = 0.05
-"Share of the greatest force, and of the fastest rate, below which a sign is noise."
+"A sign is noise below this share of the greatest force or rate."
 OUTLIER_SDS, OUTLIER_OF_RANGE = 12.0, 0.05
-"A force is an outlier that far from the median of its neighbours: in their deviations, and of the range of forces."
+"An outlier is so far from its neighbours' median: in their deviations, and in the range of forces."
 NEIGHBOURS = 5
 MAX_OUTLIERS = 0.02
 GAP_OF_RANGE = 0.25
-"Between neighbouring fields, or rates on a logarithmic scale, a gap of this share of the range is missing data."
+"A gap of this share of the range, of rates on a logarithmic scale, is missing data."
 RATES_MM_S = (0.5, 300.0)
-"Rates that a handle meets."
 
 
 class Column(NamedTuple):
-    """A column of a file, taken for a quantity."""
-
     name: str
     unit: str
     factor: float
-    "From its unit to the quantity's."
+    "From its unit to ours."
     has_unit: bool
 
 
 Stated = tuple[str, str | None]
-"A column's name and unit, as a person states them; None: the quantity's usual unit."
+"A column's name and unit, as a person states them; None is the usual unit."
 
 
 class Imported(NamedTuple):
-    """What became of one file."""
-
     data: Dataset
     taken: dict[str, str]
-    "By quantity, the column and unit that it was taken from."
+    "Column and unit, by quantity."
     made: list[str]
-    "In words, what was turned round or computed."
+    "What was turned round or computed, in words."
     left_out: dict[str, int]
     "Rows by reason."
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab import-data`; only the files and `--out` are needed."""
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.csv", help="several are one cycle each")
     parser.add_argument("--out", type=Path, required=True, metavar="ROWS.csv", help="for train-model, a new file")
     parser.add_argument("--cip", type=within(0.0, 100.0, "%"), metavar="PERCENT", help="iron, where no column has it")
@@ -108,7 +102,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Write `options.out` from `options.files` and return what was taken for what, left out, and missing."""
     if options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
     if options.picture is not None and options.picture.suffix != ".png":
@@ -140,7 +133,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | None, cycle: int | None) -> Imported:
-    """Return the rows of a file as training data; `cip_percent` and `cycle` stand for columns that it lacks."""
+    """Return the rows of a file as training data; `cip_percent` and `cycle` replace missing columns."""
     columns, quantities, missing = _read(path, stated)
     if cip_percent is None and "cip_percent" not in quantities:
         raise LabError(f"{path}: no column has the share of iron; state it by --cip PERCENT")
@@ -164,7 +157,7 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
 
 
 def _stated(text: str) -> tuple[str, Stated]:
-    """Return the quantity, and the column's name and unit, of the option `QUANTITY=NAME[:UNIT]`; no unit is None."""
+    """Parse the option `QUANTITY=NAME[:UNIT]`."""
     quantity, equals, column = text.partition("=")
     name, colon, unit = column.rpartition(":")
     if not colon:
@@ -176,7 +169,7 @@ def _stated(text: str) -> tuple[str, Stated]:
 
 
 def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], dict[str, Array], int]:
-    """Return the columns of a file by quantity, their values in our units, and how many rows lacked one."""
+    """Return columns and values by quantity, in our units, and how many rows lacked one."""
     rows = _rows(path)
     header, columns = _header(path, rows, stated)
     places = {name: header.index(column.name) for name, column in columns.items()}
@@ -208,7 +201,7 @@ def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], 
 def _header(
     path: Path, rows: Iterator[tuple[int, list[str]]], stated: Mapping[str, Stated]
 ) -> tuple[list[str], dict[str, Column]]:
-    """Take rows until one names MIN_NAMED quantities; return its cells, and the columns by quantity."""
+    """Take rows until one names MIN_NAMED quantities, and return its cells and the columns."""
     header: list[str] = []
     columns: dict[str, Column] = {}
     for _, header in rows:
@@ -222,7 +215,7 @@ def _header(
 
 
 def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[str, Array]) -> None:
-    """Raise LabError for fields of no stated unit that are more likely in tesla, and for a time that falls in a cycle."""
+    """Refuse fields that are likely in tesla, and a time that falls within a cycle."""
     field, most_mT = columns["field_mT"], found["field_mT"].max()
     if not field.has_unit and most_mT < MIN_FIELD_MT:
         raise LabError(
@@ -243,7 +236,7 @@ def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[s
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line, from 1, and the cells of each row, with decimal points; comments and empty rows are left out."""
+    """Yield each row's line number and cells, without comments and empty rows."""
     try:
         text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8-sig")
     except OSError as error:
@@ -260,7 +253,6 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _columns(path: Path, header: list[str], stated: Mapping[str, Stated]) -> dict[str, Column]:
-    """Return which column of `header` is which quantity, stated ones first; a cell that no name fits is passed over."""
     found: dict[str, Column] = {}
     for cell in header:
         match = re.fullmatch(r"([A-Za-z ]+?)[ _]*(?:[\[(](.*)[\])]|_([A-Za-z_/%]+))?", cell)
@@ -297,20 +289,19 @@ def _number(text: str) -> float | None:
 
 
 def _without_duplicates(quantities: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
-    """Return the quantities with each row once, in the order in which they were measured, and how many went."""
     table = np.column_stack(list(quantities.values()))
     kept = np.sort(np.unique(table, axis=0, return_index=True)[1])
     return {name: values[kept] for name, values in quantities.items()}, len(table) - len(kept)
 
 
 def _outliers(path: Path, force_N: Array) -> Mask:
-    """Return a mask (n) of the forces that are far from the median of their neighbours, in order of time."""
+    """Return a mask of the forces far from the median of their neighbours in time."""
     half = NEIGHBOURS // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(force_N, half, mode="edge"), NEIGHBOURS)
     off_N = np.abs(force_N - np.median(around, axis=1))
     range_N = np.subtract(*np.percentile(force_N, (98.0, 2.0)))
     most_N = max(OUTLIER_SDS * 1.4826 * float(np.median(off_N)), OUTLIER_OF_RANGE * float(range_N))
-    # rows of a table without order jump everywhere: there nothing is an outlier by its neighbours
+    # rows of an unordered table jump everywhere, so neighbours name no outlier there
     far: Mask = (off_N > most_N) & (np.median(off_N) <= OUTLIER_OF_RANGE * range_N)
     if (share := float(far.mean())) > MAX_OUTLIERS:
         raise LabError(f"{path}: {share:.1%} of the forces are far from the next ones; allowed is {MAX_OUTLIERS:.0%}")
@@ -318,7 +309,7 @@ def _outliers(path: Path, force_N: Array) -> Mask:
 
 
 def _sign(path: Path, quantities: dict[str, Array]) -> str:
-    """Turn `quantities["force_N"]` so that it is positive against the motion, and return in words what was done."""
+    """Make the force positive against the motion, in place, and return what was done."""
     force_N, rate = quantities["force_N"], quantities.get("rate_mm_s")
     if rate is None:
         rate = np.gradient(quantities["displacement_mm"]) if "displacement_mm" in quantities else np.ones(len(force_N))
@@ -337,8 +328,7 @@ def _sign(path: Path, quantities: dict[str, Array]) -> str:
 
 
 def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
-    """Give the rate its magnitude and the displacement its meaning, travel since the turn; return in words what was
-    made of what."""
+    """Make the rate a magnitude and the displacement the travel since the turn, and return what was done."""
     made = []
     place, time_s = quantities.get("displacement_mm"), quantities.get("time_s")
     if "rate_mm_s" not in quantities:
@@ -361,7 +351,7 @@ def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
 
 
 def _missing(data: Dataset) -> list[str]:
-    """Return in words what the data lack: gaps in field and rate, and rates at the ends of what a handle meets."""
+    """Return in words the gaps in field and rate, and the missing ends of what a handle meets."""
     fields_mT = np.unique(data.features[:, 2])
     rates = np.log10(np.unique(np.clip(data.features[:, 1], RATES_MM_S[0], None)))
     missing = []
@@ -381,7 +371,6 @@ def _missing(data: Dataset) -> list[str]:
 
 
 def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
-    """Draw field and rate of all rows, coloured by force, into the PNG file `path`."""
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)
     title = "\n".join(missing) or "fields and rates are covered"

@@ -1,12 +1,12 @@
 """The device's law: the force of a brake with one insert in ten numbers, fitted by least squares, without torch.
 
     K = m K0(b) + F0                   K0: the thesis's force law (Eq. 33) of the insert, its modulus scaled, too
-    b = tanh(q B_m (B / B_m)^n) / q    what of the field B acts: not quite what the gap says, and iron saturates
+    b = tanh(q B_m (B / B_m)^n) / q    what of the field B acts: iron saturates
     L = K (1 + r exp(-(v / v_s)^2) + e ln((v + v_0) / (v_1 + v_0))) + c v
     F = L (1 - exp(-k x / L)) before mobilisation, then L
 
-It rises with the field, whatever the rows, and some fifty of them tell it. Only a brake has it. A model file holds a
-network, so one that rises with the field is fitted to the law. The file's metrics say how far the two differ.
+The law rises with the field whatever the rows, and about fifty of them determine it. A network that rises with the
+field is fitted to it for the model file, whose metrics say how far the two differ.
 """
 
 import datetime
@@ -35,23 +35,22 @@ MIDDLE_MT = 450.0
 REFERENCE_MM_S, SLOW_MM_S = 42.0, 0.1
 "v_1 and v_0."
 MIN_N = 1e-6
-"Least level that the fit tries."
 ROBUST_N = 0.05
-"Errors beyond this count less: rows near a reversal."
+"Larger errors count less: they are rows near a reversal."
 FITTED_ROWS = 3000
 DRAWN = 2048
-"Points of the box at which the network is fitted to the law."
+"Points of the box at which the network is fitted."
 SLIDING = 0.7
-"Share of these points at full displacement: what plans ask."
+"Share of these points at full displacement, which plans ask for."
 EDGE = 0.05
 "Share of these points at each end of a range."
 
 STEEP, MIN_WEIGHT, MIN_TURN_MM_S = 3.0, 1e-2, 3.0
-"Where the fit of a network begins: the steepness of its units, least weight of the field, least width over the rate."
+"Start of the network's fit: steepness of its units, least weight of the field, least width over the rate."
 
 
 class Law(NamedTuple):
-    """The numbers of the law of one insert. Factors are logarithms; the docstring of the module has the equations."""
+    """The numbers of one insert's law, as in the module's docstring; factors are logarithms."""
 
     log_modulus: float
     log_m: float
@@ -65,7 +64,7 @@ class Law(NamedTuple):
     saturating_1_T: float
 
     def forces_N(self, rows: Array, fitted: Insert) -> Array:
-        """Return the force (n), N, at `rows` (n x 4, order of `FEATURES`) of the insert `fitted`."""
+        """Return the force (n) at `rows` (n x 4, order of `FEATURES`)."""
         displacement_mm, rate_mm_s, field_mT, _ = rows.T
         nominal, thickness_m = fitted.elastomer, TORMAG.thickness_m
         inner_m, outer_m = TORMAG.inner_radius_m, TORMAG.outer_radius_m
@@ -86,7 +85,7 @@ class Law(NamedTuple):
 
 
 def mobilised_N(level_N: Array, displacement_mm: Array, stiffness_N_mm: float) -> Array:
-    """Return the force (n), N, at displacements (n) of an element whose friction has the level (n), N, above 0."""
+    """Return the force (n) at displacements (n) with the friction level (n) above 0."""
     borne_N: Array = level_N * -np.expm1(-stiffness_N_mm * displacement_mm / level_N)
     return np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
 
@@ -98,7 +97,7 @@ SCALE = Law(0.1, 0.1, 0.1, 0.05, 0.1, 0.5, 0.01, 1e-3, 0.5, 0.3)
 
 
 def fit_law(data: Dataset, fitted: Insert) -> Law:
-    """Return the law of the insert `fitted` that is nearest to `data`, by least squares; rows far off count less."""
+    """Fit the law of the insert by least squares in which rows far off count less."""
     kept = data.subset(np.arange(0, len(data), max(1, len(data) // FITTED_ROWS)))
 
     def residual(numbers: Array) -> Array:
@@ -121,7 +120,6 @@ def fit_law_model(
     epochs: int = 200,
     seed: int = 0,
 ) -> ForceModel:
-    """Fit the law of a brake's insert to `training`, and return it as a network of `hidden` units."""
     fitted, (low_mT, high_mT) = insert(insert_name), training.ranges()["field_mT"]
     require_that(low_mT < high_mT, "field_mT", low_mT, "fields that differ: a law is of the force over the field")
     slowest_mm_s = min(float(side.features[:, RATE].min()) for side in (training, validation))
@@ -152,7 +150,7 @@ def fit_law_model(
 
 
 def _drawn(data: Dataset) -> Array:
-    """Return DRAWN rows (n x 4) spread over the box of `data`, its edges included; rates are spread by logarithm."""
+    """Return DRAWN rows (n x 4) over the box of `data`, edges included, with rates spread by logarithm."""
     low, high = data.features.min(axis=0), data.features.max(axis=0)
     share = Halton(len(FEATURES), scramble=False).random(DRAWN)
     share = np.clip((1.0 + 2.0 * EDGE) * share - EDGE, 0.0, 1.0)
@@ -164,7 +162,7 @@ def _drawn(data: Dataset) -> Array:
 
 
 def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: int, seed: int) -> ForceModel:
-    """Return a network that rises with the field everywhere, fitted to `forces_N` (n) at `rows` (n x 4)."""
+    """Return a network that rises with the field everywhere, fitted to forces (n) at `rows` (n x 4)."""
     scaling, hidden = metadata.scaling, metadata.hidden
     inputs = scaling.scaled(rows)
     targets = (forces_N - scaling.output_offset) * scaling.output_gain
@@ -177,7 +175,6 @@ def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: i
 
     @lru_cache(maxsize=1)  # the curvature is asked for where the cost was
     def jacobian(packed: bytes) -> tuple[Array, Array]:
-        """The errors (n), and their slopes (n x p), for numbers (p) as bytes."""
         numbers = np.frombuffer(packed)
         weight, bias, output = split(numbers)
         units = expit(inputs @ weight.T + bias)
@@ -203,7 +200,6 @@ def _as_network(metadata: ModelMetadata, rows: Array, forces_N: Array, epochs: i
 
 
 def _first(metadata: ModelMetadata, rows: Array, seed: int) -> Array:
-    """Return the numbers (p) that the fit of a network begins with, as `_as_network` has them, drawn by `seed`."""
     random = np.random.default_rng(seed)
     scaling, hidden = metadata.scaling, metadata.hidden
     turns = rows[random.integers(len(rows), size=hidden)]

@@ -1,9 +1,8 @@
-"""Levenberg-Marquardt training of the force network (the thesis used it too, section 4.2.5).
+"""Levenberg-Marquardt training of the force network, as in the thesis (section 4.2.5).
 
-Written here and not taken from the package torch-levenberg-marquardt. That differentiates the network for each row
-(vmap over jacrev), in 3.5 times the time of one hidden layer's closed form (4096 rows, 50 units). The damping schedule,
-the early stop and the determinism are part of the published result, so they should be readable in one place. Without
-them and the Jacobian nothing would remain of the package but a Cholesky solve.
+The package torch-levenberg-marquardt differentiates the network for each row (vmap over jacrev). That takes 3.5 times
+as long as one hidden layer's closed form (4096 rows, 50 units). The damping schedule, early stop and determinism are
+part of the published result, so they are readable here.
 """
 
 import math
@@ -20,7 +19,7 @@ from tormagd.model.network import ForceNetwork
 from tormagd.physics.errors import DomainError
 
 BATCH_ROWS = 4096
-"""Rows of the Jacobian held at a time: 10 MB at 50 hidden units, whatever the size of the data set."""
+"10 MB of the Jacobian at 50 hidden units."
 
 INITIAL_DAMPING = 1e-3
 DAMPING_DOWN = 0.1
@@ -30,12 +29,10 @@ MIN_POSITIVE = 1e-3
 MIN_IMPROVEMENT = 1e-4
 MIN_DAMPING = 1e-15
 GREATEST_DAMPING = 1e10
-"""Marquardt's schedule with the factors that trainlm made usual; errors are means, so they fit any number of rows."""
+"Marquardt's schedule with trainlm's usual factors; errors are means, so they fit any number of rows."
 
 
 class Epoch(NamedTuple):
-    """One accepted step, and the root-mean-square errors after it."""
-
     epoch: int
     train_rmse_N: float
     validation_rmse_N: float
@@ -43,7 +40,7 @@ class Epoch(NamedTuple):
 
 @dataclass(frozen=True)
 class Training:
-    """How a training went: every accepted step, the one whose weights were kept, and why it ended."""
+    """A training's accepted steps, the one whose weights were kept, and why it ended."""
 
     history: tuple[Epoch, ...]
     best: Epoch
@@ -51,7 +48,7 @@ class Training:
 
 
 def jacobian(network: ForceNetwork, inputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return scaled force (n) and its derivatives (n x p) by every weight, for scaled `inputs` (n x 4)."""
+    """Return the scaled force (n) and its derivatives (n x p) by every weight."""
     hidden = torch.sigmoid(torch.addmm(network.hidden_bias, inputs, network.hidden_weight.T))
     by_bias = hidden * (1 - hidden) * network.output_weight
     by_weight = (by_bias[:, :, None] * inputs[:, None, :]).flatten(start_dim=1)
@@ -70,7 +67,7 @@ def train(
     patience: int = 10,
     rising: bool = False,
 ) -> Training:
-    """Fit `network`, of float64, to `training` in place, and leave it with the weights that did best on `validation`."""
+    """Fit `network` to `training` in place, and leave it with the weights that did best on `validation`."""
     for name, count in (("epochs", epochs), ("patience", patience)):
         if count < 1:
             raise DomainError(name, count, "1 or more")
@@ -120,15 +117,14 @@ def train(
 
 
 def _made_rising(network: ForceNetwork) -> Tensor:
-    """Turn each unit of `network`, in place, so that it rises with the field; return which parameters must stay
-    positive."""
+    """Turn each unit to rise with the field, in place, and return which parameters must stay positive."""
     weight, output = network.hidden_weight, network.output_weight
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
     weight.mul_(side[:, None])
     network.hidden_bias.mul_(side)
     weight[:, FIELD].clamp_(min=MIN_POSITIVE)
     output.abs_().clamp_(min=MIN_POSITIVE)
-    network.output_bias.fill_(-output.sum() / 2)  # in the middle of the forces
+    network.output_bias.fill_(-output.sum() / 2)
     is_positive = [torch.zeros_like(each, dtype=torch.bool) for each in network.parameters()]
     is_positive[0][:, FIELD] = True
     is_positive[2][:] = True
@@ -145,7 +141,7 @@ def _mean_square(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> floa
 
 
 def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return J'J / n (p x p) and J'r / n (p) of the scaled force over p parameters, with r = output - target."""
+    """Return J'J / n (p x p) and J'r / n (p) of the scaled force, with r = output - target."""
     size = sum(parameter.numel() for parameter in network.parameters())
     normal = torch.zeros(size, size, dtype=inputs.dtype)
     gradient = torch.zeros(size, dtype=inputs.dtype)
@@ -157,7 +153,7 @@ def _normal_equations(network: ForceNetwork, inputs: Tensor, targets: Tensor) ->
 
 
 def _step(normal: Tensor, gradient: Tensor, damping: float) -> Tensor | None:
-    """Return the step (p), -(J'J + damping I)^-1 J'r; None where rounding has cost the matrix its definiteness."""
+    """Return the step (p) -(J'J + damping I)^-1 J'r, or None where rounding made the matrix indefinite."""
     damped = normal + damping * torch.eye(len(gradient), dtype=normal.dtype)
     factor, failed = torch.linalg.cholesky_ex(damped)
     if int(failed):

@@ -23,7 +23,6 @@ from tormagd.output import write_line
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab train-model`; data, element, insert and the file to write are needed."""
     parser.add_argument(
         "data", type=Path, metavar="DATA.csv", help="training CSV; a `cycle` column keeps cycles together"
     )
@@ -51,8 +50,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Train a model on the CSV `options.data`, write it to `options.out` and return `out`, `data_sha256` and its
-    metrics."""
     if options.out.is_dir() or not options.out.parent.is_dir():
         raise LabError(f"cannot write {options.out}: allowed is a file in a folder that exists")
     if options.law and (options.element is not Element.TORQUE or len(options.insert) > 1):
@@ -64,9 +61,8 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, dict[str, str]]:
-    """Train on `data` as `options` say, and return the model with its metrics, and of a network `stopped_by`."""
     if not options.law:
-        from tormagd.lab.training.fitting import fit_model  # with torch, which a law does without
+        from tormagd.lab.training.fitting import fit_model  # loads torch, which a law does without
     data_sha256, memory = data.sha256(), NO_MEMORY
     if options.without_memory:
         memory, data = identify(data)

@@ -1,15 +1,14 @@
 """Bench records freed of memory: what relaxation and the field's hysteresis did to each row is found and taken out.
 
-A force model of displacement, rate and field has no memory; the elastomer and the magnets' circuit have. Fitted to the
-records as they are, a model learns the memory of the bench's own program. So the memory is identified with them:
+A force model of displacement, rate and field has no memory; fitted to raw records, it would learn that of the bench's
+own program. So the memory of the elastomer and of the magnets' circuit is identified with them:
 
     G = D(B - h) m S(v)       m = 1 - sum g_i q_i / D(B)       q_i: D(B) behind a low-pass of time constant tau_i
     F = G (1 - exp(-k x / G)) before mobilisation, then G
 
 D is the force of the field at rest, a smooth curve of each insert. S = 1 + s exp(-(v / v_s)^2) + c v is friction over
-its kinetic level, k x what the elastomer bears at first, over the displacement. h follows the field's changes towards
-+-h_max. A record begins after a long rest at its first row's field. Inserts of one matrix relax alike, and their fields
-lag alike, each to the scale of its greatest.
+its kinetic level. h follows the field's changes towards +-h_max. A record begins after a long rest at its first row's
+field. Inserts of one matrix relax and lag alike, the lag scaled to the field.
 """
 
 import numpy as np
@@ -24,19 +23,19 @@ from tormagd.model.memory import Memory
 START_TIMES_S = (10.0, 100.0, 1000.0)
 "Time constants of field-step tests."
 TIME_SPREADS = (3.0, 3.0, 1.01)
-"""A fitted time stays within this factor of its start, so that times cannot change places."""
+"""Factors that keep times from changing places. Ten minutes do not tell a slow term from a slower and greater one, so
+the last hardly moves."""
 START_FRACTION = 0.03
 DEGREE = 4
-"Degree of the polynomial for the logarithm of D over that of the field."
+"Of the polynomial for the logarithm of D over that of the field."
 FITTED_ROWS = 3000
 MIN_N = 1e-6
-"Least force that the fit tries for an insert."
 ROBUST_N = 0.05
-"Errors beyond this count less: rows near a reversal of the field."
+"Larger errors count less: they are rows near a reversal of the field."
 
 
 def identify(data: Dataset) -> tuple[Memory, Dataset]:
-    """Identify the memory in the records of `data`; return it, and the rows with the forces of a device without memory."""
+    """Identify the memory in `data`, and return it and the rows with forces freed of it."""
     every = max(1, len(data) // FITTED_ROWS)
     kept = data.subset(np.arange(0, len(data), every))
     terms = len(START_TIMES_S)
@@ -58,7 +57,7 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
         return shapes, friction, memory
 
     def forces(parameters: Array, rows: Dataset) -> tuple[Array, Array]:
-        """Without memory, and with it."""
+        """Return the forces without and with memory."""
         shapes, (static, speed_mm_s, viscous, stiffness_N_mm), memory = split(parameters)
         displacement_mm, rate, field_mT, iron = rows.features.T
         of_insert = np.searchsorted(irons, iron)
@@ -100,7 +99,7 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
 
 
 def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
-    """Return by how much the element's field lags behind `field_mT` (n) at each row, mT (n)."""
+    """Return the lag of the element's field behind `field_mT` (n) at each row."""
     lag_mT = np.zeros_like(field_mT)
     for record in records(times_of(rows)):
         now, found = 0.0, []
@@ -114,7 +113,7 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
 
 
 def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:
-    """Return how much of the force `driving_N` (n) has relaxed away at each row, N (n)."""
+    """Return how much of `driving_N` (n) has relaxed away at each row."""
     times, away_N = times_of(rows), np.zeros_like(driving_N)
     fractions = np.array(memory.fractions)
     for record in records(times):

@@ -19,32 +19,32 @@ from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import pull_of_magnets_N
 
 VOLTS, AMPS = 0.5, 0.3
-"Sizes of the errors of both laws in the fit."
+"Error scales of both laws in the fit."
 RIPPLE_MS = 0.02
-"For each ms of a control tick: share by which a current that ripples within it, and is told once, may be off."
+"Relative error, for each ms of a tick, of a current that ripples within the tick and is told once."
 SUPPLY_STEP_V = 0.1
-"In which a Status tells the supply."
+"Resolution of the supply in a Status."
 
 
 class Driven(NamedTuple):
-    """The carriages' estimate, and by how much a speed that it does not explain moves the gap within their lag, RMS."""
+    """The carriages' estimate, and how far unexplained speed moves the gap within their lag, RMS."""
 
     estimate: Estimate
     error_mm: float
 
 
 MIN_MOVING = 200
-"Rows of a carriage: four seconds on the way."
+"Four seconds of motion of a carriage."
 
 
 def lag_s(plant: PlantParameters) -> float:
-    """Return the time constant, s, with which a motor's speed follows the voltage; gearbox and screw do not count."""
+    """Return the time constant of a motor's speed after its voltage, without gearbox and screw."""
     motor = plant.motor
     return motor.inertia_kg_m2 * motor.resistance_Ohm / motor.back_emf_V_s_rad**2
 
 
 def priors_of(plant: PlantParameters, supply_V: float, tick_ms: float) -> list[Prior]:
-    """Return what is believed of carriages before, about `plant`: the spread of the plant card's devices."""
+    """Return what is believed of carriages beforehand: the spread of the plant card's devices."""
     ripple = RIPPLE_MS * tick_ms
     shares = {
         "motor.resistance_Ohm": (0.15, 0.0),
@@ -67,7 +67,6 @@ def priors_of(plant: PlantParameters, supply_V: float, tick_ms: float) -> list[P
 
 
 def fit_carriages(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Driven:
-    """Fit both motors, gearboxes and screws to all moving rows of `ways`, and return them as told beside `prior`."""
     tick_ms = 1e3 / GRID_HZ / float(np.median(ways[0].ticks))
     priors = [
         each
@@ -103,7 +102,7 @@ def fit_carriages(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequenc
 
 
 def _volts_off(plant: PlantParameters, seen: Moves, told: Mapping[str, float]) -> Array:
-    """Return by how much each row (n) of one carriage misses the law of volts, V; above 0 where too much was applied."""
+    """Return by how much each row (n) misses the law of volts, V; positive where too much was applied."""
     motor, omega = plant.motor, _screw(plant, seen.speed_m_s)
     applied = told["supply"] * (seen.volts - told["delay_s"] * seen.volts_s)
     return (
@@ -115,8 +114,7 @@ def _volts_off(plant: PlantParameters, seen: Moves, told: Mapping[str, float]) -
 
 
 def _amps_off(plant: PlantParameters, seen: Moves, pull_N: Array, side: str) -> Array:
-    """Return by how much each row (n) of one carriage misses the law of torque, A; above 0 where the current is too
-    much."""
+    """Return by how much each row (n) misses the law of torque, A; positive where the current is too much."""
     gear, screw = plant.gear, plant.screw
     coupling = gear.ratio * plant.motor.back_emf_V_s_rad
     way = np.sign(seen.speed_m_s)

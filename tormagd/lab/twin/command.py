@@ -1,12 +1,12 @@
-"""Fits a plant file to recordings of one device: the simulator's laws, by regression, without simulating.
+"""Fit a plant file to recordings of one device: the simulator's laws, by regression, without simulating.
 
 tormag-lab twin FILE.mcap ... --out mine.toml
 
-Ordinary use serves: ten minutes with steps, pulses and holds, the handle going both ways. A number is told where its
-95 % interval is at most half as wide as what is believed of any device. What is not told keeps the prior's value, and
-the motion that would tell it is named. Magnets, insert and the sensor's gain share the strength: only a weight parts
-them (tormagctl commission --weight-N). A sensor that stands still is cut out, one that drifts is refused. What the
-laws do not explain is the model error. Exit code 1: it is too large for the plant to stand for this device.
+Ordinary use will do: ten minutes with steps, pulses and holds, the handle going both ways. A number is told where its
+interval (95 %) is at most half as wide as what is believed of any device. The others keep the prior's values, and the
+motion that would tell them is named. Magnets, insert and the sensor's gain share the strength: only a weight parts them
+(tormagctl commission --weight-N). A sensor that stands still is cut out, one that drifts is refused. What the laws do
+not explain is the model error. Exit code 1 means that it is too large for the plant to stand for this device.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from tormagd.simulation.parameters import Assumed, PlantParameters, load_plant
 
 MAX_FILES = 10
 BELIEVED = 0.4
-"No device of the plant card is further off sample 1's strength."
+"No device of the plant card is further from sample 1's strength."
 
 
 SLIDE = "slide the handle both ways at over 20 mm/s for a minute, at several forces"
@@ -57,11 +57,10 @@ MOTIONS: Mapping[str, str] = {
     "force_sensor.drift_mN_min": "record ten minutes, the handle going both ways",
     "force_sensor.delay_ms": "turn the handle round within 0.1 s, ten times",
 }
-"By key or table, what would tell it."
+"What would tell a key, or the keys of a table."
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `tormag-lab twin`."""
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="recordings of one device, unthinned")
     parser.add_argument("--out", type=Path, metavar="PLANT.toml", help="write the plant, a new file")
     parser.add_argument("--prior", default="sample_1", metavar="PLANT", help="what is believed before (sample_1)")
@@ -69,7 +68,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Fit a plant to the recordings `options.files`, and return what is told, what is not, and the model error."""
     if options.out is not None and options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
     if options.plot is not None and options.plot.suffix != ".png":
@@ -89,7 +87,6 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> dict[str, Any]:
-    """Return a twin as plain data: numbers with half the width of their 95 % intervals, and sentences."""
     strength = value_at(twin.plant, STRENGTH) / value_at(prior, STRENGTH)
     error_mN, noise_mN = 1e3 * twin.force.error_N, 1e3 * twin.noise_N
     says = [
@@ -124,8 +121,6 @@ def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> d
 
 
 def draw(path: Path, twin: Twin, way: Excerpt) -> None:
-    """Draw the measured force of one recording, what the plant explains of it, and the difference, to the PNG file
-    `path`."""
     zero_N = 1e-3 * (twin.force.zeros[0]["zero_mN"] + twin.force.zeros[0]["drift_mN_min"] * way.minute)
     explained_N = along(twin.plant, way, twin.force.memory_N, fresh_along(twin.plant, way)) + zero_N
     draw_beside(
@@ -140,13 +135,11 @@ def draw(path: Path, twin: Twin, way: Excerpt) -> None:
 
 
 def motion_for(key: str) -> str:
-    """Return, in words, what would tell a key that the recordings do not; for a key without a motion, that a data sheet
-    does."""
+    """Say what would tell a key that the recordings do not: a motion, or else a data sheet."""
     return MOTIONS.get(key) or MOTIONS.get(key.split(".")[0], DATASHEET)
 
 
 def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
-    """Write the plant to the new file `path`, with the lines of `head` as comments above, and read it again."""
     text = "\n".join([*(f"# {line}" for line in head), *_lines(twin)]) + "\n"
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -160,8 +153,6 @@ def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
 
 
 def _lines(twin: Twin) -> Iterator[str]:
-    """Yield the lines of the plant file: each table's head after an empty line, then `key = value # comment` for each
-    key."""
     tables: dict[str, Any] = msgspec.to_builtins(twin.plant)
     usual = msgspec.to_builtins(Assumed())
     for title in PlantParameters.__struct_fields__:
@@ -175,14 +166,13 @@ def _lines(twin: Twin) -> Iterator[str]:
 
 
 def _short(value: Any) -> Any:
-    """Return a number, or each of a list, to six digits."""
     if isinstance(value, list | tuple):
         return [_short(each) for each in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _comment(twin: Twin, key: str, value: Any) -> str:
-    """Return the comment of a key: how sure it is, or what would tell it."""
+    """Say how sure a key's value is, or what would tell it."""
     if isinstance(value, list | tuple):
         told = [twin.keys.get(f"{key}.{place}") for place in range(len(value))]
         if any(told):

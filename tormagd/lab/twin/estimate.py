@@ -1,6 +1,6 @@
 """Least squares about a prior: the plant that fits, and 95 % intervals of whatever the data tell of it.
 
-What is fitted stands at keys of a plant file, as `motor.resistance_Ohm`.
+Values are fitted at keys of a plant file, such as `motor.resistance_Ohm`.
 """
 
 import math
@@ -17,10 +17,10 @@ from tormagd.lab.arrays import Array
 from tormagd.simulation.parameters import PlantParameters
 
 TOLD = 0.5
-"An interval of at most this share of the prior's is a value; a wider one is unknown."
+"A number is told where its interval is at most this share of the prior's."
 ROUNDS = 12
 STEP = 1e-3
-"Of a derivative, in widths of the prior."
+"Step of a derivative, in widths of the prior."
 
 PARTS = PlantParameters.__struct_fields__[: PlantParameters.__struct_fields__.index("assumed")]
 "Tables of the plant card."
@@ -30,7 +30,7 @@ PlantOf = Callable[[Values], PlantParameters]
 
 
 def value_at(plant: PlantParameters, key: str) -> float:
-    """Return the number at a key of the plant file, as `motor.resistance_Ohm`; `.0` is the first of a list."""
+    """Return the number at a key of the plant file; `.0` is the first of a list."""
     found: Any = plant
     for name in key.split("."):
         found = found[int(name)] if name.isdigit() else getattr(found, name)
@@ -38,8 +38,6 @@ def value_at(plant: PlantParameters, key: str) -> float:
 
 
 def keys_of(plant: PlantParameters) -> list[str]:
-    """Return the keys of all numbers in a plant file, as `value_at` takes them; not of what is assumed, of [pad] or
-    [second]."""
     tables = msgspec.to_builtins(plant)
     named = ((f"{title}.{name}", value) for title in PARTS for name, value in tables[title].items())
     listed = (
@@ -51,7 +49,6 @@ def keys_of(plant: PlantParameters) -> list[str]:
 
 
 def with_values(plant: PlantParameters, values: Mapping[str, float]) -> PlantParameters:
-    """Return the plant with other numbers at some keys, as `value_at` takes them; `plant` itself stays."""
     for key, value in values.items():
         table, name, *index = key.split(".")
         part = getattr(plant, table)
@@ -65,19 +62,19 @@ def with_values(plant: PlantParameters, values: Mapping[str, float]) -> PlantPar
 
 
 class Prior(NamedTuple):
-    """What is known of a number before: its key, its value, and half the width of its interval."""
+    """What is known of a number beforehand. A key without a dot is no key of the plant file."""
 
     key: str
     value: float
     half_width: float
     least: float = -np.inf
-    "No value under this makes sense."
+    "No smaller value makes sense."
     floor: float = 0.0
-    "By how much the way of fitting alone may be off."
+    "How far the way of fitting alone may be off."
 
 
 class Estimate(NamedTuple):
-    """Values (p) of some priors and their covariance (p x p), what they leave (n), and the plant that they make."""
+    """Values (p), their covariance, what residuals they leave, and their plant. `deviations` make 95 %."""
 
     priors: Sequence[Prior]
     values: Array
@@ -91,12 +88,11 @@ class Estimate(NamedTuple):
         return self.plant_of(named(self.priors, self.values))
 
     def width_of(self, key: str) -> float:
-        """Return half the width of the 95 % interval of the values at a key, told or not: the widest."""
+        """Return half the widest 95 % interval of the values at a key."""
         places = [place for place, each in enumerate(self.priors) if each.key == key]
         return self.deviations * math.sqrt(float(np.diag(self.covariance)[places].max()))
 
     def half_width(self, function: Callable[[PlantParameters], float]) -> float:
-        """Return half the width of the 95 % interval of a number of the plant, in its unit."""
         widths = np.array([each.half_width for each in self.priors])
 
         def at(values: Array) -> float:
@@ -110,15 +106,13 @@ class Estimate(NamedTuple):
 
 
 def named(priors: Sequence[Prior], values: Array) -> Values:
-    """Return values (p) by the keys of their priors (p)."""
     return {each.key: value for each, value in zip(priors, values.tolist(), strict=True)}
 
 
 def estimated(
     residuals: Callable[[Array], Array], priors: Sequence[Prior], blocks: Array, noise: float, plant_of: PlantOf
 ) -> Estimate:
-    """Return the values that make `residuals` (n, of the p values) small beside `noise`, and stay near their priors
-    (p)."""
+    """Find the values (p) that make `residuals` (n) small beside `noise` and stay near their priors."""
     middle, widths = (np.array([getattr(each, name) for each in priors]) for name in ("value", "half_width"))
     least = (np.array([each.least for each in priors]) - middle) / widths
 
@@ -129,7 +123,7 @@ def estimated(
     found = least_squares(off, start, bounds=(least, np.inf), xtol=1e-3, ftol=1e-4, max_nfev=ROUNDS)
     numbers = np.concatenate([blocks, blocks.max() + 1.0 + np.arange(len(priors))])
     bread = np.linalg.inv(found.jac.T @ found.jac)
-    # what a prior leaves open is open, however well its middle fits
+    # what a prior leaves open stays open, however well its middle fits
     spread = sandwich(found.jac, found.fun, numbers) + bread @ bread
     return Estimate(
         priors,

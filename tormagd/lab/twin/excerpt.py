@@ -1,6 +1,6 @@
 """What a twin takes from a recording, in one pass: the force a hundred times a second, and how the carriages move.
 
-Of each half minute only that stays in memory, about 5 kB for a second of recording.
+Only that stays in memory, about 5 kB for a second of recording.
 """
 
 import math
@@ -16,25 +16,24 @@ from tormagd.lab.errors import LabError
 from tormagd.recording.reader import RecordingError, Seen, read_recording
 
 GRID_HZ = 100.0
-"Rows of the force: each is the mean of a hundredth of a second."
+"Each row is a mean over its time."
 CHUNK_S = 30.0
 LONGEST_S = 4.0 * 3600.0
 MIN_S, MIN_HZ = 20.0, 200.0
 "A shorter recording shows no memory; a thinned one no motor."
 EVERY_TICK = 0.9
-"Changes of the reading for each tick, above which the sensor is as fast as the ticks, or faster."
+"With more changes of the reading for each tick, the sensor is at least as fast as the ticks."
 MIN_TICKS = 1000
 "A shorter end of a recording is not smoothed for its carriages."
 MOVING_EVERY_S = 0.02
-"Time between two rows of a carriage."
 MIDDLE, MIDDLE_SD = np.linspace(0.3, 0.7, 41), 0.6868
-"Quantiles of how far a value is off, the mean of which steps of the sensor hardly move; and that of a normal one."
+"Middle quantiles, whose mean the sensor's steps hardly move, and that mean of a normal value."
 IDLE_A = 0.2
-"About the current of an idling gearbox; the laws are linear about it."
+"About the current of an idling gearbox, about which the laws are linear."
 
 
 class Tick(msgspec.Struct, frozen=True, gc=False):
-    """What is read of a control tick; NaN is not known."""
+    """What is read of a control tick; NaN is unknown."""
 
     monotonic_s: float = math.nan
     measurement: float = math.nan
@@ -67,13 +66,14 @@ class Moves(NamedTuple):
     acceleration_m_s2: Array
     gap_mm: Array
     over_A: Array
-    "Mean of what the current is over IDLE_A, either way: it ripples, and the mesh loses a share of each peak."
+    "Mean of the current above IDLE_A: it ripples, and the mesh loses a share of each peak."
     over_share: Array
-    "Share of the time for which it is."
+    "Share of the time above IDLE_A."
 
 
 class Excerpt(NamedTuple):
-    """What one recording says: rows (n) at GRID_HZ, without a gap in time, and the moving carriages."""
+    """What one recording says: rows (n) at GRID_HZ without a gap in time, and the moving carriages. `force_N` is NaN
+    where the sensor had no new reading; `noise_N` is its noise by chunk."""
 
     name: str
     gap_mm: Array
@@ -92,7 +92,6 @@ class Excerpt(NamedTuple):
         return float(np.median(self.noise_N))
 
     def first(self, lasts_s: float) -> "Excerpt":
-        """Return the excerpt of so many seconds, or of all, without its carriages."""
         rows = {name: getattr(self, name)[: round(lasts_s * GRID_HZ)] for name in ROWS}
         return self._replace(**rows, moves={})
 
@@ -106,11 +105,9 @@ class Excerpt(NamedTuple):
 
 
 ROWS = ("gap_mm", "handle_mm", "force_N", "temperature_C", "readings", "ticks")
-"Fields of an excerpt that have a value for each row."
 
 
 def excerpt_of(path: Path) -> Excerpt:
-    """Read the recording in `path`, once from its beginning, and return its excerpt."""
     taking = Taking(str(path))
     try:
         read_recording(path, Tick, taking.see)
@@ -120,7 +117,7 @@ def excerpt_of(path: Path) -> Excerpt:
 
 
 class Taking:
-    """Takes control ticks one by one, in the order of time, and gives the `Excerpt` of all of them."""
+    """Makes an `Excerpt` of control ticks, taken in the order of time."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -134,7 +131,7 @@ class Taking:
         self._moves: dict[str, list[Array]] = {side: [] for side in SIDES}
 
     def see(self, seen: Seen) -> None:
-        """Take a message of a recording; snapshots, and ticks without a time, are passed over."""
+        """Take a message, if it is a control tick with a time."""
         if not seen.is_tick or self._refusal or math.isnan(now_s := seen.message.monotonic_s):
             return
         if not self._rows:
@@ -150,7 +147,6 @@ class Taking:
         self._rows.append((*numbers, float(mode == "RUN")))
 
     def done(self) -> Excerpt:
-        """Return what all ticks said; to be called once, after the last."""
         if self._rows:
             self._end_chunk()
         grid = np.concatenate(self._grids, axis=1) if self._grids else np.zeros((6, 1))
@@ -185,7 +181,7 @@ class Taking:
         )
 
     def _end_chunk(self) -> None:
-        """Reduce the waiting ticks, one at least, to rows, noise, supply, clock and moves of a chunk, and drop them."""
+        """Reduce the waiting ticks to rows, noise, supply, clock and moves of a chunk."""
         columns = dict(zip((*NUMBERS, "runs"), np.array(self._rows).T, strict=True))
         columns["gap_mm"] = columns["left_mm"] + columns["right_mm"]
         self._rows = []
@@ -208,10 +204,10 @@ class Taking:
             mean(columns[name]) for name in ("gap_mm", "device_handle_mm", "device_force_N", "device_temperature_C")
         ]
         self._grids.append(np.array([*means, np.bincount(place, changes, minlength=rows), ticks]))
-        # a sensor that reads in every tick at times reads the same twice
+        # a sensor that reads in every tick sometimes reads the same twice
         told = changes | (changes.mean() > EVERY_TICK)
         fresh_N = force_N[told & np.isfinite(force_N)]
-        # a reversal is no noise: what is in the middle passes it over
+        # a reversal is no noise, and the middle quantiles pass it over
         bends_N = np.abs(fresh_N[2:] - 2.0 * fresh_N[1:-1] + fresh_N[:-2])
         middle_N = float(np.quantile(bends_N, MIDDLE).mean()) if bends_N.size else 0.0
         self._noise_N.append(middle_N / MIDDLE_SD / math.sqrt(6.0))
@@ -224,12 +220,11 @@ class Taking:
 
 
 def _moving(columns: dict[str, Array], side: str, times_s: Array, period_s: float) -> Array:
-    """Return the rows of `Moves` of a chunk (10 x n), in order of its fields, while the duties drive the carriage
-    `side`."""
+    """Return the rows of `Moves` (10 x n) while the duties drive the carriage `side`."""
     seen = smoothed(period_s, columns, side)
     margin = 2 * seen.window
     even = np.ones(len(times_s))
-    # what is smoothed over a gap in time, or over another mode, is no motion by these duties
+    # across a gap in time or another mode, smoothed motion is not of these duties
     even[1:] = np.abs(np.diff(times_s) - period_s) < 0.5 * period_s
     steady = np.convolve(1.0 - even * columns["runs"], np.ones(2 * margin + 1), "same") < 0.5
     steady[:margin] = steady[-margin:] = False
@@ -237,7 +232,7 @@ def _moving(columns: dict[str, Array], side: str, times_s: Array, period_s: floa
     kept = kept[:: max(round(MOVING_EVERY_S / period_s), 1)]
     volts_s = np.gradient(seen.volts) / period_s
     told_A = columns[f"{side}_current_A"]
-    # of a current that rises to what it is told as, the mean is about half way
+    # the current rises to its reading within a tick, so its mean is about half way
     over_A = np.abs(0.5 * (told_A + np.roll(told_A, 1))) - IDLE_A
     return np.array(
         [

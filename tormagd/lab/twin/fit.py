@@ -20,26 +20,24 @@ CHOICE = (STRENGTH, EXPONENT, "field.hysteresis_percent", "friction.static_to_ki
 CHOICE_S = 120.0
 "Enough to tell the field laws apart."
 SLOW_MM_S = 2.0
-"Handle speed at which the low-speed factor is said."
 NEAR_MM, FAR_MM = 60.0, 85.0
-"Gaps whose forces make the slope."
 EXPLAINED_N, EXPLAINED_MM = 0.015, 0.05
-"Above these the laws are not those of this device."
+"Above these the laws are not this device's."
 CLOCK_PPM = 0.7
 RATE_SHARE = 0.05
 NOISE_SHARE = 0.02
-"By how much the noise of a sensor with steps of its own may be off."
+"How far the noise of a sensor with steps of its own may be off."
 
 
 class Told(NamedTuple):
-    """A number and half the width of its 95 % interval; NaN: it is not told."""
+    """A number and half the width of its 95 % interval; NaN where it is not told."""
 
     value: float
     half_width: float
 
 
 class Twin(NamedTuple):
-    """A plant, what is told of its keys and of COMBINATIONS, and what is not explained: RMS, in N and in mm."""
+    """A plant, what is told of its keys and of COMBINATIONS, and the unexplained RMS."""
 
     plant: PlantParameters
     keys: dict[str, Told]
@@ -54,12 +52,10 @@ class Twin(NamedTuple):
 
 
 def slope(plant: PlantParameters) -> float:
-    """Return the force at NEAR_MM over that at FAR_MM."""
     return strength_N(plant, NEAR_MM) / strength_N(plant, FAR_MM)
 
 
 def low_speed_factor(plant: PlantParameters) -> float:
-    """Return the friction at SLOW_MM_S over that of a fast handle."""
     return friction_of(plant).level_N(SLOW_MM_S, 1.0)
 
 
@@ -70,13 +66,12 @@ OF_FORCE: dict[str, Callable[[PlantParameters], float]] = {
 }
 OF_CARRIAGES: dict[str, Callable[[PlantParameters], float]] = {"lag of the carriages, s": lag_s}
 COMBINATIONS = OF_FORCE | OF_CARRIAGES
-"What several keys share, and the data tell better than each."
+"Figures that several keys share, and that the data tell better than each key."
 STANDS_FOR = {STRENGTH: strength_N, EXPONENT: slope}
-"Keys that take on, for the others of a combination, what the data tell of it."
+"Keys that take on what the data tell of a combination, on behalf of its other keys."
 
 
 def twin_of(prior: PlantParameters, ways: Sequence[Excerpt]) -> Twin:
-    """Fit a plant about `prior` to the recordings `ways` of one device, one at least, and return it with what is told."""
     if prior.pad is not None or prior.second is not None:
         raise LabError("--prior: allowed is a plant with an insert, without [pad] and [second]")
     under = [
@@ -87,7 +82,7 @@ def twin_of(prior: PlantParameters, ways: Sequence[Excerpt]) -> Twin:
     base = min(under, key=lambda each: rms(fit_force(each, early, CHOICE).estimate.residual))
     open_force, open_driven = fit_force(base, ways).estimate, fit_carriages(base, ways).estimate
     told = _told(open_force) | _told(open_driven)
-    # what is not told stays the prior's, and the rest goes where it then fits best: a part of what is not sure
+    # keys that are not told stay the prior's, and the others move to where they then fit best
     force, driven = fit_force(base, ways, tuple(told)), fit_carriages(base, ways, tuple(told))
     plant = with_values(force.estimate.plant, {key: value_at(driven.estimate.plant, key) for key in _told(open_driven)})
     keys, combinations = {}, {}
@@ -106,7 +101,7 @@ def twin_of(prior: PlantParameters, ways: Sequence[Excerpt]) -> Twin:
 
 
 def _told(estimate: Estimate) -> dict[str, float]:
-    """Return half the width of the interval of each key of the plant file that the data tell; the others are absent."""
+    """Return half the interval of each key of the plant file that the data tell."""
     found, plant = {}, estimate.plant
     for key in (each.key for each in estimate.priors if "." in each.key):
         function = STANDS_FOR.get(key, lambda plant, key=key: value_at(plant, key))
@@ -118,15 +113,13 @@ def _told(estimate: Estimate) -> dict[str, float]:
 
 
 def _noise_N(ways: Sequence[Excerpt]) -> tuple[float, float]:
-    """Return the noise of one reading, N, as the median of all chunks of `ways`, and half the width of its interval,
-    N."""
     noise_N = np.concatenate([way.noise_N for way in ways])
     spread = 2.0 * float(noise_N.std()) / math.sqrt(len(noise_N))
     return float(np.median(noise_N)), math.hypot(spread, NOISE_SHARE * float(np.median(noise_N)))
 
 
 def _of_sensor(ways: Sequence[Excerpt], force: Fitted) -> dict[str, Told]:
-    """Return by key what is seen without a law: the sensor's noise, drift and rate, the supply, and the device's clock."""
+    """Return what needs no law: the sensor's noise, drift and rate, the supply, and the device's clock."""
     noise_N, width_N = _noise_N(ways)
     drift_mN_min = float(np.mean([abs(zero["drift_mN_min"]) for zero in force.zeros]))
     rows, readings, ticks = (

@@ -24,21 +24,21 @@ from tormagd.simulation.static_laws import radial_moment_Tm
 
 STRENGTH, EXPONENT = "elastomer.kinetic_friction", "field.exponent"
 PIVOT_MM = 67.0
-"Gap at which the strength is said, and about which the field's exponent turns: the middle of what is used."
+"Gap of the stated strength, about which the field's exponent turns: the middle of what is used."
 BURN_S = 5.0
-"Until then hysteresis and bristles have forgotten what was before the recording."
+"By then hysteresis and bristles have forgotten what was before the recording."
 BLOCK_S = 10.0
 FIT_N = 0.03
-"Size of a row's error in the fit: some noise, and more of what neighbouring rows share."
+"Size of a row's error in the fit: some noise, and more that neighbouring rows share."
 FROZEN_S, FROZEN_N = 0.3, 0.1
-"A reading that stays for so long while the law moves by this much is no reading."
+"A reading that stays so long while the law moves by this much is no reading."
 GRID_RATIO = 0.003
-"By how much rows of a hundredth of a second blur the friction of a handle that stops."
+"Rows of a hundredth of a second blur the friction of a stopping handle by so much."
 DRIFT_MN_MIN = 5.0
-"Of the plant card's sensors, at most."
+"Greatest drift of the plant card's sensors."
 MAX_LOST = 0.3
 MAX_DRIFT_MN_MIN, MAX_ZERO_MN = 10.0, 150.0
-"A sensor whose zero moves more, or is further off at one time, is refused."
+"A sensor whose zero drifts faster, or is further off, is refused."
 WANDER_S = 30.0
 
 
@@ -49,29 +49,27 @@ class Fitted(NamedTuple):
     cut_out: list[str]
     zeros: list[dict[str, float]]
     memory_N: list[float]
-    "Of the first recording, as `along` takes it."
+    "Of the first recording, for `along`."
     error_N: float
 
 
 def fresh_N(plant: PlantParameters, moment_Tm: Array) -> Array:
-    """Return the kinetic friction of the fresh, cool insert (n), N, at radial moments (n), T m."""
+    """Return the kinetic friction of the fresh, cool insert (n) at radial moments (n)."""
     mre = plant.elastomer
     law = reduced(Rubber(mre.shear_modulus_kPa * 1e3, mre.relative_permeability, mre.kinetic_friction), TORMAG)
     return np.asarray(law.force(moment_Tm))
 
 
 def moments_Tm(plant: PlantParameters, gap_mm: Array) -> Array:
-    """Return the radial moments (n), T m, at gaps (n), without hysteresis."""
     return np.asarray(radial_moment_Tm(gap_mm, plant), dtype=np.float64)
 
 
 def strength_N(plant: PlantParameters, gap_mm: float = PIVOT_MM) -> float:
-    """Return the kinetic friction of the fresh, cool insert at a gap, N."""
     return float(fresh_N(plant, moments_Tm(plant, np.array([gap_mm])))[0])
 
 
 def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
-    """Return the fresh insert's kinetic friction (n), N, along the way, as warm as it is, with the lag of its field."""
+    """Return the fresh insert's kinetic friction (n), at its temperature and with the lag of its field."""
     moment_Tm = moments_Tm(plant, way.gap_mm)
     warmer_K = way.temperature_C - plant.assumed.ambient_C
     lag_Tm = lag_of(plant).along_Tm(moment_Tm, 0.0, float(moment_Tm[0]))
@@ -79,7 +77,7 @@ def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
 
 
 def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh: Array) -> Array:
-    """Return the friction (n), N, with the sign of the handle's motion, as the sensor shows it after its delay."""
+    """Return the friction (n), signed as the handle's motion, as the sensor shows it after its delay."""
     series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
     step = series.discretise(1.0 / GRID_HZ)
     changes = np.diff(fresh, prepend=fresh[0])
@@ -92,8 +90,6 @@ def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh
 
 
 def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
-    """Return the friction at the roller (n), N, for kinetic levels (n), N, and handle speeds (n), mm/s, at rows of
-    GRID_HZ."""
     friction, bristles_mm, forces = friction_of(plant), 0.0, []
     for speed, level_N in zip(speed_mm_s.tolist(), kinetic_N.tolist(), strict=True):
         force_N, bristles_mm = friction.advance(bristles_mm, speed, level_N, 1.0 / GRID_HZ)
@@ -102,7 +98,6 @@ def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
 
 
 def made(prior: PlantParameters, values: Values) -> PlantParameters:
-    """Return the plant with values at keys of the element; the others stay as in `prior`."""
     field, own_N = prior.field, strength_N(prior)
     exponent = values.get(EXPONENT, field.exponent)
     turned = {"field.coefficient": field.coefficient * PIVOT_MM ** (field.exponent - exponent)}
@@ -112,7 +107,7 @@ def made(prior: PlantParameters, values: Values) -> PlantParameters:
 
 
 def priors_of(plant: PlantParameters) -> list[Prior]:
-    """Return what is believed of an element before, about `plant`: the spread of the plant card's devices."""
+    """Return what is believed of an element beforehand: the spread of the plant card's devices."""
 
     def about(key: str, share: float = 0.0, plain: float = 0.0, least: float = 0.0, floor: float = 0.0) -> Prior:
         value = value_at(plant, key)
@@ -134,7 +129,7 @@ def priors_of(plant: PlantParameters) -> list[Prior]:
 
 
 def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[str] | None = None) -> Fitted:
-    """Fit the element, under the field law of `prior`, to the forces along `ways`, one at least, and return it."""
+    """Fit the element to the forces along `ways`, under the field law of `prior`."""
     shared = [each for each in priors_of(prior) if only is None or each.key in only]
     branches = [Prior(f"memory_{place}", 0.0, 0.5) for place in range(len(prior.relaxation.fractions))]
     sensor = [Prior("zero_N", 0.0, 0.06), Prior("drift_N_min", 0.0, 0.02), *branches]
@@ -143,7 +138,7 @@ def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[st
     def plant_of(values: Values) -> PlantParameters:
         return made(prior, {key: value for key, value in values.items() if "." in key})
 
-    # most of the derivatives leave these tables alone
+    # most derivatives leave these tables alone
     @lru_cache(maxsize=4 * len(ways))
     def fresh(number: int, elastomer: Elastomer, field: Field, thermal: Thermal) -> Array:
         plant = msgspec.structs.replace(prior, elastomer=elastomer, field=field, thermal=thermal)
@@ -186,8 +181,7 @@ def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[st
 
 
 def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mask], list[str]]:
-    """Return a mask of the rows of each way that count, and a sentence for each stretch in which the sensor stands
-    still."""
+    """Return a mask of the rows of each way that count, and a sentence for each stuck stretch of the sensor."""
     kept, cut_out = [], []
     for way in ways:
         known = np.isfinite(way.force_N)
@@ -196,7 +190,7 @@ def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mas
         edges = np.flatnonzero(np.diff(stands)).reshape(-1, 2)
         for begin, end in edges[np.diff(edges)[:, 0] >= FROZEN_S * GRID_HZ].tolist():
             if np.ptp(expected_N[begin:end]) > FROZEN_N:
-                # in the rows before and after it stood for a part
+                # the rows before and after it were stuck for a part
                 known[max(begin - 1, 0) : end + 1] = False
                 cut_out.append(
                     f"{way.name}: the force sensor stood still from {begin / GRID_HZ:.1f} to {end / GRID_HZ:.1f} s"
@@ -212,7 +206,7 @@ def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mas
 def _require_steady(
     way: Excerpt, zero_mN: float, drift_mN_min: float, width_mN_min: float, residual_N: Array, time_s: Array
 ) -> None:
-    """Raise LabError for a sensor whose zero is far off, surely drifts, or wanders; else do nothing."""
+    """Refuse a sensor whose zero is far off, surely drifts, or wanders."""
     part = np.floor(time_s / WANDER_S).astype(np.int64)
     sums, counts = np.bincount(part, residual_N), np.bincount(part)
     wander_mN = 1e3 * float(np.ptp(sums[counts > 0] / counts[counts > 0]))
