@@ -103,6 +103,12 @@ def test_bytes_and_values_are_those_of_cantools_in_bulk(layout: Layout) -> None:
         assert [type(values[signal.name]) for signal in layout.signals] == [signal.type for signal in layout.signals]
 
 
+def test_units_of_the_dbc_are_those_that_names_end_with() -> None:
+    units = {signal.name: signal.unit for message in DATABASE.messages for signal in message.signals if signal.unit}
+    assert units["force_N"] == "N"
+    assert [name for name, unit in units.items() if not name.endswith(f"_{unit.replace('deg', '')}")] == []
+
+
 def test_crc8_is_sae_j1850() -> None:
     assert crc8(b"123456789") == bitwise_crc8(b"123456789") == 0x4B
     assert crc8(b"") == 0

@@ -39,7 +39,7 @@ for name in sys.argv[1:]:
     except SystemExit as ended:
         assert ended.code == 0, name
 """
-LIGHT = ("characterise", "identify-motor", "optimise-design", "tune-position", "wire-log")
+LIGHT = ("characterise", "identify-motor", "optimise-design", "tune-position")
 
 
 def without_heavy(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -82,7 +82,6 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
     (("optimise-design", "--region", "1", "1", "2", "2", "--dask", "no://one"), "", "--dask no://one: unknown address"),
     (("tune-position", "--config", "absent.toml"), "", "absent.toml"),
     (("bench-sweep", "--plant", "absent", "--out", "x.csv"), "", "absent"),
-    (("wire-log", "virtual", "session.mp3"), "", ".mp3"),
     (("tactile-experiment", "--out", "none"), "", "not a directory"),
     (("fleet", "/nowhere"), "", "/nowhere: no such folder or file"),
     (("fleet", "nothing://there"), "", "Protocol not known: nothing"),
@@ -155,9 +154,6 @@ DESIGN, SWEEP = ("optimise-design", "--region", "1", "1", "2", "2"), ("bench-swe
 @pytest.mark.parametrize(
     ("arguments", "allowed"),
     [
-        *((("wire-log", "virtual", "x.log", "--seconds", text), "a finite number") for text in ("nan", "inf")),
-        (("wire-log", "virtual", "x.log", "--seconds", "-1"), "0..86400 s"),
-        (("wire-log", "tap", "x.log", "--baud", "-5"), "1..12000000"),
         *(((*DESIGN, "--starts", text), "1..10000") for text in ("-1", "0", "1.5", "x")),
         ((*DESIGN, "--off", "nan"), "a finite number"),
         *(

@@ -50,7 +50,6 @@ COMMANDS = {
     "twin": ("twin.command", "a plant file of one device from its recordings"),
     "identify-motor": ("motor.command", "a motor and its screw from a log"),
     "tune-position": ("tune_position", "the gains of the position loop for a motor"),
-    "wire-log": ("wire_log", "a session between host and device as a CAN log"),
     "fleet": ("consoles.command", "what the recordings of many consoles say of each"),
 }
 
