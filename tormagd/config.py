@@ -203,7 +203,7 @@ class BlackBox(Strict, frozen=True):
 
 
 class Recordings(Strict, frozen=True):
-    """What `tormagctl record` keeps in a folder, and with which seals."""
+    """What `tormagctl record` keeps in a folder."""
 
     folder: str = "/var/lib/tormag/recordings"
     "Where `tormagctl recordings` looks."
@@ -219,8 +219,6 @@ class Recordings(Strict, frozen=True):
     "Stays free on that disk, for black boxes and profiles."
     one_tick_of: Annotated[int, Meta(ge=1, le=1_000)] = 1
     "Of so many ticks one is recorded, and all within 10 s of a fault or a mark."
-    key: str = ""
-    "A file of 16 to 64 bytes, which seals recordings and black boxes."
 
     def __post_init__(self) -> None:
         require(

@@ -9,12 +9,10 @@ READ, WROTE = "read", "wrote"
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
-    """First message of the daemon: the folder for black boxes, the header of each, and the file of the key that seals
-    them. Empty texts stand for none."""
+    """First message of the daemon: the folder for black boxes, and the header of each."""
 
     folder: str
     header: dict[str, str]
-    key: str = ""
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):

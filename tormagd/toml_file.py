@@ -33,7 +33,10 @@ _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place that a refusal of msgspec ends with."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
-GONE = {"neutral_margin_N": "; delete it: `enable` goes to any setpoint along a ramp now"}
+GONE = {
+    "limits.neutral_margin_N": "; delete it: `enable` goes to any setpoint along a ramp now",
+    "recordings.key": "; delete it: recordings have no seals now; `tormagctl recordings export` tells a file's SHA-256",
+}
 "Keys of earlier versions, and what to do about them."
 _NOTHING = object()
 "Stands for no value: a value of a table may be None."
@@ -120,10 +123,11 @@ def table_in(kind: Any) -> type[msgspec.Struct] | None:
 
 def _known_key(kind: Any, message: str) -> str:
     """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key in GONE."""
-    if (unknown := _UNKNOWN.search(message)) is None or unknown[1] in GONE:
-        return GONE[unknown[1]] if unknown else ""
+    key = _key_in(message)
+    if (unknown := _UNKNOWN.search(message)) is None or ".".join(key) in GONE:
+        return GONE[".".join(key)] if unknown else ""
     table = table_in(kind)
-    for name in _key_in(message)[:-1]:
+    for name in key[:-1]:
         fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}
         table = table_in(fields.get(name))
     return did_you_mean(unknown[1], [field.name for field in msgspec.structs.fields(table)]) if table else ""

@@ -92,6 +92,8 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
         ("sene = 'pulse'", "$", "sene", "unknown field"),
         ("[device]\nprot = '/dev/null'", "$.device", "prot", "unknown field"),
         ("[rates]\ncontrol_Hz = 1000", "$.rates", "control_Hz", "unknown field"),
+        ("[recordings]\nkey = 'seal.key'", "$.recordings", "key", "; delete it: recordings have no seals now;"),
+        ("[limits]\nneutral_margin_N = 1", "$.limits", "neutral_margin_N", "; delete it: `enable` goes to"),
         ("scene = 3", "$.scene", "3", "`str`"),
         ("[device]\noptions = 3", "$.device.options", "3", "a `[table]`"),
         ("[rates]\ncontrol_hz = 1000.5", "$.rates.control_hz", "1000.5", "`int`"),

@@ -1,6 +1,8 @@
+import hashlib
 import json
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -83,10 +85,11 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     assert names[-1] == Path(made["file"]).name
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.mcap", names[-1])
     assert {row["is_marked"] for row in listed["recordings"]} == {False}
-    # what an operator keeps, stays; the copy says what its seals say
+    # what an operator keeps, stays
     kept = ctl(*command, "recordings", "mark", str(folder / names[-1])).ended(0).result["file"]
     copied = ctl(*command, "recordings", "export", kept, "--to", str(tmp_path)).ended(0).result
-    assert (copied["file"], copied["seal"]) == (str(tmp_path / Path(kept).name), "whole")
+    assert copied["sha256"] == hashlib.sha256((tmp_path / Path(kept).name).read_bytes()).hexdigest()
+    assert (copied["file"], copied["damage"]) == (str(tmp_path / Path(kept).name), "")
     config.write_text(config.read_text() + "most_days = 1e-9\n")
     assert ctl(*command, "recordings", "prune").ended(0).result["removed"] == names[:-1]
     assert [path.name for path in folder.iterdir()] == [Path(kept).name]
@@ -101,9 +104,8 @@ def test_a_report_is_one_page_of_one_recording_or_of_two(fake_daemon, tmp_path, 
     other.write_bytes(file.read_bytes().replace(b"tormagd.Tick", b"tormagd.Tack"))
     page = tmp_path / "a.html"
     ctl("report", str(file), "-o", str(page)).ended(0)
-    assert f"{file.name} is whole: all {file.stat().st_size} bytes are as they were written." in page.read_text()
-    said = ctl("--json", "report", str(file), str(other), "-o", str(page)).ended(1).result["seals"]
-    assert list(said.values()) == ["whole", "altered or damaged"]
+    said = ctl("--json", "report", str(file), str(other), "-o", str(page)).ended(1).result["notes"]
+    assert list(said.values()) == [[], ["damaged: the CRC of its summary is wrong"]]
     both = page.read_text()
     assert both.count("data:image/png;base64,") == 2
     # nothing is asked of elsewhere, and no name is taken for markup
@@ -112,18 +114,17 @@ def test_a_report_is_one_page_of_one_recording_or_of_two(fake_daemon, tmp_path, 
     assert ctl("--json", "report", *[str(file)] * 3, "-o", str(page)).ended(2).error["hint"]
 
 
-def test_a_recording_whose_key_is_not_here_is_shown_and_does_not_pass_for_sound(fake_daemon, tmp_path, ctl):
-    folder, key, keyed = tmp_path / "r", tmp_path / "key", tmp_path / "keyed.toml"
-    folder.mkdir()
-    key.write_bytes(b"k" * 16)
-    keyed.write_text(f'[recordings]\nkey = "{key}"\n')
-    made = ctl("--config", str(keyed), *fake_daemon.at, "--json", "record", str(folder), "--duration", "0.3").ended(0)
-    file, page, picture = made.result["file"], tmp_path / "a.html", str(tmp_path / "a.png")
-    for command in (("report", file, "-o", str(page)), ("plot", file, "-o", picture)):
-        assert "sealed with a key that is not here: it was not checked" in ctl(*command).ended(1).out
-        assert "whole: all" in ctl("--config", str(keyed), *command).ended(0).out
-    assert "it cannot be checked" in ctl("recordings", "list", str(folder)).ended(0).out
-    assert "checked" not in ctl("--config", str(keyed), "recordings", "list", str(folder)).ended(0).out
+def test_a_recording_with_seals_of_before_is_shown_listed_and_exported(tmp_path, ctl):
+    sealed = shutil.copy(Path(__file__).parents[1] / "recording/sealed.mcap", tmp_path)
+    drawn = ctl("--json", "plot", sealed, "-o", str(tmp_path / "a.png")).ended(0).result
+    assert (drawn["ticks"], drawn["telemetry"], drawn["faults"], drawn["is_complete"]) == (80, 80, ["SKEW"], True)
+    assert ctl("--json", "recordings", "list", str(tmp_path)).ended(0).result["recordings"][0]["faults"] == ["SKEW"]
+    data = bytearray(Path(sealed).read_bytes())
+    data[3_000] ^= 1  # in a chunk
+    Path(sealed).write_bytes(data)
+    damaged = ctl("--json", "recordings", "export", sealed, "--to", str(tmp_path / "b.mcap")).ended(1).result
+    assert "crc validation failed in Chunk" in damaged["damage"]
+    assert "crc validation failed in Chunk" in ctl("plot", sealed, "-o", str(tmp_path / "a.png")).ended(2).err
 
 
 def test_rubbish_is_counted_and_left_out(fake_daemon, ctl, file):

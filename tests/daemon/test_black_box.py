@@ -43,7 +43,7 @@ class Rig:
         self.stepper, self.planner = core.stepper(), core.planner()
         self.output = self.stepper.step(1.0, None, self.planner.planned)
         with patch("tormagd.daemon.beside.start_beside", self.start):
-            self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000, "seal.key")
+            self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000)
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
         self.box.begin(self.stepper, self.planner, connection)
 
@@ -84,12 +84,12 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
     for _ in range(302):
         rig.tick(10)
         parts += rig.heard()
-    assert (first, {type(part) for part in parts}) == (Begin("/boxes", {"format": "1"}, "seal.key"), {Part})
+    assert (first, {type(part) for part in parts}) == (Begin("/boxes", {"format": "1"}), {Part})
     assert (names(parts[0])[:3], names(parts[0])[-3:]) == (["state", "step", "tick"], ["plan", "step", "tick"])
     assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 50, 100, 150]
     assert [each for part in parts for each in names(part)].count("tick") == 3_010
     rig.box.begin_scene({"format": "2"}, rig.stepper, rig.planner)
-    assert rig.heard()[-1] == Begin("/boxes", {"format": "2"}, "seal.key")
+    assert rig.heard()[-1] == Begin("/boxes", {"format": "2"})
 
 
 def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) -> None:

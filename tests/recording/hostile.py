@@ -12,9 +12,8 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, Schema
-from mcap.writer import Writer
+from mcap.writer import MCAP0_MAGIC as MAGIC, Writer
 
-from tormagd.recording.stream import MAGIC
 from tormagd.recording.writer import OVERVIEW
 
 NESTED = b"[" * 100_000 + b"]" * 100_000

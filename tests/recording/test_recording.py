@@ -17,15 +17,13 @@ import pytest
 from hypothesis import example, given, strategies as st
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from sent import COLUMNS, START_NS, Back, back, batch, telemetry
 
-from tormagd.recording.overview import MAX_STRETCHES, Codes, Curves, Glance, Overview, OverviewBuilder, unpacked
+from tormagd.recording.overview import MAX_STRETCHES, Codes, Curves, Glance, OverviewBuilder, unpacked
 from tormagd.recording.plot import figure, save_plot
-from tormagd.recording.reader import RecordingError, RecordingFile
-from tormagd.recording.seal import State
+from tormagd.recording.reader import RecordingError, RecordingFile, damage_in, summary_of
 from tormagd.recording.ticks import decode_ticks
-from tormagd.recording.writer import OVERVIEW, THINNED, RecordingWriter
+from tormagd.recording.writer import THINNED, RecordingWriter
 from tormagd_client.messages import Mark, MessageError, encode
 
 
@@ -335,36 +333,25 @@ def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path:
     assert overview.spans_s("operating_state")["FAULT"] == [pytest.approx((25.0, 30.0), abs=1e-6)]
 
 
-def rewritten(path: Path, target: Path, overview: Overview) -> Path:
-    """The same messages of the fault by the usual writer, without seals, and with another overview."""
-    with path.open("rb") as source, target.open("wb") as made:
-        writer, channels = Writer(made), {}
-        writer.start()
-        for schema, channel, message in make_reader(source).iter_messages(starting_at=START_NS + 24_000_000_000):
-            if channel.id not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.add_attachment(0, 0, OVERVIEW, "application/msgpack", overview.packed())
-        writer.finish()
-    return target
-
-
-def test_an_overview_that_nothing_vouches_for_is_not_shown(path: Path, tmp_path: Path) -> None:
-    own = RecordingFile(path).overview
-    no_fault = msgspec.structs.replace(own, codes=own.codes | {"faults": {}}, end_ns=own.start_ns)
-    unsealed = rewritten(path, tmp_path / "unsealed.mcap", no_fault)
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [(b"\xa4SKEW", b"\xa4SHOW", "the CRC of its data is wrong"), (b"tormagd.Tick", b"tormagd.Tack", "its summary")],
+)
+def test_what_no_crc_vouches_for_is_named_and_an_overview_not_shown(path, tmp_path, old, new, said) -> None:
     spoilt = tmp_path / "spoilt.mcap"
-    assert own.packed() != no_fault.packed()
-    spoilt.write_bytes(path.read_bytes().replace(b"\xa4SKEW", b"\xa4SHOW"))
-    for file, state in ((unsealed, State.UNSEALED), (spoilt, State.ALTERED)):
-        known = RecordingFile(file)
-        assert (known.seal.state, list(known.overview.codes["faults"]), known.overview.end_ns) == (
-            state,
-            ["SKEW"],
-            own.end_ns,
-        )
-    assert RecordingFile(spoilt).notes[0].startswith("altered or damaged: the bytes ")
+    spoilt.write_bytes(path.read_bytes().replace(old, new))
+    known = RecordingFile(spoilt)
+    assert said in known.damage in known.notes[0]
+    assert (list(known.overview.codes["faults"]), known.overview) == (["SKEW"], RecordingFile(path).overview)
+
+
+@given(place=st.floats(0.0, 1.0), value=st.integers(1, 255))
+def test_no_byte_is_changed_unnoticed(path, tmp_path_factory, place, value) -> None:
+    data, changed = bytearray(path.read_bytes()), Path(tmp_path_factory.getbasetemp()) / "changed.mcap"
+    data[int(place * (len(data) - 1))] ^= value
+    changed.write_bytes(data)
+    with changed.open("rb") as file:
+        assert damage_in(file) or summary_of(changed) is None
 
 
 def test_neither_approach_nor_decay_is_in_how_well_a_force_was_followed(path: Path) -> None:

@@ -164,9 +164,9 @@ class Flight:
         self.until(lambda: not self.loop.measurement.is_busy and self.loop.measurement.is_homed)  # type: ignore[union-attr]
         self.command("enable")
 
-    def write(self, path: Path, key: bytes = b"", **changes: str) -> Path:
+    def write(self, path: Path, **changes: str) -> Path:
         """Its black box; `changes` are of the header."""
-        write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.ring.parts(), key)
+        write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.ring.parts())
         return path
 
 

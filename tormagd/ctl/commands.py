@@ -232,7 +232,7 @@ COMMANDS = {
         (option("text", metavar="TEXT", help="what happened, in 1..200 characters"),),
     ),
     "recordings": Command(
-        "list a folder of recordings, prune it to its budget, keep one (mark), or copy one and check it (export)",
+        "list a folder of recordings, prune it to its budget, keep one (mark), or copy one with its SHA-256 (export)",
         "recordings.recordings",
         ("config",),
         (
@@ -325,7 +325,7 @@ COMMANDS = {
     "plot": Command(
         "draw a recording: forces, gap, duty, limits and faults",
         "report.plot",
-        ("config",),
+        (),
         (
             option("source", type=Path, metavar="FILE.mcap"),
             option("-o", "--output", dest="target", type=Path, required=True, metavar="FILE.png"),
@@ -334,7 +334,7 @@ COMMANDS = {
     "report": Command(
         "one page to keep of a recording, or of two side by side",
         "report.report",
-        ("config",),
+        (),
         (
             option("sources", type=Path, nargs="+", metavar="FILE.mcap"),
             option("-o", "--output", dest="target", type=Path, required=True, metavar="FILE.html"),
@@ -343,7 +343,7 @@ COMMANDS = {
     "dashboard": Command(
         "a page for the browser on this machine: the daemon live, or a recording to scrub through",
         "dashboard.dashboard",
-        ("config", "endpoints", "wait_s"),
+        ("endpoints", "wait_s"),
         (
             option("path", type=Path, nargs="?", metavar="FILE.mcap", help="the recording; live without"),
             option("--port", type=port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: one that is free"),

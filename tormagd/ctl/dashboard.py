@@ -6,7 +6,6 @@ import sys
 import time
 from pathlib import Path
 
-from tormagd.config import Config
 from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
 from tormagd.ctl.report import opened
 from tormagd.dashboard.live import Live
@@ -17,11 +16,11 @@ from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import Endpoints
 
 
-def dashboard(config: Config, endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
+def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
     """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording."""
     start_s = time.monotonic()
     try:
-        asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(config, path, port))
+        asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(path, port))
     except OSError as error:
         raise usage_error(
             f"nothing is served at {LOOPBACK}:{port}: {error.strerror}", "give another --port; 0 takes one that is free"
@@ -41,9 +40,9 @@ async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
             listening.cancel()
 
 
-async def _recorded(config: Config, path: Path, port: int) -> None:
+async def _recorded(path: Path, port: int) -> None:
     """Serve the page of a recording."""
-    (file,) = opened(config, [path])
+    (file,) = opened([path])
     with as_usage_error(ValueError, hint="give a recording with data"):
         shown = Recorded(file)
     await serve(shown, port, _ready)

@@ -11,11 +11,10 @@ import msgspec
 import zmq
 
 from tormagd.config import Config, Recordings
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.interrupt import interrupted_by
 from tormagd.output import write_line
 from tormagd.recording.folder import Budget, RecordingFolder
-from tormagd.recording.seal import read_key
 from tormagd.recording.ticks import decode_ticks, listening
 from tormagd.recording.writer import RecordingWriter
 from tormagd_client.blocking import Client
@@ -44,17 +43,11 @@ def budget_of(settings: Recordings) -> Budget:
     )
 
 
-def key_of(config: Config) -> bytes:
-    """Read the configured sealing key; empty where none is configured."""
-    with as_usage_error(OSError, ValueError, hint="[recordings] key names a file of 16 to 64 bytes"):
-        return read_key(config.recordings.key)
-
-
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
     """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder."""
     if path.suffix != ".mcap" and not path.is_dir():
         raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
-    key, keys = key_of(config), keys_of(endpoints.curve)
+    keys = keys_of(endpoints.curve)
     context = zmq.Context()
     try:
         telemetry = listening(context, endpoints.telemetry, keys, TELEMETRY_TOPIC)
@@ -65,7 +58,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
             about = _about(endpoints, wait_s)
             try:
                 place = RecordingFolder(path, budget_of(config.recordings)) if path.is_dir() else path
-                writer = RecordingWriter(place, about, key, config.recordings.one_tick_of)
+                writer = RecordingWriter(place, about, config.recordings.one_tick_of)
             except FileExistsError as error:
                 raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
             except OSError as error:

@@ -1,16 +1,16 @@
 """`tormagctl recordings` and `mark`: what a folder of recordings holds, and which of it stays."""
 
 import contextlib
+import hashlib
 import shutil
 from pathlib import Path
 from typing import Any
 
 from tormagd.config import Config
 from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
-from tormagd.ctl.record import budget_of, key_of
+from tormagd.ctl.record import budget_of
 from tormagd.recording.folder import RecordingFolder, Segment, mark as mark_segment
-from tormagd.recording.reader import RecordingError, summary_of
-from tormagd.recording.seal import State, verified
+from tormagd.recording.reader import RecordingError, damage_in, summary_of
 from tormagd_client.blocking import Client
 
 
@@ -21,24 +21,24 @@ def mark(client: Client, text: str) -> Outcome:
 
 
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
-    """List a folder, prune it to its budget, mark a recording so that it is kept, or export a checked copy to `target`."""
+    """List a folder, prune it to its budget, mark a recording so that it is kept, or copy it to `target`."""
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):
             folder = RecordingFolder(path or Path(config.recordings.folder), budget_of(config.recordings))
             if not folder.path.is_dir():
                 raise usage_error(f"{folder.path}: no such folder", "name the folder, or set [recordings] folder")
-            return _list(folder, config.recordings.key) if action == "list" else _prune(folder)
+            return _list(folder) if action == "list" else _prune(folder)
         if path is None:
             raise usage_error(f"{action}: no recording is named", f"tormagctl recordings {action} FILE.mcap")
         if action == "mark":
             kept = mark_segment(path)
             return Outcome({"file": str(kept)}, f"{kept} stays until somebody takes it away")
-        return _export(path, target, key_of(config))
+        return _export(path, target)
 
 
-def _list(folder: RecordingFolder, key: str) -> Outcome:
+def _list(folder: RecordingFolder) -> Outcome:
     """Describe each segment of the folder, the oldest first, and say their total size."""
-    rows = [_row(segment, bool(key)) for segment in folder.segments()]
+    rows = [_row(segment) for segment in folder.segments()]
     size_MB = sum(row["MB"] for row in rows)
     lines = [
         f"{row['name']:<44} {row['MB']:9.1f} MB {row['seconds'] or 0.0:9.1f} s  "
@@ -49,7 +49,7 @@ def _list(folder: RecordingFolder, key: str) -> Outcome:
     return Outcome({"folder": str(folder.path), "recordings": rows, "MB": size_MB}, "\n".join([*lines, total]))
 
 
-def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
+def _row(segment: Segment) -> dict[str, Any]:
     """Describe one segment by its overview; without one, `said` tells why."""
     seconds, faults, marks = None, [], []
     try:
@@ -59,11 +59,10 @@ def _row(segment: Segment, has_key: bool) -> dict[str, Any]:
     else:
         said = ["no overview: still written, not ended by its recorder, or older"]
         if known is not None:
-            contents, overview = known
+            _, overview = known
             seconds = round(overview.duration_s, 3)
             faults, marks = list(overview.spans_s("faults")), [each.text for each in overview.marks]
-            unchecked = [f"{State.OTHER_KEY}: it cannot be checked"] if contents.is_keyed and not has_key else []
-            said = [*unchecked, *faults, *(f"“{text}”" for text in marks)]
+            said = [*faults, *(f"“{text}”" for text in marks)]
     return {
         "name": segment.path.name,
         "began_s": segment.began_s,
@@ -85,8 +84,8 @@ def _prune(folder: RecordingFolder) -> Outcome:
     return Outcome({"removed": names, "over": over}, f"{text}\n{over}".strip(), Exit.REFUSED if over else Exit.DONE)
 
 
-def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
-    """Copy a recording to a new file, check the copy's seals under `key`, and say their verdict; REFUSED where unsound."""
+def _export(path: Path, target: Path | None) -> Outcome:
+    """Copy a recording to a new file, check the copy's CRCs, and tell its SHA-256; REFUSED where it is damaged."""
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target
@@ -97,6 +96,9 @@ def _export(path: Path, target: Path | None, key: bytes) -> Outcome:
             with contextlib.suppress(OSError):
                 copy.unlink()  # half a copy is none
             raise
-    seal = verified(copy, key)
-    result = {"file": str(copy), "seal": seal.state, "why": seal.why}
-    return Outcome(result, f"{copy}: {seal.text()}", Exit.DONE if seal.is_sound else Exit.REFUSED)
+    with copy.open("rb") as made:
+        digest = hashlib.file_digest(made, "sha256").hexdigest()
+        damage = damage_in(made)
+    text = "\n".join([f"{copy}: SHA-256 {digest}", *([f"damaged: {damage}"] if damage else [])])
+    result = {"file": str(copy), "sha256": digest, "damage": damage}
+    return Outcome(result, text, Exit.REFUSED if damage else Exit.DONE)

@@ -41,15 +41,13 @@ def replay(
     except ChildProcessError as error:
         hint = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
         raise usage_error(str(error), hint) from error
-    seal = result["seal"]
-    head = f"{seal['state']}: {seal['why']}\n" + (f"altered: {result['odd']}\n" if result["odd"] else "")
-    is_sound = seal["is_sound"] and not result["odd"]
+    head = f"altered: {result['odd']}\n" if result["odd"] else ""
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
     notes += "" if result["is_complete"] else "\nthe file is cut short"
     if "rerun" not in result:
-        return Outcome(result, head + _instead(result) + notes, Exit.DONE if is_sound else Exit.REFUSED)
+        return Outcome(result, head + _instead(result) + notes, Exit.REFUSED if result["odd"] else Exit.DONE)
     text, is_exact = _rerun(result["rerun"])
-    return Outcome(result, head + text + notes, Exit.DONE if is_exact and is_sound else Exit.REFUSED)
+    return Outcome(result, head + text + notes, Exit.DONE if is_exact and not result["odd"] else Exit.REFUSED)
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:

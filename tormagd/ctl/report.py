@@ -4,9 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from tormagd.bounded_file import in_place_of
-from tormagd.config import Config
 from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
-from tormagd.ctl.record import key_of
 from tormagd.dashboard.report import report as page_of
 from tormagd.recording.plot import figure, save_plot
 from tormagd.recording.reader import RecordingFile
@@ -14,28 +12,26 @@ from tormagd.recording.reader import RecordingFile
 WRITABLE = "give a file in a directory you may write to"
 
 
-def opened(config: Config, sources: list[Path]) -> list[RecordingFile]:
-    """Open recordings, checked with the configured key, in the order of `sources`; an altered one is not refused."""
-    key = key_of(config)
+def opened(sources: list[Path]) -> list[RecordingFile]:
+    """Open recordings, in the order of `sources`."""
     with as_usage_error(ValueError, hint="give files that tormagctl record has made"):
-        return [RecordingFile(source, key) for source in sources]
+        return [RecordingFile(source) for source in sources]
 
 
 def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> Outcome:
-    """Say what was written, and before that what the seals say: REFUSED where one is not sound."""
-    seals = {str(each.path): each.seal.state for each in of}
-    said = (f"{each.path}: {'. '.join(dict.fromkeys([each.seal.text(), *each.notes]))}" for each in of)
-    text = "\n".join([*said, str(target)])
-    is_sound = all(each.seal.is_sound for each in of)
-    return Outcome({"file": str(target), "seals": seals, **result}, text, Exit.DONE if is_sound else Exit.REFUSED)
+    """Say what was written, and before that what is to be noted of each recording; REFUSED where one is damaged."""
+    said = (f"{each.path}: {'. '.join(each.notes)}" for each in of if each.notes)
+    notes = {str(each.path): each.notes for each in of}
+    exit_code = Exit.REFUSED if any(each.damage for each in of) else Exit.DONE
+    return Outcome({"file": str(target), "notes": notes, **result}, "\n".join([*said, str(target)]), exit_code)
 
 
-def report(config: Config, sources: list[Path], target: Path) -> Outcome:
+def report(sources: list[Path], target: Path) -> Outcome:
     """Write an HTML page on one or two recordings to `target`; a page there is replaced, whole or not at all."""
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"
         raise usage_error(said, "tormagctl report A.mcap B.mcap -o AB.html")
-    of = opened(config, sources)
+    of = opened(sources)
     with as_usage_error(ValueError, hint="give recordings with data"):
         page = page_of(of)
     with as_usage_error(OSError, hint=WRITABLE), in_place_of(target) as unfinished:
@@ -43,9 +39,9 @@ def report(config: Config, sources: list[Path], target: Path) -> Outcome:
     return _outcome(of, target, {})
 
 
-def plot(config: Config, source: Path, target: Path) -> Outcome:
+def plot(source: Path, target: Path) -> Outcome:
     """Draw the recording `source` into the picture file `target`; a picture there is replaced, whole or not at all."""
-    (recording,) = of = opened(config, [source])
+    (recording,) = of = opened([source])
     overview, following = recording.overview, recording.overview.following
     with as_usage_error(ValueError, hint="give -o a picture's name, such as pulse.png, and a recording with data"):
         drawn = figure(overview, source.stem, recording.notes)

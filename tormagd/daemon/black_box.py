@@ -65,8 +65,8 @@ def header(config: Config, core: Core) -> dict[str, str]:
 class BlackBox:
     """Hands the core's journal to the keeper, a process that writes black boxes into `folder`."""
 
-    def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int, key: str = "") -> None:
-        self._folder, self._key = folder, key
+    def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
+        self._folder = folder
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: Beside | None = None
         if folder is None:
@@ -80,7 +80,7 @@ class BlackBox:
                 self._refusal = f"the process that keeps it did not start: {error.strerror}"
             else:
                 self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-                self._beside.send(msgspec.msgpack.encode(Begin(str(folder), header, key)))
+                self._beside.send(msgspec.msgpack.encode(Begin(str(folder), header)))
         if folder is not None and self._refusal:
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         self.journal = Journal(is_kept=self._beside is not None)
@@ -100,7 +100,7 @@ class BlackBox:
         """Begin anew with the core of another scene, from a snapshot of these states."""
         self.journal.take()
         self._packer.take()
-        self._send(Begin(str(self._folder), header, self._key))
+        self._send(Begin(str(self._folder), header))
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:

@@ -27,8 +27,7 @@ def report(of: Sequence[RecordingFile]) -> str:
     names = [each.path.name for each in of]
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
-        *(_sealed(each) for each in of),
-        *_succession(of),
+        *(_notes(each) for each in of if each.notes),
         table(["", *names], _figures(of)),
         *(_picture(each) for each in of),
         "<h2>What held the force back</h2>",
@@ -45,18 +44,9 @@ def report(of: Sequence[RecordingFile]) -> str:
     return page(f"tormagd: {', '.join(names)}", parts)
 
 
-def _sealed(of: RecordingFile) -> str:
-    """Say in HTML what the seals tell, and what else is noted."""
-    kind = "" if of.seal.is_sound else ' class="bad"'
-    said = ". ".join(dict.fromkeys([of.seal.text(), *of.notes]))
-    return f"<p{kind}>{escape(f'{of.path.name} is {said}')}.</p>"
-
-
-def _succession(of: Sequence[RecordingFile]) -> list[str]:
-    """Say in HTML which recordings follow each other, by the seals' digests; empty where none do."""
-    names = {each.seal.last: each.path.name for each in of if each.seal.last}
-    known = [(each.path.name, names[each.seal.follows]) for each in of if each.seal.follows in names]
-    return [f"<p>{escape(name)} begins where {escape(before)} ends.</p>" for name, before in known]
+def _notes(of: RecordingFile) -> str:
+    kind = ' class="bad"' if of.damage else ""
+    return f"<p{kind}>{escape('. '.join([f'{of.path.name}: {of.notes[0]}', *of.notes[1:]]))}.</p>"
 
 
 def _figures(of: Sequence[RecordingFile]) -> list[list[str]]:

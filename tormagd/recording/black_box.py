@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata
+from mcap.records import Channel, McapRecord, Message, Metadata
 
 from tormagd import __version__
 from tormagd.bounded_file import in_place_of
 from tormagd.keeping import READ, WROTE, Part
-from tormagd.recording.reader import RecordingError, opened, scan
-from tormagd.recording.stream import Record, Sent
-from tormagd.recording.writer import TICK_SCHEMA, TICKS_TOPIC, known_values, plain_schema, registered, sealed_mcap
+from tormagd.recording.reader import RecordingError, damage_in, opened, scan
+from tormagd.recording.writer import TICK_SCHEMA, TICKS_TOPIC, begun, known_values, plain_schema, registered
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 MAX_OFF_NS = {TICKS_TOPIC: 0, FRAMES_TOPIC: 1_000}
@@ -99,13 +97,13 @@ class Derived:
                 yield Shown(FRAMES_TOPIC, t_ns, self._frames, msgspec.json.encode(frame))
 
 
-def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], key: bytes = b"") -> None:
+def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -> None:
     """Write a new black box of these parts, whole or not at all."""
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
     derived = Derived(header["columns"])
     with in_place_of(path) as beside, beside.open("wb") as file:
-        sealing, mcap = sealed_mcap(file, key, {}, {"version": __version__, "kind": HEADER})
+        mcap = begun(file, {"version": __version__, "kind": HEADER})
         mcap.add_metadata(HEADER, header)
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
         schemas = {TICKS_TOPIC: TICK_SCHEMA, FRAMES_TOPIC: plain_schema(Frame)}
@@ -116,7 +114,7 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part], k
             for shown in derived.of(msgspec.msgpack.decode(part.entries), offset_ns):
                 t_ns, channel = shown.t_ns, channels[shown.topic]
                 mcap.add_message(channel, t_ns, shown.data, publish_time=t_ns, sequence=shown.sequence)
-        sealing.finish(mcap)
+        mcap.finish()  # type: ignore[no-untyped-call]
 
 
 def is_tick(entry: Any) -> bool:
@@ -129,11 +127,12 @@ def read_black_box(path: Path) -> BlackBoxFile:
     found = _Reading(path)
     with opened(path) as file:
         is_complete = scan(file, str(path), found.take, found.message)
+        damage = damage_in(file)
     if not found.header or not found.entries:
         raise RecordingError(f"{path}: {NO_BLACK_BOX}")
     if is_complete:
         found.end()
-    return BlackBoxFile(found.header, found.entries, is_complete, found.odd)
+    return BlackBoxFile(found.header, found.entries, is_complete, found.odd or damage)
 
 
 NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC} or no header {HEADER!r}"
@@ -153,29 +152,26 @@ class _Reading:
         self._late_ns = {TICKS_TOPIC: 0}
         self._size = self._parts = 0
 
-    def take(self, record: Record) -> None:
+    def take(self, record: McapRecord, _at: int) -> None:
         """Take a record that is no message: note a channel's topic, add to the header; others are passed over."""
-        if record.opcode == Opcode.CHANNEL:
-            channel = record.read(Channel)
-            if channel.topic == CORE_TOPIC and channel.message_encoding != "msgpack":
-                raise ValueError(f"{CORE_TOPIC} is {channel.message_encoding[:20]!r}: allowed is msgpack")
-            self._topics.setdefault(channel.id, channel.topic)
-        elif record.opcode == Opcode.METADATA:
-            known = record.read(Metadata)
-            if known.name == HEADER:
-                self.header.update(known.metadata)
+        if isinstance(record, Channel):
+            if record.topic == CORE_TOPIC and record.message_encoding != "msgpack":
+                raise ValueError(f"{CORE_TOPIC} is {record.message_encoding[:20]!r}: allowed is msgpack")
+            self._topics.setdefault(record.id, record.topic)
+        elif isinstance(record, Metadata) and record.name == HEADER:
+            self.header.update(record.metadata)
 
-    def message(self, sent: Sent) -> None:
+    def message(self, sent: Message) -> None:
         """Keep the entries in a message of `/core`, or compare one of `/ticks` or `/frames` with them, or pass it over."""
         if not self.header:
             raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read
-        topic = self._topics.get(sent.channel, "")
+        topic = self._topics.get(sent.channel_id, "")
         if topic == CORE_TOPIC:
             self._part(sent)
         elif topic in self._expected and not self.odd:
             self._compare(topic, sent)
 
-    def _part(self, sent: Sent) -> None:
+    def _part(self, sent: Message) -> None:
         """Add a part's entries to `entries`, and expect the messages derived from them in the file."""
         self._size, self._parts = self._size + len(sent.data), self._parts + 1
         if self._size > MAX_BYTES or self._parts > MAX_PARTS:
@@ -192,11 +188,11 @@ class _Reading:
         except (ValueError, TypeError, AttributeError, OverflowError) as error:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
 
-    def _compare(self, topic: str, sent: Sent) -> None:
+    def _compare(self, topic: str, sent: Message) -> None:
         """Compare the file's next message of `topic` with the next derived one, and note in `odd` where they differ."""
         if self._expected[topic]:
             expected = self._expected[topic].popleft()
-            late_ns = sent.t_ns - expected.t_ns
+            late_ns = sent.log_time - expected.t_ns
             off_ns = abs(late_ns - self._late_ns.setdefault(topic, late_ns))
             if (sent.sequence, sent.data) == (expected.sequence, expected.data) and off_ns <= MAX_OFF_NS[topic]:
                 return

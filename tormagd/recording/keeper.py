@@ -130,7 +130,7 @@ class Keeper:
                 raise OSError(0, "nothing is kept yet")
             folder.mkdir(mode=0o750, parents=True, exist_ok=True)
             details = {**begun.header, **write.details, "reason": write.reason}
-            write_black_box(folder / write.name, details, parts, _key(begun.key))
+            write_black_box(folder / write.name, details, parts)
             for old in sorted(folder.glob("*Z-*.mcap"))[:-MAX_FILES]:
                 old.unlink()
         except (OSError, ValueError, TypeError, KeyError, msgspec.MsgspecError) as error:
@@ -141,17 +141,6 @@ class Keeper:
     def _answer(self, answer: Written) -> None:
         with contextlib.suppress(OSError):  # there may be nobody any more
             self._socket.send(msgspec.msgpack.encode(answer), socket.MSG_DONTWAIT)
-
-
-def _key(file: str) -> bytes:
-    """Read the seals' key from `file`, without surrounding white space; empty for an empty name."""
-    from tormagd.recording.seal import read_key
-
-    try:
-        return read_key(file)
-    except (OSError, ValueError) as error:
-        write_line(f"tormagd: the black box is sealed without a key: {error}", sys.stderr)
-        return b""
 
 
 def main() -> None:

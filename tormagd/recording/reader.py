@@ -1,32 +1,56 @@
-"""Reading a recording: its overview, some seconds of it, or message by message."""
+"""Reading a recording: its overview, some seconds of it, or message by message.
+
+`mcap` takes the file apart. A file costs no more memory and time than its size explains. A record has at most
+MAX_RECORD_BYTES, and so has a chunk unpacked; all chunks together have MAX_RATIO times the file's bytes.
+"""
 
 import contextlib
 import struct
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, Metadata, MetadataIndex
-from zstandard import ZstdError
+from mcap.reader import FOOTER_SIZE
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    Message,
+    Metadata,
+    MetadataIndex,
+)  # fmt: skip
+from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+from zstandard import CONTENTSIZE_UNKNOWN, ZstdError, get_frame_parameters
 
 from tormagd.recording.overview import Glance, Overview, OverviewBuilder, unpacked
-from tormagd.recording.seal import KEYED, SEALED, State, verified
-from tormagd.recording.stream import END, HEAD, MAGIC, Record, Sent, Unpacker, contents, following, record_at
 from tormagd.recording.writer import ABOUT, CUT, OVERVIEW, TELEMETRY_TOPIC, THINNED, TICKS_TOPIC
 from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
+MAX_RECORD_BYTES = 8_000_000
+"A black box's largest message has half of this."
+MAX_RATIO, FREE_BYTES = 100, 16_000_000
+"All chunks unpack to at most MAX_RATIO times what was read of the file, plus FREE_BYTES."
+MAX_WINDOW_BYTES = 1 << 24
+DATA_END_BYTES = 13
+BLOCK_BYTES = 1 << 20
 MAX_INDEX = 1_000_000
 "Bound on the chunks of one file: some days of them."
 MAX_SEEN = 400_000
 "Bound on the messages read at once: at 4 kHz more than a minute."
-TAIL_BYTES = HEAD.size + 20 + len(MAGIC)
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
-    McapError, ZstdError, ValueError, OverflowError, MemoryError, RecursionError, struct.error, msgspec.MsgspecError,
+    McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
+    msgspec.MsgspecError,
 )  # fmt: skip
 """What damage raises; MemoryError where a damaged length asks for more than there is."""
 
@@ -65,20 +89,120 @@ def readable(name: str) -> Iterator[None]:
         raise RecordingError(f"{name}: not an intact MCAP file ({str(error)[:200]})") from error
 
 
-def scan(file: BinaryIO, name: str, take: Callable[[Record], None], message: Callable[[Sent], None]) -> bool:
-    """Read an MCAP file from its beginning: each message goes to `message`, any other record, also a chunk, to `take`."""
-    last = -1
+class _Bounded:
+    """A file that an MCAP reader reads: `left` bytes of it until somebody allows more."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.left = file, MAX_RECORD_BYTES
+
+    def read(self, size: int) -> bytes:
+        """Read `size` bytes."""
+        self.left -= size
+        if self.left < 0:
+            raise ValueError(f"a record of over {MAX_RECORD_BYTES} bytes")
+        data = self._file.read(size)
+        if len(data) < size:
+            raise EOFError("it ends within a record")
+        return data
+
+
+def _records(file: BinaryIO, *, has_magic: bool = False) -> Iterator[McapRecord]:
+    """Yield the records from where `file` stands to the end, chunks packed."""
+    stream = _Bounded(file)
+    reader = StreamReader(stream, skip_magic=not has_magic, emit_chunks=True)  # type: ignore[arg-type]
+    for record in reader.records:
+        yield record
+        stream.left = MAX_RECORD_BYTES
+
+
+def _within(chunk: Chunk) -> list[McapRecord]:
+    """Return the records in a chunk."""
+    size = chunk.uncompressed_size
+    if size > MAX_RECORD_BYTES or chunk.compression not in ("zstd", ""):
+        raise ValueError(f"a chunk of {size} bytes ({chunk.compression[:20]!r}): allowed is zstd, {MAX_RECORD_BYTES}")
+    if chunk.compression:
+        frame = get_frame_parameters(chunk.data)
+        if frame.content_size not in (size, CONTENTSIZE_UNKNOWN) or frame.window_size > MAX_WINDOW_BYTES:
+            raise ValueError("a chunk does not unpack to the size that it states")
+    return breakup_chunk(chunk, validate_crc=True)
+
+
+def scan(
+    file: BinaryIO, name: str, take: Callable[[McapRecord, int], None], message: Callable[[Message], None]
+) -> bool:
+    """Read an MCAP file from byte 0: each message goes to `message`, other records, and behind which byte each is, to
+    `take`."""
+    at, size = MAGIC_SIZE, 0
     with readable(name):
-        for record in contents(file, message):
-            last = record.opcode
-            take(record)
-        if last < 0:
-            raise ValueError("there is nothing in it")
-    return last == END
+        try:
+            for record in _records(file, has_magic=True):
+                within = [record]
+                if isinstance(record, Chunk):
+                    take(record, at)
+                    size += record.uncompressed_size
+                    if size > MAX_RATIO * file.tell() + FREE_BYTES:
+                        raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
+                    within = _within(record)
+                for each in within:
+                    if isinstance(each, Message):
+                        message(each)
+                    else:
+                        take(each, at)
+                at = file.tell()
+        except EOFError:
+            return False
+        if file.read(1):
+            raise ValueError("it does not end as MCAP does")
+    return True
+
+
+def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
+    """Read the record of this kind behind byte `at`."""
+    file.seek(at)
+    record = next(_records(file))
+    if not isinstance(record, kind):
+        raise ValueError(f"at byte {at} there is no {kind.__name__}")
+    return record
+
+
+def _end(file: BinaryIO) -> tuple[Footer | None, int]:
+    """Return the footer of a file, None for one cut short or without a summary, and the byte at which it begins."""
+    at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
+    file.seek(at)
+    footer = _at(file, at, Footer) if file.read().endswith(MCAP0_MAGIC) else None
+    return (footer if footer and footer.summary_start else None), at
+
+
+def damage_in(file: BinaryIO) -> str:
+    """Say in words which CRC of a whole MCAP file is wrong; empty for none, and for a file cut short."""
+    try:
+        footer, at = _end(file)
+        if footer is None:
+            return ""
+        data_end_at = footer.summary_start - DATA_END_BYTES
+        data_crc = _at(file, data_end_at, DataEnd).data_section_crc
+        if not data_crc:
+            file.seek(0)
+            scan(file, file.name, lambda record, at: None, lambda message: None)
+        elif data_crc != _crc(file, 0, data_end_at):
+            return "the CRC of its data is wrong"
+        if footer.summary_crc not in (0, _crc(file, footer.summary_start, at + FOOTER_SIZE - 4)):
+            return "the CRC of its summary is wrong"
+    except UNREADABLE as error:
+        return str(error)[:200] or repr(error)
+    return ""
+
+
+def _crc(file: BinaryIO, first: int, end: int) -> int:
+    crc = 0
+    file.seek(first)
+    for at in range(first, end, BLOCK_BYTES):
+        crc = zlib.crc32(file.read(min(end - at, BLOCK_BYTES)), crc)
+    return crc
 
 
 class Place(NamedTuple):
-    """Where a chunk is: its messages' times in ns since 1970, and the byte at which it begins."""
+    """Where a chunk is: its messages' times in ns since 1970, and the byte behind which it is."""
 
     from_ns: int
     to_ns: int
@@ -92,33 +216,26 @@ class Contents:
         self._topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
-        self.is_keyed = False
-        "Whether it says that it is sealed with a key."
         self.is_complete = True
         "False where the recorder was killed or the disk was full: messages up to then are there."
 
-    def take(self, record: Record) -> None:
-        """Note what a record that is no message tells: a channel's topic, tormagd's metadata, or a chunk's place."""
-        if record.opcode == Opcode.CHANNEL:
-            channel = record.read(Channel)
-            self._topics[channel.id] = channel.topic
-        elif record.opcode == Opcode.METADATA:
-            known = record.read(Metadata)
-            if known.name == ABOUT:
-                self.metadata.update(known.metadata)
-            self.is_keyed = self.is_keyed or (known.name == SEALED and known.metadata.get("by") == KEYED)
-        elif record.opcode == Opcode.CHUNK and len(self.places) < MAX_INDEX:
-            chunk = record.read(Chunk)
-            self.places.append(Place(chunk.message_start_time, chunk.message_end_time, record.at))
+    def take(self, record: McapRecord, at: int) -> None:
+        """Note what a record behind byte `at` tells: a channel's topic, tormagd's metadata, or a chunk's place."""
+        if isinstance(record, Channel):
+            self._topics[record.id] = record.topic
+        elif isinstance(record, Metadata) and record.name == ABOUT:
+            self.metadata.update(record.metadata)
+        elif isinstance(record, Chunk) and len(self.places) < MAX_INDEX:
+            self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
-    def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Sent], None]:
-        """Return a function of one Sent, which hands each tick and snapshot to `each`, decoded as the type `wanted`."""
+    def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Message], None]:
+        """Return a function of one message, which hands each tick and snapshot to `each`, decoded as the type `wanted`."""
         decoder = msgspec.json.Decoder(wanted)
 
-        def message(sent: Sent) -> None:
-            topic = self._topics.get(sent.channel)
+        def message(sent: Message) -> None:
+            topic = self._topics.get(sent.channel_id)
             if topic in TOPICS:
-                each(Seen(sent.t_ns, topic == TICKS_TOPIC, decoder.decode(sent.data)))
+                each(Seen(sent.log_time, topic == TICKS_TOPIC, decoder.decode(sent.data)))
 
         return message
 
@@ -155,11 +272,11 @@ def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Con
 class RecordingFile:
     """A recording on the disk, of any length: its `overview`, `metadata`, `is_complete`, and any seconds of it."""
 
-    def __init__(self, path: Path, key: bytes = b"") -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        with opened(path):
-            self.seal = verified(path, key)
-        found = summary_of(path) if self.seal.state is State.WHOLE else None
+        with opened(path) as file:
+            self.damage = damage_in(file)
+        found = None if self.damage else summary_of(path)
         if found is None:
             builder = OverviewBuilder()
             found = read_recording(path, Glance, lambda seen: builder.add(*seen)), builder.made()
@@ -168,7 +285,7 @@ class RecordingFile:
         self.is_complete = self._contents.is_complete
         known = self.metadata
         self.notes = [
-            *([] if self.seal.is_sound else [self.seal.text()]),
+            *([f"damaged: {self.damage}"] if self.damage else []),
             *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
             *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
         ]
@@ -185,59 +302,38 @@ class RecordingFile:
                 if len(found) > MAX_SEEN:
                     raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
 
-        message, unpacker = self._contents.reading(wanted, keep), Unpacker()
+        message = self._contents.reading(wanted, keep)
         with opened(self.path) as file, readable(str(self.path)):
             for place in self._contents.places:
                 if place.from_ns <= to_ns and place.to_ns >= from_ns:
-                    for _ in unpacker.records(_at(file, place.at, Opcode.CHUNK), message):
-                        pass
+                    for each in _within(_at(file, place.at, Chunk)):
+                        if isinstance(each, Message):
+                            message(each)
         return found
 
 
 def summary_of(path: Path) -> tuple[Contents, Overview] | None:
     """Read contents and overview from the end of the file in `path`, without its messages."""
+    found, told, overview_at = Contents(), [], 0
     with opened(path) as file, readable(str(path)):
-        found = _from_summary(file)
-        if found is not None:
-            found[0].require(str(path))
-        return found
-
-
-def _from_summary(file: BinaryIO) -> tuple[Contents, Overview] | None:
-    """Read contents and overview from the end of a finished file; None for a cut file, or one without an overview."""
-    at = file.seek(0, 2) - TAIL_BYTES
-    file.seek(max(0, at))
-    if at < 0 or not file.read().endswith(MAGIC):
-        return None
-    file.seek(at)
-    footer = record_at(file, at)
-    start = footer.read(Footer).summary_start if footer is not None and footer.opcode == Opcode.FOOTER else 0
-    found = Contents()
-    overview_at, told = None, []
-    file.seek(start)
-    for record in following(file, start) if start else ():
-        if record.opcode == Opcode.CHUNK_INDEX and len(found.places) < MAX_INDEX:
-            index = record.read(ChunkIndex)
-            found.places.append(Place(index.message_start_time, index.message_end_time, index.chunk_start_offset))
-        elif record.opcode == Opcode.METADATA_INDEX:
-            told.append(record.read(MetadataIndex).offset)
-        elif record.opcode == Opcode.ATTACHMENT_INDEX:
-            attached = record.read(AttachmentIndex)
-            overview_at = attached.offset if attached.name == OVERVIEW else overview_at
-        else:
-            found.take(record)
-    if overview_at is None:
-        return None
-    for at in told:
-        found.take(_at(file, at, Opcode.METADATA))
-    found.is_complete = CUT not in found.metadata
-    return found, unpacked(_at(file, overview_at, Opcode.ATTACHMENT).read(Attachment).data)
-
-
-def _at(file: BinaryIO, at: int, opcode: Opcode) -> Record:
-    """Read the record at byte `at`, and leave `file` behind it."""
-    file.seek(at)
-    record = record_at(file, at)
-    if record is None or record.opcode != opcode:
-        raise ValueError(f"its index points to byte {at}, where something else is")
-    return record
+        footer, _ = _end(file)
+        if footer is None:
+            return None
+        file.seek(footer.summary_start)
+        for record in _records(file):
+            if isinstance(record, ChunkIndex) and len(found.places) < MAX_INDEX:
+                place = Place(record.message_start_time, record.message_end_time, record.chunk_start_offset)
+                found.places.append(place)
+            elif isinstance(record, MetadataIndex):
+                told.append(record.offset)
+            elif isinstance(record, AttachmentIndex) and record.name == OVERVIEW:
+                overview_at = record.offset
+            elif isinstance(record, Channel):
+                found.take(record, 0)
+        if not overview_at:
+            return None
+        for at in told:
+            found.take(_at(file, at, Metadata), at)
+        found.require(str(path))
+        found.is_complete = CUT not in found.metadata
+        return found, unpacked(_at(file, overview_at, Attachment).data)

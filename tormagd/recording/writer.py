@@ -2,7 +2,7 @@
 
 Channel `/telemetry` has the daemon's snapshots as published, `/ticks` one message for every control tick. The files
 open in Foxglove and PlotJuggler as they are. A value that is not known is left out of its message: viewers read only
-plain schemas, in which a number cannot be null. An overview stands at the end, and seals in between (`seal.py`).
+plain schemas, in which a number cannot be null. An overview stands at the end.
 """
 
 import contextlib
@@ -17,12 +17,11 @@ from types import TracebackType
 from typing import Any, BinaryIO, NoReturn, Self
 
 import msgspec
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from tormagd import __version__
 from tormagd.recording.folder import RecordingFolder
 from tormagd.recording.overview import OverviewBuilder
-from tormagd.recording.seal import KEYED, PLAIN, SEALED, SealingFile
 from tormagd.recording.thinning import AROUND_S, Thinning
 from tormagd.recording.ticks import TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry, TickRecord
@@ -39,7 +38,6 @@ TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC = "/ticks"
 NUMBER_COLUMN = "tick"
 "Column of the control tick's number; a missing number is a lost tick."
-CHUNK_BYTES = 1024 * 1024
 CHUNK_NS = 500_000_000
 "Time that one chunk spans, lost where the recorder is killed."
 MIN_FREE_BYTES = 16_000_000
@@ -63,10 +61,9 @@ class RecordingWriter:
         self,
         place: Path | RecordingFolder,
         metadata: Mapping[str, str] | None = None,
-        key: bytes = b"",
         every: int = 1,
     ) -> None:
-        self._key, self._thinning = key, Thinning(every)
+        self._thinning = Thinning(every)
         self._folder = place if isinstance(place, RecordingFolder) else None
         self._about = {"version": __version__, **(metadata or {})}
         if every > 1:
@@ -76,32 +73,31 @@ class RecordingWriter:
         self._mark: Mark | None = None
         self.telemetry_count = self.telemetry_lost = 0
         self.tick_count = self.ticks_lost = 0
-        self._begin(place.new() if isinstance(place, RecordingFolder) else place, "")
+        self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
-    def _begin(self, path: Path, follows: str) -> None:
+    def _begin(self, path: Path) -> None:
         """Open a new file in `path`, lock it against pruning, and write its head and metadata."""
         self.path = path
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody takes it away while it is written
         self._overview = OverviewBuilder()
-        self._sealing, self._mcap = sealed_mcap(self._file, self._key, {"follows": follows}, self._about)
-        self._sealing.flush()
+        self._mcap = begun(self._file, self._about)
+        self._file.flush()
         self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
         self._tick_channels: dict[bool, int] = {}
         self._begin_ns = self._chunk_ns = 0
 
     def _rotate(self, folder: RecordingFolder) -> None:
-        """End the file and go on in a new one, which names the old one's last seal, where size or length are over the
-        budget."""
-        if not folder.is_due(self._sealing.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
+        """End the file and go on in a new one, where size or length are over the budget."""
+        if not folder.is_due(self._file.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
             return
         try:
             path = folder.new()
         except OSError as error:
             self._give_up(str(error.strerror))
         self._end()
-        self._begin(path, self._sealing.digest)
+        self._begin(path)
 
     def _give_up(self, reason: str) -> NoReturn:
         """End the file in order, with `reason` in its metadata, and raise OSError with ENOSPC and that reason."""
@@ -148,17 +144,17 @@ class RecordingWriter:
             self._rotate(self._folder)
 
     def close(self) -> None:
-        """Write waiting ticks, overview, index and last seal, and close the file; do nothing where it is closed."""
+        """Write waiting ticks, overview and index, and close the file; do nothing where it is closed."""
         if not self._file.closed:
             self._write(self._thinning.rest(self._thinning.every))
             self._end()
 
     def _end(self) -> None:
-        """Write overview, index and last seal, and close the file, whatever fails."""
+        """Write overview and index, and close the file, whatever fails."""
         with self._file:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", self._overview.made().packed())
-            self._sealing.finish(self._mcap)
+            self._mcap.finish()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
         return self
@@ -188,27 +184,21 @@ class RecordingWriter:
         first."""
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
-            index_bytes = self._sealing.tell() // INDEX_SHARE
+            index_bytes = self._file.tell() // INDEX_SHARE
             reason = disk_room(self.path, index_bytes) if self._folder is None else self._folder.room(index_bytes)
             if reason:
                 self._give_up(reason)
-            if self._chunk_ns:
-                self._sealing.seal()
-                self._sealing.flush()
+            self._file.flush()
             self._begin_ns, self._chunk_ns = self._begin_ns or t_ns, t_ns
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 
 
-def sealed_mcap(
-    file: BinaryIO, key: bytes, sealed: Mapping[str, str], about: dict[str, str]
-) -> tuple[SealingFile, Writer]:
-    """Begin an MCAP file that is to be sealed, with `key` unless it is empty, and write its first metadata."""
-    sealing = SealingFile(file, key)
-    mcap = Writer(sealing, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+def begun(file: BinaryIO, about: dict[str, str]) -> Writer:
+    """Begin an MCAP file whose CRCs cover all of it, with `about` as metadata of what is recorded."""
+    mcap = Writer(file, enable_data_crcs=True)
     mcap.start(profile="", library=f"tormagd {__version__}")
-    mcap.add_metadata(SEALED, {"by": KEYED if key else PLAIN, **sealed})
     mcap.add_metadata(ABOUT, about)
-    return sealing, mcap
+    return mcap
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:

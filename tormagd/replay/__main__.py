@@ -11,11 +11,10 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd.assembly.build import sources_hash
-from tormagd.config import Config, load_config
+from tormagd.config import load_config
 from tormagd.output import write_line
 from tormagd.recording.black_box import BlackBoxFile, read_black_box
 from tormagd.recording.reader import RecordingError
-from tormagd.recording.seal import read_key, verified
 from tormagd.replay.rebuild import Recorded, ReplayError, differences, rebuilt, recorded
 from tormagd.replay.rehearse import changed, rehearse, script
 from tormagd.replay.rerun import rerun
@@ -35,12 +34,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         configured = None if options.config is None else load_config(options.config)
         box = read_black_box(options.file)
-        seal = verified(options.file, _key(configured))
         try:
             known = recorded(box, options.file.absolute().parent)
             result: dict[str, Any] = {
                 "file": str(options.file),
-                "seal": {"state": seal.state, "is_sound": seal.is_sound, "why": seal.why},
                 "odd": box.odd,
                 "version": known.header["version"],
                 "reason": box.header.get("reason", ""),
@@ -61,14 +58,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0 if write_line(json.dumps(result), sys.stdout) is None else 1
-
-
-def _key(configured: Config | None) -> bytes:
-    """Return the configured key of seals, empty without one."""
-    try:
-        return read_key("" if configured is None else configured.recordings.key)
-    except ValueError as error:
-        raise ReplayError(str(error)) from error
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
