@@ -36,13 +36,12 @@ the [fault matrix](fault-matrix.md). `python tools/safety_pages.py` writes this 
 """
 _MATRIX_HEAD = """# Fault matrix
 
-What each fault comes to, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
-[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`, which also has all times.
+The effect of each fault, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
+[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`.
 
-Faults are put in while 1.8 ± 0.1 N are rendered at a turning handle; those of homing and of the start are there from
-the beginning. A row is of both buses, where they agree. *Safe after* is when the gap was open or at rest, or the limit
-was told. *Leads out* are the commands that the daemon names, once the cause has gone. Then the force is followed again
-within 0.15 N.
+Faults are injected while 1.8 ± 0.1 N are rendered at a turning handle, those of homing and of the start from the
+beginning. A row is for both buses if they agree. *Safe after* is when the gap was open or at rest, or the limit was
+told. *Leads out* are the commands that the daemon names once the cause has gone; then the force is followed again.
 
 """
 
