@@ -114,8 +114,8 @@ def _pulse(pulse: Json) -> str:
         "## The pulse experiment of section 4.3\n\n"
         "MRE-C, 4,322 samples at 160 Hz: pressed to 4.5 mm at 1 mm/s, then held while the field follows a pulse "
         f"between 100 and 200 mT: {pulse['shape']}. The field is found from the force. Its error counts where "
-        f"|dF/dB| >= 0.03 N/mT ({pulse['scored_share']:.1%} of the samples); elsewhere the force's counts. The thesis measured "
-        f"{PULSE_MAE_MT} ± {PULSE_SD_MT} mT, at most {PULSE_MAX_MT} mT.\n\n"
+        f"|dF/dB| >= 0.03 N/mT ({pulse['scored_share']:.1%} of the samples); elsewhere the force's counts. The thesis "
+        f"measured {PULSE_MAE_MT} ± {PULSE_SD_MT} mT, at most {PULSE_MAX_MT} mT.\n\n"
         + table(columns, rows.values())
         + "\nThe network alone drifts with [the pad's](tactile.md) relaxation, where one percent of the held force is "
         "worth 10 mT. The other pads have constants drawn 3 to 15 % off.\n\n"
