@@ -41,7 +41,8 @@ The effect of each fault, in virtual time on simulated devices. Written by `pyth
 
 Faults are injected while 1.8 ± 0.1 N are rendered at a turning handle, those of homing and of the start from the
 beginning. A row is for both buses if they agree. *Safe after* is when the gap was open or at rest, or the limit was
-told. *Leads out* are the commands that the daemon names once the cause has gone; then the force is followed again.
+told. The headings have the commands that the daemon names once the cause has gone. After them the force is followed
+again.
 
 """
 
@@ -81,12 +82,14 @@ def matrix_page(record: dict[str, Any]) -> str:
     for cell in cells:
         lines.setdefault((cell["fault"], *_outcome(cell)), []).append(cell)
     buses = Counter(fault for fault, *_ in lines)
-    made = []
+    made: dict[str, list[tuple[str, ...]]] = {}
     for (fault, named, reaction, leads_out), alike in lines.items():
         name = fault if buses[fault] == 1 else f"{fault} ({alike[0]['bus']})"
         safe_s = [cell["seconds"] for cell in alike if cell["seconds"] is not None]
-        made.append((name, named, reaction, f"{max(safe_s):.3f} s" if safe_s else "-", leads_out))
-    return _MATRIX_HEAD + says + table(("fault", "named as", "reaction", "safe after", "leads out"), made)
+        told = f"{reaction}, {max(safe_s):.3f} s" if safe_s else reaction
+        made.setdefault(leads_out, []).append((name, named, told))
+    columns = ("fault", "named as", "reaction, safe after")
+    return _MATRIX_HEAD + says + "\n".join(f"## Leads out: {by}\n\n{table(columns, of)}" for by, of in made.items())
 
 
 def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
@@ -95,7 +98,7 @@ def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
     told = [name for name in told if name.replace("device:", "DEVICE_") not in told or not name.startswith("device:")]
     failed = [f"not {word}" for name, word in HELD.items() if not cell[name]]
     reaction = cell["expected"] + (f" (**{', '.join(failed)}**)" if failed else "")
-    return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "-"
+    return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "no command"
 
 
 def _diagram() -> str:
