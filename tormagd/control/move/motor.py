@@ -111,7 +111,7 @@ def margins(motor: Motor, position: Position, period_s: float) -> Margins:
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)
     plant = zero_order_hold(motor, period_s)
-    open_loop = np.polyval(plant.numerator, z) / np.polyval(plant.denominator, z) / z
+    open_loop = np.polyval(plant.numerator, z) / np.polyval(plant.denominator, z) * z**-1.0
     integral = period_s / position.integral_time_s / (1.0 - 1.0 / z)
     smoothing = period_s / (position.derivative_filter_s + period_s)
     derivative = position.derivative_time_s * smoothing * (1.0 - 1.0 / z) / period_s / (1.0 - (1.0 - smoothing) / z)
