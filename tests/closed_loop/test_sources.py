@@ -13,7 +13,7 @@ from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Sources
 from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
-from tormagd.daemon.source_clock import SETTLED_S
+from tormagd.daemon.source import SETTLED_S
 from tormagd.daemon.way import Way
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Budget
@@ -102,11 +102,11 @@ def run(
         while following is not None and following[0] <= now_s:
             inbox.take(following[1], now_s, START_NS + round(now_s * 1e9))
             following = next(coming, None)
-        inbox.playout.update(now_s)
+        inbox.hand_on(now_s)
         at(inbox, now_s - start_s)
         used = loop.planner.planned
         samples.append(loop.tick(inbox.newest))
-        way.ticked(loop.stepper.time_s, used)
+        way.ticked(loop.stepper.time_s, used, sources.playout_ms * 1e-3)
     for _ in range(8):
         inbox.refresh(loop.now_s)
     way.to_duty.refresh()

@@ -30,7 +30,7 @@ from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, SafetyState
 from tormagd_client.messages import TickRecord
 
-FORMAT = 13
+FORMAT = 14
 "Version of the entries and their states: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),

@@ -44,7 +44,6 @@ class TimedSetpoint(Value):
         holder: int = 0,
         limits: tuple[Limit, ...] = (),
         withdraw_N: float | None = None,
-        playout_s: float = 0.0,
         wall: Wall | None = None,
     ) -> None:
         self.force_N: Final = force_N
@@ -57,7 +56,6 @@ class TimedSetpoint(Value):
         self.holder: Final = holder
         self.limits: Final = limits
         self.withdraw_N: Final = withdraw_N
-        self.playout_s: Final = playout_s
         self.wall: Final = wall
 
     def asked_N(self, travel: "Travel") -> float:

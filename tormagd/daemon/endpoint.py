@@ -122,7 +122,7 @@ class Endpoint:
             else:
                 data = b"" if frame.more else frame.bytes
                 is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
-        return self.inbox.playout.update(time.monotonic()) or is_newer
+        return self.inbox.hand_on(time.monotonic()) or is_newer
 
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
         """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its first part."""

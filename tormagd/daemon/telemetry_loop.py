@@ -122,7 +122,7 @@ class TelemetryLoop:
         if control.output is None or control.used is None:
             return
         self._left -= 1
-        self._way.ticked(control.stepper.time_s, control.used)
+        self._way.ticked(control.stepper.time_s, control.used, self._endpoint.inbox.sources.playout_ms * 1e-3)
         timing = control.timing
         record = tick_record(
             control.stepper,
@@ -236,13 +236,13 @@ class TelemetryLoop:
         return is_homed(self._connection.measurement, self._control.stepper.measured)
 
     def _snapshot(self, now_s: float) -> Telemetry:
-        newest = self._endpoint.inbox.newest
+        in_force = self._endpoint.inbox.in_force
         return snapshot(
             self._ticks[-1],
             self.timing.runs,
             self._is_homed(),
             self.is_busy(),
-            None if newest is None else now_s - newest.stamp_s,
+            None if in_force is None else now_s - in_force.stamp_s,
             beliefs(self._inference.planner, self._control.stepper, now_s, self._core.scene.terms),
             self.topics.handle(),
             self.topics.verdict(),
@@ -366,7 +366,7 @@ class TelemetryLoop:
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
         inbox = self._endpoint.inbox
-        before = inbox.hold.source
+        before = inbox.holder
         inbox.give(source, time.monotonic())
         log.info("the brake is given to the source %r", source)
         return {"source": source, "instead_of": before}

@@ -44,7 +44,7 @@ class Topics:
 
     def verdict(self) -> Verdict | None:
         """Return the verdict on the newest setpoint, as things are now; None without a setpoint."""
-        in_force = self._endpoint.inbox.playout.in_force
+        in_force = self._endpoint.inbox.in_force
         return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
@@ -65,7 +65,7 @@ class Topics:
 
     def _publish_verdicts(self) -> bool:
         """Publish the verdict on the setpoint in force, and on one refused because another source holds the brake."""
-        in_force, is_said = self._endpoint.inbox.playout.in_force, False
+        in_force, is_said = self._endpoint.inbox.in_force, False
         # a setpoint is a new object, even where its source begins its numbers anew
         if in_force is not None and in_force is not self._judged:
             self._judged, is_said = in_force, True

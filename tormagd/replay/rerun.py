@@ -34,7 +34,7 @@ UNTAKEN = (
 "What the core may raise for values that it never makes itself."
 SETPOINT = tuple[
     float, float, float, float | None, float | None, tuple[float, ...], float, int, tuple[Limit, ...], float | None,
-    float, Any,
+    Any,
 ]  # fmt: skip
 NOT_THE_CORES = 1
 "Number of leading columns that the core does not make: `t_ns`, from the clock."

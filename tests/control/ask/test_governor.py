@@ -15,7 +15,7 @@ from tormagd.control.ask.forecast import HORIZON_S, Forecast
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, _wanted_N
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.records import Ask, TimedSetpoint, Travel, Wall
+from tormagd.control.records import Ask, TimedSetpoint, Travel
 from tormagd.exact import plain, restore
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Limit
@@ -65,26 +65,6 @@ def stream_of(
         now_s = number * period_s
         ask = decide(following, now_s, TimedSetpoint(force_N, now_s, VALID_S), lag_s)
     return following, ask
-
-
-@pytest.mark.parametrize(
-    "form",
-    [{}, {"preview_N": (1.1, 1.3, 1.2), "preview_dt_s": 0.03}, {"wall": Wall(2.0, 0.4)}, {"withdraw_N": 0.5}],
-    ids=["plain", "preview", "wall", "withdraws"],
-)
-def test_what_is_played_out_later_is_followed_alike_whatever_it_is(form: dict[str, Any]) -> None:
-    playout_s = 0.0625
-    now, later = governor(), governor()
-    for number in range(1, 60):
-        now_s, stamp_s = number * 0.004, (number - number % 3) * 0.004
-        force_N, travel = 1.0 + 0.5 * math.sin(5.0 * stamp_s), Travel(20.0 * now_s, 20.0, number < 50)
-        at_once = now.update(now_s, TimedSetpoint(force_N, stamp_s, 0.5, **form), DeviceFit(), 0.01, travel)
-        held = TimedSetpoint(force_N, stamp_s - playout_s, 0.5, playout_s=playout_s, **form)
-        played = later.update(now_s, held, DeviceFit(), 0.01, travel)
-        now.foresee(), later.foresee()
-        assert path_N(played) == pytest.approx(path_N(at_once), abs=1e-9)
-        assert (played.age_s, played.limits) == (pytest.approx(now_s - held.stamp_s), at_once.limits)
-    assert Limit.STALE in later.update(held.stamp_s + 0.51, held, DeviceFit(), 0.01).limits
 
 
 RAMP_N = [1.0 + 0.01 * k for k in range(40)]

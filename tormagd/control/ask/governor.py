@@ -118,7 +118,7 @@ class Governor:
         _require_numbers(setpoint, age_s)
         if age_s > setpoint.valid_for_s:
             return self._decay(dt_s, lowest_N, age_s, (Limit.STALE, *setpoint.limits))
-        soon_s = max(age_s - setpoint.playout_s, 0.0)
+        soon_s = max(age_s, 0.0)
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
         # slope and forecast are of what is asked: the least force of the device is learned, and varies
         asked_N = setpoint.asked_N(travel)
@@ -346,9 +346,8 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         and -_LARGEST <= (setpoint.displacement_mm or 0.0) <= _LARGEST
         and -_LARGEST <= (setpoint.rate_mm_s or 0.0) <= _LARGEST
         and -_LARGEST <= (setpoint.withdraw_N or 0.0) <= _LARGEST
-        and -_LARGEST <= setpoint.playout_s <= _LARGEST
     ):
-        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N", "playout_s"):
+        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N"):
             require_number(name, getattr(setpoint, name) or 0.0)
         require_number("age_s", age_s)
     if setpoint.wall is not None:
