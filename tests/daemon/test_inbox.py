@@ -114,6 +114,14 @@ def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over
     assert (publishing.send(0, 2.0, at_s=0.051), publishing.force_N) == (True, 2.0)
 
 
+def test_a_new_run_begins_a_ramp_also_where_its_first_messages_are_refused(publishing: Publishing) -> None:
+    publishing.send(100, valid_for_ms=1_000.0)
+    for number in range(60):
+        publishing.send(number, 2.0, "a", -2.0, at_s=0.01 + number * 0.005, valid_for_ms=1_000.0)
+        assert publishing.newest.holder == (publishing.force_N == 2.0)
+    assert publishing.force_N == 2.0
+
+
 # -- who holds the brake -------------------------------------------------------------------------------------------
 
 
@@ -253,7 +261,9 @@ def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock
     assert (publishing.send(1, 2.0, "a", -AHEAD_S - 0.001), publishing.counters()) == (False, (0, 1, 0))
     with pytest.raises(RefusedError, match="nothing that is still valid"):
         publishing.inbox.give("a", publishing.now_s)
-    assert "51 ms ahead" in str(publishing.inbox.last_refusal)
+    assert "0.051 s ahead of this clock: allowed are 0.05 s ahead and 86400 s behind" in str(
+        publishing.inbox.last_refusal
+    )
     assert publishing.send(2, 2.0, "a", -AHEAD_S - 0.001, at_s=SETTLED_S)
     # of a source that is known, it is the clock; and no setpoint is younger than its arrival
     assert publishing.send(1, 1.0, "b", 0.0, valid_for_ms=1.0) is False

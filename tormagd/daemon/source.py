@@ -1,10 +1,10 @@
 """One publisher of setpoints: which of its messages count, how old they are, and how evenly they come.
 
-A message that does not follow the newest may be old, repeated, wrong, or the first of a new run, which shows itself in
-a few messages: no number keeps a publisher out. A message's lateness, our time less its stamp, is the offset of its
-clock plus the time on the way. None arrives before it was sent, those of one publisher do not overtake each other, and
-clocks drift slowly. So the least lateness is the offset plus the constant part of the way, and what is above is delay.
-From one side these two cannot be told apart: up to MAX_WAY_S counts as the way.
+No number keeps a publisher out. A message that does not follow the newest may be the first of a new run, which shows
+itself in a few messages. A message's lateness, our time less its stamp, is the offset of its clock plus the time on the
+way. None arrives before it was sent, those of one publisher do not overtake each other, and clocks drift slowly. So the
+least lateness is the offset plus the constant part of the way, and what is above is delay. From one side these two
+cannot be told apart: up to MAX_WAY_S counts as the way.
 
 No I/O and no clock: times are arguments.
 """
@@ -34,8 +34,8 @@ STRAYS_S = 1.0
 
 FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
 "ns in what publishers send instead."
-FAR_NS = 86_400 * 10**9
-"Stamps of such another unit are years away; nearer ones are of a clock."
+FAR_S = 86_400.0
+"Stamps of such another unit are years away; nearer ones are of a clock. No setpoint is older than this."
 LOOKED_AT, MIN_S = 8, 0.005
 "Messages, and time, that it takes to see how fast far stamps run."
 SLOW = 0.03
@@ -296,6 +296,7 @@ class Source:
         self.cause = self.remedy = ""
         self._fit: ClockReport | None = None
         self._is_named = False
+        self._begun = Order.NEWER
         self._unit = ""
         self._far, self._far_s, self._far_ns = 0, 0.0, 0
         "Messages with far stamps that are looked at; arrival and stamp of the first."
@@ -311,19 +312,22 @@ class Source:
             order = self.sequence.order(now_s, setpoint.session, setpoint.seq, is_over=is_over)
             if order is Order.STRAY:
                 return order
+            if order is not Order.NEWER:
+                self._begun = order
         self.heard_s = now_s
         self._require_ns(setpoint, now_s, realtime_ns)
         lateness_s = (realtime_ns - setpoint.stamp_ns) * 1e-9
         delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is not Order.REPLACED)
-        if delay_s < -AHEAD_S:
+        if not -AHEAD_S <= delay_s <= FAR_S:
             raise MessageError(
-                f"stamp_ns is {-delay_s * 1e3:.0f} ms ahead of this clock: allowed is {AHEAD_S * 1e3:.0f} ms, "
-                "until the clock of its source has shown itself"
+                f"stamp_ns is {abs(delay_s):.3f} s {'ahead of' if delay_s < 0.0 else 'behind'} this clock: allowed are "
+                f"{AHEAD_S:g} s ahead and {FAR_S:.0f} s behind, until the clock of its source has shown itself"
             )
         self.setpoint, self.stamp_s = setpoint, now_s - max(delay_s, 0.0)
         if self.clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
             self._note_manner(now_s, max(delay_s, playout_s), playout_s, needs)
+        order, self._begun = self._begun, Order.NEWER
         return order
 
     def is_stale(self, now_s: float) -> bool:
@@ -369,7 +373,7 @@ class Source:
     def _require_ns(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
         """Raise MessageError where the stamps do not count ns, or where this is not known yet."""
         stamp_ns = setpoint.stamp_ns
-        if abs(realtime_ns - stamp_ns) < FAR_NS:
+        if abs(realtime_ns - stamp_ns) < FAR_S * 1e9:
             self._unit, self._far = "ns", 0
         else:
             if self._far == 0:
