@@ -395,3 +395,24 @@ def test_what_is_over_is_not_told_any_more(inbox: SetpointInbox) -> None:
     assert inbox.newest.limits == (Limit.SOURCE_JITTER,)
     hear(inbox, 500.0, steady(0.03), 0.0, 1, 4.0, 6.2)
     assert inbox.newest.limits == ()
+
+
+@pytest.mark.parametrize("rate_hz", [25.0, 100.0, 500.0])
+@pytest.mark.parametrize("what", ["pauses", "restarts", "restarts with a session", "restarts elsewhere"])
+def test_no_pause_and_no_restart_is_told_as_a_manner_of_sending(
+    inbox: SetpointInbox, what: str, rate_hz: float
+) -> None:
+    noise, now_s, number, session, way_s = random.Random(round(rate_hz)), 0.0, 0, 1, 0.001
+    for _ in range(50):
+        for _ in range(round(rate_hz * noise.uniform(0.2, 3.0))):
+            now_s, number = now_s + noise.uniform(0.9, 1.1) / rate_hz, number + 1
+            message = {"v": 1, "source": "a", "seq": number, "stamp_ns": START_NS + round((now_s - way_s) * 1e9)}
+            message |= {"servo_cf": 1.0, "valid_for_ms": 100.0, "session": session if "session" in what else None}
+            inbox.take(msgpack.packb(message), now_s, START_NS + round(now_s * 1e9))
+            assert inbox.newest.limits == (), (now_s, inbox.told(now_s))
+        if what == "pauses" or noise.random() < 0.7:
+            now_s += noise.choice([0.15, 0.4, 0.9, 2.0, 20.0])
+        if what != "pauses":
+            number, session = 0, session + 1
+        if what == "restarts elsewhere":
+            way_s = noise.uniform(0.001, 0.1)

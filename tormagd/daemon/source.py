@@ -96,8 +96,8 @@ class Sequence:
 
     def __init__(self, session: int | None, seq: int) -> None:
         self.session, self.seq = session, seq
-        self.lost = 0
-        "Messages missing in `seq`, counted where the publisher counts by ones."
+        self.lost = self.missing = 0
+        "Messages missing in `seq`, of all and before the newest, counted where the publisher counts by ones."
         self.restarts = 0
         self._latest_session = session
         self._step = 0
@@ -110,8 +110,8 @@ class Sequence:
             step = seq - self.seq
             known = self._step
             if known == 0 or step <= LONGEST_JUMP * known or is_over:
-                if known == 1:
-                    self.lost += min(step, LONGEST_JUMP) - 1
+                self.missing = min(step, LONGEST_JUMP) - 1 if known == 1 else 0
+                self.lost += self.missing
                 if known == 0 or step < known:
                     self._step = step
                 self.seq, self._in_row = seq, 0
@@ -137,7 +137,7 @@ class Sequence:
     def _begin(self, session: int | None, seq: int, order: Order) -> Order:
         """Follow a new run from this message, count a restart, and return `order`."""
         self.session, self.seq, self._step = session, seq, 0
-        self._in_row = self._strays = 0
+        self._in_row = self._strays = self.missing = 0
         self.restarts += 1
         return order
 
@@ -301,8 +301,8 @@ class Source:
         self._far, self._far_s, self._far_ns = 0, 0.0, 0
         "Messages with far stamps that are looked at; arrival and stamp of the first."
         self._began_s: float | None = None
-        self._lost = 0
-        self._late_s: list[float] = []
+        self._sent_s = 0.0
+        self._window: list[tuple[int, float, float]] = []
 
     def judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int, playout_s: float, needs: Needs) -> Order:
         """Judge a message, and make it the newest of its source unless it is a stray, or a MessageError refuses it."""
@@ -324,10 +324,12 @@ class Source:
                 f"{AHEAD_S:g} s ahead and {FAR_S:.0f} s behind, until the clock of its source has shown itself"
             )
         self.setpoint, self.stamp_s = setpoint, now_s - max(delay_s, 0.0)
+        order, self._begun = self._begun, Order.NEWER
+        if order is not Order.NEWER:
+            self._began_s, self.found = None, {}
         if self.clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
-            self._note_manner(now_s, max(delay_s, playout_s), playout_s, needs)
-        order, self._begun = self._begun, Order.NEWER
+            self._note_manner(now_s, delay_s, playout_s, needs)
         return order
 
     def is_stale(self, now_s: float) -> bool:
@@ -395,28 +397,32 @@ class Source:
             f"{LOOKED_AT} messages show whether it counts ns"
         )
 
-    def _note_manner(self, now_s: float, late_s: float, playout_s: float, needs: Needs) -> None:
-        """Note that the newest setpoint is followed `late_s` after its stamp, and judge the window that it fills."""
-        if self._began_s is not None:
-            self._late_s.append(late_s)
-            past_s = now_s - self._began_s
-            if past_s < WINDOW_S or len(self._late_s) < MIN_MESSAGES:
-                return
-            self.found = self._judged(past_s, playout_s, needs)
-        self._began_s, self._lost, self._late_s = now_s, self.sequence.lost, []
+    def _note_manner(self, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
+        """Note how the newest setpoint came, and judge the window that it fills."""
+        sent_s, missing = now_s - delay_s, self.sequence.missing
+        spacing_s, self._sent_s = (sent_s - self._sent_s) / (1 + missing), sent_s
+        if self._began_s is None:
+            self._began_s, self._window = now_s, []
+            return
+        self._window.append((missing, spacing_s, max(delay_s, playout_s)))
+        if now_s - self._began_s >= WINDOW_S and len(self._window) >= MIN_MESSAGES:
+            self.found = self._judged(playout_s, needs)
+            self._began_s, self._window = now_s, []
 
-    def _judged(self, past_s: float, playout_s: float, needs: Needs) -> dict[Limit, Explanation]:
-        """Return what is wrong in a full window of `past_s`, s, with cause and remedy; empty where nothing is."""
-        lost, late_s, hidden_s = self.sequence.lost - self._lost, self._late_s, self.clock.hidden_s
-        sent = len(late_s) + lost
+    def _judged(self, playout_s: float, needs: Needs) -> dict[Limit, Explanation]:
+        """Return what is wrong in a full window, with cause and remedy; empty where nothing is."""
+        lost, received, hidden_s = sum([each[0] for each in self._window]), len(self._window), self.clock.hidden_s
+        late_s = [each[2] for each in self._window]
         found = {}
-        if lost > MAX_LOST * sent:
+        if lost > MAX_LOST * (received + lost):
             found[Limit.SOURCE_LOSS] = Explanation(
-                f"{lost / sent:.0%} of its setpoints are lost on the way", "look for the lossy part of the network"
+                f"{lost / (received + lost):.0%} of its setpoints are lost on the way",
+                "look for the lossy part of the network",
             )
-        spacing_s = past_s / sent
         preview_s = len(self.setpoint.preview_N or ()) * (self.setpoint.preview_dt_ms or 0.0) * 1e-3
-        if spacing_s > max(SLACK / needs.setpoint_hz, preview_s):
+        most_s, spacings_s = max(SLACK / needs.setpoint_hz, preview_s), [each[1] for each in self._window]
+        if 2 * len([each_s for each_s in spacings_s if each_s > most_s]) > received:
+            spacing_s = sorted(spacings_s)[(received - 1) // 2]
             found[Limit.SOURCE_SELDOM] = Explanation(
                 f"it sends {1.0 / spacing_s:.1f} setpoints a second, and the scene needs {needs.setpoint_hz:g}",
                 "send more often, or a preview_N that reaches to the next one",
