@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -422,6 +423,7 @@ class TelemetryLoop:
             scene_change=self._scene_change.newest,
             is_open=self.is_open(),
             following=self._following.report(),
+            process_id=os.getpid(),
         )
 
     def _arm_report(self) -> ArmReport | None:

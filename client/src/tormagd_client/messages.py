@@ -445,6 +445,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     arm: ArmReport | None = None
     scene_change: SceneReport | None = None
     calibration: CalibrationReport = CalibrationReport()
+    process_id: int | None = None
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
