@@ -83,7 +83,7 @@ def test_starts_disabled_and_asks_nothing() -> None:
 def test_what_a_command_wants_and_has_not_is_said(name: str, changes: dict[str, bool | float], code: str) -> None:
     refused = refusal(SafetyState(), name, READY.replaced(**changes))
     assert refused.code == code
-    assert code != "device_latched" or refused.hint == "tormagctl arm"
+    assert code != "device_latched" or refused.hint == (ARM if name == "enable" else CLEAR)
 
 
 @pytest.mark.parametrize(
@@ -111,17 +111,17 @@ def test_only_a_missing_device_has_a_remedy_of_its_own() -> None:
 
 OPENED = (DISABLED, DeviceRequest.RETRACT)
 STOPPED = (FAULT, DeviceRequest.RETRACT)
-ARM = "tormagctl arm"
+ARM, CLEAR = "tormagctl arm", "tormagctl clear-fault"
 TAKEN: dict[str, tuple[OperatingState | tuple[OperatingState, DeviceRequest] | str, ...]] = {
     # in DISABLED, ENABLED, PAUSED, FAULT
     "enable": (ENABLED, "nothing to do", "tormagctl resume", ARM),
-    "disable": (OPENED, OPENED, OPENED, ARM),
-    "pause": (ARM, PAUSED, "nothing to do", ARM),
+    "disable": (OPENED, OPENED, OPENED, CLEAR),
+    "pause": ("nothing to do", PAUSED, "nothing to do", CLEAR),
     "resume": (ARM, "nothing to do", ENABLED, ARM),
-    "home": ((DISABLED, DeviceRequest.HOME), "tormagctl disable", "tormagctl disable", ARM),
+    "home": ((DISABLED, DeviceRequest.HOME), "tormagctl disable", "tormagctl disable", CLEAR),
     "stop": (STOPPED, STOPPED, STOPPED, STOPPED),
     "clear-fault": (DISABLED, ENABLED, PAUSED, DISABLED),
-    "use-scene": (DISABLED, "tormagctl disable", "tormagctl disable", ARM),
+    "use-scene": (DISABLED, "tormagctl disable", "tormagctl disable", CLEAR),
 }
 """Where each command leads and what it asks of the device, or what is hinted at where it is refused."""
 

@@ -78,7 +78,8 @@ def use_scene(client: "Client", name: str) -> Outcome:
     if change.error is not None:
         raise CommandError(Exit.REFUSED, change.error.code, change.error.cause, change.error.remedy)
     result = {"scene": state.scene, "fingerprint": state.scene_fingerprint, "is_homed": state.is_homed}
-    return Outcome(result, f"scene {state.scene} runs until the daemon is started anew. next: tormagctl arm")
+    text = f"scene {state.scene} runs until the daemon is started anew; nothing moves before tormagctl arm"
+    return Outcome(result, text)
 
 
 def list_scenes() -> Outcome:

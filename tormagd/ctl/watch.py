@@ -58,7 +58,7 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
     """Return why the setpoints of `source` are not rendered, as an error (REFUSED) that the caller may raise; None
     while they are."""
-    require_no_fault(status, "the device is in FAULT")
+    require_no_fault(status, "the device is in FAULT", "tormagctl arm")
     if status.operating_state != "ENABLED":
         return CommandError(
             Exit.REFUSED,

@@ -223,6 +223,8 @@ def _because(present: Conditions) -> str:
 
 
 ARM: Final = "tormagctl arm"
+"The hint of a command that wishes for force; no other command hints at it."
+CLEAR: Final = "tormagctl clear-fault"
 CONNECTED = Guard("not_connected", "the device is connected", _not_connected, "check port, cable and supply")
 NOT_BUSY = Guard(
     "busy",
@@ -230,10 +232,10 @@ NOT_BUSY = Guard(
     _busy,
     "wait until is_busy is false",
 )
-NOT_LATCHED = Guard("device_latched", "the device has latched nothing", _latched, ARM)
+NOT_LATCHED = Guard("device_latched", "the device has latched nothing", _latched, CLEAR)
 READY: tuple[Guard, ...] = (
     CONNECTED,
-    NOT_LATCHED,
+    NOT_LATCHED._replace(remedy=ARM),
     NOT_BUSY,
     Guard("not_homed", "it has homed since the last fault that took positions away", _lost, ARM),
     Guard("not_homed", "the device is homed", _unhomed, ARM),
@@ -278,11 +280,11 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Transition(Event.DISABLE, DISABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
     Transition(Event.DISABLE, ENABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
     Transition(Event.DISABLE, PAUSED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
-    Refusal(Event.DISABLE, FAULTED, "fault", ARM),
-    Refusal(Event.PAUSE, DISABLED, "not_enabled", ARM),
+    Refusal(Event.DISABLE, FAULTED, "fault", CLEAR),
+    Refusal(Event.PAUSE, DISABLED, "not_enabled", NOTHING_TO_DO),
     Transition(Event.PAUSE, ENABLED, PAUSED, "the gap is held where it is", (CONNECTED,)),
     Refusal(Event.PAUSE, PAUSED, "not_enabled", NOTHING_TO_DO),
-    Refusal(Event.PAUSE, FAULTED, "fault", ARM),
+    Refusal(Event.PAUSE, FAULTED, "fault", CLEAR),
     Refusal(Event.RESUME, DISABLED, "not_paused", ARM),
     Refusal(Event.RESUME, ENABLED, "not_paused", NOTHING_TO_DO),
     Transition(Event.RESUME, PAUSED, ENABLED, "the force goes to the setpoint along a ramp", (CONNECTED,)),
@@ -297,7 +299,7 @@ ROWS: tuple[Transition | Refusal, ...] = (
     ),
     Refusal(Event.HOME, ENABLED, "not_disabled", "tormagctl disable"),
     Refusal(Event.HOME, PAUSED, "not_disabled", "tormagctl disable"),
-    Refusal(Event.HOME, FAULTED, "fault", ARM),
+    Refusal(Event.HOME, FAULTED, "fault", CLEAR),
     # stop is never refused, and needs no device: a device that comes back finds a fault that somebody has to clear
     *[Transition(Event.STOP, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
     # the daemon has latched nothing here; a device may hold what it latched while nobody was there to see it
@@ -309,7 +311,7 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Transition(Event.USE_SCENE, DISABLED, DISABLED, "another scene takes the place of this one", (NOT_BUSY,)),
     Refusal(Event.USE_SCENE, ENABLED, "not_disabled", "tormagctl disable"),
     Refusal(Event.USE_SCENE, PAUSED, "not_disabled", "tormagctl disable"),
-    Refusal(Event.USE_SCENE, FAULTED, "fault", ARM),
+    Refusal(Event.USE_SCENE, FAULTED, "fault", CLEAR),
     *[Transition(Event.FAULT, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
