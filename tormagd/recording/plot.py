@@ -8,11 +8,9 @@ from pathlib import Path
 from textwrap import fill
 
 import numpy as np
-from matplotlib import rcParams
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from tormagd.bounded_file import in_place_of
+from tormagd.drawing import Axes, Figure, rcParams
 from tormagd.following import in_words
 from tormagd.recording.overview import BREAK_S, Overview, Series
 
