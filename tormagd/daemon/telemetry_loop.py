@@ -413,7 +413,7 @@ class TelemetryLoop:
             least_gap_mm=round(plan.min_gap_mm, 2),
             fault_details=self._causes.of_faults(safety.faults),
             limit_details=self._causes.of_limits(
-                newest.limits, outside, self._endpoint.inbox.told(now_s), self._control.measurement
+                newest.limits, outside, self._endpoint.inbox.told(now_s), self._control.measurement, now_s
             ),
             newest_stall=self._causes.stall,
             not_granted=self._not_granted,
