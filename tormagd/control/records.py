@@ -16,7 +16,7 @@ from tormagd.safety.operating_state import DeviceRequest
 
 @final
 class Wall(Value):
-    """An elastic wall at `place_mm` on the handle's way. In front of it a handle that pushes on feels `friction_N`."""
+    """An elastic wall on the handle's way. A handle that pushes on in front of it feels `friction_N`."""
 
     def __init__(self, place_mm: float, stiffness_N_mm: float, friction_N: float = 0.0) -> None:
         self.place_mm: Final = place_mm
@@ -24,13 +24,16 @@ class Wall(Value):
         self.friction_N: Final = friction_N
 
     def force_N(self, handle_mm: float) -> float:
-        """Return the force, N, on a handle that pushes on and is at `handle_mm`."""
+        """Return the force on a handle that pushes on and is at `handle_mm`."""
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
 
 
 @final
 class TimedSetpoint(Value):
-    """A publisher's newest valid setpoint. It states the force over the handle's place and way: `asked_N`."""
+    """A publisher's newest valid setpoint, stamped on the clock of `now_s`. A handle that draws back gets `withdraw_N`,
+    or where that is None the wall's friction, or `force_N` without a wall. `playout_s` delays the setpoint against
+    jitter.
+    """
 
     def __init__(
         self,
@@ -59,7 +62,7 @@ class TimedSetpoint(Value):
         self.wall: Final = wall
 
     def asked_N(self, travel: "Travel") -> float:
-        """Return the force, N, that is asked for a handle with this `travel`: its `is_pushing` decides, not its rate."""
+        """Return the force that is asked for a handle with this `travel`."""
         if not travel.is_pushing and self.withdraw_N is not None:
             return self.withdraw_N
         if self.wall is None:
@@ -77,7 +80,9 @@ class TimedSetpoint(Value):
 
 @final
 class Travel(Value):
-    """The handle's place, mm, and its rate, mm/s, both positive pushing on."""
+    """The handle's place and rate, both positive when it pushes on. A handle that is pulled back withdraws, even while
+    it is held.
+    """
 
     def __init__(self, place_mm: float, rate_mm_s: float, is_pushing: bool = True) -> None:
         self.place_mm: Final = place_mm
@@ -86,12 +91,14 @@ class Travel(Value):
 
 
 AT_REST: Final = Travel(0.0, 0.0)
-"The travel of a handle before a measurement."
 
 
 @final
 class Handle(Value):
-    """The motion of a handle or a finger."""
+    """The motion of a handle since its last turn, or of a finger since it touched the pad. Friction has the level of
+    `sliding_mm_s`, a mean over travel that a stopped handle keeps; `quick_mm_s` is filtered less and shows a stop
+    sooner.
+    """
 
     def __init__(
         self,
@@ -110,7 +117,9 @@ class Handle(Value):
 
 @final
 class Measured(Value):
-    """What is measured of the carriages and the handle."""
+    """What is measured of the carriages and the handle; places and gap mean nothing unless `is_homed`. `sensed_s` is
+    when force and handle came on the host's clock, `handle_time_s` on the device's.
+    """
 
     def __init__(
         self,
@@ -155,7 +164,10 @@ class Measured(Value):
 
 @final
 class Belief(Value):
-    """What is believed of the device at a plan."""
+    """What is believed of the device at a plan: its fit at the handle's rate (`device`), at speed, and of a device that
+    is not known yet (`unseen`, while `device` is known only from another day). `sensor_doubted_s` counts time of
+    sliding.
+    """
 
     def __init__(
         self,
@@ -178,7 +190,9 @@ class Belief(Value):
 
 @final
 class Ask(Value):
-    """The force to render."""
+    """The force to render now and along `path.PATH_S`. `foresight`, 0..1, says how well what comes is known: 1 from a
+    preview, 0 where it is extrapolated. `is_meant` is False while the force decays without a valid setpoint.
+    """
 
     def __init__(
         self,
@@ -258,7 +272,7 @@ class Plan(Value):
 
 @final
 class Duty(Value):
-    """What goes to the device: the drive mode, and a duty for each motor, within +-position.duty_limit."""
+    """What goes to the device: the drive mode and a duty for each motor, within +-position.duty_limit."""
 
     def __init__(
         self,

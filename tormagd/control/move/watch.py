@@ -18,48 +18,48 @@ from tormagd.scenes.scene import Scene
 STARTING_S: Final = 0.15
 "After enabling, the device may take this long to report that it runs."
 STILL_MM_S: Final = 0.5
-"Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
+"A slower carriage does not move: this is half an encoder count per millisecond, filtered."
 STARTS_OVER: Final = 1.25
-"Static over kinetic friction at most: a start from rest may take so many times the greatest force."
+"Static over kinetic friction at most: a start from rest may take this many times the greatest force."
 OVER_N: Final = 0.1
-"How far the sensor may be off besides."
+"Allowance for the error of the sensor."
 OVER_HELD_S: Final = 0.03
 OVER_FAULT_S: Final = 0.1
-"A force over the ceiling opens the gap after OVER_HELD_S, and is a fault after OVER_FAULT_S."
+"A force over the ceiling opens the gap after the first, and is a fault after the second."
 OVER_FADES: Final = 0.25
-"While it is under, the time over it falls by so much a second."
+"The time over the ceiling falls by this much per second while the force is under it."
 SENSOR_FAULT_S: Final = 2.0
-"A sensor not believed for so long of sliding is a fault: forces are then only as good as the model."
+"A sensor that is not believed for this long of sliding is a fault: forces are then only as good as the model."
 SENSE_FAULT_S: Final = 0.1
 STATUS_FAULT_S: Final = 0.1
-"A Sense, or a Status, that is older is a fault: Status comes every 20 ms, Sense with every State."
+"An older message is a fault: Status comes every 20 ms, Sense with every State."
 OPPOSED_S: Final = 0.1
-"A carriage that moves against its duty for so long does not brake: it brakes from full speed within 0.06 s."
+"A carriage that moves against its duty for this long is not braking: it brakes from full speed within 0.06 s."
 WENT_AGAINST_S: Final = 0.015
-"Carriages that come apart, or to a stop, do so by wrong wiring if one has gone against its duty for so long."
+"Carriages that come apart or stop are wired wrong if one has moved against its duty for this long."
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
-"""Shares of the delay that the position loop bears besides its own period."""
+"Shares of the delay that the position loop bears besides its own period: a limit, and a fault."
 CLOCK_OFF: Final = 0.01
 CLOCK_FAULT: Final = 0.1
-"A device's clock that is off by more than CLOCK_OFF is a limit, by more than CLOCK_FAULT a fault."
+"A device's clock that is off by more is a limit, or a fault."
 STALL_SHARE: Final = 0.8
-"A stall of the host shorter than this share of the device's timeout did not make it run out."
+"A stall of the host shorter than this share of the device's timeout did not let that timeout expire."
 
 _DEVICE_RUN: Final = DeviceMode.RUN
 
 
 def ceiling_N(scene: Scene) -> float:
-    """Return the greatest force, N, that the sensor may show in `scene`."""
+    """Return the greatest force that the sensor may show in `scene`."""
     return STARTS_OVER * scene.force.most_N + OVER_N
 
 
 @final
 class Watch:
-    """The watch on one device: counts for how long a driven device misbehaves, and tells its faults and limits."""
+    """The watch on one device: counts how long a driven device misbehaves, and tells its faults and limits."""
 
     enabled_s: float = math.inf
-    "When the device was enabled; inf while it is not."
+    "inf while the device is not enabled."
     straying_s: float = 0.0
     "How long the gap has been too far from its reference."
     still_s: float = 0.0
@@ -69,11 +69,10 @@ class Watch:
     over_s: float = 0.0
     "How long the measured force has been over the ceiling of late while the handle moved."
     is_over: bool = False
-    "Whether the force is over the ceiling, and has been for so long of late that the gap has to open."
+    "Whether the force has been over the ceiling for so long that the gap has to open."
     left_duty: float = 0.0
     "The left motor's duty at the step before."
     right_duty: float = 0.0
-    "The right motor's duty at the step before."
 
     def __init__(self, config: Config, scene: Scene) -> None:
         limits, device, period_s = config.limits, config.device, 1.0 / config.rates.control_hz
@@ -98,7 +97,7 @@ class Watch:
         self._ceiling_N: Final = ceiling_N(scene)
 
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
-        """Return `conditions` completed by the carriages' skew, and by the greatest values that a command may find."""
+        """Return `conditions` with the carriages' skew and the greatest values that a command may find."""
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
@@ -108,7 +107,7 @@ class Watch:
         )
 
     def begin(self, enabled_s: float) -> None:
-        """Begin all counts anew for a device enabled at `enabled_s`; inf: not enabled."""
+        """Restart all counts for a device enabled at `enabled_s`; inf means not enabled."""
         self.enabled_s = enabled_s
         self.straying_s = self.still_s = self.opposed_s = self.over_s = 0.0
         self.is_over = False
@@ -123,7 +122,7 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        """Return all faults that show now, and change nothing: `operating_state.latch` sorts them."""
+        """Return all faults that show now."""
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
@@ -138,14 +137,14 @@ class Watch:
                 faults.append(Fault.OUT_OF_STROKE)
         if safety.is_driven:
             faults += self._of_link(now_s, measurement, sight)
-            if leap is None:  # after a leap positions say nothing of the motion
+            if leap is None:  # after a leap positions say nothing about the motion
                 faults += self._of_motion(measured, sensor_doubted_s)
                 if measurement.mode is not _DEVICE_RUN and not faults and now_s - self.enabled_s > STARTING_S:
                     faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """Return the limits that show now, and change nothing: SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK."""
+        """Return the limits that show now."""
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
@@ -161,7 +160,7 @@ class Watch:
         return limits
 
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
-        """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`."""
+        """Count one tick in which the motors were driven with these duties towards `reference_mm`."""
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
@@ -173,11 +172,11 @@ class Watch:
         self.left_duty, self.right_duty = left_duty, right_duty
 
     def rest(self) -> None:
-        """Take one tick without duties: the newest duties become 0, and the counted times stand."""
+        """Take one tick without duties."""
         self.left_duty = self.right_duty = 0.0
 
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
-        """Return the faults that the device reports; none while a clearing of its faults may still be under way."""
+        """Return the faults that the device reports, except while they are being cleared."""
         shown: int = measurement.faults
         if not shown or now_s < safety.clearing_until_s:
             return []
@@ -187,7 +186,7 @@ class Watch:
         return list(device_faults(measurement.faults, is_host_stall=is_ours))
 
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
-        """Return the faults of the link: messages too old, a round trip too long, a device's clock too far off."""
+        """Return the faults of the link: messages too old, a round trip too long, a clock too far off."""
         faults: list[Fault] = []
         # the tick nearest to the end of a timeout judges it: the next one could be a period late
         at_s = now_s + self._period_s / 2.0
@@ -206,7 +205,6 @@ class Watch:
         return faults
 
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
-        """Return the faults of motion and force, by the counted times; empty for none."""
         faults: list[Fault] = []
         is_skewed = abs(measured.skew_mm) > self._max_apart_mm
         is_still = self.still_s > self._no_motion_time_s
@@ -216,7 +214,7 @@ class Watch:
             faults.append(Fault.SKEW)
         if self.straying_s > self._following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
-        if self.over_s > OVER_FAULT_S and self._slides:  # on a pad the finger itself may press so hard
+        if self.over_s > OVER_FAULT_S and self._slides:  # on a pad the finger itself may press this hard
             faults.append(Fault.OVER_FORCE)
         if self._needs_sensor and sensor_doubted_s > SENSOR_FAULT_S:
             faults.append(Fault.SENSOR)
@@ -225,8 +223,8 @@ class Watch:
         return faults
 
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
-        """Tell whether a carriage stands while it is driven the same way as a step before; one of the two is enough."""
-        # a duty that turns round before the carriage could move drives it nowhere
+        """Tell whether a carriage stands still although it is driven the same way as a step before."""
+        # a duty that reverses before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
         is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
         is_left_still = is_left_driven and abs(measured.left_mm_s) < STILL_MM_S
@@ -234,7 +232,7 @@ class Watch:
         return is_left_still or is_right_still
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        """Count in `opposed_s`, by `dt_s`, for how long a carriage moves against its duty."""
+        """Count how long a carriage has moved against its duty."""
         left_mm_s = right_mm_s = 0.0
         is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
         if is_left_driven:
