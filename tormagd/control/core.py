@@ -41,7 +41,7 @@ _PAUSED: Final = OperatingState.PAUSED
 
 @final
 class Planner:
-    """The planning half of the core: turns the newest setpoint and measurement of one device into a plan of the gap."""
+    """The planning half of the core: turns the newest setpoint and measurement into a plan of the gap."""
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begin at `now_s` with the gap open and nothing known of the device."""
@@ -59,18 +59,18 @@ class Planner:
     def plan(
         self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None, is_followed: bool = True
     ) -> Plan:
-        """Make the next plan, keep it in `planned`, and return it."""
+        """Make the next plan, and keep it in `planned`."""
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
         is_believed = belief.sensor_doubted_s == 0.0 and self.believe.knows_zero(now_s)
         travel = self.way.update(measured, self.believe.zero.zero_N, is_sensor_believed=is_believed)
         held_N = None if is_followed else self._held_N(measured, belief.device)
-        # at the open gap the element's field lags and gives more than the portrait says: the path begins from there
+        # at the open gap the element's field lags and gives more than the portrait says
         device = belief.device.relaxed(self._portrait.min_N - self.believe.memory.open_N())
         ask = self.governor.update(now_s, setpoint, device, belief.lag_s, travel, held_N)
         plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
-        # the carriages' delay is learned from this plan's gap and acts on the next plan
+        # what is learned of the carriages' delay acts on the next plan
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan
         return plan
@@ -80,14 +80,13 @@ class Planner:
         portrait, planned = self._portrait, self.planned
         if measured is None or not measured.is_homed:
             return device.force_N(portrait.min_N)
-        # the newest plan's gap differs from the portrait's by the element's memory and the handle's rate
+        # the rest of the plan's gap is the element's memory and the handle's rate
         beside_mm = planned.gap_mm - portrait.gap_mm_at(device.model_N(planned.governed_N))
         if Limit.CEILING in planned.limits:
             beside_mm = 0.0
         return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
 
     def foresee(self) -> bool:
-        """Forecast the force for the next plans, and return whether a forecast was due."""
         return self.governor.foresee()
 
     @property
@@ -95,7 +94,6 @@ class Planner:
         return self.aim.question
 
     def answered(self, answer: Answer) -> None:
-        """Take the `answer` of the search that runs beside the plans."""
         self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
@@ -114,10 +112,9 @@ class Planner:
 
 @final
 class Stepper:
-    """The driving half of the core: turns measurements and plans of one device into duties, and latches faults."""
+    """The driving half of the core: turns measurements and plans into duties, and latches faults."""
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
-        """Begin disabled at `now_s`."""
         position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s = now_s
         self.safety = SafetyState()
@@ -168,7 +165,7 @@ class Stepper:
         return self._drive(now_s, dt_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
-        """Carry out an operator's command `name`, one of `operating_state.COMMANDS`."""
+        """Carry out an operator's command, one of `operating_state.COMMANDS`."""
         measured, before = self.measured, self.safety
         self.safety = command(before, name, now_s, self.watch.command_conditions(conditions, measured))
         if self.is_followed and before.operating_state is OperatingState.DISABLED:
@@ -177,11 +174,10 @@ class Stepper:
             self.watch.begin(now_s)
 
     def latch(self, fault: Fault) -> None:
-        """Latch a fault that was found outside the core."""
         self.safety = latch(self.safety, (fault,))
 
     def lose_link(self) -> None:
-        """Forget the device whose link broke: its newest measurement, and how fast its motors accelerate."""
+        """Forget the device whose link broke."""
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
         self.opening.rest(self.safety.request_number)
@@ -189,7 +185,6 @@ class Stepper:
         self.move.lose_device()
 
     def _judge(self, now_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Measured:
-        """Latch the faults that show, and return `measured`."""
         measure = self.measure
         shown = self.watch.faults(
             now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
@@ -209,7 +204,7 @@ class Stepper:
         return measure.without_position(measured)
 
     def _hold(self, now_s: float) -> Duty:
-        """Return zero duties in mode RUN, in which the device keeps answering and friction holds the gap."""
+        """Return zero duties in mode RUN: the device keeps answering, and friction holds the gap."""
         limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
         if self.measure.leap is not None:
             limit = Limit.ENCODER
@@ -217,7 +212,6 @@ class Stepper:
         return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
 
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
-        """Return the duties that follow `plan`, or that hold the gap while PAUSED."""
         followed = None if self.safety.operating_state is _PAUSED else plan
         try:
             drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
@@ -228,7 +222,7 @@ class Stepper:
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
     def _begin_anew(self) -> Duty:
-        """Latch NOT_FINITE, forget all motion, and return zero duties in mode OFF."""
+        """Latch NOT_FINITE, forget all motion, and stop driving."""
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()
         self.homing = Homing(self._ceiling_N)

@@ -9,7 +9,7 @@ from tormagd.physics.field import PowerFieldLaw, flux_density_T
 
 @final
 class FieldOfGap:
-    """The flux density at the shaft's surface over the gap, in one insert: Eq. 6 with a power law of the gap."""
+    """The flux density at the shaft's surface over the gap: Eq. 6 with a power law of the gap."""
 
     def __init__(self, law: PowerFieldLaw, relative_permeability: float, inner_radius_m: float) -> None:
         self._coefficient: Final = law.coefficient

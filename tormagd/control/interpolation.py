@@ -7,9 +7,9 @@ from tormagd.model.features import require_number
 from tormagd.physics.errors import DomainError
 
 STRETCHES: Final = 1024
-"A rising list is divided into this many equal stretches, so that few points share one and a search is short."
+"A rising list is divided into this many stretches, so that few points share one and a search is short."
 MIN_SPAN: Final = 1e-9
-"The least span that a list counts as having, against a division by 0."
+"The least span of a list, against a division by 0."
 MIN_STEP: Final = 1e-200
 "Neighbours that differ by less have no finite slope between them."
 
@@ -25,7 +25,6 @@ class Rising:
                 raise DomainError("values", value, f"{values[place - 1]:g}, or {MIN_STEP:g} from there")
         self.values: Final = values
         self._per_unit: Final = STRETCHES / max(values[-1] - values[0], MIN_SPAN)
-        # how many points lie before each stretch, and last, before everything beyond them
         points_in = [0] * (STRETCHES + 1)
         for value in values:
             points_in[min(max(int((value - values[0]) * self._per_unit), 0), STRETCHES)] += 1
@@ -46,12 +45,12 @@ class Rising:
 
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x`, linear between the points of `xs` and `ys`, and constant beyond the ends."""
+    """Return y at `x`, linear between the points and constant beyond the ends."""
     return interpolated_before(xs.after(x), x, xs, ys)
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x` as `interpolated` does, for a known place `after` = `xs.after(x)`."""
+    """Return y at `x` for a known place `after` = `xs.after(x)`."""
     if after == 0:
         return ys[0]
     if after == len(ys):
@@ -62,7 +61,7 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """Return y at `steps` >= 0 from the first of the evenly spaced `ys`, linear between them."""
+    """Return y at `steps` from the first of the evenly spaced `ys`, linear between them."""
     if not steps < len(ys) - 1:
         if steps != steps:
             raise DomainError("steps", steps, "a number")

@@ -11,7 +11,7 @@ from tormagd.model.displacement import MOVING_MM_S, Turn
 
 RATE_FILTER_S: Final = 0.05
 QUICK_FILTER_S: Final = 0.01
-"Time constants of the handle's rate, and of the quicker rate that shows a stop sooner."
+"The quicker of the handle's two rates shows a stop sooner."
 SLIDING_MM: Final = 0.3
 "Travel over which friction takes on the level of another rate."
 FAST_MM_S: Final = 2.0 * MOVING_MM_S
@@ -27,7 +27,7 @@ class Measure:
     measured: Measured | None = None
     "None until the device has said something."
     leap: Leap | None = None
-    "A step of the encoders that no carriage can make, kept until the device has said whether it was reset."
+    "A step of the encoders that no carriage can make, until the device has said whether it was reset."
 
     def __init__(
         self, home_mm: float, derivative_filter_s: float, turns: bool, full_speed_mm_s: float, period_s: float
@@ -39,7 +39,7 @@ class Measure:
         self._full_speed_mm_s: Final = full_speed_mm_s
 
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
-        """Measure at `now_s`, one tick after `last_s`: keep the new record in `measured`, and return it."""
+        """Measure at `now_s`, one tick after `last_s`, and keep the record in `measured`."""
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
         self.sight.update(last_s, now_s, is_new)
@@ -62,7 +62,6 @@ class Measure:
         self.measured = None
 
     def forget(self) -> None:
-        """Return to the state before the first step."""
         self.measured, self.leap = None, None
         self.sight.forget()
 
@@ -87,14 +86,13 @@ class Measure:
         )
 
     def _measured(self, last: Measured | None, measurement: Measurement) -> Measured:
-        """Return the record of `measurement`, or `last` where the device has said nothing new."""
         if last is None:
             return self._first(measurement)
         dt_s = measurement.device_time_s - last.device_time_s
         if measurement.number == last.number or dt_s < MIN_DT_S:
             return last
         left_mm, right_mm = self._home_mm + measurement.left_mm, self._home_mm + measurement.right_mm
-        # a handle without a new Sense has not stopped: its motion is judged over the whole time since the last Sense
+        # a handle without a new Sense has not stopped: its motion is judged over the time since the last Sense
         handle, handle_time_s = last.handle, last.handle_time_s
         if measurement.sensed_s != last.sensed_s:
             handle = self._handle(last, measurement.handle_mm, measurement.device_time_s - handle_time_s)
@@ -115,7 +113,6 @@ class Measure:
         )
 
     def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
-        """Return the motion of a handle or finger that has moved to `position_mm` in `dt_s`."""
         before = last.handle
         travel_mm = position_mm - last.handle_mm
         rate_mm_s = low_pass(before.turn.direction * before.rate_mm_s, travel_mm / dt_s, dt_s, RATE_FILTER_S)

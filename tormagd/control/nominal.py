@@ -11,8 +11,6 @@ from tormagd.model.model_file import ForceModel
 
 @final
 class Nominal:
-    """The nominal element: the force that one model gives over the field."""
-
     def __init__(self, model: ForceModel, contact: ElementContact, cip_percent: float, has_rate: bool) -> None:
         self._network: Final = model.network
         self.contact: Final = contact
@@ -27,7 +25,6 @@ class Nominal:
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        """Return the force over the field for the handle's present motion, held within the model's range."""
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.motion_now(measured)
@@ -36,7 +33,7 @@ class Nominal:
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
     ) -> tuple[ForceCurve, tuple[Outside, ...]]:
-        """Return the force over the field for the motion to plan for, and what of that motion is out of range."""
+        """Return the force over the field for the motion to plan for, and what of it is out of range."""
         if not self._has_rate:
             return self.only, ()
         displacement_mm, rate_mm_s = self.contact.planned(setpoint, measured)

@@ -24,15 +24,13 @@ class Wall(Value):
         self.friction_N: Final = friction_N
 
     def force_N(self, handle_mm: float) -> float:
-        """Return the force on a handle that pushes on and is at `handle_mm`."""
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
 
 
 @final
 class TimedSetpoint(Value):
-    """A publisher's newest valid setpoint, stamped on the clock of `now_s`. A handle that draws back gets `withdraw_N`,
-    or where that is None the wall's friction, or `force_N` without a wall. `playout_s` delays the setpoint against
-    jitter.
+    """A publisher's newest valid setpoint, stamped on the clock of `now_s`; `playout_s` delays it against jitter. A
+    handle that draws back gets `withdraw_N`, or else the wall's friction or `force_N`.
     """
 
     def __init__(
@@ -62,7 +60,6 @@ class TimedSetpoint(Value):
         self.wall: Final = wall
 
     def asked_N(self, travel: "Travel") -> float:
-        """Return the force that is asked for a handle with this `travel`."""
         if not travel.is_pushing and self.withdraw_N is not None:
             return self.withdraw_N
         if self.wall is None:
@@ -80,8 +77,8 @@ class TimedSetpoint(Value):
 
 @final
 class Travel(Value):
-    """The handle's place and rate, both positive when it pushes on. A handle that is pulled back withdraws, even while
-    it is held.
+    """The handle's place and rate, positive when it pushes on. A handle that is pulled back withdraws even while it is
+    held.
     """
 
     def __init__(self, place_mm: float, rate_mm_s: float, is_pushing: bool = True) -> None:
@@ -95,9 +92,8 @@ AT_REST: Final = Travel(0.0, 0.0)
 
 @final
 class Handle(Value):
-    """The motion of a handle since its last turn, or of a finger since it touched the pad. Friction has the level of
-    `sliding_mm_s`, a mean over travel that a stopped handle keeps; `quick_mm_s` is filtered less and shows a stop
-    sooner.
+    """The motion of a handle since its last turn, or of a finger in the pad. Friction has the level of `sliding_mm_s`,
+    a mean over travel; `quick_mm_s` shows a stop sooner.
     """
 
     def __init__(
@@ -117,8 +113,8 @@ class Handle(Value):
 
 @final
 class Measured(Value):
-    """What is measured of the carriages and the handle; places and gap mean nothing unless `is_homed`. `sensed_s` is
-    when force and handle came on the host's clock, `handle_time_s` on the device's.
+    """What is measured of the carriages and the handle; places mean nothing unless `is_homed`. `sensed_s` is on the
+    host's clock, `handle_time_s` on the device's.
     """
 
     def __init__(
@@ -164,9 +160,8 @@ class Measured(Value):
 
 @final
 class Belief(Value):
-    """What is believed of the device at a plan: its fit at the handle's rate (`device`), at speed, and of a device that
-    is not known yet (`unseen`, while `device` is known only from another day). `sensor_doubted_s` counts time of
-    sliding.
+    """What is believed of the device at a plan: at the handle's rate (`device`), at speed, and, until it is known from
+    today, as any device may be (`unseen`).
     """
 
     def __init__(
@@ -190,8 +185,8 @@ class Belief(Value):
 
 @final
 class Ask(Value):
-    """The force to render now and along `path.PATH_S`. `foresight`, 0..1, says how well what comes is known: 1 from a
-    preview, 0 where it is extrapolated. `is_meant` is False while the force decays without a valid setpoint.
+    """The force to render now and along `path.PATH_S`. `foresight` is 1 with a preview, 0 where the force is
+    extrapolated.
     """
 
     def __init__(
@@ -215,7 +210,7 @@ class Ask(Value):
 
 @final
 class Outside(Value):
-    """A quantity outside what the model knows: its name, the value asked for, and the value used instead."""
+    """A quantity outside what the model knows."""
 
     def __init__(self, quantity: str, asked: float, used: float) -> None:
         self.quantity: Final = quantity
@@ -272,7 +267,7 @@ class Plan(Value):
 
 @final
 class Duty(Value):
-    """What goes to the device: the drive mode and a duty for each motor, within +-position.duty_limit."""
+    """What goes to the device in one tick."""
 
     def __init__(
         self,

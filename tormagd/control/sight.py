@@ -11,9 +11,8 @@ BLIND_S: Final = 0.005
 BLIND_PERIODS: Final = 5.0
 "Without a new State for longer than both, the carriages' places are too uncertain to drive them."
 UNSENSED_S: Final = 0.02
-"Without a new Sense for longer than both this and BLIND_PERIODS, force and handle are not measured."
+"Without a new Sense for longer than both, force and handle are not measured."
 SHOWN_S: Final = 0.1
-"A stall is reported for this long after its end."
 
 
 @final
@@ -21,13 +20,12 @@ class Sight:
     """Whether the loop is blind, told from the times of steps and of new States."""
 
     seen_s: float = math.inf
-    "When a State was last found; inf before the first."
+    "inf before the first State."
     stalled_s: float
     stall_s: float = 0.0
-    "Length of the last stall, or of the longest of stalls that came within SHOWN_S of each other."
+    "Length of the last stall, or of the longest within SHOWN_S of each other."
     is_blind: bool = False
     was_blind: bool = False
-    "Whether the loop was blind at the step before."
 
     def __init__(self, period_s: float) -> None:
         self.stalled_s = -math.inf
@@ -57,5 +55,4 @@ class Sight:
 
 
 def unsensed_s(period_s: float) -> float:
-    """Return the greatest age that a Sense may have at this control period."""
     return max(UNSENSED_S, BLIND_PERIODS * period_s)

@@ -37,7 +37,7 @@ OLDEST_ANSWER_S: Final = 0.5
 _PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
 _TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
 _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
-"Weights that give the speed and acceleration at a path's start from its distances to there, by a fitted parabola."
+"Weights from distances along a path to the speed and acceleration of a fitted parabola at its start."
 
 
 class Element(NamedTuple):
@@ -54,13 +54,13 @@ class Element(NamedTuple):
 
 @final
 class Aim:
-    """The last stage of planning: turns the force asked for into a field, the field into a gap, and both into a plan."""
+    """The last stage of planning: turns the force into a field, the field into a gap, and both into a plan."""
 
     number: int = 0
     element_mT: float = 0.0
-    "The element's field at the newest plan; of several fields that give a force, the nearest to this is taken."
+    "Of several fields that give a force, the nearest to this is taken."
     question: Question | None = None
-    "The newest plan's question to a search beside the plans; None where plans search themselves."
+    "For a search beside the plans; None where plans search themselves."
     answer: Answer
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
@@ -95,7 +95,6 @@ class Aim:
         memory: ElementMemory,
         measured: Measured | None,
     ) -> Plan:
-        """Return the next plan, for the force in `ask` and the device in `belief`."""
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
@@ -119,7 +118,6 @@ class Aim:
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        """Return the field for the model's force `wanted_N` along `curve`."""
         if not self._is_beside:
             return self._search.solve(curve, wanted_N, self.element_mT)
         self.question = Question(now_s, curve.displacement_mm, curve.rate_mm_s, wanted_N, self.element_mT)
@@ -173,7 +171,6 @@ class Aim:
         is_held: bool,
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
-        """Return what holds the force back, in the order in which it acts."""
         limits = (*ask.limits, *believed)
         if outside:
             limits = (*limits, Limit.MODEL_RANGE)

@@ -1,4 +1,4 @@
-"""Guards of the gap: how close it may come, and how far the search's field may differ from the force law's."""
+"""Guards of the gap: how close it may come, and how far the field may differ from the force law's."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ from tormagd.control.records import Belief
 CEILING: Final = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
 LAW_SHARE: Final = 0.12
-"Greatest share by which a field may differ from the force law's; on sample 1 the search's differs by 1 to 11%."
+"On sample 1 the search's field differs from the force law's by 1 to 11%."
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
@@ -26,7 +26,6 @@ def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: 
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
-    """Return `field_mT`, held within LAW_SHARE of the field that the force law gives for `wanted_N`."""
     if law is None:
         return field_mT
     law_mT = law.field_mT(wanted_N)

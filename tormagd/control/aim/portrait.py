@@ -14,13 +14,12 @@ from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
-"Number of gaps in a portrait."
 
 
 @final
 class Portrait:
-    """Force and its slope |dF/dgap| over the gap, from open to closed at n >= 2 points, for one contact and without
-    memory. Outside the range the nearer end holds.
+    """Force and its slope |dF/dgap| over the gap, from open to closed, without memory. Beyond the ends the nearer end
+    holds.
     """
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
@@ -39,7 +38,6 @@ class Portrait:
         return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
-        """Return |dF/dgap| at the gap that gives `force_N`."""
         return interpolated(force_N, self._rising_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
@@ -55,13 +53,12 @@ class Portrait:
         return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
-        """Return how fast a gap speed changes the force at the gap that gives `force_N`."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 
 @final
 class PortraitSearch:
-    """The field search of a scene without the term `rate`: looks up the force's gap in a portrait."""
+    """The field search of a scene without the term `rate`: a look into the portrait."""
 
     def __init__(self, shown: Portrait, field: FieldOfGap) -> None:
         self._portrait: Final = shown
@@ -80,21 +77,19 @@ class PortraitSearch:
 
 @final
 class LawOfField:
-    """The magnetoelastic law of the insert (Eq. 29 to 34) over a portrait's gaps, scaled to the portrait's force."""
+    """The insert's magnetoelastic law (Eq. 29 to 34) over a portrait's gaps, scaled to its force."""
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
         self._rising_N: Final = Rising(force_N)
         self.fields_mT: Final = fields_mT
 
     def field_mT(self, force_N: float) -> float:
-        """Return the field that gives `force_N` by the law, or the nearer end's field where none does."""
         return interpolated(force_N, self._rising_N, self.fields_mT)
 
 
 def law_beside(
     shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
 ) -> LawOfField:
-    """Return the force law at the gaps of the portrait `shown`, scaled to the portrait's force."""
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
     scaled_N: list[float] = (scale * forces_N).tolist()
@@ -102,7 +97,7 @@ def law_beside(
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
-    """Return the portrait that the model's `curve` predicts at GRID gaps over `gap_range_mm` (closed, open)."""
+    """Return the portrait that the model's `curve` predicts over `gap_range_mm` (closed, open)."""
     gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))

@@ -6,8 +6,8 @@ path      where forces ahead are known: those of the gap's path that misses them
           over the force there
 blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes
 decay     without a setpoint, or with one that is too old: to the device's least force at the scene's release rate
-passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none (before
-          the first setpoint, while the gap was open or held, after a silence)
+passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none
+          (before the first setpoint, while the gap was open or held, after a silence)
 """
 
 import math
@@ -29,18 +29,17 @@ from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 _LARGEST: Final[float] = LARGEST
 SLOPE_FILTER_S: Final = 0.003
 AHEAD_S: Final = 0.05
-"Setpoints are carried on along their slope, or past the end of their preview, by no more than this."
+"Setpoints are carried on along their slope, or past their preview's end, by no more than this."
 MIN_TIMES: Final = 9
-"At least this many of TIMES_S are looked at, where a preview ends before them or a forecast is used."
+"At least this many of TIMES_S are looked at, however short a preview is."
 _FORECAST_S: Final = TIMES_S[:MIN_TIMES]
 OUTRUN_N: Final = 0.02
-"The limit RATE acts where the path misses what is known ahead by more: the carriages are too slow."
+"The limit RATE acts where the carriages make the path miss what is known ahead by more."
 
 EARLY_N: Final = 0.08
 "The gap closes before a wall by this much more than is felt there: 0.1 N with what is not known of a device."
 
 Bounds = tuple[float, float]
-"Least and greatest force that the scene allows and the device gives."
 
 
 @final
@@ -49,16 +48,15 @@ class Governor:
 
     time_s: float
     asked_N: float
-    "Force that the newest plan asked of the device."
     above_N: float
-    "By how much `asked_N` was above the device's least force, as that was known then."
+    "`asked_N` less the device's least force, as that was known then."
     stamp_s: float
-    "Of the setpoint that the force follows; -inf where it follows none."
+    "Of the setpoint that the force follows; -inf without one."
     slope_N_s: float
     last_N: float
     "The newest setpoint's force, within what the scene allows."
     holder: int
-    "Number of the publisher whose setpoint was followed last; 0 before the first."
+    "Number of the publisher whose setpoint was followed last."
     is_passing: bool
     "Whether the force is on the ramp to the forces of its holder."
     sent_mm: float | None
@@ -66,9 +64,9 @@ class Governor:
     from_mm: float
     "The portrait's gap that the newest plan asked for."
     expected_N: float | None
-    "Force that the lagging gap should give by now on its path; None where it follows no path."
+    "What the lagging gap should give by now on its path; None where it follows no path."
     law_N: float | None
-    "Force asked for at the place `law_mm` by a wall, or on the ramp from one; None without either."
+    "Asked for at the place `law_mm` by a wall, or on the ramp from one; None without either."
     law_mm: float
     blend_N: float
     "What is left of the ramp from one wall to another, or to none."
@@ -77,7 +75,6 @@ class Governor:
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
     ) -> None:
-        """Begin at `now_s` with the gap open and no publisher."""
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._path: Final = Path(portrait, gap_speed_mm_s)
@@ -103,7 +100,7 @@ class Governor:
         travel: Travel = AT_REST,
         held_N: float | None = None,
     ) -> Ask:
-        """Return the force to render now and the forces ahead, with the limits that hold them back."""
+        """Return the force to render now and the forces ahead, with the limits on them."""
         lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
         dt_s = max(now_s - self.time_s, 0.0)
         self.time_s = now_s
@@ -117,7 +114,7 @@ class Governor:
             return self._decay(dt_s, lowest_N, age_s, (Limit.STALE, *setpoint.limits))
         soon_s = max(age_s, 0.0)
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
-        # slope and forecast are of what is asked: the device's least force is learned, and varies
+        # slope and forecast are of what is asked, because the device's least force is learned and varies
         asked_N = setpoint.asked_N(travel)
         allowed_N = within(asked_N, self._allowed)
         blended_N = self._blended(setpoint, travel, allowed_N, dt_s)
@@ -160,11 +157,9 @@ class Governor:
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def foresee(self) -> bool:
-        """Forecast the force for the next plans, and return whether a forecast was due."""
         return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def _note_setpoint(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
-        """Update the setpoints' slope, newest force, stamp and holder."""
         spacing_s = setpoint.stamp_s - self.stamp_s
         if setpoint.holder != self.holder:  # another publisher's forces say nothing about this one's
             self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
@@ -205,7 +200,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces at PATH_S on the best path for a handle that pushes on at its present rate."""
+        """Return the forces at PATH_S for a handle that pushes on at its present rate."""
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
         begins_s = lag_s + SPEEDING_UP_S
         wanted_N = [
@@ -220,7 +215,7 @@ class Governor:
         return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
-        """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1."""
+        """Give the forecast one setpoint, and return how far it is trusted, 0..1."""
         if not self._has_forecast:
             return 0.0
         self.forecast.update(stamp_s, allowed_N)
@@ -237,7 +232,6 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces at PATH_S on the best path for the setpoint's preview."""
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after the preview is foreseen from its end
             self.slope_N_s = setpoint.preview_slope_N_s
@@ -280,7 +274,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces at PATH_S along the setpoints' slope and the forecast, weighted by `foresight`."""
+        """Return the forces at PATH_S along the setpoints' slope and the forecast."""
         begins_s = soon_s + foresight * lag_s
         times_s = _FORECAST_S if foresight > 0.0 else PATH_S
         slope_N_s = self.slope_N_s
@@ -298,7 +292,7 @@ class Governor:
         return path_N[: len(PATH_S)]
 
     def _left_from(self, force_N: float, device: DeviceFit) -> tuple[float, float]:
-        """Return two of the portrait's gaps: the last plan's, and the one that the carriages were sent to."""
+        """Return two of the portrait's gaps: the last plan's, and where the carriages were sent."""
         # a ramp leads to what is asked, whatever the gap can make of it
         if self.is_passing or self.sent_mm is None:
             gap_mm = self._path.gap_mm(force_N if self.is_passing else self.asked_N, device)
@@ -308,7 +302,6 @@ class Governor:
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
     ) -> tuple[float, tuple[Limit, ...]]:
-        """Return `allowed_N`, held to what the device gives, and the limits in force."""
         limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._allowed[1] else (Limit.RANGE,)
         if asked_N < self._allowed[0] and self._least_N < self._allowed[0]:
             limits = (*limits, Limit.STANDBY)
@@ -334,7 +327,7 @@ class Governor:
 
 
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
-    """Raise DomainError, naming the field, unless the setpoint's numbers and its age are finite and within LARGEST."""
+    """Raise DomainError, naming the field, unless all numbers are finite and within LARGEST."""
     if not (
         -_LARGEST <= age_s <= _LARGEST
         and -_LARGEST <= setpoint.force_N <= _LARGEST
@@ -353,14 +346,14 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         return
     if not 0.0 < setpoint.preview_dt_s <= _LARGEST:
         raise DomainError("preview_dt_s", setpoint.preview_dt_s, "above 0 s")
-    # one sum finds NaN and infinity anywhere; each force is held to its bounds where it is used
+    # one sum finds NaN and infinity anywhere
     if not -_LARGEST <= sum(setpoint.preview_N) <= _LARGEST:
         for force_N in setpoint.preview_N:
             require_number("preview_N", force_N)
 
 
 def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:
-    """Return the forces of a preview, held to `bounds`, at TIMES_S from `begins_s` after its stamp."""
+    """Return the forces of a preview at TIMES_S from `begins_s` after its stamp."""
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
     ends_s, mean_N_s, trust = setpoint.preview_s, setpoint.preview_slope_N_s, forecast.trust

@@ -19,7 +19,7 @@ class Skill(Value):
         self.apart: Final = apart
 
     def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
-        """Return the skill after both guesses' newest errors, which count for `share` of the means."""
+        """Return the skill after both guesses' newest errors, weighted by `share`."""
         gained = other_error_N * other_error_N - error_N * error_N
         difference_N = other_error_N - error_N
         apart = difference_N * difference_N

@@ -12,7 +12,7 @@ from typing import Final, final
 from tormagd.control.records import AT_REST, Measured, Travel
 
 PULLS_N: Final = 0.1
-"Least force of a hand that pulls: more than the force sensor's noise and the uncertainty of its zero."
+"More than the force sensor's noise and the uncertainty of its zero."
 SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, at 5 N/mm and 1.5 N either way."
 
@@ -24,11 +24,10 @@ def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
 
 @final
 class Way:
-    """The stage that follows a brake's handle along the way of the task."""
+    """Follows a brake's handle along the way of the task."""
 
     travel: Travel = AT_REST
     changed_mm: float = 0.0
-    "The encoder's place where the way last changed."
 
     def __init__(self, push_sign: int) -> None:
         self._push_sign: Final = float(push_sign)

@@ -15,12 +15,12 @@ class Acted:
     """The number of ticks in which each limit of the output has acted."""
 
     rate: int = 0
-    "The speed of the gap's reference was limited."
+    "On the speed of the gap's reference."
     slew: int = 0
-    "The acceleration of the gap's reference was limited."
+    "On the acceleration of the gap's reference."
     not_finite: int = 0
     range: int = 0
-    "A duty was out of its range."
+    "On a duty."
 
 
 @final
@@ -41,16 +41,15 @@ class Actuator:
     """What makes the gap follow a plan, by the duties of two motors."""
 
     reference: Reference | None = None
-    "Where the gap is driven; None while nothing is driven."
+    "None while nothing is driven."
     acceleration_scale: float = 1.0
-    "The acceleration that the actuator has shown over the one that every device must reach, 1 or more."
+    "What the actuator has shown over what every device must reach, 1 or more."
 
     def __init__(self) -> None:
         self.acted = Acted()
 
     @property
     def reference_mm(self) -> float:
-        """The gap that is driven to; NaN while nothing is driven."""
         return math.nan if self.reference is None else self.reference.gap_mm
 
     def begin(self, gap_mm: float) -> None:
@@ -76,7 +75,6 @@ class Actuator:
         raise NotImplementedError
 
     def stop(self) -> None:
-        """Drop the reference, so that nothing is driven."""
         self.reference = None
 
     def lose_device(self) -> None:

@@ -12,16 +12,16 @@ from tormagd.safety.codes import Fault
 LONGEST_S: Final = 12.0
 "The slowest homing from a closed gap takes under 10 s."
 BACKS_OFF_MM: Final = 3.0
-"A firmware backs off less from a switch: a carriage that goes further towards closed goes the wrong way."
+"A firmware backs off less from a switch: a carriage that goes further goes the wrong way."
 WENT_BACK_MM: Final = 0.5
 "A carriage whose homing failed went the wrong way if it moved this far towards closed."
 ZEROED_MM: Final = 1.0
 "No carriage moves this far between two looks: the device has set its zero."
 STATUS_S: Final = 0.1
-"A homing device sends a Status every 20 ms; after this long without one it may no longer be homing."
+"A homing device sends a Status every 20 ms."
 OVER_S: Final = 0.04
 RISES: Final = 1.25
-"The sensor may show this many times what it showed when homing began, for OVER_S at most."
+"The sensor may show this many times what it showed at the start, for OVER_S at most."
 
 _HOMING: Final = DeviceMode.HOMING
 _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
@@ -35,17 +35,16 @@ class Homing:
     began_s: float = 0.0
     time_s: float = 0.0
     left_mm: float = 0.0
-    "How far open the left carriage has been."
+    "How far open the carriage has been."
     right_mm: float = 0.0
     left_at_mm: float = 0.0
-    "Where the left carriage is."
+    "Where it is."
     right_at_mm: float = 0.0
     switches: int = 0
-    "Which open switches were seen closed, as bits of `Switches`."
+    "The open switches that were seen closed."
     max_N: float = 0.0
-    "The greatest force that the sensor may show in this homing."
+    "The greatest force that the sensor may show."
     over_s: float = 0.0
-    "How long the sensor has shown more."
     faults: tuple[Fault, ...] = ()
 
     def __init__(self, ceiling_N: float) -> None:
@@ -84,7 +83,6 @@ class Homing:
         self.max_N = max(self._ceiling_N, RISES * abs(measurement.force_N))
 
     def _follow(self, now_s: float, measurement: Measurement) -> None:
-        """Watch a homing that goes on, and set the first fault that shows."""
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -101,7 +99,7 @@ class Homing:
             self.faults = (Fault.STATUS_STALE,)
 
     def _end(self, now_s: float, measurement: Measurement) -> None:
-        """Judge a homing that has ended: completed, given up, or replaced by a request to open."""
+        """Judge a homing that was completed, given up, or replaced by a request to open."""
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN
         if measurement.is_homed:
@@ -111,7 +109,6 @@ class Homing:
             self.faults = (self._went_back(WENT_BACK_MM, measurement),)
 
     def _went_back(self, most_mm: float, measurement: Measurement) -> Fault:
-        """Return the fault of a carriage that has moved more than `most_mm` towards closed."""
         left_mm, right_mm = self.went_back_mm
         is_left_stuck = left_mm > most_mm and measurement.is_left_open
         is_right_stuck = right_mm > most_mm and measurement.is_right_open

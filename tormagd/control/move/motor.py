@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 PULL_STATED_MM: Final = 45.0
 "The gap for which `motor.pull_V` is stated."
 MAX_MARGIN_DB: Final = 200.0
-"Bound of a gain margin: of a loop that no gain makes swing or, negative, that swings with every gain."
+"Of a loop that no gain makes swing or, negative, that swings with every gain."
 PULL_DEPTH_MM: Final = 32.0
 "Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
 
@@ -31,8 +31,6 @@ class TransferFunction(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Stability margins of the open position loop."""
-
     gain_margin_dB: float
     phase_margin_deg: float
     crossover_Hz: float
@@ -44,27 +42,26 @@ def full_speed_mm_s(motor: Motor) -> float:
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:
-    """Return the voltage that one motor needs against the magnets' pull, to open from `gap_mm`."""
+    """Return the voltage that one motor needs against the magnets' pull at `gap_mm`."""
     nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
     nearness *= nearness
     return stated_V * nearness * nearness
 
 
 def mechanical_time_s(motor: Motor) -> float:
-    """Return the time constant of the speed after a voltage step: J R / Ke^2."""
+    """Return the time constant of the speed: J R / Ke^2."""
     return motor.inertia_kg_m2 * motor.resistance_ohm / motor.back_emf_V_s**2
 
 
 def electrical_time_s(motor: Motor) -> float:
-    """Return the time constant of the current after a voltage step: L / R."""
     return motor.inductance_mH * 1e-3 / motor.resistance_ohm
 
 
 def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
-    """Return H(z) from duty to carriage position, mm, exact for a duty that is held over each period."""
+    """Return H(z) from duty to carriage position, mm, exact for a duty held over each period."""
     inductance_H = motor.inductance_mH * 1e-3
     advance_mm = motor.screw_lead_mm / (2.0 * math.pi * motor.gear_ratio)
-    # states: current A, motor speed rad/s, carriage position mm; the last row and column carry the held input
+    # states: current A, motor speed rad/s, carriage position mm; last, the held input
     continuous = np.zeros((4, 4))
     continuous[0] = [
         -motor.resistance_ohm / inductance_H,
@@ -101,7 +98,7 @@ def _exponential(matrix: Array) -> Array:
 
 
 def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
-    """Return the delay beyond one period's exchange that the position loop bears before it swings."""
+    """Return the delay beyond one period's exchange that the position loop bears."""
     known = margins(motor, position, period_s)
     return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
 

@@ -25,7 +25,7 @@ SEARCH_SHARE: Final = 0.5
 REPORT_S: Final = 0.1
 "A longer pause between two Status messages counts as this."
 LOWEST_SUPPLY: Final = 0.5
-"Least share of the nominal voltage that counts: a lower reading gives no speed, and the device reports it."
+"A lower reading gives no speed, and the device reports it."
 
 _HOMING: Final = DeviceMode.HOMING
 _RETRACTING: Final = DeviceMode.RETRACTING
@@ -44,29 +44,27 @@ class Opening:
     """The watch on the opening of a device that the core does not drive. `faults` are those of the newest look."""
 
     is_watching: bool = False
-    "Whether the newest look was judged."
     device_s: float = 0.0
     "The device's clock at the newest State."
     left_mm: float = 0.0
     right_mm: float = 0.0
     left_late_s: float = 0.0
-    "How late the left carriage is against the device's own speed."
+    "Against the device's own speed."
     right_late_s: float = 0.0
     reported_s: float = 0.0
-    "When the newest Status came."
     waits_s: float = 0.0
     "How long a device whose carriages' places are unknown has not been open."
     unheard_request: int = 0
-    "The newest request before this watch began: it was for another device or another purpose."
+    "The newest request before this watch began, which had another purpose."
     told_request: int = -1
-    "The request that followed the newest fault; only later requests are judged."
+    "The request that followed the newest fault; only later ones are judged."
     faults: tuple[Fault, ...] = ()
 
     def __init__(self, config: Config, scene: Scene) -> None:
         self._full_mm_s: Final = config.device.retract_mm_s
         self._supply_V: Final = config.motor.supply_V
-        # a device without a zero may be anywhere, and normally reports by itself that it failed; this is for one that
-        # does not
+        # a device without a zero may be anywhere, and should report by itself that it failed: this is in case it does
+        # not
         self._search_s: Final = 0.5 * scene.insert.gap_open_mm / (SEARCH_SHARE * self._full_mm_s) + LATE_S
 
     def __str__(self) -> str:
@@ -78,7 +76,6 @@ class Opening:
         )
 
     def rest(self, request_number: int) -> None:
-        """Stop watching, because the device is driven, homes or has gone."""
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
@@ -111,7 +108,6 @@ class Opening:
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
 
     def _judge_by_places(self, measurement: Measurement) -> None:
-        """Judge each carriage by how late it is on its way to the open end."""
         dt_s = max(measurement.device_time_s - self.device_s, 0.0)
         share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
         speed_mm_s = share * self._full_mm_s

@@ -15,7 +15,7 @@ from tormagd.model.features import LARGEST, require_number
 # compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST
 ON_TARGET_MM: Final = 0.001
-"Just over half an encoder count (4,480 counts on 8 mm): a carriage cannot be told to stand nearer."
+"Just over half an encoder count: a carriage cannot be told to stand nearer."
 
 
 @final
@@ -23,7 +23,6 @@ class Pid:
     """The position loop of one carriage."""
 
     integral: float = 0.0
-    "The integral part of the duty."
     is_saturated: bool = False
 
     def __init__(self, position: Position) -> None:
@@ -37,12 +36,12 @@ class Pid:
         self.integral, self.is_saturated = 0.0, False
 
     def rest(self, error_mm: float, dt_s: float) -> None:
-        """Let the integral decay for `dt_s` while the carriage is on its target."""
+        """Let the integral decay while the carriage is on its target."""
         if abs(error_mm) <= ON_TARGET_MM:
             self.integral = self.integral * self._integral_time_s / (self._integral_time_s + dt_s)
 
     def update(self, error_mm: float, error_mm_s: float, feed_forward: float, dt_s: float, is_blocked: bool) -> float:
-        """Return the duty after `dt_s` > 0, within the duty limit."""
+        """Return the duty after `dt_s` > 0."""
         proportional = self._proportional_per_mm * error_mm
         derivative = self._proportional_per_mm * self._derivative_time_s * error_mm_s
         asked = proportional + self.integral + derivative + feed_forward
@@ -53,7 +52,7 @@ class Pid:
         growth = proportional / self._integral_time_s + (duty - asked) / self._back_calculation_s
         if is_blocked:
             growth = min(growth, 0.0)
-        # no carriage needs more than the whole duty from the integral, however long it was saturated
+        # no carriage needs more than the whole duty from the integral
         self.integral = min(max(self.integral + growth * dt_s, -self._limit), self._limit)
         self.is_saturated = within != asked and duty == within
         return duty

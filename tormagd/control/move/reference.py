@@ -8,11 +8,11 @@ from tormagd.control.filter import low_pass
 from tormagd.control.records import Plan
 
 CARRY_S: Final = 0.012
-"A plan's gap is carried on along its motion by no more than this, three inference periods."
+"A plan's gap is carried on for no more than three inference periods."
 APPROACH_S: Final = 0.01
-"Time constant of the last stretch: with a shorter one the reference would chase every quantum of its target."
+"Of the last stretch: with less the reference would chase every quantum of its target."
 MIN_BRAKING: Final = 0.2
-"Share of the acceleration that is left to brake with, however hard the target itself turns."
+"Share of the acceleration that is left to brake with, however hard the target turns."
 
 
 @final
@@ -82,18 +82,17 @@ def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> flo
 
 @final
 class Expected:
-    """The gap that the carriages are expected at: the reference with its jerk limited."""
+    """Where the carriages are expected: the reference with its jerk limited."""
 
     gap_mm: float = 0.0
     speed_mm_s: float = 0.0
     filtered_mm_s: float = 0.0
-    "The speed, filtered like the measured speeds."
+    "Filtered like the measured speeds."
 
     def begin(self, gap_mm: float, speed_mm_s: float = 0.0) -> None:
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """Follow the place and speed of `reference` for `dt_s` with the time constant `lag_s`."""
         self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
         self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)
         self.filtered_mm_s = low_pass(self.filtered_mm_s, self.speed_mm_s, dt_s, filter_s)

@@ -16,35 +16,34 @@ from tormagd.safety.operating_state import Conditions, SafetyState
 from tormagd.scenes.scene import Scene
 
 STARTING_S: Final = 0.15
-"After enabling, the device may take this long to report that it runs."
+"The device may take this long to report that it runs."
 STILL_MM_S: Final = 0.5
-"A slower carriage does not move: this is half an encoder count per millisecond, filtered."
+"A slower carriage stands still: half an encoder count per millisecond, filtered."
 STARTS_OVER: Final = 1.25
-"Static over kinetic friction at most: a start from rest may take this many times the greatest force."
+"Static over kinetic friction: a start from rest may take this many times the greatest force."
 OVER_N: Final = 0.1
-"Allowance for the error of the sensor."
+"The error of the sensor."
 OVER_HELD_S: Final = 0.03
 OVER_FAULT_S: Final = 0.1
 "A force over the ceiling opens the gap after the first, and is a fault after the second."
 OVER_FADES: Final = 0.25
-"The time over the ceiling falls by this much per second while the force is under it."
+"The time over the ceiling falls by this much per second below it."
 SENSOR_FAULT_S: Final = 2.0
-"A sensor that is not believed for this long of sliding is a fault: forces are then only as good as the model."
+"Of sliding, without a sensor that is believed: forces are then only as good as the model."
 SENSE_FAULT_S: Final = 0.1
 STATUS_FAULT_S: Final = 0.1
-"An older message is a fault: Status comes every 20 ms, Sense with every State."
+"Status comes every 20 ms, Sense with every State."
 OPPOSED_S: Final = 0.1
-"A carriage that moves against its duty for this long is not braking: it brakes from full speed within 0.06 s."
+"A carriage that brakes moves against its duty for 0.06 s at most."
 WENT_AGAINST_S: Final = 0.015
 "Carriages that come apart or stop are wired wrong if one has moved against its duty for this long."
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
-"Shares of the delay that the position loop bears besides its own period: a limit, and a fault."
+"Shares of the delay that the position loop bears besides its period: a limit, and a fault."
 CLOCK_OFF: Final = 0.01
 CLOCK_FAULT: Final = 0.1
-"A device's clock that is off by more is a limit, or a fault."
 STALL_SHARE: Final = 0.8
-"A stall of the host shorter than this share of the device's timeout did not let that timeout expire."
+"A shorter stall of the host did not let the device's timeout expire."
 
 _DEVICE_RUN: Final = DeviceMode.RUN
 
@@ -56,7 +55,7 @@ def ceiling_N(scene: Scene) -> float:
 
 @final
 class Watch:
-    """The watch on one device: counts how long a driven device misbehaves, and tells its faults and limits."""
+    """The watch on one device: counts how long it misbehaves, and tells its faults and limits."""
 
     enabled_s: float = math.inf
     "inf while the device is not enabled."
@@ -67,11 +66,10 @@ class Watch:
     opposed_s: float = 0.0
     "How long a carriage has moved against its duty."
     over_s: float = 0.0
-    "How long the measured force has been over the ceiling of late while the handle moved."
+    "How long the force has been over the ceiling of late while the handle moved."
     is_over: bool = False
-    "Whether the force has been over the ceiling for so long that the gap has to open."
+    "Whether the gap has to open, because the force has been over the ceiling for too long."
     left_duty: float = 0.0
-    "The left motor's duty at the step before."
     right_duty: float = 0.0
 
     def __init__(self, config: Config, scene: Scene) -> None:
@@ -97,7 +95,7 @@ class Watch:
         self._ceiling_N: Final = ceiling_N(scene)
 
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
-        """Return `conditions` with the carriages' skew and the greatest values that a command may find."""
+        """Return `conditions` with the carriages' skew and what a command allows."""
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
@@ -107,7 +105,7 @@ class Watch:
         )
 
     def begin(self, enabled_s: float) -> None:
-        """Restart all counts for a device enabled at `enabled_s`; inf means not enabled."""
+        """Restart all counts for a device enabled at `enabled_s`."""
         self.enabled_s = enabled_s
         self.straying_s = self.still_s = self.opposed_s = self.over_s = 0.0
         self.is_over = False
@@ -122,13 +120,12 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        """Return all faults that show now."""
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
                 faults.append(Fault.ENCODER)
         elif measured.is_homed and not safety.needs_homing:
-            # switches come with Status: an older Status, or an older State, is of another place
+            # switches come with Status: with an older Status or State they are of another place
             is_told = not sight.is_blind and measurement.reported_s >= measurement.received_s
             switches: int = measurement.switches
             if is_outside(measured, self._closed_mm, self._open_mm) or (
@@ -144,7 +141,6 @@ class Watch:
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """Return the limits that show now."""
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
@@ -160,7 +156,7 @@ class Watch:
         return limits
 
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
-        """Count one tick in which the motors were driven with these duties towards `reference_mm`."""
+        """Count one tick of driving with these duties towards `reference_mm`."""
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
@@ -172,7 +168,7 @@ class Watch:
         self.left_duty, self.right_duty = left_duty, right_duty
 
     def rest(self) -> None:
-        """Take one tick without duties."""
+        """Count one tick without duties."""
         self.left_duty = self.right_duty = 0.0
 
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
@@ -186,9 +182,8 @@ class Watch:
         return list(device_faults(measurement.faults, is_host_stall=is_ours))
 
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
-        """Return the faults of the link: messages too old, a round trip too long, a clock too far off."""
         faults: list[Fault] = []
-        # the tick nearest to the end of a timeout judges it: the next one could be a period late
+        # the next tick could be a period late
         at_s = now_s + self._period_s / 2.0
         if not sight.is_waiting(now_s):
             # a State that has just come over a slow line is old too, and a loop around such a delay would swing
@@ -232,7 +227,6 @@ class Watch:
         return is_left_still or is_right_still
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        """Count how long a carriage has moved against its duty."""
         left_mm_s = right_mm_s = 0.0
         is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
         if is_left_driven:
