@@ -8,13 +8,13 @@ from tormagd.model.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
 
 ACCURACY_MT: Final = 1e-3
-"""Largest error of the root: a twentieth of the largest change of field over one encoder count (1/560 mm)."""
+"Of the root: a twentieth of the largest change of field over one encoder count (1/560 mm)."
 
 LOOKED_AT_MT: Final = 0.25 * ACCURACY_MT
-"""A step that should end this near the root is taken for the last: at its end only the force is evaluated, no slope."""
+"A step that should end this near the root is taken for the last, and its end needs no slope."
 
 MAX_EVALUATIONS: Final = 60
-"""Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; three times as many allow for steps between bisections."""
+"Bisection alone needs 20 from 1000 mT to ACCURACY_MT; three times as many allow for steps between bisections."
 
 
 @final
@@ -31,7 +31,6 @@ class RisingSearch:
         self._high_mT = high_mT
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`."""
         low, high = self._low_mT, self._high_mT
         span = high - low
         field = checked_near_mT(force_N, last_field_mT, low)

@@ -17,7 +17,7 @@ torch.set_num_threads(1)  # a second thread costs more than it saves at these si
 
 
 def batch(model: ForceModel, fields_mT: Floats) -> Batch:
-    """Return a function from a curve to the forces of `model`, N, at all `fields_mT` (n), in one pass in torch."""
+    """Return a function from a curve to the model's forces at all `fields_mT`, in one pass in torch."""
     network, rows = to_network(model), torch.zeros((len(fields_mT), len(FEATURES)), dtype=torch.float64)
     rows[:, FIELD] = torch.from_numpy(fields_mT)
     others = torch.tensor([column for column in range(len(FEATURES)) if column != FIELD])
@@ -33,7 +33,7 @@ def batch(model: ForceModel, fields_mT: Floats) -> Batch:
 
 
 def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
-    """Return a function from a curve and one field, mT, to the force of `model`, N: a pass in torch for one row."""
+    """Return a function from a curve and one field to the model's force, a pass in torch for one row."""
     network = to_network(model)
 
     def force_N(curve: ForceCurve, field_mT: float) -> float:
@@ -54,7 +54,6 @@ class RowByRow:
         self._epsilon_N, self._predict_N = epsilon_N, predict_N
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest."""
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0
         for field_mT in self._fields_mT:

@@ -12,13 +12,13 @@ class Reach(StrEnum):
     """Whether the fields in range can give the force that was asked."""
 
     INSIDE = "inside"
-    BELOW = "below"  # less force was asked than the least that any field gives
-    ABOVE = "above"  # more force was asked than the greatest that any field gives
+    BELOW = "below"  # less than any field gives
+    ABOVE = "above"  # more than any field gives
 
 
 @final
 class FieldSolution(Value):
-    """The field for a force, and the force that the model predicts there."""
+    """The field for a force, and the force that the model predicts there. A pass over a whole grid is one iteration."""
 
     def __init__(
         self, field_mT: float, predicted_force_N: float, confidence: float, iterations: int, reach: Reach
@@ -32,7 +32,7 @@ class FieldSolution(Value):
 
 @final
 class Question(Value):
-    """A question to a search in a process of its own: at which field does the brake give `force_N`?"""
+    """A question to a search in its own process: which field gives `force_N`?"""
 
     def __init__(
         self, time_s: float, displacement_mm: float, rate_mm_s: float, force_N: float, last_field_mT: float
@@ -46,7 +46,7 @@ class Question(Value):
 
 @final
 class Answer(Value):
-    """The answer of a search in a process of its own to the `Question` of `time_s`."""
+    """The answer of a search in its own process to the `Question` of `time_s`."""
 
     def __init__(self, time_s: float, solution: FieldSolution) -> None:
         self.time_s: Final = time_s
@@ -54,7 +54,7 @@ class Answer(Value):
 
 
 TIE: Final = 16.0 * 2.0**-52
-"Share of a sum's magnitude within which two forces are equal: a network's sum is off by a few units of rounding."
+"Share of a sum's magnitude within which two forces are equal: rounding moves a network's sum by a few units."
 
 
 class FieldSolver(Protocol):
@@ -65,7 +65,7 @@ class FieldSolver(Protocol):
 
 
 def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float) -> float:
-    """Check the arguments of a search; return the field that its answer should be near, mT."""
+    """Check a search's arguments, and return the field that its answer should be near."""
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):
         require_number("last_field_mT", near_mT)
@@ -74,13 +74,13 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
 
 
 def tie_N(curve: ForceCurve) -> float:
-    """Return the difference of force, N, up to which two forces of `curve` count as equal: its rounding error."""
+    """Return the rounding error of `curve`, up to which two of its forces are equal."""
     return TIE * curve.magnitude_N
 
 
 def answer(
     curve: ForceCurve, field_mT: float, force_N: float, predicted_N: float, iterations: int, reach: Reach
 ) -> FieldSolution:
-    """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence."""
+    """Return the solution at a field where `curve` predicts `predicted_N`, with its confidence."""
     trust = curve.confidence(field_mT, force_N - predicted_N)
     return FieldSolution(field_mT, predicted_N, trust, iterations, reach)

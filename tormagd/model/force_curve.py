@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from tormagd.model.features import FEATURES, FIELD, LARGEST, require_number
 
 EXTRAPOLATION_RATE: Final = 4.0
-"""Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."""
+"Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."
 
 RESIDUAL_RATE: Final = 20.0
-"""Confidence falls to 1/e when 5% of the training force span remains between force asked and force predicted."""
+"Confidence falls to 1/e when 5% of the training force span remains between force asked and force predicted."
 
 LARGEST_EXPONENT: Final = 700.0
-"exp() of a little more overflows. A sigmoid unit this far from its step adds nothing to the last digit of a force."
+"exp() of a little more overflows; a unit this far from its step adds nothing to the last digit of a force."
 
 # compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST
@@ -26,7 +26,7 @@ Floats: TypeAlias = NDArray[np.floating]
 
 
 class ForceCurve(Protocol):
-    """Force over field at a fixed displacement and rate of the handle and share of iron. Fields are finite, in mT."""
+    """Force over field at a fixed displacement and rate of the handle and share of iron."""
 
     @property
     def displacement_mm(self) -> float:
@@ -38,7 +38,7 @@ class ForceCurve(Protocol):
 
     @property
     def cip_percent(self) -> float:
-        """The elastomer's share of carbonyl iron, percent by volume."""
+        """The elastomer's share of carbonyl iron, by volume."""
 
     @property
     def magnitude_N(self) -> float:
@@ -58,13 +58,12 @@ class ForceCurve(Protocol):
 
 
 def within(value: float, ends: tuple[float, float]) -> float:
-    """Return `value`, held within the two `ends`, the least first: so a model is asked only where it was trained."""
     return min(max(value, ends[0]), ends[1])
 
 
 @final
 class Known:
-    """What a model was trained on: the least and the greatest of each feature, and the span of the forces, N."""
+    """What a model was trained on: the range of each feature, and the span of the forces."""
 
     def __init__(self, ranges: tuple[tuple[float, float], ...], span_N: float) -> None:
         self.lows: Final = [low for low, _ in ranges]
@@ -74,8 +73,7 @@ class Known:
         self.span_N: Final = span_N
 
     def excess(self, place: int, value: float) -> float:
-        """Return how far feature number `place` of `FEATURES`, from 0, lies outside its range, as a share of it; 0
-        inside, and for NaN."""
+        """Return how far feature number `place` lies outside its range, as a share of the range."""
         outside = max(self.lows[place] - value, value - self.highs[place])
         return outside / self.scales[place] if outside > 0.0 else 0.0
 
@@ -111,8 +109,7 @@ class Network:
         self.known: Final = known
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
-        """Return the force curve at a state of the handle, in mm, mm/s and percent of iron by volume. Raises
-        `DomainError` naming a number that is not finite, or beyond `LARGEST`."""
+        """Return the force curve at a state of the handle. Raises `DomainError` for a number beyond `LARGEST`."""
         # written out because it stands before every prediction of the control loop
         if not (
             -_LARGEST <= displacement_mm <= _LARGEST
@@ -130,7 +127,7 @@ class Network:
 
 @final
 class NetworkCurve:
-    """The `ForceCurve` of a network at one state of the handle, made by `Network.curve`."""
+    """The `ForceCurve` of a network at one state of the handle."""
 
     def __init__(
         self, network: Network, shift: list[float], displacement_mm: float, rate_mm_s: float, cip_percent: float
@@ -143,11 +140,9 @@ class NetworkCurve:
 
     @property
     def magnitude_N(self) -> float:
-        """The sum of the magnitudes of a force's terms: its rounding error is a share of this."""
         return self._network.magnitude_N
 
     def force_N(self, field_mT: float) -> float:
-        """Return the force, N, at one field, mT."""
         network, total_N = self._network, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -156,7 +151,6 @@ class NetworkCurve:
         return total_N + network.constant_N
 
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """Return the force, N, and its slope dF/dB, N/mT, at one field, mT."""
         network, total_N, slope = self._network, 0.0, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -169,8 +163,6 @@ class NetworkCurve:
         return total_N + network.constant_N, slope
 
     def forces_N(self, fields_mT: Floats) -> Floats:
-        """Return the force, N, at each field (n), mT, in the precision of the fields, float32 or float64; NaN gives
-        NaN."""
         network, kind = self._network, fields_mT.dtype
         hidden = np.multiply.outer(fields_mT, network.field_half.astype(kind, copy=False))
         hidden -= np.array(self._shift, dtype=kind) / 2
@@ -179,7 +171,7 @@ class NetworkCurve:
         return forces
 
     def confidence(self, field_mT: float, error_N: float) -> float:
-        """Return the trust exp(-4 e - 20 r), 0..1, in a field whose force misses the force asked by `error_N`."""
+        """Return the trust exp(-4 e - 20 r) in a field whose force misses the force asked by `error_N`."""
         known = self._network.known
         excess = (
             known.excess(0, self.displacement_mm)

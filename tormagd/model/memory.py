@@ -18,7 +18,7 @@ LONGEST_S = 1e5
 
 
 class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Relaxation and field lag of one element; the defaults are an element that remembers nothing."""
+    """Relaxation and field lag of one element; by default it remembers nothing."""
 
     fractions: tuple[float, ...] = ()
     times_s: tuple[float, ...] = ()
@@ -47,7 +47,6 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def added(self) -> PronySeries:
-        """The relaxation of the force that the field adds."""
         own = self.field_fractions
         return PronySeries(self.fractions if isinstance(own, msgspec.UnsetType) else own, self.times_s)
 

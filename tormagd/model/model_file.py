@@ -38,19 +38,19 @@ from tormagd.physics.errors import DomainError, require_that
 
 Array: TypeAlias = NDArray[np.float64]
 Ranges: TypeAlias = dict[str, tuple[float, float]]
-"By name, the least and the greatest value of each feature and of `force_N`."
+"The least and the greatest value of each feature and of `force_N`, by name."
 
 FORMAT = "tormagd-force-model-1"
 MAX_HIDDEN = 4096
 MAX_FILE_BYTES = 1 << 20
-"""Room for the largest admissible network, and little enough that a wrong file is refused before it costs memory."""
+"Room for the largest admissible network; a wrong file is refused before it costs memory."
 
 TEXT_FIELDS = frozenset({"element", "insert", "training_data_sha256", "created"})
-"""Header fields written as they are; the others are JSON."""
+"Header fields written as they are; the others are JSON."
 
 
 class ModelFileError(ValueError):
-    """A model file that is missing, damaged, or meant for another element or insert; the text says which."""
+    """A model file that is missing, damaged, or meant for another element or insert."""
 
 
 class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -122,7 +122,7 @@ class PhysicalLayers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """Force of an insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network."""
+    """Force of an insert over the four `FEATURES`, by a 4-h-1 sigmoid network."""
 
     metadata: ModelMetadata
     hidden_weight: Array
@@ -131,7 +131,7 @@ class ForceModel:
     output_bias: float
     physical: PhysicalLayers = field(init=False, repr=False)
     network: Network = field(init=False, repr=False)
-    "The network once more, on lists of floats: its curves are what plans ask."
+    "The network on lists of floats: its curves are what plans ask."
 
     def __post_init__(self) -> None:
         hidden = self.metadata.hidden
@@ -166,7 +166,6 @@ class ForceModel:
 
     @property
     def force_span_N(self) -> float:
-        """Greatest less least force seen in training, N."""
         low, high = self.metadata.ranges["force_N"]
         return high - low
 
@@ -175,7 +174,7 @@ class ForceModel:
         return _checksum(_header(self.metadata), _tensors(self))
 
     def of(self, insert: str) -> "ForceModel":
-        """Return the model of one of its several inserts: the ranges are that insert's alone; the weights are the same."""
+        """Return the model of one of its inserts: the weights are the same, the ranges are that insert's alone."""
         whole, memory = self.metadata, self.metadata.memory
         ranges = (whole.boxes or {}).get(insert)
         if ranges is None:
@@ -186,11 +185,10 @@ class ForceModel:
         return replace(self, metadata=own)
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
-        """Return the force over the field at one state of the handle, as `Network.curve`."""
         return self.network.curve(displacement_mm, rate_mm_s, cip_percent)
 
     def predict(self, features: ArrayLike) -> Array:
-        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`); a single point is 1 x 4."""
+        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`)."""
         rows = feature_rows(features)
         weight, bias, output, constant = self.physical
         # sigmoid(z) = (1 + tanh(z/2)) / 2: one operation fewer than exp, and it cannot overflow
@@ -198,12 +196,12 @@ class ForceModel:
         return np.asarray(forces_N, dtype=np.float64)
 
     def predict_one(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Return the force, N, at one point, by the curve that plans use."""
+        """Return the force at one point, by the curve that plans use."""
         require_number("field_mT", field_mT)
         return self.curve(displacement_mm, rate_mm_s, cip_percent).force_N(field_mT)
 
     def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
-        """Return the slope of the force over the field, dF/dB, N/mT (n), at `features` (n x 4, order of `FEATURES`)."""
+        """Return dF/dB (n) at `features` (n x 4, order of `FEATURES`)."""
         rows = feature_rows(features)
         weight, bias, output, _ = self.physical
         # the sigmoid's slope without 1 - tanh^2, which is 0 by rounding where a unit is saturated
@@ -221,7 +219,7 @@ def save_model(path: Path | str, model: ForceModel) -> None:
 
 
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
-    """Read a model file for `element` and `insert`; None accepts any insert."""
+    """Read a model file for `element` and `insert`; None accepts any insert. Raises ModelFileError."""
     source = Path(path)
     try:
         model = _decode(read_bounded(source, MAX_FILE_BYTES)).of(insert or "")
@@ -242,7 +240,6 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
 
 
 def _decode(data: bytes) -> ForceModel:
-    """Return the model in a file's bytes."""
     # the library proves that the header is whole and that the tensors lie inside the file
     tensors = {name: _tensor(name, content) for name, content in safetensors.deserialize(data)}  # type: ignore[no-untyped-call]
     header = _json_header(data).get("__metadata__", {})
@@ -266,14 +263,13 @@ def _decode(data: bytes) -> ForceModel:
 
 
 def _tensor(name: str, content: dict[str, Any]) -> Array:
-    """Return a tensor as an array."""
     if content["dtype"] not in ("F64", "float64"):
         raise ModelFileError(f"tensor {name} is {content['dtype']}; needed is F64")
     return np.frombuffer(content["data"], dtype="<f8").reshape(content["shape"])
 
 
 def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return `value` as a read-only float64 copy of `shape`; `name` is what an error calls it."""
+    """Return `value` as a read-only float64 copy of `shape`; errors call it `name`."""
     source = np.asarray(value)
     require_that(source.dtype.kind == "f", name, source.dtype, "floating-point numbers")
     array = source.astype(np.float64)
@@ -301,7 +297,6 @@ def _header(metadata: ModelMetadata) -> dict[str, str]:
 
 
 def _checksum(header: dict[str, str], tensors: dict[str, Array]) -> str:
-    """Return the SHA-256 of header and tensors, as hexadecimal digits; their order does not matter."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]

@@ -19,7 +19,7 @@ import numpy as np
 from tormagd.physics.errors import Real
 
 MAX_COMPRESSION = 0.95
-"""Largest compression the model is used at (lambda1 = 0.05): the force goes to infinity as lambda1 goes to 0."""
+"The force goes to infinity as the stretch lambda1 goes to 0; here lambda1 = 0.05."
 
 _SCALAR = SimpleNamespace(
     sqrt=math.sqrt,
@@ -32,12 +32,11 @@ _SCALAR = SimpleNamespace(
 
 
 def functions(value: Any) -> SimpleNamespace | ModuleType:
-    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for anything else."""
     return _SCALAR if isinstance(value, float | int) else np
 
 
 class BrakeCurve(NamedTuple):
-    """The brake curve of one wall ratio and body-force weight: w (`wall`), A (`a`) and B (`b`) of Eq. 29 to 34."""
+    """The brake curve of one wall ratio and body-force weight: w, A and B of Eq. 29 to 34."""
 
     wall: float
     a: float
@@ -49,7 +48,7 @@ class BrakeCurve(NamedTuple):
         return cls(wall, 1.0 - 0.5 * wall * body_force, wall * (1.0 + 1.5 * body_force))
 
     def compression(self, load: Real) -> Real:
-        """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq."""
+        """Return the compression eps at the load y >= 0 (Eq. 29)."""
         fn = functions(load)
         p = 1.0 - self.a * load
         larger = fn.sqrt(p * p + 2.0 * self.b * load) + abs(p)
@@ -58,12 +57,12 @@ class BrakeCurve(NamedTuple):
         return compression
 
     def load(self, compression: Real) -> Real:
-        """Return the load y that compresses by eps, 0 to MAX_COMPRESSION: the inverse of `compression`."""
+        """Return the load that compresses by eps: the inverse of `compression`."""
         load: Real = 0.5 * compression * (2.0 + compression) / (self.b + self.a * compression)
         return load
 
     def force(self, compression: Real, load: Real) -> Real:
-        """Return the force phi (Eq."""
+        """Return the force phi (Eq. 33 and 34) from a load and the compression that it gives."""
         fn = functions(load)
         stretch = 1.0 - compression
         elastic: Real = fn.expm1(-4.0 * fn.log1p(-compression))

@@ -24,7 +24,7 @@ MU0_H_M = 4e-7 * math.pi
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Elastomer cylinder around its shaft, and the roller, all in m."""
+    """The elastomer's cylinder around its shaft, and the roller."""
 
     inner_radius_m: float
     outer_radius_m: float
@@ -43,12 +43,12 @@ class Geometry:
 
 
 TORMAG = Geometry(inner_radius_m=0.004, outer_radius_m=0.011, thickness_m=0.020, roller_radius_m=0.020)
-"""The thesis's device (table 2.2)."""
+"The thesis's device (table 2.2)."
 
 
 @dataclass(frozen=True, slots=True)
 class Elastomer:
-    """Shear modulus G0 (Pa), relative permeability mu_r and kinetic friction coefficient mu_d of one insert."""
+    """What of one insert makes its force: G0, mu_r and the kinetic friction coefficient mu_d."""
 
     shear_modulus_Pa: float
     relative_permeability: float
@@ -61,19 +61,21 @@ class Elastomer:
 
 
 def max_radial_moment_Tm(elastomer: Elastomer, geometry: Geometry) -> float:
-    """Return the largest admissible radial moment, T m: it compresses the elastomer to lambda1 = 0.05."""
+    """Return the largest admissible radial moment, which compresses the elastomer to lambda1 = 0.05."""
     return reduced(elastomer, geometry).max_moment_Tm
 
 
 def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the kinetic friction force at the roller, N, >= 0 (Eq."""
+    """Return the kinetic friction force at the roller (Eq. 33 and 34). Raises `DomainError` for a moment beyond
+    `max_radial_moment_Tm`.
+    """
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return law.force(radial_moment_Tm)
 
 
 class Reduced(NamedTuple):
-    """The force law of one elastomer in one geometry: the dimensionless curve and the two scales that give it units."""
+    """The force law of one elastomer in one geometry: the dimensionless curve and its two scales."""
 
     curve: BrakeCurve
     load_root_per_Tm: float
@@ -81,19 +83,16 @@ class Reduced(NamedTuple):
     max_moment_Tm: float
 
     def load(self, moment_Tm: Real) -> Real:
-        """Return the dimensionless load y at a radial moment, T m; nothing is checked."""
         root = self.load_root_per_Tm * moment_Tm
         return root * root
 
     def force(self, moment_Tm: Real) -> Real:
-        """Return the friction force at the roller, N, at a radial moment of 0 to `max_moment_Tm`, T m."""
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
 
 
 @lru_cache(maxsize=64)
 def reduced(elastomer: Elastomer, geometry: Geometry) -> Reduced:
-    """Return the force law of one elastomer in one geometry."""
     g0, mu_r = elastomer.shear_modulus_Pa, elastomer.relative_permeability
     inner, outer, thickness = geometry.inner_radius_m, geometry.outer_radius_m, geometry.thickness_m
     curve = BrakeCurve.of(wall=(outer - inner) / inner, body_force=thickness * (mu_r - 1.0))

@@ -2,9 +2,9 @@
 
     F = (1 - sum g_i) F0 + sum g_i h_i           dh_i/dt = dF0/dt - h_i / tau_i
 
-F0 is the force the elastomer would give without memory. After a step F0 the force starts at F0 and relaxes to
-(1 - sum g_i) F0. After a long rest at a high F0, a fall to a low F0 undershoots and can leave F below zero. Contact is
-then lost: the caller has to bound a brake's level at zero.
+F0 is the force the elastomer would give without memory. After a step F0 the force starts at F0 and relaxes to (1 - sum
+g_i) F0. After a long rest at a high F0, a fall to a low F0 undershoots and can leave F below zero. Contact is then
+lost: the caller has to bound a brake's level at zero.
 """
 
 import math
@@ -14,7 +14,7 @@ from firmware_protocol.value import Value
 from tormagd.physics.errors import DomainError, require, require_that
 
 PronyState: TypeAlias = tuple[float, ...]
-"""The last driving force, N, then one branch force h_i, N, for each time constant."""
+"The last driving force, N, then one branch force h_i, N, for each time constant."
 
 MAX_FORCE_N: Final = 1e9
 MAX_STEP_S: Final = 1e9
@@ -27,7 +27,7 @@ class PronyStep(Value):
     __match_args__ = ("fractions", "decays", "gains")
 
     def __init__(self, fractions: tuple[float, ...], decays: tuple[float, ...], gains: tuple[float, ...]) -> None:
-        relaxing = 0.0  # summed here: `sum` is a call, and a plan makes two of these
+        relaxing = 0.0  # `sum` is a call, and a plan makes two of these
         for fraction in fractions:
             relaxing += fraction
         self.equilibrium_fraction: Final = 1.0 - relaxing
@@ -36,7 +36,7 @@ class PronyStep(Value):
         self.gains: Final = gains
 
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
-        """Return the force, N, and the state at the end of a step, from the state at its beginning."""
+        """Return the force, N, and the state after one step."""
         if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
             require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         if len(state) != len(self.fractions) + 1:
@@ -51,7 +51,7 @@ class PronyStep(Value):
         return force_N, tuple(following)
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
-        """Return the step, of equal length, of a series with equal times and other fractions; this one stays."""
+        """Return the step, of equal length, of a series with equal times and other fractions."""
         return PronyStep(fractions, self.decays, self.gains)
 
 
@@ -71,7 +71,7 @@ class PronySeries(Value):
         self.times_s: Final = times_s
 
     def relaxed(self, driving_N: float) -> PronyState:
-        """Return the state after an endless rest at a driving force: that force, and 0 N in every branch."""
+        """Return the state after an endless rest at a driving force."""
         require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         return (driving_N, *[0.0 for _ in self.fractions])
 

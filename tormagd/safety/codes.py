@@ -7,8 +7,6 @@ from firmware_protocol.codec import DeviceFault
 
 
 class Reaction(StrEnum):
-    """The safe reaction to a fault or limit."""
-
     OPENING = "opening"
     "The gap opens at a bounded speed, and the drives go off there."
     LIMITED = "limited"
@@ -583,6 +581,6 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
-    """Return the faults for the firmware's fault bits, in the order of the bits; empty for none."""
+    """Return the faults for the firmware's fault bits, in the order of the bits."""
     names = _BY_DEVICE_FAULT | ({DeviceFault.COMMAND_TIMEOUT: Fault.HOST_STALL} if is_host_stall else {})
     return tuple(fault for bit, fault in names.items() if bit in bits)

@@ -7,7 +7,7 @@ from msgspec import Struct
 
 
 class OperatingPoint(Struct, frozen=True):
-    """One way to serve a scene: rates of control and of plans, Hz, and the search for the field."""
+    """One way to serve a scene: rates of control and of plans, and the search for the field."""
 
     control_hz: int
     inference_hz: int
@@ -31,7 +31,7 @@ class Share(Struct, frozen=True):
 
 
 class Tried(Struct, frozen=True):
-    """The RMS error of the force, N, of a scene's own signal served in one way, on each of the three samples."""
+    """The force error of a scene's own signal served in one way, on each of the three samples."""
 
     way: OperatingPoint
     rms_N: tuple[float, ...]
@@ -71,7 +71,6 @@ class MeasuredScene(Struct, frozen=True):
         return self.usual.worst_N <= self.tolerance_N
 
     def of(self, way: OperatingPoint) -> Tried:
-        """Return what was found of `way`: the same rates and the same search."""
         return next(each for each in self.tried if each.way == way)
 
 
@@ -89,27 +88,25 @@ class Measurements(Struct, frozen=True):
     scenes: tuple[MeasuredScene, ...]
 
     def share(self, way: OperatingPoint) -> Share | None:
-        """Return what serving in this `way` costs; None where it was not measured."""
         return next((each for each in self.shares if each.way == way), None)
 
     def scene(self, fingerprint: str) -> MeasuredScene | None:
-        """Return what was measured of the scene with this `fingerprint`; None where none was."""
         return next((each for each in self.scenes if each.fingerprint == fingerprint), None)
 
 
 FILE = "measured.json"
 TOLERATED = 0.8
-"Share of a scene's tolerance: an error within it may be chosen."
+"An error within this share of a scene's tolerance may be chosen."
 WORSE = 0.2
-"Share of a scene's tolerance: an error that is so much over the usual way's may be chosen."
+"An error that exceeds the usual way's by this share of the tolerance may be chosen."
 
 
 def measured() -> Measurements:
-    """Read the file of measurements that comes with the package, anew at each call, and return it."""
+    """Read the file of measurements that comes with the package."""
     return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measurements)
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
-    """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`."""
+    """Return the greatest error of a way that may replace the usual one with the error `usual_N`."""
     most_N = max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)
     return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N
