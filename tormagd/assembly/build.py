@@ -44,22 +44,22 @@ SOURCES += ("tormagd/hardware", "tormagd/control", "tormagd/assembly")
 SENSED_N = 0.001
 "One step of the force sensor's message."
 SETTLES_MM = 4.0 * 8.0 / 4480.0
-"Friction holds the gap to within four counts of the encoders, wherever it comes to rest."
+"Friction holds the gap to within four counts of the encoders."
 STANDBY_N = 0.3
 "A hand may feel this much over the open gap's force of a brake that waits."
 DEPTHS = 9
-"Depths at which a pad's force is checked for whether it rises."
+"At which a pad's force is checked for whether it rises."
 LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
-"How much of a scene's signal is held against the device's speed, and how finely: per second, and per period."
+"How much of a scene's signal is looked at, how often a second, and how often in a period."
 SEVERAL_BRANCHES = named("nearest", neighbours=16, reason="the force falls with the field somewhere")
 "With fewer neighbours answers jump between branches; more gain little (docs/tactile.md)."
 IN_PORTRAIT = Choice("portrait", 0.0, 0, "the scene requires no rate: force over gap is one table")
 BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most exact")
-"At every tolerance and network size: docs/inverse_trade.md, and docs/scenes.md on the device."
+"At every tolerance and network size: docs/inverse_trade.md."
 
 
 ROUNDED_UP = 1.005
-"Three digits of a number times this are not below the number."
+"A number times this, to three digits, is not below the number."
 
 
 class Core(NamedTuple):
@@ -74,9 +74,9 @@ class Core(NamedTuple):
     model: str
     "The model's fingerprint."
     models: Path
-    "Where the scene's model was looked for."
+    "Where the model was looked for."
     missed: Missed | None = None
-    "What the gap's speed alone leaves of the scene's signal; None without a signal."
+    "What the gap's speed alone leaves of the scene's signal."
 
     @property
     def gap_speed_mm_s(self) -> float:
@@ -95,7 +95,7 @@ class Core(NamedTuple):
 
 def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
     """Build the core for a scene, by default `config.scene`. Raises ConfigError where scene, model and configuration do
-    not fit each other.
+    not fit.
     """
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
@@ -127,7 +127,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
-    """Return the scene's element as the model describes it, and the choice of the search for its field."""
+    """Return the scene's element and the choice of the search for its field."""
     terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
     require("insert.name, cip_percent", cip_percent, *model.feature_ranges[FEATURES.index("cip_percent")])
@@ -159,7 +159,7 @@ def platform_name() -> str:
 
 
 def _brake(scene: Scene) -> tuple[ElementContact, FieldOfGap, float]:
-    """Return a brake's contact, the field over its gap, and its share of iron in percent by volume."""
+    """Return a brake's contact, the field over its gap, and its share of iron in percent."""
     fitted = insert(scene.insert.name)
     permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
     return Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction
@@ -185,7 +185,7 @@ def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
 def _known_fields_mT(
     scene: Scene, model: ForceModel, contact: ElementContact, field: FieldOfGap
 ) -> tuple[tuple[float, float], bool]:
-    """Return the range of fields that the scene's gaps give and the model knows, and whether the force rises in it."""
+    """Return the fields that the gaps give and the model knows, and whether the force rises in them."""
     low_mT, high_mT = model.field_range_mT
     low_mT = max(low_mT, field.field_mT(scene.insert.gap_open_mm))
     high_mT = min(high_mT, field.field_mT(scene.insert.gap_closed_mm))
@@ -230,8 +230,8 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
 
 
 def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
-    """Return, a line each, which of the scene's greatest and standby forces the gaps do not reach."""
-    # a lowest force below the open gap's is no error: no passive brake gives 0, and the limit F_MIN says so
+    """Return which of the scene's greatest and standby forces the gaps do not reach."""
+    # a lower least force is no error: no passive brake gives 0, and the limit F_MIN says so
     unmet = []
     if not reach.min_N < scene.force.most_N <= reach.max_N:
         unmet.append(
@@ -248,7 +248,6 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:
-    """Return the configuration at the scene's rates, if `rates.of_scene` says so."""
     if not config.rates.of_scene:
         return config
     needed = scene.bandwidth
@@ -261,7 +260,6 @@ def at_rates_of(scene: Scene, config: Config) -> Config:
 
 
 def _slowed(config: Config, scene: Scene) -> Config:
-    """Return the configuration at the scene's gap speed, where that is lower."""
     position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
     if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
         return config
@@ -269,7 +267,7 @@ def _slowed(config: Config, scene: Scene) -> Config:
 
 
 def approaches_s(core: Core) -> list[tuple[float, float]]:
-    """Return forces at which a brake may wait, N, each with the gap's time to the middle of the scene's forces, s."""
+    """Return forces at which a brake may wait, N, and how long the gap takes from there to the middle force, s."""
     if core.scene.element == "tactile":
         return []
     reach, force = core.portrait, core.scene.force
@@ -279,7 +277,7 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
-    """Return the smallest difference of force that the device makes and measures up to `most_N`."""
+    """Return the smallest difference of force that the device makes and measures."""
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
@@ -294,7 +292,7 @@ def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
-    """Return which of the handle's rates, or of the finger's depth and rate, the model was not trained on."""
+    """Return which motions of the hand the model was not trained on."""
     depths_mm, rates_mm_s, *_ = model.feature_ranges
     handle, finger = scene.handle, scene.finger
     stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
@@ -320,7 +318,7 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
 
 
 def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
-    """Return that ideal carriages miss the signal by more than its tolerance, with the tolerance that they keep."""
+    """Return whether ideal carriages miss the signal by more than its tolerance, as text."""
     if miss is None or miss.rms_N <= scene.force.tolerance_rms_N:
         return []
     worst = ", ".join(
@@ -335,9 +333,8 @@ def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
 
 
 def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
-    """Return that an opening gap could release the force faster than the scene allows, with what it has to allow."""
-    # the weakest believable device makes a force at the least gap, where a gap's speed changes the force most; the
-    # ceiling lets no gap make more than CEILING times the scene's greatest force
+    """Return whether an opening gap releases the force faster than the scene allows, as text."""
+    # the weakest believable device makes a force at the least gap, where the gap's speed changes it most
     opening_mm_s, key = max(
         (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
         (config.position.gap_speed_mm_s, "position.gap_speed_mm_s"),
@@ -354,7 +351,6 @@ def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    """Return the search that `scene` names, with its settings."""
     wanted = scene.solver
     if wanted.name == AUTO:
         if not scene.terms.rate:

@@ -51,7 +51,7 @@ def conditions(
 
 
 def _late_stream(now_s: float, measurement: Measurement, timeout_s: float) -> str:
-    """Return which stream of the device has stopped, as in "no Sense for 312 ms"."""
+    """Return which stream has stopped, as in "no Sense for 312 ms"."""
     for name, came_s, longest_s in (
         ("State", measurement.received_s, timeout_s),
         ("Sense", measurement.sensed_s, SENSE_FAULT_S),

@@ -41,35 +41,33 @@ STEP = "step"
 PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
-"A conversation began or ended. READ and WROTE are in `keeping`, for the black box's process."
+"A conversation began or ended. READ and WROTE are in `keeping`."
 STATE, MISSING = "state", "missing"
 MAX_ENTRIES = 4_096
-"Entries that nobody took are dropped at this number, and MISSING takes their place."
+"When so many entries were not taken, MISSING takes their place."
 
 _LENGTH = struct.Struct(">I")
 _NONE = b"\xdd" + _LENGTH.pack(0)
-"An empty array in msgpack's form with a length of four bytes."
+"In msgpack's form with a length of four bytes."
 
 Entry = str | TickRecord | tuple[Any, ...]
 
 
 class Journal:
-    """The core's inputs since the last `take`, in their order. Every method but `take` adds an entry."""
+    """The core's inputs since the last `take`. Every other method adds an entry."""
 
     def __init__(self, *, is_kept: bool = True) -> None:
         self.is_kept = is_kept
         self._entries: list[Entry] = []
 
     def stepped(self) -> None:
-        """Note that a step is about to run; its inputs stand in the record that `ticked` adds after it."""
+        """Note that a step is about to run; its inputs follow with `ticked`."""
         self._add(STEP)
 
     def ticked(self, record: TickRecord) -> None:
-        """Note the record of a control period, with the inputs and results of its step."""
         self._add(record)
 
     def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """Note that a plan begins, which uses the newest measurement."""
         self._add((PLAN, now_s, setpoint))
 
     def foresaw(self) -> None:
@@ -80,7 +78,7 @@ class Journal:
         self._add((AFRESH, now_s))
 
     def taught(self, learned: Learned) -> None:
-        """Note that the estimators were set to what is known of the device from another day."""
+        """Note that the estimators were set to what is known from another day."""
         self._add((TEACH, learned))
 
     def confirmed(self, what: str) -> None:
@@ -94,18 +92,15 @@ class Journal:
         self._add((COMMAND, name, now_s, is_refused, conditions))
 
     def latched(self, fault: Fault) -> None:
-        """Note a fault that was found outside the step."""
         self._add((LATCH, str(fault)))
 
     def lost_link(self) -> None:
         self._add((LOSE_LINK,))
 
     def read(self, now_s: float, raw: Received) -> None:
-        """Note what was read from the device, as in `connection.Traffic`."""
         self._add((READ, now_s, raw))
 
     def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        """Note what was written to the device in one period, as in `connection.Traffic`."""
         self._add((WROTE, now_s, raw, unsent))
 
     def connected(self, memory: Any) -> None:
@@ -118,11 +113,10 @@ class Journal:
             self._add((STATE, plain(stepper), plain(planner), connection))
 
     def missed(self) -> None:
-        """Note that entries before this one were lost."""
         self._add((MISSING,))
 
     def take(self) -> list[Entry]:
-        """Return and remove the entries since the last `take`, the oldest first."""
+        """Return and remove all entries."""
         entries, self._entries = self._entries, []
         return entries
 
@@ -146,7 +140,6 @@ class Packer:
             self._count += 1
 
     def take(self) -> bytes:
-        """Return the array's bytes, and begin an empty one."""
         _LENGTH.pack_into(self._bytes, 1, self._count)
         packed = bytes(self._bytes)
         self._bytes, self._count = bytearray(_NONE), 0

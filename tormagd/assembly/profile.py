@@ -29,11 +29,11 @@ ZERO_LASTS_S = 600.0
 
 
 class ProfileError(ValueError):
-    """A profile that cannot be used. The text says why."""
+    """A profile that cannot be used."""
 
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is known of a device, by serial number, with an insert and a model, by fingerprint."""
+    """What is known of a device with an insert and a model."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
@@ -60,7 +60,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def gains_of(config: Config) -> str:
-    """Return the SHA-256 of what the carriages are driven with: [motor] and [position]."""
+    """Return the SHA-256 of [motor] and [position]."""
     return hashlib.sha256(msgspec.json.encode((config.motor, config.position))).hexdigest()
 
 

@@ -25,7 +25,7 @@ from tormagd_client.printable import printable
 
 TIMER_S = 2.0
 CORE_S = 0.7
-"Virtual time of the loop whose calls are timed; repeating them takes as long again in real time."
+"In virtual time; repeating the calls takes as long again in real time."
 SHARES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
@@ -42,7 +42,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
-    """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer."""
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority
     late, cost = uvloop.run(_in_real_time(config, timer_s, steps, plans))
@@ -68,7 +67,6 @@ async def _in_real_time(
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Return `mean`, `p50`, `p99`, `p999` and `max` of `values`, rounded to 0.1."""
     return {"mean": round(float(np.mean(values)), 1)} | {
         name: round(float(np.percentile(values, share)), 1) for name, share in SHARES.items()
     }

@@ -1,7 +1,6 @@
 """A bare timer: what this machine gives a thread that only asks to be woken in every control period.
 
-It has the daemon's heartbeat, event loop and scheduling, but no controller and no device. What it misses, the daemon
-would have missed too.
+It has the daemon's heartbeat, event loop and scheduling, but no controller and no device.
 """
 
 import asyncio
@@ -21,7 +20,7 @@ OnBeat = Callable[[Heartbeat, int, int], None]
 
 
 class Lateness(NamedTuple):
-    """How late each beat was, how many beats were missed, and what scheduling the kernel refused."""
+    """How late each beat was, how many were missed, and what the kernel refused."""
 
     beats_us: list[float]
     missed: int
@@ -46,7 +45,6 @@ async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
 
 
 async def lateness(realtime: RealTime, rate_hz: int, seconds: float) -> Lateness:
-    """Measure for `seconds` how late a bare timer of `rate_hz` beats."""
     not_granted = prepare(realtime)
     late_us: list[float] = []
     missed = -WARM_UP_BEATS

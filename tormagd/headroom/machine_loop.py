@@ -1,9 +1,8 @@
 """A fixed piece of pure Python: how long it takes says what interpreter and processor are worth right now.
 
-Two carriages under a PID, and the CRC of what they would send: the operations of a control tick, without NumPy, the
-kernel or code of ours, and never compiled. It stands beside every figure, so that figures of two machines, or of two
-hours on a shared one, can be told apart. A change would make every earlier figure incomparable: a test holds its
-result.
+Two carriages under a PID, and the CRC of what they would send: the operations of a control tick, never compiled. Its
+time stands beside every figure, to tell two machines, or two hours on a shared one, apart. A change would make every
+earlier figure incomparable: a test holds its result.
 """
 
 import statistics
@@ -14,8 +13,6 @@ REPETITIONS = 25
 
 
 class _Carriage:
-    """A carriage whose speed follows the duty, with the integral of its PID."""
-
     __slots__ = ("integral", "position_mm", "speed_mm_s")
 
     def __init__(self) -> None:

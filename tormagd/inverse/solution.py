@@ -18,7 +18,7 @@ class Reach(StrEnum):
 
 @final
 class FieldSolution(Value):
-    """The field for a force, and the force that the model predicts there. A pass over a whole grid is one iteration."""
+    """The field for a force, and the force that the model predicts there."""
 
     def __init__(
         self, field_mT: float, predicted_force_N: float, confidence: float, iterations: int, reach: Reach
@@ -46,26 +46,22 @@ class Question(Value):
 
 @final
 class Answer(Value):
-    """The answer of a search in its own process to the `Question` of `time_s`."""
-
     def __init__(self, time_s: float, solution: FieldSolution) -> None:
         self.time_s: Final = time_s
         self.solution: Final = solution
 
 
 TIE: Final = 16.0 * 2.0**-52
-"Share of a sum's magnitude within which two forces are equal: rounding moves a network's sum by a few units."
+"Forces that differ by less than this share of a sum's magnitude are equal up to rounding."
 
 
 class FieldSolver(Protocol):
-    """A search for the field at which the brake gives `force_N`."""
-
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`; of several, the one nearest `last_field_mT`, or the least where that is None."""
+        """Return the field for `force_N`; of several, the one nearest `last_field_mT` (None: the least)."""
 
 
 def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float) -> float:
-    """Check a search's arguments, and return the field that its answer should be near."""
+    """Check a search's arguments, and return the field to be near."""
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):
         require_number("last_field_mT", near_mT)
@@ -74,13 +70,11 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
 
 
 def tie_N(curve: ForceCurve) -> float:
-    """Return the rounding error of `curve`, up to which two of its forces are equal."""
     return TIE * curve.magnitude_N
 
 
 def answer(
     curve: ForceCurve, field_mT: float, force_N: float, predicted_N: float, iterations: int, reach: Reach
 ) -> FieldSolution:
-    """Return the solution at a field where `curve` predicts `predicted_N`, with its confidence."""
     trust = curve.confidence(field_mT, force_N - predicted_N)
     return FieldSolution(field_mT, predicted_N, trust, iterations, reach)

@@ -14,7 +14,7 @@ MOVING_MM_S: Final = 5.0
 
 @final
 class Turn(Value):
-    """Where a handle last turned, the way it has gone since, 1 or -1, and the furthest it has been."""
+    """Where a handle last turned, which way it has gone since (1 or -1), and how far it has been."""
 
     def __init__(self, direction: float, turned_mm: float, furthest_mm: float) -> None:
         self.direction: Final = direction
@@ -30,5 +30,4 @@ class Turn(Value):
         return self
 
     def displacement_mm(self, position_mm: float) -> float:
-        """Return the distance from the turn to `position_mm`, at most MOBILISED_MM."""
         return min(abs(position_mm - self.turned_mm), MOBILISED_MM)

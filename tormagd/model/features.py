@@ -16,18 +16,18 @@ FIELD: Final = FEATURES.index("field_mT")
 CIP: Final = FEATURES.index("cip_percent")
 
 LARGEST: Final = 1e9
-"No device comes near this bound on every input and weight, and the product of two does not overflow float32."
+"No device comes near this, and the product of two does not overflow float32."
 
 
 class Element(StrEnum):
-    """The element that the features were measured on. A model serves one of them only."""
+    """A model serves one element only."""
 
     TORQUE = "torque"
     TACTILE = "tactile"
 
 
 class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Affine map between physical values and the network's -1..1: scaled = (value - offset) * gain."""
+    """Affine map to the network's -1..1: scaled = (value - offset) * gain."""
 
     input_offset: tuple[float, float, float, float]
     input_gain: tuple[float, float, float, float]
@@ -46,7 +46,7 @@ def require_number(name: str, value: float) -> None:
 
 
 def feature_rows(features: ArrayLike) -> NDArray[np.float64]:
-    """Return `features` as an array of float64, n x 4 in the order of `FEATURES`. Raises `DomainError`."""
+    """Return `features` as float64, n x 4 in the order of `FEATURES`. Raises `DomainError`."""
     rows = np.asarray(features, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != len(FEATURES):
         raise DomainError("features", f"an array of shape {rows.shape}", f"n x 4 in the order {', '.join(FEATURES)}")

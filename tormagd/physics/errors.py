@@ -11,7 +11,7 @@ Real = TypeVar("Real", float, FloatArray)
 
 
 class DomainError(ValueError):
-    """A value outside the range in which a model holds. The text names the variable, the value and what is allowed."""
+    """A value outside the range in which a model holds."""
 
     def __init__(self, variable: str, value: object, allowed: str) -> None:
         super().__init__(f"{variable} = {value} is not allowed: {allowed}")
@@ -20,7 +20,7 @@ class DomainError(ValueError):
         self.allowed = allowed
 
     def __reduce__(self) -> tuple[type["DomainError"], tuple[str, object, str]]:
-        # by default rebuilt from its text: one raised in a process pool's worker would break the pool
+        # one raised in a process pool's worker would be rebuilt from its text, and break the pool
         return type(self), (self.variable, self.value, self.allowed)
 
 

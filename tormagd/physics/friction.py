@@ -17,8 +17,6 @@ from firmware_protocol.value import Value
 
 @final
 class Friction(Value):
-    """Friction at the roller, apart from its kinetic level, which the field sets."""
-
     def __init__(
         self,
         presliding_stiffness_N_mm: float,
@@ -37,7 +35,7 @@ class Friction(Value):
         return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))
 
     def advance(self, deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> tuple[float, float]:
-        """Return force, N, and deflection, mm, after a step at constant speed and kinetic level."""
+        """Return force, N, and deflection, mm, after a step at constant speed."""
         viscous_N = self.viscous_N_s_mm * speed_mm_s
         reach_mm = self.level_N(speed_mm_s, kinetic_N) / self.presliding_stiffness_N_mm
         if reach_mm == 0.0:

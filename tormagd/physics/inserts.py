@@ -25,13 +25,13 @@ _Force = Annotated[float, Meta(ge=0.0, le=1e3)]
 
 
 def relative_permeability(cip_fraction: float) -> float:
-    """Return the relative permeability mu_r at a volume fraction of iron (Eq. 5)."""
+    """Return mu_r at a volume fraction of iron (Eq. 5)."""
     require("cip_fraction", cip_fraction, 0.10, 0.40)
     return 2.0 + 2.0 * (cip_fraction - 0.10) / 0.30
 
 
 class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
-    """The force at a gap of 45 mm less that at 95 mm: mean and deviation as measured, and the thesis's estimate."""
+    """The force at a gap of 45 mm less that at 95 mm."""
 
     measured_N: Annotated[float, Meta(ge=1e-6, le=1e3)]
     deviation_N: _Force
@@ -45,8 +45,6 @@ class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Matrix(Struct, frozen=True, forbid_unknown_fields=True):
-    """The silicone that inserts of one Shore hardness are made of."""
-
     product: Annotated[str, Meta(min_length=1, max_length=100)]
     shore_hardness: _Hardness
     density_g_cc: Annotated[float, Meta(ge=0.1, le=25.0)]
@@ -54,7 +52,7 @@ class Matrix(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Insert(Struct, frozen=True, forbid_unknown_fields=True):
-    """One fabricated insert. Fractions are of volume; the shear modulus is without field."""
+    """Fractions are of volume; the shear modulus is without field."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
     shore_hardness: _Hardness
@@ -94,7 +92,6 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def masses_g(self) -> dict[str, float]:
-        """Mass of each content in 100 cc."""
         matrix_fraction = 1.0 - self.cip_fraction - self.slacker_fraction - self.thinner_fraction
         return {
             "matrix": 100.0 * matrix_fraction * self.matrix.density_g_cc,

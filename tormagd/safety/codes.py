@@ -20,7 +20,6 @@ class Position(StrEnum):
 
     KEPT = "kept"
     LOST_HERE = "lost"
-    "An encoder's counts are wrong."
     LOST_THERE = "given up by the device"
     "A device that has latched, or was reset, does not call itself homed."
 
@@ -32,9 +31,9 @@ class Explanation(NamedTuple):
     remedy: str
     reaction: Reaction = Reaction.HELD
     safe_ms: float = 100.0
-    "The longest time from when the cause shows to when the reaction begins."
+    "From when the cause shows to when the reaction begins."
     shows: str = "at once"
-    "When the cause shows: many faults hide from a device at rest."
+    "Many faults hide from a device at rest."
     position: Position = Position.KEPT
 
     @property
@@ -581,6 +580,6 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
-    """Return the faults for the firmware's fault bits, in the order of the bits."""
+    """Return the faults for the firmware's fault bits."""
     names = _BY_DEVICE_FAULT | ({DeviceFault.COMMAND_TIMEOUT: Fault.HOST_STALL} if is_host_stall else {})
     return tuple(fault for bit, fault in names.items() if bit in bits)

@@ -32,7 +32,7 @@ LIMITS_OF: Final[dict[Hazard, str]] = {
     Hazard.WORN: "SKEW",
 }
 HARMLESS: Final = "NO_SETPOINT STANDBY F_MIN F_MAX RATE SATURATED"
-"Limits that tell what the device can do, and control no hazard."
+"They tell what the device can do, and control no hazard."
 
 
 class Cause(NamedTuple):
@@ -42,11 +42,11 @@ class Cause(NamedTuple):
     hazard: Hazard
     cause: str
     control: str = ""
-    "What is done about it; empty where nothing can be."
+    "Empty where nothing can be done."
     test: str = ""
-    "A test of it, as FILE::FUNCTION within tests."
+    "As FILE::FUNCTION within tests."
     cell: str = ""
-    "A row of the fault matrix that shows it."
+    "A row of the fault matrix."
 
 
 CAUSES: Final = (
@@ -118,4 +118,3 @@ CAUSES: Final = (
         "firmware_protocol/test_conformance.py::test_the_c_sources_pass",
     ),
 )
-"Every known cause that is not a code's."

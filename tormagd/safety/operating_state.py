@@ -16,7 +16,7 @@ from tormagd.safety.codes import FAULTS, Fault, Position
 CLEARING_S = 0.5
 "How long the device may take to report that a cleared fault is gone."
 LOST_POSITION = frozenset({fault for fault, row in FAULTS.items() if row.position is Position.LOST_HERE})
-"Faults after which an encoder's counts are not believed, though the device goes on calling itself homed."
+"The device goes on calling itself homed, but an encoder's counts are not believed any more."
 
 
 class OperatingState(StrEnum):
@@ -30,7 +30,7 @@ class OperatingState(StrEnum):
 
 
 class Event(StrEnum):
-    """What may change the operating state: an operator's command, or faults that show."""
+    """What may change the operating state."""
 
     ENABLE = "enable"
     DISABLE = "disable"
@@ -62,8 +62,6 @@ class RefusedError(Exception):
 
 @final
 class Conditions(Value):
-    """The conditions on which a command is taken or refused."""
-
     def __init__(
         self,
         connected: bool,
@@ -88,7 +86,7 @@ class Conditions(Value):
         self.device_latched: Final = device_latched
         self.sensor_doubted: Final = sensor_doubted
         self.cause: Final = cause
-        "What keeps the device from being connected, or its measurements from being fresh."
+        "Why the device is not connected, or its measurements not fresh."
         self.remedy: Final = remedy
         self.round_trip_s: Final = round_trip_s
         self.clock_drift: Final = clock_drift
@@ -123,12 +121,12 @@ class SafetyState(Value):
         return self.operating_state is OperatingState.ENABLED or self.operating_state is OperatingState.PAUSED
 
     def ask(self, request: DeviceRequest) -> "SafetyState":
-        """Return this state with a new request to the device, under the next request number."""
+        """Return this state with a new request to the device, under the next number."""
         return self.replaced(request=request, request_number=self.request_number + 1)
 
 
 Refuses = Callable[[SafetyState, Conditions], str]
-"Returns what is wrong, in a sentence with the figures; empty where nothing is."
+"Returns what is wrong, with the figures; empty where nothing is."
 
 
 class Guard(NamedTuple):
@@ -142,21 +140,17 @@ class Guard(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One row of the table: where `event` leads from `source`."""
-
     event: Event
     source: OperatingState
     target: OperatingState
     reason: str
-    "What the transition means, for the log."
+    "For the log."
     guards: tuple[Guard, ...] = ()
-    "In the order in which they are asked; the first that does not hold is told."
+    "The first that does not hold is told."
     request: DeviceRequest = DeviceRequest.NONE
 
 
 class Refusal(NamedTuple):
-    """A row of the table for an `event` that is refused in `source`."""
-
     event: Event
     source: OperatingState
     code: str
@@ -296,7 +290,7 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Refusal(Event.HOME, FAULTED, "fault", CLEAR),
     # stop is never refused, and needs no device: a device that comes back finds a fault that somebody has to clear
     *[Transition(Event.STOP, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
-    # the daemon has latched nothing here; a device may hold what it latched while nobody was there to see it
+    # the daemon has latched nothing here; a device may hold what it latched while nobody was there
     Transition(Event.CLEAR_FAULT, DISABLED, DISABLED, _UNLATCHED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
     # a fault that the device latches meanwhile is news, and must not be cleared unseen
     Transition(Event.CLEAR_FAULT, ENABLED, ENABLED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
@@ -309,7 +303,7 @@ ROWS: tuple[Transition | Refusal, ...] = (
     *[Transition(Event.FAULT, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
-"All transitions and refusals. A fault that is latched already is no event."
+"A fault that is latched already is no event."
 COMMANDS: tuple[str, ...] = tuple([str(event) for event in Event if event is not Event.FAULT])
 _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
@@ -371,7 +365,7 @@ def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
 
 
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
-    """Return the commands that lead from `state` to ENABLED, in their order."""
+    """Return the commands that lead from `state` to ENABLED."""
     if state.operating_state is ENABLED:
         return ()
     if state.operating_state is PAUSED:
@@ -384,7 +378,7 @@ def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
 
 
 def reason(name: str, source: OperatingState) -> str:
-    """Return the log's line for a command that was taken, as in "FAULT to DISABLED: why"."""
+    """Return the log's line for a command, as in "FAULT to DISABLED: why"."""
     row = TRANSITIONS[Event(name), source]
     return f"{source} to {row.target}: {row.reason}" if isinstance(row, Transition) else ""
 

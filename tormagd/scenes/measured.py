@@ -7,8 +7,6 @@ from msgspec import Struct
 
 
 class OperatingPoint(Struct, frozen=True):
-    """One way to serve a scene: rates of control and of plans, and the search for the field."""
-
     control_hz: int
     inference_hz: int
     search: str
@@ -18,7 +16,7 @@ class OperatingPoint(Struct, frozen=True):
 
 
 class Share(Struct, frozen=True):
-    """The processor time of a daemon that serves a scene in one way, live on the simulated device."""
+    """The processor time of a daemon that serves a scene in one way on the simulated device."""
 
     way: OperatingPoint
     daemon: float
@@ -53,8 +51,6 @@ class WorstDevice(Struct, frozen=True):
 
 
 class MeasuredScene(Struct, frozen=True):
-    """What was measured of one scene."""
-
     name: str
     fingerprint: str
     tolerance_N: float
@@ -79,11 +75,11 @@ class Measurements(Struct, frozen=True):
 
     command: str
     machine_us: float
-    "Of the machine that the shares are of: see `tormagd.headroom.machine_loop`."
+    "See `tormagd.headroom.machine_loop`."
     pairs: int
     "Runs of each way that a share is the median of."
     draws: int
-    "Devices drawn from the plant card that decided; twice as many judged."
+    "Devices from the plant card that decided; twice as many judged."
     shares: tuple[Share, ...]
     scenes: tuple[MeasuredScene, ...]
 
@@ -96,17 +92,16 @@ class Measurements(Struct, frozen=True):
 
 FILE = "measured.json"
 TOLERATED = 0.8
-"An error within this share of a scene's tolerance may be chosen."
+"An error within this share of the tolerance may be chosen."
 WORSE = 0.2
 "An error that exceeds the usual way's by this share of the tolerance may be chosen."
 
 
 def measured() -> Measurements:
-    """Read the file of measurements that comes with the package."""
     return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measurements)
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
-    """Return the greatest error of a way that may replace the usual one with the error `usual_N`."""
+    """Return the greatest error of a way that may replace the usual one."""
     most_N = max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)
     return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N

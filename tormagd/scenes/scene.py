@@ -20,9 +20,9 @@ AUTO = "auto"
 MIN_SETPOINT_HZ = 12.0
 "Setpoints a tenth of a second apart are no stream any more."
 MIN_CONTROL_HZ = 500
-"Safety is watched in every control tick, so none may be slower."
+"Safety is watched in every control tick."
 AND_UNMET = "; and "
-"Stands between what a device does not give of a scene."
+"Between what a device does not give of a scene."
 ENDING = ".toml"
 _SHIPPED = resources.files(__package__)
 
@@ -31,16 +31,16 @@ class Force(Strict, frozen=True):
     """The forces that the task asks for, and how closely they must be rendered."""
 
     least_N: Annotated[float, Meta(ge=0.0, le=1_000.0)]
-    "Below the device's F_min the task gets F_min, and the limit F_MIN shows."
+    "Below the device's F_min the task gets F_min."
     most_N: Annotated[float, Meta(gt=0.0, le=1_000.0)]
     resolution_N: Annotated[float, Meta(gt=0.0, le=100.0)]
-    "The smallest difference of force that matters."
+    "The smallest difference that matters."
     tolerance_rms_N: Annotated[float, Meta(gt=0.0, le=100.0)]
     least_variance_accounted_for: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     release_N_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.0
-    "How fast the force is let go when its publisher is gone, or passes to another publisher's."
+    "How fast the force is let go, or passes to another publisher's."
     most_release_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 20.0
-    "How fast it may be lost at most, whatever fails."
+    "How fast it may be lost, whatever fails."
     standby_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
     "Where the brake waits while less is asked: nearer to the forces that come, and felt as drag."
 
@@ -60,17 +60,17 @@ class Signal(Strict, frozen=True):
     """The force that the task asks for over time: a recording, or `force`'s range up and down."""
 
     file: str = ""
-    "A CSV with the columns t_s,force_N, relative to the scene file; between its rows the force follows a smooth curve."
+    "A CSV with the columns t_s,force_N, relative to the scene file; the force follows a smooth curve through its rows."
     bandwidth_hz: Annotated[float, Meta(gt=0.0, le=100.0)] | UnsetType = UNSET
     "Each rise and each fall is half a period of a cosine of this frequency."
     step_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
     "Of each rise and fall; by default the whole range."
     hold_s: Annotated[float, Meta(ge=0.0, le=86_400.0)] | UnsetType = UNSET
-    "After each rise and each fall; by default 0."
+    "After each rise and each fall."
     is_known_ahead: bool = False
-    "Whether the publisher knows what comes, and sends it as a preview."
+    "The publisher sends what comes as a preview."
     setpoint_hz: Annotated[float, Meta(ge=MIN_SETPOINT_HZ, le=1_000.0)] | UnsetType = UNSET
-    "How often the publisher sends; by default as often as plans are made."
+    "By default as often as plans are made."
 
     def __post_init__(self) -> None:
         shaped = {key: getattr(self, key) for key in ("bandwidth_hz", "step_N", "hold_s")}
@@ -83,24 +83,23 @@ class Signal(Strict, frozen=True):
 
 
 class Handle(Strict, frozen=True):
-    """How fast the brake's handle slides at the roller's surface. The model must have been trained on it."""
+    """How fast the brake's handle slides. The model must have been trained on it."""
 
     least_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
     most_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
-    "By default the thesis's 20 rpm."
+    "The thesis's 20 rpm."
 
 
 class Finger(Strict, frozen=True):
-    """How a finger presses into the pad. The model must have been trained on such a depth and rate."""
+    """How a finger presses into the pad. The model must have been trained on it."""
 
     depth_mm: Annotated[float, Meta(gt=0.0, le=20.0)]
-    "The depth for which the forces are asked; a finger that is less deep gets the gap of this depth."
+    "For which the forces are asked; a finger that is less deep gets the gap of this depth."
     most_mm_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 1.0
-    "Pressing in and drawing back; by default the thesis's."
 
 
 class Budget(Strict, frozen=True):
-    """What the control of the scene may cost; `tormagctl scene check` says whether it keeps to that."""
+    """What the control of the scene may cost, as `tormagctl scene check` says."""
 
     core_share: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
     "Of one processor's time, for steps and plans."
@@ -126,7 +125,7 @@ class Terms(Strict, frozen=True):
         return tuple(name for name in TERMS if not getattr(self, name))
 
     def without(self, *names: str) -> "Terms":
-        """Return these terms with `names` left out, too. Raises ValueError for an unknown name."""
+        """Return these terms with `names` left out. Raises ValueError for an unknown name."""
         for name in names:
             if name not in TERMS:
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
@@ -138,7 +137,7 @@ EVERY_TERM = Terms()
 
 
 class Insert(Strict, frozen=True):
-    """Which elastomer is fitted, which device it is in, and the model learned from the two."""
+    """Which elastomer is fitted, in which device, and the model learned from the two."""
 
     name: str
     model: str
@@ -150,7 +149,7 @@ class Insert(Strict, frozen=True):
     thickness_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
     roller_radius_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] | UnsetType = UNSET
-    "The fastest that the task lets the gap move, where that is less than the configuration's."
+    "The fastest that the task lets the gap move."
 
 
 class Solver(Strict, frozen=True):
@@ -160,7 +159,7 @@ class Solver(Strict, frozen=True):
     step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET
     "Of the grid over the field."
     neighbours: Annotated[int, Meta(ge=1, le=64)] | UnsetType = UNSET
-    """Points of the grid that compete for the answer of the search "nearest"."""
+    "Points of the grid that compete for the answer."
 
     def __post_init__(self) -> None:
         for key in ("step_mT", "neighbours"):
@@ -177,12 +176,12 @@ class Scene(Strict, frozen=True):
     force: Force
     insert: Insert
     element: Literal["torque", "tactile"] = "torque"
-    "What makes the force: the brake on the handle's shaft, or a pad under a finger."
+    "The brake on the handle's shaft, or a pad under a finger."
     signal: Signal | None = None
     "Without one nothing is refused for how fast the force changes."
     handle: Handle = msgspec.field(default_factory=Handle)
     finger: Finger | UnsetType = UNSET
-    "What presses into a pad; only tactile scenes have it."
+    "Only in tactile scenes."
     budget: Budget = msgspec.field(default_factory=Budget)
     terms: Terms = EVERY_TERM
     bandwidth: Bandwidth = msgspec.field(default_factory=Bandwidth)
@@ -214,7 +213,6 @@ class Scene(Strict, frozen=True):
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
 
     def _require_no_brake(self) -> None:
-        """Raise ValueError where a tactile scene states what only a brake has."""
         usual = Insert(self.insert.name, self.insert.model)
         for key in ("inner_radius_mm", "outer_radius_mm", "thickness_mm", "roller_radius_mm"):
             value = getattr(self.insert, key)
@@ -231,7 +229,7 @@ class Scene(Strict, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """The hash, 16 hex digits, of what the scene asks for."""
+        """A hash, 16 hex digits, of what the scene asks for."""
         signal, insert = self.signal, self.insert
         task = msgspec.structs.replace(
             self,
@@ -252,7 +250,6 @@ def shipped_scenes() -> tuple[str, ...]:
 
 
 def scene_path(name_or_path: str) -> Path:
-    """Return the path of a shipped scene by its name, or of a file."""
     return named("scene", name_or_path, _SHIPPED, ENDING)
 
 

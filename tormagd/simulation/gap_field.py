@@ -11,7 +11,7 @@ SMALLEST_GAP_MM: Final = 45.0
 
 @final
 class GapField:
-    """Radial moment of a plant's magnets, T m, with rate-independent hysteresis of at most `branch_Tm` either way."""
+    """Radial moment of a plant's magnets, with rate-independent hysteresis of at most `branch_Tm` either way."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float) -> None:
         self.static: Final = moment_over_gap(plant)
@@ -27,7 +27,7 @@ class GapField:
         return self._moment_Tm + self._lag_Tm
 
     def advance(self, gap_mm: float) -> float:
-        """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m."""
+        """Move the gap, and return the radial moment there."""
         moment_Tm = self.static.at(gap_mm)
         change_Tm = moment_Tm - self._moment_Tm
         if change_Tm != 0.0:

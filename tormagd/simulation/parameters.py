@@ -14,7 +14,7 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import require
 
 PLANTS_INSERT = "MRE-50-40"
-"Insert of the committed samples."
+"Of the committed samples."
 _PLANTS = resources.files(__package__) / "plants"
 
 PlantError = ConfigError
@@ -33,8 +33,7 @@ class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Friction(Struct, frozen=True, forbid_unknown_fields=True):
-    """Contact of insert and shaft: static over kinetic friction, Stribeck speed, pre-sliding stiffness and
-    viscosity."""
+    """Contact of insert and shaft."""
 
     static_to_kinetic: Annotated[float, Meta(ge=1.0, le=3.0)]
     stribeck_speed_mm_s: Positive
@@ -43,7 +42,7 @@ class Friction(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Field(Struct, frozen=True, forbid_unknown_fields=True):
-    """Radial moment of the magnets over their gap, with hysteresis in percent of its value at a gap of 45 mm."""
+    """Radial moment of the magnets over their gap; hysteresis is a share of its value at 45 mm."""
 
     law: Literal["power", "thesis"]
     coefficient: Annotated[float, Meta(gt=0.0, le=10.0)]
@@ -69,7 +68,8 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
 
 class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """A tactile pad between plates, in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked
-    pad at small strain."""
+    pad at small strain.
+    """
 
     cip_percent: Annotated[float, Meta(ge=0.0, le=60.0)]
     modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
@@ -91,7 +91,7 @@ class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """The element of the second plant, in the place of the insert; `SecondElement` states the laws of these constants."""
+    """The element of the second plant; `SecondElement` states the laws of these constants."""
 
     concentration: Annotated[float, Meta(ge=1.0, le=3.0)]
     without_field_N: NotNegative
@@ -120,7 +120,7 @@ class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
-    """Temperature of the insert: its effect on the force, and how fast the insert begins to warm."""
+    """How the insert's temperature affects the force, and how fast the insert begins to warm."""
 
     force_percent_K: Annotated[float, Meta(ge=-5.0, le=5.0)]
     drift_K_h: Annotated[float, Meta(ge=0.0, le=20.0)]
@@ -144,7 +144,8 @@ class Motor(Struct, frozen=True, forbid_unknown_fields=True):
 
 class Gear(Struct, frozen=True, forbid_unknown_fields=True):
     """One gearbox. The mesh loses 1 - `efficiency` of the torque above `output_friction_Nm`, which the no-load current
-    shows."""
+    shows.
+    """
 
     ratio: Annotated[float, Meta(ge=1.0)]
     efficiency: Annotated[float, Meta(gt=0.0, le=1.0)]
@@ -163,7 +164,7 @@ class Screw(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
-    """Drive stage and encoders; an encoder's counts are per turn of the gearbox output."""
+    """Drive stage and encoders; counts are per turn of the gearbox output."""
 
     encoder_counts_per_rev: Annotated[int, Meta(ge=16, le=1_000_000)]
     supply_V: Annotated[float, Meta(gt=0.0, le=25.0)]
@@ -172,8 +173,7 @@ class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True):
-    """The force sensor: noise is one sample's standard deviation. The offset drifts steadily, up or down by the
-    seed."""
+    """The noise is one sample's standard deviation. The offset drifts steadily, up or down by the seed."""
 
     noise_mN: Annotated[float, Meta(ge=0.0, le=1000.0)]
     drift_mN_min: Annotated[float, Meta(ge=0.0, le=1000.0)]
@@ -182,7 +182,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FirmwareTiming(Struct, frozen=True, forbid_unknown_fields=True):
-    """How far the device's clock is off the host's, and the width of the uniform random delay before a reply."""
+    """How far the device's clock is off the host's, and the width of the random delay before a reply."""
 
     clock_ppm: Annotated[float, Meta(ge=-1000.0, le=1000.0)]
     reply_jitter_us: Annotated[float, Meta(ge=0.0, le=5000.0)]
@@ -198,7 +198,7 @@ class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
     home_mm: Positive = 47.5  # open switch: half of the largest gap, 95 mm
     closed_mm: Positive = 22.25  # closed switch: a quarter millimetre inside half of the smallest gap, 45 mm
     stop_beyond_mm: Positive = 0.25  # hard stop behind the closed switch; twice that behind the open one
-    start_left_mm: Positive = 40.0  # where the carriages stand at power-on: somewhere, and not equal
+    start_left_mm: Positive = 40.0  # where the carriages are at power-on: somewhere, and not equal
     start_right_mm: Positive = 39.0
     attraction_factor: Annotated[float, Meta(ge=0.5, le=5.0)] = 2.0  # iron shaft: 30 N at 45 mm in air, card 50..80 N
     hysteresis_scale: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1  # field change, of the largest, that turns a branch
@@ -281,12 +281,11 @@ def _kind(tables: dict[str, Any]) -> type[PlantParameters | _Between]:
 
 
 def plant_names() -> tuple[str, ...]:
-    """Return the names of the plants that come with the package, sorted."""
     return shipped(_PLANTS, ".toml")
 
 
 def load_plant(path_or_name: str | Path) -> PlantParameters:
-    """Read a plant by the name of a packaged one (`sample_1`), or from a TOML file; a packaged name goes first."""
+    """Read a plant by the name of a packaged one, such as `sample_1`, or from a TOML file. Raises PlantError."""
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)
     if isinstance(read, PlantParameters):
@@ -296,7 +295,7 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
-    """Return the plant with the insert called `name` in the place of its own; the plant itself for PLANTS_INSERT."""
+    """Return the plant with the insert called `name` in the place of its own."""
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
     own = plant.elastomer
     fitted = Elastomer(
