@@ -22,7 +22,6 @@ Maker = Callable[..., ClosedLoop]
 
 @pytest.fixture(scope="session")
 def core() -> Core:
-    """Of the shipped coronary scene."""
     return build_core(Config())
 
 
@@ -65,13 +64,12 @@ def arm(make: Maker) -> Maker:
 
 @pytest.fixture
 def armed(arm: Maker) -> ClosedLoop:
-    """A loop that is armed: homing is the same every time."""
     return arm()
 
 
 @pytest.fixture(scope="session")
 def gap_ticks() -> Callable[[ClosedLoop, float, float], Iterator[Sample]]:
-    """The ticks while a gap is asked for, for so many seconds, one by one: between them the stages can be looked at."""
+    """The ticks, one by one, while a gap is asked for, so that the stages can be looked at between them."""
 
     def ticks(loop: ClosedLoop, gap_mm: float, seconds: float) -> Iterator[Sample]:
         for _ in range(round(1e3 * seconds)):
@@ -82,13 +80,12 @@ def gap_ticks() -> Callable[[ClosedLoop, float, float], Iterator[Sample]]:
 
 @pytest.fixture(scope="session")
 def hold_gap(gap_ticks: Callable[..., Iterator[Sample]]) -> Callable[[ClosedLoop, float, float], list[Sample]]:
-    """All of them."""
     return lambda *asked: list(gap_ticks(*asked))
 
 
 @pytest.fixture(scope="session")
 def render() -> Callable[[ClosedLoop, float, float], list[Sample]]:
-    """The ticks while a publisher asks for a force, for so many seconds."""
+    """The ticks while a publisher asks for a force."""
 
     def rendered(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
         return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))

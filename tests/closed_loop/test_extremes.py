@@ -34,7 +34,7 @@ def on_the_way(loop: ClosedLoop, gap_mm: float, ticks: int) -> list[Sample]:
 
 
 def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
-    """One tick towards a gap: finite everywhere, nothing wound up beyond the duty limit."""
+    """Tick towards a gap, and check that all is finite and nothing winds up beyond the duty limit."""
     sample, move = loop.tick(plan=gap_plan(gap_mm, loop.now_s, speed_mm_s)), loop.stepper.move
     limit = CONFIG.position.duty_limit
     assert isinstance(move, Carriages)
@@ -59,7 +59,7 @@ def uneven() -> PlantParameters:
 
 
 def skews_um(synchronisation: float) -> Array:
-    """Skew by the encoders on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
+    """Skew on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
     config = msgspec.structs.replace(
         CONFIG, position=msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
     )
@@ -99,7 +99,7 @@ def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
 
 
 def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sample]:
-    """The ticks on the way to a gap, each this long after the one before it."""
+    """The ticks on the way to a gap, with these periods."""
     samples = []
     for period_s in periods_s:
         now_s = loop.now_s
@@ -149,7 +149,7 @@ AT_REST = RecordedHand((0.0,), (0.0,))
 
 
 def lag_mm(loop: ClosedLoop) -> float:
-    """How far the encoders are off what is expected of them."""
+    """Return how far the encoders are off what is expected of them."""
     stepper = loop.stepper
     assert isinstance(stepper.move, Carriages)
     return abs(stepper.move.expected.gap_mm - stepper.measured.gap_mm)  # type: ignore[union-attr]

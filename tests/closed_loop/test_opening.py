@@ -25,9 +25,9 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 CLOSED_MM, HALF_MM, OPEN_MM = 48.0, 70.0, 95.0
 NAMED_S = 0.5
 SHOULD_S = (OPEN_MM - HALF_MM) / 2.0 / Config().device.retract_mm_s + 0.3
-"When it should be open: the way at the device's speed, and what it takes to turn round and to taper."
+"When it should be open: the way at the device's speed, turning round and tapering."
 MM_S = 20.0
-"What the weakest device closes the gap by, and more."
+"More than the weakest device closes the gap by."
 Spoils = Callable[[MessageDevice, float], None]
 Opens = Callable[..., ClosedLoop]
 
@@ -51,7 +51,7 @@ def closed(core: Core) -> Opens:
 
 
 def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0) -> float:
-    """How long after now NOT_OPENING is latched, infinity where it is not; `spoils` is done before each tick."""
+    """Return how long after now NOT_OPENING is latched, or infinity; `spoils` runs before each tick."""
     begins_s = loop.now_s
     while loop.now_s < begins_s + seconds:
         if spoils is not None:

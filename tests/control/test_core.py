@@ -107,7 +107,7 @@ def test_homing_forgets_the_motion_before_it(bench) -> None:
     for tick in range(5):
         bench.step(mode=DeviceMode.HOMING, left_mm=float(tick), right_mm=float(tick), switches=Switches(0))
     bench.step(left_mm=0.0, right_mm=0.0)
-    # the origin jumped by 4 mm with the last homing state: one period's filtered jump is not carried further
+    # the origin jumped with the last homing state: one period's filtered jump is not carried further
     bench.step(left_mm=0.0, right_mm=0.0, mode=DeviceMode.RETRACTING)
     assert bench.stepper.measured.left_mm_s == 0.0
 
@@ -249,8 +249,6 @@ def test_any_history_keeps_duties_in_bounds_and_repeats_itself(make_bench, histo
 
 @pytest.fixture
 def make_moving(make_bench):
-    """Makes benches on the way from 80 to 60 mm, whose carriages are where they are wanted."""
-
     def make():
         moving = make_bench().enabled()
         for _ in range(10):
@@ -295,7 +293,7 @@ def test_after_a_stall_one_drive_asks_and_moves_nothing(make_moving, elapsed_s: 
 @pytest.mark.parametrize("came_mm", [0.0, -1.7, 1.0])
 def test_the_answer_to_it_is_gone_on_from_without_a_kick(make_moving, came_mm: float) -> None:
     moving = make_moving()
-    # carriages that are where they are wanted at once pass for lively, and those are braked harder
+    # carriages that are at once where they are wanted pass for lively, and those are braked harder
     moving.move.acceleration_scale = 1.0
     integral, came_mm = moving.move.left.integral, moving.move.reference.gap_mm + came_mm
     for number, at_s in enumerate((moving.now_s + 0.045, moving.now_s + 0.046), moving.ticks):

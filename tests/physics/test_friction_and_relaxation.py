@@ -69,7 +69,7 @@ def test_the_dry_force_never_exceeds_the_level(
     force, deflection = friction.advance(start_mm, speed_mm_s, kinetic_N, dt_s)
     assert math.isfinite(force)
     level_N = friction.level_N(speed_mm_s, kinetic_N)
-    # below 1e-300 a float has not the digits for a relative bound
+    # below 1e-300 a float lacks the digits for a relative bound
     assert abs(friction.presliding_stiffness_N_mm * deflection) <= level_N * (1 + 1e-12) + 1e-300
 
 

@@ -1,4 +1,4 @@
-"""Field, force and attraction over the gap, and the inserts: against published figures and 50 digits; their domains."""
+"""Field, force and attraction over the gap, and the inserts, against published figures and 50 digits; their domains."""
 
 import math
 import pickle
@@ -114,7 +114,7 @@ def over_loads(seed: int) -> Iterator[Case]:
 def test_float64_force_and_slope_agree_with_50_digits(cases: Callable[[int], Iterator[Case]], count: int) -> None:
     admitted = 0
     for case in islice(cases(1), count):
-        # as `tools/numerics.py` computes it in 50 digits
+        # computed in 50 digits by `tools/numerics.py`
         truth = reference(Batch(case.elastomer, case.geometry, None, np.array([])), case.moment)
         if case.moment > max_radial_moment_Tm(case.elastomer, case.geometry):
             assert truth.stretch < 0.05
@@ -200,7 +200,8 @@ def test_the_edge_of_the_domain_is_admitted_and_nothing_beyond() -> None:
         d_force_d_gap(5.0, PowerFieldLaw(), STIFF, TORMAG)
 
 
-# -- the attraction of the magnets, against the published 64-term sum in 50 digits, and against magpylib ---------------
+# -- the attraction of the magnets
+# ---------------------------------------------------------------------------------------
 
 
 BLOCK = CuboidMagnet(width_m=0.040, depth_m=0.040, thickness_m=0.020, remanence_T=1.45)
@@ -256,7 +257,6 @@ def modelled_range_N(item: Insert) -> float:
 
 
 THESIS = [f"MRE-{shore}-{cip}" for shore in (10, 30, 50) for cip in (10, 20, 30, 40)]
-"Three matrices by four fillings."
 
 
 def test_the_twelve_inserts_of_the_thesis_are_there() -> None:
@@ -321,7 +321,7 @@ ONE_BY_ONE: list[tuple[Callable[[Any], Any], float, float, float]] = [
     ),
     (lambda gap: attraction_N(gap, BLOCK), 0.02, 200.0, 300),
 ]
-"""Each with a range, and by how many of its last digits a number of an array may differ."""
+"Each with a range, and by how many of its last digits a number of an array may differ."
 
 
 @pytest.mark.parametrize(("law", "low", "high", "digits"), ONE_BY_ONE)
@@ -346,7 +346,6 @@ Refused = tuple[Callable[..., Any], tuple[Any, ...], str]
 def in_each_place(
     function: Callable[..., Any], values: tuple[float, ...], names: tuple[str, ...], bad: tuple[float, ...]
 ) -> list[Refused]:
-    """Each of these values in turn is bad, and is named."""
     return [
         (function, (*values[:place], wrong, *values[place + 1 :]), name)
         for place, name in enumerate(names)
@@ -357,7 +356,6 @@ def in_each_place(
 def alone_and_among(
     function: Callable[..., Any], good: float, bad: Iterable[float], name: str, *rest: Any
 ) -> list[Refused]:
-    """Each bad value by itself, and in an array with a good one."""
     return [(function, (value, *rest), name) for one in bad for value in (one, np.array([good, one]))]
 
 

@@ -55,7 +55,6 @@ def test_bytes_take_ten_bits_each_in_both_directions(baud: int) -> None:
 
 
 def answered(device: MessageDevice, time_s: float, counter: int) -> Packet:
-    """The State that a Drive is answered with."""
     device.receive(time_s, FUNCTION[Drive], encode(Drive(0.0, 0.0, DriveMode.OFF, counter)))
     device.advance(time_s + 9e-4)
     answer = next(packet for packet in device.outbox if packet.function == FUNCTION[State])

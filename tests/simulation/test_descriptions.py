@@ -30,7 +30,6 @@ def written(folder: Path, text: str) -> Path:
 
 
 def refused(folder: Path, text: str, *said: str) -> None:
-    """A plant's file with this text is, and these words say why."""
     with pytest.raises(PlantError) as refusal:
         load_plant(written(folder, text))
     assert [word for word in said if word not in str(refusal.value)] == []

@@ -1,4 +1,4 @@
-"""The simulator's doors: a process of its own, and hosts as the daemon or python-can's own interfaces open them."""
+"""The simulator's doors: a process of its own, and hosts that open them as the daemon or python-can do."""
 
 import contextlib
 import csv
@@ -48,7 +48,6 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 
 def descriptor(backend: Any) -> int:
-    """What is readable when something has come: the daemon waits for nothing."""
     return int(backend._fd)
 
 
@@ -71,14 +70,13 @@ def channel(process: "subprocess.Popen[str]") -> str:
 
 
 def ended(process: "subprocess.Popen[str]") -> None:
-    """Asks it to end, which it does without a word."""
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, output) == (0, ""), errors
 
 
 def meet(device: Device) -> None:
-    """Opens the line as the daemon does, repeats Hello until both Identity and Status have come, and closes it."""
+    """Open the line as the daemon does, repeat Hello until Identity and Status have come, and close it."""
     seen: set[type[Message]] = set()
     deadline_s = time.monotonic() + LIMIT_S
     with contextlib.closing(choose(device, Rates()).open()) as backend:
@@ -174,7 +172,7 @@ def test_a_wrong_call_says_what_is_right_and_exits_with_2(
 
 
 class Served:
-    """A door in this process, and the clock it lives by."""
+    """A door in this process, and its clock."""
 
     def __init__(self, path: Path) -> None:
         self.device = CanDevice(MessageDevice(load_plant("sample_1"), SteadyHand(), seed=1))
@@ -182,7 +180,6 @@ class Served:
         self.now_s = 0.0
 
     def host(self) -> socket.socket:
-        """A host that has just come."""
         host = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         host.settimeout(LIMIT_S)
         host.connect(self.door.address)
@@ -190,7 +187,6 @@ class Served:
         return host
 
     def exchange(self, duration_s: float) -> None:
-        """Lets the door work for that long."""
         until_s = self.now_s + duration_s
         while True:
             readable, _, _ = select.select(self.door.descriptors(), [], [], 0.0)

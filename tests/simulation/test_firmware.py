@@ -25,7 +25,8 @@ from tormagd.simulation.faults import KNOWN, SIZED, parse_fault
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-# -- the firmware, seen through the wire; the rules of the page are the conformance kit's, which it passes -------------
+# -- the rules of the page are the conformance kit's, which this firmware passes
+# -----------------------------------------
 
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
@@ -53,7 +54,7 @@ class Port:
 
 
 class Bench(Host):
-    """A simulated device and the conformance kit's host of it, which looks through the wire."""
+    """A simulated device and the conformance kit's host, which looks through the wire."""
 
     def __init__(self, faults: Iterable[str] = (), plant: PlantParameters | None = None) -> None:
         self.device = VirtualDevice(
@@ -62,7 +63,6 @@ class Bench(Host):
         super().__init__(SerialLine(Port(self.device)))
 
     def go_to(self, gap_mm: float, seconds: float = 1.5) -> None:
-        """Run to a gap with a plain proportional loop on each carriage, starting homed."""
         target_mm = gap_mm / 2.0 - 47.5
         for _ in range(round(seconds / PERIOD_S)):
             state = self.last(State)
@@ -74,12 +74,11 @@ class Bench(Host):
             self.beat(Beat.RUN, duty, duty)
 
     def reaches(self, mode: DeviceMode, beat: Beat = Beat.NOTHING, limit_s: float = 10.0) -> None:
-        """Waits until Status shows the mode."""
         assert self.until(lambda: self.status.mode is mode, limit_s, beat), self.status
 
 
 def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "sample_1") -> Bench:
-    """A device homed and at that gap, in RUN, which is before 3.4 s."""
+    """A homed device at that gap, in RUN before 3.4 s."""
     sample = load_plant(plant)
     near_home = msgspec.structs.replace(sample.assumed, start_left_mm=46.0, start_right_mm=45.5)
     host = Bench(faults, msgspec.structs.replace(sample, assumed=near_home))
@@ -164,7 +163,7 @@ def test_duties_are_applied_in_steps_of_ten_bits() -> None:
 
 
 class Ending(NamedTuple):
-    """How a run from a gap of `gap_mm` ends, with these faults of the device, while the host drives so."""
+    """How a run from a gap of `gap_mm` ends, with these faults of the device and these duties of the host."""
 
     faults: tuple[str, ...]
     duties: tuple[float, float] | None

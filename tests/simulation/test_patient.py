@@ -1,4 +1,4 @@
-"""The simulated patient and its network, in virtual time, and its process before a daemon that is played."""
+"""The simulated patient and its network in virtual time, and its process before a daemon that is played."""
 
 import math
 from typing import Any
@@ -17,7 +17,6 @@ def felt_along(patient: Patient, handle_mm: np.ndarray) -> list[Felt]:
 
 
 def in_and_out(to_mm: float, seconds: float = 1.0) -> np.ndarray:
-    """To a place, a rest there, and back."""
     way = np.linspace(0.0, to_mm, round(seconds / STEP_S))
     return np.concatenate([way, np.full(500, to_mm), way[::-1], np.zeros(500)])
 
@@ -72,7 +71,7 @@ def test_what_a_setpoint_says_in_each_mode() -> None:
 
 
 def arrivals(delay: NetworkDelay[int], messages: int = 20_000) -> list[tuple[float, float, int]]:
-    """When what arrived: the time, when it was sent, its number."""
+    """Return the time, the time of sending, and the number of what arrived."""
     found = []
     for number in range(messages):
         delay.send(number * 1e-3, number)

@@ -29,8 +29,6 @@ RESTING = {"handle": Handle(MOBILISED_MM, 0.0, TURN, 42.0)}
 
 @pytest.fixture
 def first(core, planned):
-    """The first plan for a setpoint."""
-
     def plan(force_N: float, measured: Measured | None = None, **setpoint: object) -> Plan:
         return planned(core.planner(), force_N, measured, **setpoint)
 
@@ -62,7 +60,7 @@ def test_a_handle_that_rests_does_not_close_the_gap(first, moving, rate_mm_s: fl
     resting = moving(handle=Handle(MOBILISED_MM, rate_mm_s, TURN, 42.0))
     gap_mm = first(force_N, moving()).gap_mm
     assert first(force_N, resting).gap_mm == pytest.approx(gap_mm, abs=0.1)
-    # nothing is known of a handle that was never seen: it is planned for as one that moves slowly
+    # a handle that was never seen is planned for as one that moves slowly
     assert first(force_N).gap_mm == pytest.approx(gap_mm, abs=1.5)
 
 
@@ -267,14 +265,14 @@ def test_the_most_open_of_the_guards_wins(core, device: DeviceFit, unseen: Devic
     assert plan.gap_mm >= plan.min_gap_mm
 
 
-# -- the portrait: found among its points as `bisect_right` finds it, read as straight lines give it -------------------
+# -- the portrait ------------------------------------------------------------------------------------------------------
 
 
 GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)
 
 
 def drawn_portrait(least_N: float, gains_N: list[float]) -> Portrait:
-    """A portrait whose forces rise by so much from point to point, from steep to flat as they come."""
+    """A portrait whose forces rise by these gains, from steep to flat as they come."""
     forces_N = list(accumulate(gains_N, initial=least_N))
     gaps_mm = np.linspace(40.0, 15.0, len(forces_N)).tolist()
     return Portrait(gaps_mm, forces_N, [*gains_N, 2.0 * gains_N[-1]])

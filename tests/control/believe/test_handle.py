@@ -1,4 +1,4 @@
-"""A handle whose encoder is lost: what its force shows, and what no resting hand's does."""
+"""A handle whose encoder is lost: what its force shows, and no resting hand's does."""
 
 import math
 from collections.abc import Callable
@@ -20,7 +20,7 @@ def watched(
     model_N: Callable[[float], float],
     watch: HandleWatch | None = None,
 ) -> HandleWatch:
-    """After so long of readings, of functions of time; time goes on from the reading before."""
+    """A watch after readings that are functions of time, which goes on from the reading before."""
     watch = watch or HandleWatch()
     from_s = watch.heard_s
     for reading in range(1, round(duration_s / PERIOD_S) + 1):
@@ -30,7 +30,6 @@ def watched(
 
 
 def still(now_s: float) -> float:
-    """A handle that stands, or says so."""
     return 3.0
 
 

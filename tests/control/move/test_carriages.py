@@ -1,4 +1,4 @@
-"""The carriages: duties towards where the plan leads, within the limits; and what is said of limits that act."""
+"""The carriages: duties towards where the plan leads, within the limits; and which limits are reported."""
 
 import math
 
@@ -133,7 +133,6 @@ def test_only_carriages_that_gain_speed_sooner_than_expected_are_asked_for_more(
 
 
 def acted(bench) -> tuple[int, int, int, int]:
-    """How often: rate, slew, not finite, range."""
     counts = bench.move.acted
     return counts.rate, counts.slew, counts.not_finite, counts.range
 
@@ -143,7 +142,7 @@ def test_each_stage_of_the_output_is_counted_when_it_acts(running) -> None:
     assert acted(running) == (0, 0, 0, 0), "a gap that is where it should be is held back by nothing"
     running.step(79.95)
     assert acted(running) == (0, 1, 0, 0), "a short way takes no speed, but the reference does not leap"
-    running.step(50.0, count=40)  # and is not followed: the duty grows beyond what may be given
+    running.step(50.0, count=40)
     rate, slew, not_finite, cut = acted(running)
     assert 0 < rate < slew + rate <= 2 * 41
     assert 0 < cut <= 40

@@ -1,4 +1,4 @@
-"""What is watched: every way a run can fail ends it, in its time, and what a device may do does not."""
+"""What is watched: every failure of a run ends it in time, and what a device may do does not."""
 
 import msgspec
 import pytest
@@ -173,7 +173,6 @@ def test_a_gap_that_does_not_follow(make_bench) -> None:
 def test_following_again_in_time_is_no_fault(running) -> None:
     away_mm = [80.0 - 3.5 * part / 16.0 for part in range(1, 17)]
     for _ in range(3):
-        # the gap is 3.5 mm away from where the reference rests, for less than the time allowed
         for gap_mm in (*away_mm, *[away_mm[-1]] * 20, *reversed(away_mm)):
             running.step(**running.gap(gap_mm))
         running.step(count=20)
