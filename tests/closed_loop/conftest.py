@@ -27,8 +27,6 @@ def core() -> Core:
 
 @pytest.fixture(scope="session")
 def make(core: Core) -> Maker:
-    """A loop on a simulated device that has just been switched on."""
-
     def build(
         plant: str | PlantParameters = "sample_1",
         hand: Hand | None = None,
@@ -48,8 +46,6 @@ def make(core: Core) -> Maker:
 
 @pytest.fixture(scope="session")
 def arm(make: Maker) -> Maker:
-    """A loop that is armed, at the open gap."""
-
     def armed(
         plant: str | PlantParameters = "sample_1", *hand: Hand, planned: bool = True, **options: object
     ) -> ClosedLoop:
@@ -69,7 +65,7 @@ def armed(arm: Maker) -> ClosedLoop:
 
 @pytest.fixture(scope="session")
 def gap_ticks() -> Callable[[ClosedLoop, float, float], Iterator[Sample]]:
-    """The ticks, one by one, while a gap is asked for, so that the stages can be looked at between them."""
+    """The ticks, one by one, while a gap is asked for."""
 
     def ticks(loop: ClosedLoop, gap_mm: float, seconds: float) -> Iterator[Sample]:
         for _ in range(round(1e3 * seconds)):
@@ -85,8 +81,6 @@ def hold_gap(gap_ticks: Callable[..., Iterator[Sample]]) -> Callable[[ClosedLoop
 
 @pytest.fixture(scope="session")
 def render() -> Callable[[ClosedLoop, float, float], list[Sample]]:
-    """The ticks while a publisher asks for a force."""
-
     def rendered(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
         return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))
 

@@ -28,7 +28,6 @@ def ticks(loop: ClosedLoop, duration_s: float, force_N: float | None = ASKED_N) 
 
 
 def arm_beside(loop: ClosedLoop) -> tuple[Arming, list[Sample]]:
-    """Return what came of one `arm` beside the publisher, and of the two seconds after it."""
     arming, samples = Arming(loop.now_s, loop.stepper.safety.faults), []
     while not arming.is_over:
         arming.advance(loop.now_s, loop.stepper.safety, loop.conditions(), loop.command)

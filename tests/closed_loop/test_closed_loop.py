@@ -55,9 +55,6 @@ def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
     return samples[-1].safety.faults
 
 
-# -- rendering -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("plant", "from_s", "within_N", "trim"),
     [("sample_1", 0.0, 0.03, 1.0), ("sample_2", 1.5, 0.05, 0.8), ("sample_3", 1.5, 0.05, 0.85)],
@@ -106,9 +103,8 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     samples = list(armed.run(1.2, stream(np.array([at_s]), np.array([1.4]))))
     stale = [sample for sample in samples if Limit.STALE in sample.plan.limits]
     assert stale[0].time_s - at_s == pytest.approx(0.1, abs=0.01)
-    # nobody asks for less than the least force: no advice about that
+    # nobody asks for less than the least force
     assert not any(Limit.F_MIN in sample.plan.limits for sample in stale)
-    # 2 N/s down to the least force
     governed = [sample.plan.governed_N for sample in stale]
     assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061
     # this device's least force, as far as it has shown itself
@@ -116,9 +112,6 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     assert governed[-1] == pytest.approx(least_N, abs=0.01)
     assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
     assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.02)
-
-
-# -- position ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0], ids=["closing", "opening"])
@@ -153,9 +146,6 @@ def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, fro
     assert went_mm.max() - went_mm[0] < 0.6
 
 
-# -- commands ------------------------------------------------------------------------------------------------------
-
-
 def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
     publish(armed, lambda time_s: 1.2, 1.2)
     armed.command("pause")
@@ -174,7 +164,7 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
     assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
-# -- faults: those that are put into a running pulse are rows of the fault matrix --------------------------------------
+# -- faults; others are rows of the fault matrix
 
 
 def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
@@ -192,7 +182,7 @@ def test_a_loop_without_a_planner_wants_plans(make) -> None:
         make(planned=False).tick()
 
 
-# -- the second plant, whose laws differ from everything that the core was made with -----------------------------------
+# -- the second plant, whose laws differ
 
 
 def test_a_force_is_found_on_a_plant_of_other_structure(
@@ -206,9 +196,6 @@ def test_a_force_is_found_on_a_plant_of_other_structure(
         assert statistics.fmean(felt_N) == pytest.approx(asked_N, abs=0.05)
         assert max(felt_N) < asked_N + 0.1
         assert Limit.MODEL_RANGE not in samples[-1].plan.limits
-
-
-# -- the tactile element: a finger in a pad ----------------------------------------------------------------------------
 
 
 SCENE = load_scene("radial_pulse")

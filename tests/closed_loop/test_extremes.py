@@ -47,9 +47,6 @@ def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
     return sample
 
 
-# -- synchronisation -----------------------------------------------------------------------------------------------
-
-
 def uneven() -> PlantParameters:
     """Sample 1 with three times the drag on the left."""
     plant = load_plant("sample_1")
@@ -95,11 +92,7 @@ def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
     )
 
 
-# -- the clock -----------------------------------------------------------------------------------------------------
-
-
 def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sample]:
-    """The ticks on the way to a gap, with these periods."""
     samples = []
     for period_s in periods_s:
         now_s = loop.now_s
@@ -126,9 +119,6 @@ def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(arm, period
     assert min(sample.truth.gap_mm for sample in samples) > 90.0 - 2.0
 
 
-# -- the target ----------------------------------------------------------------------------------------------------
-
-
 def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm) -> None:
     loop = arm(planned=False)
     on_the_way(loop, 85.0, 500)
@@ -141,15 +131,11 @@ def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm)
     )
 
 
-# -- strokes of the gap: magnets that pull and screws that stick -------------------------------------------------------
-
-
 AT_REST = RecordedHand((0.0,), (0.0,))
 "A handle that moves would bring a force over the scene's, and a fault."
 
 
 def lag_mm(loop: ClosedLoop) -> float:
-    """Return how far the encoders are off what is expected of them."""
     stepper = loop.stepper
     assert isinstance(stepper.move, Carriages)
     return abs(stepper.move.expected.gap_mm - stepper.measured.gap_mm)  # type: ignore[union-attr]

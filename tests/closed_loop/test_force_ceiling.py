@@ -36,8 +36,6 @@ def named_s(samples: list[Sample]) -> float:
     return doubted[0] - samples[0].time_s
 
 
-# -- the sensor ----------------------------------------------------------------------------------------------------
-
 LIES: dict[str, Lie] = {
     "+0.3 N": lambda _, reading_N: reading_N + 0.3,
     "-0.3 N": lambda _, reading_N: reading_N - 0.3,
@@ -61,8 +59,6 @@ def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(render, lie: st
 
 @pytest.fixture
 def lying(make):
-    """An armed loop whose sensor has lied from the beginning."""
-
     def build(lie: str, **options: object):
         loop = make(**options)
         LyingSensor(loop.simulated.plant, LIES[lie])
@@ -150,12 +146,9 @@ def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
         assert not any(NAMED & set(sample.plan.limits) for sample in render(loop, asked_N, 3.0))
 
 
-# -- layer a: the governed force -----------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="session")
 def open_core(core: Core) -> Core:
-    """The core of a scene that allows a hundred times the force, so that no ceiling acts."""
+    """The scene allows a hundred times the force, so that no ceiling acts."""
     force = msgspec.structs.replace(core.scene.force, most_N=100.0 * MAX_N)
     return core._replace(scene=msgspec.structs.replace(core.scene, force=force))
 
@@ -169,11 +162,8 @@ def test_the_governed_force_holds_alone(make, render, core: Core, open_core: Cor
     assert Limit.RANGE in samples[-1].plan.limits
 
 
-# -- layer b: the gap ----------------------------------------------------------------------------------------------
-
-
 def ask_for_six_newtons(core: Core) -> Governor:
-    """A governor that has gone mad: it takes the device for a giant, and asks for 6 N whatever the scene wants."""
+    """A governor that has gone mad, and asks for 6 N whatever the scene wants."""
     giant = Portrait([95.0, 45.0], [0.0, 100.0], [2.0, 2.0])
     force = msgspec.structs.replace(core.scene.force, least_N=6.0, most_N=6.0)
     return Governor(0.0, giant, force, CONFIG.position.gap_speed_mm_s)
@@ -189,9 +179,6 @@ def test_the_gap_holds_alone(make, render, core: Core, open_core: Core, sample: 
     assert MAX_N < worst_N(samples) < CEILING_N
     assert Limit.CEILING in samples[-1].plan.limits
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
-
-
-# -- layer c: the measured force -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sample", WEAKEST_AND_STRONGEST)
@@ -214,8 +201,7 @@ def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     assert worst_N(samples) < CEILING_N
 
 
-# -- a profile is a prior for tracking, never for the ceiling
-# --------------------------------------------------------------
+# -- a profile is a prior for tracking only
 
 
 RESTS_S, GOES_MM_S = 3.0, (0.0, 1.0, 42.0)

@@ -55,7 +55,6 @@ PULSE = Config(scene="pulse")
 
 @pytest.fixture(scope="module")
 def frozen() -> Core:
-    """A core that learns nothing."""
     return build_core(PULSE, msgspec.structs.replace(load_scene("pulse"), terms=Terms(learning=False)))
 
 
@@ -106,15 +105,11 @@ def test_a_term_that_is_left_out_does_not_act_though_a_preview_tells_what_comes(
     assert (told["scale"].value, told["field_lag"].value) == (1.0, 0.0)
 
 
-# -- a great step, held: the elastomer relaxes, and the trim makes up for it ------------------------------------------
-
-
 Maker = Callable[..., ClosedLoop]
 LOW_N, HIGH_N = 0.7, 2.0
 REST_S, HOLD_S = 12.0, 12.0
 "The trim knows the device before the step; the elastomer's shortest time constant is 8 s."
 TRIMMED_S = 3.0
-"Arrival takes 0.8 s; then come three time constants of the trim."
 PERIOD_S = 0.01
 
 

@@ -31,7 +31,6 @@ def recorded(arm) -> list[Sample]:
 
 
 def duties(core: Core, recorded: list[Sample], device_s: float, host_s: float) -> list[Duty]:
-    """Return the duties of a core that is given the same at another time of either clock."""
     begins_s = host_s + recorded[0].time_s
     stepper, planner = core.stepper(begins_s), core.planner(begins_s)
     found: list[Duty] = []
@@ -70,7 +69,6 @@ def test_a_rollover_changes_no_duty(core: Core, recorded: list[Sample], device_s
 
 
 def stamped_s(base_ns: int) -> float:
-    """Return the time that the newest of four setpoints about then is taken for."""
     inbox = SetpointInbox()
     for ago_ns in (4 * 10**6, 3 * 10**6, 2 * 10**6, 10**6):
         at_ns = base_ns - ago_ns

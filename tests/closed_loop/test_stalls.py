@@ -29,7 +29,6 @@ def ticks(loop: ClosedLoop, force_N: float, duration_s: float) -> Iterable[Sampl
 
 
 def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
-    """Let the daemon stand still, and return the plant's force meanwhile."""
     forces_N = []
     for _ in range(stall_ms):
         loop.skip()
@@ -81,7 +80,7 @@ def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedL
     assert not samples[-1].output.limits
     forces_N += [sample.truth.force_N for sample in samples]
     assert max(abs(force_N - FORCE_N) for force_N in forces_N) < ALLOWED_N
-    # judged within two periods, and the integral has moved no more than holding moves it
+    # the integral has moved no more than holding moves it
     assert sum(are_blind) <= 2
     assert integrals[2] == pytest.approx(before, abs=0.02)
 

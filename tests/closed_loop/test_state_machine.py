@@ -42,24 +42,19 @@ from tormagd.simulation.plant import Truth
 
 UP, DOWN = "to the daemon", "to the device"
 SLOWEST = 0.7
-"The slowest device clock here, over the host's."
 TIMEOUT_MS = 51
 "By when a device that hears no Drive has left RUN."
 SILENT_MS = {FUNCTION[State]: 52, FUNCTION[Status]: 102, FUNCTION[Sense]: 102}
 "By when the daemon drives no more without this stream (docs/states.md)."
 ASKED_MS = 5
-"How long a command may be on its way."
 RECONNECTED_MS = 6_000
-"By when a device that was reset has been found, asked to open, and is open, though messages are lost."
+"By when a device that was reset has been found, asked to open, and is open."
 MODE_AT = 6
-"Of a Drive's mode, behind function, sequence and two duties."
 OPEN_MM, OPENED_MM, UNHOMED_MM_S, TURNED_MS = 95.0, 93.5, 8.0, 300.0
-"How slowly a device without a zero opens, and what turning round and tapering take."
+"How slowly a device without a zero opens, and what turning round takes."
 FROZEN_MS = 103
-"Until its watchdog resets a firmware that hangs."
 PATIENCE_S, SETTLED_MS = 15.0, 110
 CLOSING_MS = 300
-"In which an armed gap closes by some millimetres."
 HINDERING = (
     "blocked_left",
     "motor_dead_left",
@@ -70,10 +65,8 @@ HINDERING = (
 )
 "With these nothing can open the gap; they are named all the same."
 HELD = DeviceFault.SUPPLY | DeviceFault.HOMING_FAILED | DeviceFault.RETRACT_FAILED
-"With these latched the device rests where it is until it is cleared and homed."
 DEAF, RESTS = ("commands_vanish", "other_schema"), (DeviceMode.IDLE, DeviceMode.LATCHED)
 ASKED = {DeviceMode.HOMING: DeviceRequest.HOME, (DeviceMode.LATCHED, DeviceMode.IDLE): DeviceRequest.CLEAR}
-"Modes and transitions that a device takes only on request."
 FAULTS = (
     *("reset", "frozen", "overheated", "end_stop_left", "commands_vanish", "no_state", "no_sense", "no_status"),
     *("encoder_stuck_left", "encoder_jump", "encoder_reversed_left", "duties_reversed", "answers_half", "state_crc"),
@@ -92,7 +85,7 @@ Pair = tuple[OperatingState, DeviceMode]
 
 
 class BadLine:
-    """A device behind a line that loses or damages the next frames of a direction, all or those of one function."""
+    """A device behind a line that loses or damages the next frames."""
 
     def __init__(self, device: SerialDevice) -> None:
         self._device, self.messages = device, device.messages
@@ -134,7 +127,6 @@ class BadLine:
 
 @cache
 def plant() -> PlantParameters:
-    """Sample 1, switched on near its open end: it has homed within a second."""
     parameters = load_plant("sample_1")
     near = msgspec.structs.replace(parameters.assumed, start_left_mm=47.2, start_right_mm=47.0)
     return msgspec.structs.replace(parameters, assumed=near)
@@ -163,12 +155,10 @@ class Together(RuleBasedStateMachine):
         self.force_N = 1.1
         self.is_armed = False
         self.firmware, self.mode = device.messages.firmware, DeviceMode.IDLE
-        # in periods: when the daemon last drove, asked for each request, and reset the device; and until when it hangs
+        # in periods: when the daemon last drove, asked for each request, and reset the device
         self.undriven = self.reset = self.hangs_until = 0
         self.asked = dict.fromkeys(DeviceRequest, 0)
         self.open_by, self.was_held = 0.0, False
-
-    # -- what happens ----------------------------------------------------------------------------------------------
 
     @initialize(is_armed=st.sampled_from([True, True, True, False]), force_N=st.sampled_from([0.95, 1.1, 1.3]))
     def begin(self, is_armed: bool, force_N: float) -> None:
@@ -239,8 +229,6 @@ class Together(RuleBasedStateMachine):
         type(self).examples += 1
         type(self).periods += self.line.period
 
-    # -- how time passes -------------------------------------------------------------------------------------------
-
     def put_right(self) -> None:
         self.loop.simulated.mend()
         self.struck.clear()
@@ -286,8 +274,6 @@ class Together(RuleBasedStateMachine):
                 self.loop.tick(TimedSetpoint(self.force_N, now_s - now_s % 0.01, 0.1))
             self.judge(is_away)
 
-    # -- what holds ------------------------------------------------------------------------------------------------
-
     def judge(self, is_away: bool) -> None:
         safety, firmware, line = self.loop.stepper.safety, self.loop.simulated.firmware, self.line
         before, self.mode = self.mode, firmware.mode
@@ -311,7 +297,7 @@ class Together(RuleBasedStateMachine):
                 assert silent_ms <= longest_ms, f"driven {silent_ms} ms after the last of function {function}"
 
     def judge_device(self, before: DeviceMode) -> None:
-        """It runs only for a daemon that drives it, and homes or clears a fault only on request."""
+        """It runs, homes or clears a fault only for a daemon that asks for it."""
         now, mode = self.line.period, self.mode
         if mode is DeviceMode.RUN:
             most_ms = TIMEOUT_MS / (SLOWEST if "clock=-30%" in self.struck else 1.0)
@@ -323,7 +309,6 @@ class Together(RuleBasedStateMachine):
             assert since_ms <= ASKED_MS, f"{before.name} to {mode.name} {since_ms} ms after {request} was asked"
 
     def judge_gap(self) -> None:
-        """Whatever is lost, the gap is open in the time that opening takes."""
         gap_mm, now = self.loop.simulated.truth.gap_mm, self.line.period
         is_deaf = self.mode in RESTS and not self.struck.isdisjoint(DEAF)
         is_over = self.mode is DeviceMode.RUN or gap_mm > OPENED_MM

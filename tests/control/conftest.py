@@ -112,7 +112,6 @@ class Bench:
 
     @property
     def opened_for(self) -> tuple[Fault, ...] | None:
-        """The faults for which the drives are off and the device has been asked to open, or None."""
         is_faulty = self.stepper.safety.operating_state is OperatingState.FAULT
         is_opened = is_faulty and self.is_off and self.output.request is DeviceRequest.RETRACT
         return self.faults if is_opened else None
@@ -130,7 +129,6 @@ class Bench:
         return at_rest.replaced(**fields)  # type: ignore[arg-type]
 
     def at(self, now_s: float, measurement: Measurement | None, aim: Plan | float = 80.0) -> Duty:
-        """Step once, whenever that is."""
         self.now_s = now_s
         self.output = self.stepper.step(now_s, measurement, aim if isinstance(aim, Plan) else self.plan(aim))
         return self.output
@@ -174,8 +172,6 @@ class Bench:
 
 @pytest.fixture(scope="session")
 def make_bench(core: Core, measure: MeasurementMaker) -> Callable[..., Bench]:
-    """Makes benches, with other values in the named sections of the configuration."""
-
     def make(scene: Scene = core.scene, **sections: dict[str, object]) -> Bench:
         changed = {
             name: msgspec.structs.replace(getattr(core.config, name), **values) for name, values in sections.items()
@@ -211,8 +207,6 @@ def moving() -> Callable[..., Measured]:
 
 @pytest.fixture(scope="session")
 def planned() -> Callable[..., Plan]:
-    """The planner's next plan, a period later, for a setpoint of that moment."""
-
     def plan(planner: Planner, force_N: float, measured: Measured | None = None, **setpoint: object) -> Plan:
         now_s = planner.planned.time_s + PLAN_PERIOD_S
         if measured is not None:

@@ -37,9 +37,6 @@ def test_enabling_wants_a_measurement(bench) -> None:
     assert (refused, bench.stepper.safety.operating_state) == ("not_fresh", OperatingState.DISABLED)
 
 
-# -- counts that jump ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
 def test_counts_that_jump_and_come_back_do_no_harm(running, jump_mm: float) -> None:
     pushed = running.step(left_mm=-7.5 + jump_mm)
@@ -112,9 +109,6 @@ def test_homing_forgets_the_motion_before_it(bench) -> None:
     assert bench.stepper.measured.left_mm_s == 0.0
 
 
-# -- a link that goes, and numbers that are none -------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("names", [[], ["pause"]])
 @pytest.mark.parametrize("is_between", [False, True], ids=["nothing measured", "between two steps"])
 def test_a_lost_link_is_a_fault_while_driven(running, names: list[str], is_between: bool) -> None:
@@ -171,9 +165,6 @@ def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> Non
     assert (running.stepper.time_s, planner.planned.number) == (before_s, 0)
 
 
-# -- commands ------------------------------------------------------------------------------------------------------
-
-
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:
     broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED, "left_mm": 0.0, "right_mm": 0.0}
     bench.step(**broken)
@@ -189,8 +180,6 @@ def test_a_latched_fault_asks_once_and_stays(running) -> None:
     running.step(count=100)
     assert running.opened_for == (Fault.DEVICE_SKEW,)
 
-
-# -- any input -----------------------------------------------------------------------------------------------------
 
 measurements = st.none() | st.builds(
     Measurement,
@@ -242,9 +231,6 @@ def test_any_history_keeps_duties_in_bounds_and_repeats_itself(make_bench, histo
             number = output.request_number
             trace.append((plain(bench.stepper), output))
     assert runs[0] == runs[1]
-
-
-# -- clocks and stalls ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

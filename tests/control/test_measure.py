@@ -33,8 +33,6 @@ def look() -> Look:
 
 @pytest.fixture(scope="session")
 def follow_handle(measure):
-    """Return what is measured after the handle was at each of these places, a millisecond apart."""
-
     def follow(positions: list[float], force_N: float = 0.6) -> Measured:
         return Look()(*[measure(number, handle_mm=mm, force_N=force_N) for number, mm in enumerate(positions)])
 

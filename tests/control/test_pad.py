@@ -34,7 +34,6 @@ def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, **
 
 
 def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = DEPTH_MM) -> Planner:
-    """Plan for a force that was asked for this long, with the gap where it should be and nothing learned."""
     planner = core.planner()
     for tick in range(1, round(seconds / PERIOD_S) + 1):
         now_s = tick * PERIOD_S

@@ -33,8 +33,6 @@ def core_without(*names: str, learning: bool = True) -> Core:
 
 @pytest.fixture(scope="session")
 def told(moving, planned):
-    """Make one more plan, for which the device shows less than the model expects: 1.2 N at 78 mm."""
-
     def tell(planner: Planner, asked_N: float, rate_mm_s: float = 42.0, **setpoint: object) -> Plan:
         at_mm = 100.0 + rate_mm_s * (planner.planned.time_s + PERIOD_S)
         handle = Handle(MOBILISED_MM, rate_mm_s, Turn(1.0, 0.0, at_mm), rate_mm_s)

@@ -67,9 +67,6 @@ class Digest:
         return self._hash.hexdigest()
 
 
-# -- step and plan, whatever is measured ---------------------------------------------------------------------------
-
-
 def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
     """Random measurements, setpoints and commands; a tenth of all numbers is none that a device gives."""
     rng = random.Random(12)
@@ -102,7 +99,7 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
                     planner.plan(now_s, setpoint, stepper.measured, rng.random() < 0.8)
                     seen.see(planner)
                     planner.foresee()
-                except (ValueError, OverflowError) as error:  # of numbers that are not finite, which no wire brings
+                except (ValueError, OverflowError) as error:
                     seen.see(error)
                     seen.see(planner)
                     planner = core.planner(now_s)
@@ -121,7 +118,6 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
 
 
 def check_step(output: Duty, before: SafetyState, after: SafetyState) -> None:
-    """Check that duties are finite and within the limit, and that nothing is driven while it may not be."""
     duties, limit = (output.left_duty, output.right_duty), CONFIG.position.duty_limit
     assert all(abs(duty) <= limit for duty in duties), f"duties = {duties} in {after}"
     is_off = output.mode is DriveMode.OFF and duties == (0.0, 0.0)
@@ -141,8 +137,6 @@ def check_way(event: Event, before: SafetyState, after: SafetyState) -> None:
 
 
 def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, strangeness: float) -> Measurement:
-    """A measurement of a homed device that mostly runs."""
-
     def some(low: float, high: float) -> float:
         return rng.choice(STRANGE) if rng.random() < strangeness else rng.uniform(low, high)
 
@@ -195,9 +189,6 @@ def conditions(rng: random.Random) -> Conditions:
     )
 
 
-# -- bytes ---------------------------------------------------------------------------------------------------------
-
-
 def vectors(core: Core, seen: Digest) -> None:
     messages = json.loads((VECTORS / "messages.json").read_text(encoding="utf-8"))
     types: dict[str, Callable[..., Any]] = {layout.message.__name__: layout.message for layout in LAYOUTS}
@@ -213,7 +204,6 @@ def vectors(core: Core, seen: Digest) -> None:
 
 
 def streams(core: Core, seen: Digest) -> None:
-    """Frames of random messages, spoiled in many ways, in pieces; and what codec and link make of them."""
     rng = random.Random(8)
     for flips in (0.0, 0.001, 0.01, 0.1):
         stream = bytearray()

@@ -31,8 +31,6 @@ from tormagd.scenes.scene import Solver, load_scene, shipped_scenes
 
 torch.set_num_threads(1)  # a second thread costs more than it saves at this size
 
-# -- models whose shape over the field is known -----------------------------------------------------------------------
-
 
 RANGES = {
     "displacement_mm": (0.0, 1.0),
@@ -59,7 +57,6 @@ def make_model(weight: np.ndarray, bias: np.ndarray, output: np.ndarray, constan
 
 @pytest.fixture(scope="session")
 def rising() -> ForceModel:
-    """A force that rises with the field everywhere, 50 units."""
     rng = np.random.default_rng(7)
     weight = rng.normal(size=(50, 4))
     weight[:, 2] = np.abs(weight[:, 2]) + 0.1
@@ -79,10 +76,6 @@ LOPSIDED = of_field([40.0, -4.0], 4.0, [1.5, 1.5], -2.0)
 PLATEAU = of_field([500.0], 0.0, [1.0], 0.0)
 "The force climbs steeply at 450 mT and is flat to the last bit on both sides."
 CREEPING = of_field([500.0, 1.0], 0.0, [1.0, 1e-14], -0.9)
-"The plateau, with a rise of 8 units of rounding across it."
-
-
-# -- what all of them promise -----------------------------------------------------------------------------------------
 
 
 REACHED_MT = (100.0, 750.0)
@@ -251,9 +244,6 @@ def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> 
         assert solution == searcher.solve(curve, force, last)
 
 
-# -- row by row and by the nearest points ------------------------------------------------------------------------------
-
-
 RANGE_MT = (100.0, 800.0)
 
 
@@ -336,10 +326,6 @@ def test_the_grid_has_both_ends_and_no_wider_step() -> None:
     assert 2.9 < np.diff(grid).max() <= 3.0
 
 
-# -- Newton's method finds the root that Brent's finds, from any last field
-# ---------------------------------------------
-
-
 KNOWN = Known(((0.0, 1.0), (0.0, 60.0), RANGE_MT, (CIP, CIP)), 6.0)
 
 Steps = list[tuple[float, float, float]]
@@ -361,7 +347,6 @@ def curve_of(units: Steps, constant_N: float = -0.5) -> ForceCurve:
 
 
 def solved(curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-    """Return the answer, after the checks that hold for every answer."""
     solution = RisingSearch(RANGE_MT).solve(curve, force_N, last_field_mT)
     assert RANGE_MT[0] <= solution.field_mT <= RANGE_MT[1]
     assert (solution.predicted_force_N, solution.confidence) == (
@@ -427,10 +412,6 @@ def test_flat_stretches_do_not_stop_it(rate: float) -> None:
     for stair in range(7):
         for last in (None, *RANGE_MT, 199.9, 450.0, 650.1):
             assert solved(curve, stair + 0.5, last).field_mT == pytest.approx(150.0 + 100.0 * stair, abs=ACCURACY_MT)
-
-
-# -- the search of a scene
-# ------------------------------------------------------------------------------------------------
 
 
 BUILT = {"newton": RisingSearch, "nearest": NearestFieldSearch, "torch": NearestFieldSearch, "thesis": ordered.RowByRow}

@@ -190,7 +190,6 @@ MEANINGS: list[tuple[str, Any, str]] = [
     ("memory", {"lag_mT": -1.0}, r"memory\.lag_mT"),
     ("colour", "red", "colour"),
 ]
-"Each has another meaning, though JSON can say it."
 
 BROKEN = [
     ("element", "tactical", "element"),
@@ -386,9 +385,6 @@ def test_a_box_that_is_none_is_refused(of_two: ForceModel) -> None:
             msgspec.structs.replace(of_two.metadata, boxes={"MRE-50-20": box})
 
 
-# -- the force curve: against the model, torch and 50 digits ----------------------------------------------------------
-
-
 BOX = ((0.0, 0.0, 100.0, 40.0), (1.0, 60.0, 800.0, 40.0))
 Array = np.ndarray
 
@@ -413,7 +409,6 @@ def steep(metadata: ModelMetadata) -> ForceModel:
 
 
 def states(count: int) -> Array:
-    """Features, a third of them up to ten ranges outside the box."""
     rng = np.random.default_rng(11)
     rows = rng.uniform(*BOX, (count, 4))
     rows[::3] += rng.normal(size=(len(rows[::3]), 4)) * (3.0, 200.0, 2000.0, 10.0)
@@ -527,9 +522,6 @@ def test_confidence_follows_its_formula(
         expected,
         curve.confidence(field, error_N),
     )
-
-
-# -- what a model knows of relaxation ----------------------------------------------------------------------------------
 
 
 def test_the_daemon_remembers_what_the_grey_box_does() -> None:

@@ -28,9 +28,6 @@ from tormagd.physics.inserts import INSERTS, Insert, MeasuredForceRange, insert,
 from tormagd.physics.magnets import CuboidMagnet, attraction_N
 from tormagd.physics.relaxation import PronySeries
 
-# -- the field over the gap --------------------------------------------------------------------------------------------
-
-
 LAWS: list[FieldLaw] = [ThesisFieldLaw(), PowerFieldLaw(), PowerFieldLaw(coefficient=0.462, exponent=-1.33)]
 
 
@@ -72,9 +69,6 @@ def test_flux_density_over_the_radial_moment() -> None:
     assert flux_density_T(3.1e-3, 3.2, 0.004) == pytest.approx(3.1e-3 * 0.8 / 0.004)
 
 
-# -- the force of the brake --------------------------------------------------------------------------------------------
-
-
 OF_MOMENT = (stretch_minus_one, brake_force_N, d_force_d_moment)
 STIFF = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
 
@@ -104,7 +98,6 @@ def over_gaps(seed: int) -> Iterator[Case]:
 
 
 def over_loads(seed: int) -> Iterator[Case]:
-    """Up to the very edge of the domain, where the force is most sensitive."""
     for elastomer, geometry, rng in corners_and_random(seed):
         share = rng.choice((1.0, 10 ** rng.uniform(-6.0, 0.0)))
         yield Case(share * max_radial_moment_Tm(elastomer, geometry), elastomer, geometry)
@@ -114,7 +107,6 @@ def over_loads(seed: int) -> Iterator[Case]:
 def test_float64_force_and_slope_agree_with_50_digits(cases: Callable[[int], Iterator[Case]], count: int) -> None:
     admitted = 0
     for case in islice(cases(1), count):
-        # computed in 50 digits by `tools/numerics.py`
         truth = reference(Batch(case.elastomer, case.geometry, None, np.array([])), case.moment)
         if case.moment > max_radial_moment_Tm(case.elastomer, case.geometry):
             assert truth.stretch < 0.05
@@ -200,10 +192,6 @@ def test_the_edge_of_the_domain_is_admitted_and_nothing_beyond() -> None:
         d_force_d_gap(5.0, PowerFieldLaw(), STIFF, TORMAG)
 
 
-# -- the attraction of the magnets
-# ---------------------------------------------------------------------------------------
-
-
 BLOCK = CuboidMagnet(width_m=0.040, depth_m=0.040, thickness_m=0.020, remanence_T=1.45)
 SLAB = CuboidMagnet(width_m=0.060, depth_m=0.015, thickness_m=0.008, remanence_T=1.2)
 
@@ -246,9 +234,6 @@ def test_agrees_with_the_published_sum_for_any_block_out_to_the_last_gap() -> No
             assert attraction_N(gap_mm, magnet) == pytest.approx(expected, rel=1e-5), edges_m
     with pytest.raises(DomainError, match="gap_mm"):
         attraction_N(1.01 * last_mm, magnet)
-
-
-# -- the twelve inserts against the thesis's tables ----------------------------------
 
 
 def modelled_range_N(item: Insert) -> float:
@@ -306,9 +291,6 @@ def test_what_makes_no_sense_is_refused_by_its_key(odd: dict[str, object]) -> No
         msgspec.convert(row | odd, Insert)
 
 
-# -- what every law keeps: type and shape of arrays, and its domain, by name -------------------------------------------
-
-
 SERIES = PronySeries(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0))
 
 
@@ -336,8 +318,6 @@ def test_arrays_keep_type_and_shape_and_agree_with_floats(
     np.testing.assert_allclose(values.ravel(), expected, rtol=digits * np.finfo(dtype).eps)
     assert isinstance(law(0.5 * (low + high)), float)
 
-
-# -- what is refused ---------------------------------------------------------------------------------------------------
 
 NO_NUMBER = (math.nan, math.inf)
 Refused = tuple[Callable[..., Any], tuple[Any, ...], str]

@@ -285,7 +285,6 @@ class Operating(RuleBasedStateMachine):
             return None
 
     def _check_request(self, before: SafetyState) -> None:
-        """A request number stands for one request, and only goes up, by one."""
         assert 0 <= self.state.request_number - before.request_number <= 1
         if self.state.request_number == before.request_number:
             assert self.state.request is before.request
@@ -328,10 +327,6 @@ def test_the_next_commands_of_each_fault_are_taken_and_arm_it(fault: Fault) -> N
         if name == "home":
             is_homed, state = True, homed_again(state, is_homed=False)
     assert (state.operating_state, next_commands(state, is_homed)) == (OperatingState.ENABLED, ())
-
-
-# -- codes
-# ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

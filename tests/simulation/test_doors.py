@@ -76,7 +76,6 @@ def ended(process: "subprocess.Popen[str]") -> None:
 
 
 def meet(device: Device) -> None:
-    """Open the line as the daemon does, repeat Hello until Identity and Status have come, and close it."""
     seen: set[type[Message]] = set()
     deadline_s = time.monotonic() + LIMIT_S
     with contextlib.closing(choose(device, Rates()).open()) as backend:
@@ -115,9 +114,6 @@ def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_no
     assert Path(path).is_socket()
     assert channel(start("--can", path)) == path
     meet(on_a_bus(path))
-
-
-# -- the serial door, and calls of the process -----------------------------------------------------------------------
 
 
 def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, tmp_path: Path) -> None:
@@ -168,12 +164,7 @@ def test_a_wrong_call_says_what_is_right_and_exits_with_2(
     assert said in errors
 
 
-# -- the bus's door ------------------------------------------------------------------------------------------------
-
-
 class Served:
-    """A door in this process, and its clock."""
-
     def __init__(self, path: Path) -> None:
         self.device = CanDevice(MessageDevice(load_plant("sample_1"), SteadyHand(), seed=1))
         self.door = CanDoor(self.device, path)
@@ -210,7 +201,7 @@ def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
         bad = served.host()
         bad.send(packet)
         served.exchange(0.002)
-        while bad.recv(64):  # a Status may have come before the end
+        while bad.recv(64):
             pass
         bad.close()
     good.send(to_socket(CanFrame(0x081, encode(HELLO))))
@@ -278,9 +269,6 @@ def test_a_host_that_does_not_read_holds_nobody_up(served: Served) -> None:
     assert heard > 100, "a Status every 20 ms"
     lazy.close()
     busy.close()
-
-
-# -- the adapter ---------------------------------------------------------------------------------------------------
 
 
 DAMAGED_FRAMES = (

@@ -21,7 +21,6 @@ from tormagd.simulation.second_element import SecondElement
 
 STEP_S, END_S, GAP_MM = 1e-3, 4.0, 50.0
 STROKE = RecordedHand((0.2, 1.0, 2.2, 3.0), (0.0, 15.0, 15.0, 0.0))
-"Pushes, holds, withdraws."
 FINGER, WRIST, ARM = Impedance(0.005, 0.4, 0.005), Impedance(0.1, 0.4, 0.006), Impedance(1.0, 0.3, 0.02)
 BRAKES = ("sample_1", "sample_2", "second")
 at_each_brake = pytest.mark.parametrize("name", BRAKES)
@@ -48,7 +47,6 @@ def freely(hand: FeltHand) -> np.ndarray:
 
 
 def swung_mm(place_mm: np.ndarray) -> float:
-    """Return how far a handle went to and fro beyond where it got to."""
     return float(np.abs(np.diff(place_mm)).sum() - abs(place_mm[-1] - place_mm[0]))
 
 

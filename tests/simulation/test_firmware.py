@@ -36,8 +36,6 @@ STATUS_PERIOD_S = 0.02
 
 
 class Port:
-    """The serial port of a simulated device, in virtual time: a `BytePort`."""
-
     def __init__(self, device: VirtualDevice) -> None:
         self.device = device
         self.time_s = 0.0
@@ -54,8 +52,6 @@ class Port:
 
 
 class Bench(Host):
-    """A simulated device and the conformance kit's host, which looks through the wire."""
-
     def __init__(self, faults: Iterable[str] = (), plant: PlantParameters | None = None) -> None:
         self.device = VirtualDevice(
             plant or load_plant("sample_1"), SteadyHand(), [parse_fault(fault) for fault in faults]
@@ -78,7 +74,6 @@ class Bench(Host):
 
 
 def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "sample_1") -> Bench:
-    """A homed device at that gap, in RUN before 3.4 s."""
     sample = load_plant(plant)
     near_home = msgspec.structs.replace(sample.assumed, start_left_mm=46.0, start_right_mm=45.5)
     host = Bench(faults, msgspec.structs.replace(sample, assumed=near_home))
@@ -88,9 +83,6 @@ def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "s
     assert host.now_s < 3.4
     assert host.device.truth.gap_mm == pytest.approx(gap_mm, abs=0.3)
     return host
-
-
-# -- what must come before a run -----------------------------------------------------------------------------------
 
 
 def test_drive_run_is_refused_without_a_hello() -> None:
@@ -103,9 +95,6 @@ def test_drive_run_is_refused_without_a_hello() -> None:
     host.hello()
     host.run_until(host.now_s + 0.1, -0.5)
     assert host.status.mode is DeviceMode.RUN
-
-
-# -- homing --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -159,9 +148,6 @@ def test_duties_are_applied_in_steps_of_ten_bits() -> None:
     assert travel(513 * step) > travel(512 * step) > 60.0
 
 
-# -- ways out of a run ---------------------------------------------------------------------------------------------
-
-
 class Ending(NamedTuple):
     """How a run from a gap of `gap_mm` ends, with these faults of the device and these duties of the host."""
 
@@ -180,7 +166,6 @@ ENDINGS = {
     "silence": Ending((), None, 60.0, DeviceFault.COMMAND_TIMEOUT, DeviceFault.COMMAND_TIMEOUT, OPEN_MM, OPEN_MM),
     "a closed switch": Ending((), (-0.3, -0.3), 50.0, DeviceFault.END_STOP, DeviceFault.END_STOP, OPEN_MM, OPEN_MM),
     "skew": Ending((), (0.4, -0.4), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM),
-    # the other carriage is opened all the same
     "a blocked carriage": Ending(
         ("blocked_left@3.5",),
         (1.0, 0.0),
@@ -274,9 +259,6 @@ def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int
     while DeviceFault.RETRACT_FAILED not in host.status.faults:
         host.pass_time(0.01)
         assert host.now_s - started_s < within_s
-
-
-# -- injected faults -----------------------------------------------------------------------------------------------
 
 
 def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap() -> None:

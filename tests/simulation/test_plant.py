@@ -19,10 +19,6 @@ from tormagd.simulation.plant import SUBSTEP_S, Plant
 from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.static_laws import pull_of_magnets_N, radial_moment_Tm
 
-# -- motor, gearbox, screw and carriage
-# -----------------------------------------------------------------------------------
-
-
 SAMPLES = ("sample_1", "sample_2", "sample_3")
 
 SAMPLE_1 = load_plant("sample_1")
@@ -53,7 +49,6 @@ def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
 
 
 def holding(plant: PlantParameters, gap_mm: float, wear: float = 1.0) -> tuple[float, float]:
-    """Return the magnets' attraction, N, and by how much a screw's friction exceeds what turns it back, N m."""
     pull_N = float(pull_of_magnets_N(gap_mm, plant))
     screw_Nm = pull_N * plant.screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
     friction_Nm = (plant.gear.output_friction_Nm + screw_Nm) / wear
@@ -141,7 +136,6 @@ def test_attraction_and_holding_margin_over_the_stroke(name: str) -> None:
 def test_the_carriages_hold_with_the_power_off(name: str, gap_mm: float) -> None:
     plant = Plant(at_gap(load_plant(name), gap_mm), SteadyHand())
     plant.advance(1.0)
-    # only the contact's springs give: the screws do not turn
     assert plant.gap_mm == pytest.approx(gap_mm, abs=1e-6)
     assert plant.left.angle_rad == plant.right.angle_rad == 0.0
 
@@ -194,7 +188,6 @@ def test_the_substep_is_fine_enough_for_hard_motion(name: str, motion: str, drag
     assert gap_um < (30.0 if motion == OPENING else 4.0)
     assert force_mN < (2.5 if motion == OPENING else 0.4)
     assert screw_um < (5.0 if motion == OPENING else 1.8)
-    # 24 V more, 0.27 ms ago
     assert current_mA < 600.0
 
 
@@ -213,17 +206,12 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
         for _ in range(steps(0.03)):
             before_m, angle_rad = axis.position_m, axis.angle_rad
             axis.step(volt, attraction_N)
-            # work on the rotor by the current of the step, and by the magnets on the carriage
             electric_J = 0.77 * axis.current_A * (axis.angle_rad - angle_rad)
             magnetic_J = -attraction_N * (axis.position_m - before_m)
             put_in_J += electric_J + magnetic_J
             throughput_J += abs(electric_J) + abs(magnetic_J)
             stored_J = 0.5 * inertia * axis.speed_rad_s**2 + 0.5 * axis.contact_N**2 / STIFFNESS_N_M
             assert put_in_J + 0.01 * throughput_J + 1e-6 >= stored_J
-
-
-# -- element and sensors, and the plant of all of them
-# ---------------------------------------------------------------------
 
 
 STEP_S = 1e-3
@@ -385,9 +373,6 @@ def test_time_may_be_cut_in_any_way() -> None:
         pieces.advance(0.3 / 3000 / 3)
         pieces.advance(0.3 / 3000 * 2 / 3)
     assert (pieces.truth, pieces.force_sensor.reading_N) == (whole.truth, whole.force_sensor.reading_N)
-
-
-# -- the pad -----------------------------------------------------------------------------------------------------------
 
 
 PADS = ("pad_1", "pad_2", "pad_3")

@@ -158,8 +158,6 @@ def test_where_the_field_lags_and_the_force_relaxes_the_gap_makes_up_for_both(pl
 
 
 class WrongSolver:
-    """A search that answers with one field, whatever is asked."""
-
     def __init__(self, field_mT: float) -> None:
         self._field_mT = field_mT
 
@@ -236,7 +234,6 @@ def test_nan_never_travels(core, moving, history: list[tuple[float, TimedSetpoin
         now_s += elapsed_s
         plan = planner.plan(now_s, setpoint, None if changes is None else moving(number=number, **changes))
         device, lag_s = planner.believe.device, planner.believe.carriages.lag_s
-        # gap, its speed and the lag are held within bounds below, where no NaN is
         told = [plan.governed_N, plan.field_mT, plan.predicted_N or 0.0, plan.gap_acceleration_mm_s2]
         told += [plan.confidence, plan.trim, plan.min_gap_mm]
         told += [getattr(device, name) for name in DeviceFit.__match_args__]
@@ -263,9 +260,6 @@ def test_the_most_open_of_the_guards_wins(core, device: DeviceFit, unseen: Devic
     for guard in (device, unseen):
         assert guard is None or plan.gap_mm >= ceiling_mm(core.portrait, guard, ceiling_N, device_bounds(CONFIG.trim))
     assert plan.gap_mm >= plan.min_gap_mm
-
-
-# -- the portrait ------------------------------------------------------------------------------------------------------
 
 
 GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)

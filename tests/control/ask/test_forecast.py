@@ -34,7 +34,6 @@ Array = npt.NDArray[np.float64]
 
 AHEAD_S = np.array([0.02, 0.04, 0.06])
 STEEPEST_N_S = 3.0
-"About what the governor allows a slope to be."
 
 
 def pulse_N(times_s: Array, seed: int = 1, rate_hz: float = 1.1) -> Array:
@@ -70,7 +69,6 @@ def tell(forecast: Forecast, stamp_s: float, force_N: float, slope_N_s: float = 
 
 
 def follow(times_s: Array, forces_N: Array) -> Followed:
-    """Observe each setpoint, and return what would have been planned for beside what came."""
     forecast, rows, slope_N_s = Forecast(), [], 0.0
     for before, (time_s, force_N) in enumerate(zip(times_s[1:].tolist(), forces_N[1:].tolist(), strict=True)):
         steepness = (force_N - forces_N[before]) / (time_s - times_s[before])
@@ -190,7 +188,6 @@ def test_after_a_jump_nothing_is_forecast_and_trust_has_to_be_earned_again(learn
     assert learned.time_s > 4.02
     learned.changes_N = changes_N
     assert learned.trust < 0.03 < trust
-    # as if it had missed all that the slope met, at the weight of the first judgement
     assert (LOST.score, LOST.apart) == (pytest.approx(-1.0, abs=0.03), pytest.approx(DOUBT_N**2))
 
 

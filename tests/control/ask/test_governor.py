@@ -40,7 +40,6 @@ def governor(
     gap_speed_mm_s: float = GAP_SPEED_MM_S,
     terms: Terms = EVERY_TERM,
 ) -> Governor:
-    """A governor on the device of these tests, which was asked for this force last."""
     begun = Governor(now_s, portrait, scene, gap_speed_mm_s, terms)
     begun.asked_N, begun.above_N = asked_N, asked_N - portrait.min_N
     return begun
@@ -137,7 +136,6 @@ def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(
         assert ask.limits == ((Limit.OTHER_SOURCE,) if is_there else (Limit.OTHER_SOURCE, Limit.TAKEOVER))
         reached = reached or tick * is_there
     assert reached == pytest.approx(0.8 / SCENE.release_N_s * 1e3, abs=5)
-    # from then on it is followed as any other
     ask = decide(following, 1.001, TimedSetpoint(1.2, 1.001, VALID_S, holder=1))
     assert (ask.force_N, ask.limits) == (1.2, ())
 
@@ -273,7 +271,6 @@ def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump(now_s: float) 
 
 
 def at(force_N: Callable[[float], float], now_s: float, ahead_s: float = 0.0) -> TimedSetpoint:
-    """The setpoint of a force, with a preview of `ahead_s`."""
     ahead_N = tuple(force_N(now_s + 0.002 * place) for place in range(1, round(500 * ahead_s) + 1))
     return TimedSetpoint(force_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=0.002)
 
@@ -287,7 +284,6 @@ def told(force_N: Callable[[float], float], seconds: float, *, ahead_s: float = 
 
 
 def swing_N(time_s: float) -> float:
-    """As slow as the gap of these tests can follow."""
     return 1.5 + 0.05 * math.sin(2.0 * math.pi * 2.0 * time_s)
 
 
@@ -346,7 +342,6 @@ def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
     following = governor(0.499, 1.0)
     soon = decide(following, 0.5, rising)
     assert np.all(np.diff(path_N(soon)) > 0.0)
-    # no further than it was known
     assert path_N(soon)[-1] < 1.02
     for tick in range(1, 100):
         late = decide(following, 0.5 + 0.01 * tick, rising)
@@ -360,13 +355,11 @@ def test_a_preview_does_not_outlive_its_validity() -> None:
 
 
 def beats_N(time_s: float) -> float:
-    """A pulse of 1.1 Hz with a notch."""
     phase = 2.0 * math.pi * 1.1 * time_s
     return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
 
 
 def beaten(seconds: float, **keywords: Any) -> Governor:
-    """A governor after so much of the pulse, 500 times a second, without a preview."""
     following = governor(**keywords)
     for tick in range(1, round(500 * seconds) + 1):
         decide(following, tick / 500, at(beats_N, tick / 500))
@@ -389,7 +382,7 @@ def learned(learned_once: Any) -> Governor:
 @pytest.mark.parametrize(("lag_s", "share"), [(0.0, 0.3), (0.01, 0.75)])
 def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> None:
     worst_N = extrapolated_N = 0.0
-    swift_mm_s = 3.0 * GAP_SPEED_MM_S  # a gap that is fast enough for this pulse
+    swift_mm_s = 3.0 * GAP_SPEED_MM_S
     following = beaten(10.0, gap_speed_mm_s=swift_mm_s)
     blind = beaten(10.0, gap_speed_mm_s=swift_mm_s, terms=EVERY_TERM.without("forecast"))
     for tick in range(5_001, 5_501):

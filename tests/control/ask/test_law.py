@@ -26,8 +26,6 @@ PASSES = 10
 
 
 class Following:
-    """A governor with a handle, one plan a call."""
-
     def __init__(self, scene: Force = SCENE) -> None:
         self.governor = Governor(0.0, PORTRAIT, scene, 38.0)
         self.now_s = 0.0
@@ -151,7 +149,6 @@ class Pushed:
         self._way, self._sign, self._turn = Way(push_sign), push_sign, Turn(1.0, 0.0, 0.0)
 
     def at(self, place_mm: float, hand_N: float, *, zero_N: float = 0.0, is_sensor_believed: bool = True) -> Travel:
-        """Move the handle there while the hand gives this force, positive pushing on."""
         encoder_mm = self._sign * place_mm
         self._turn = self._turn.moved_to(encoder_mm)
         direction = self._turn.direction

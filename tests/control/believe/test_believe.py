@@ -224,7 +224,6 @@ def swing(core, moving):
 
         for tick in range(1, round(seconds / PERIOD_S)):
             now_s = tick * PERIOD_S
-            # it starts earlier by what has been learned, and is measured before the plan
             come_s = now_s - AGE_S - late_s + planner.believe.carriages.lag_s
             gap_mm = gap_mm_at(force_N(come_s))
             side_mm_s = (gap_mm - gap_mm_at(force_N(come_s - 1e-3))) / 2e-3

@@ -14,7 +14,6 @@ def swing_mm(time_s: float) -> float:
 
 
 def swung(late_s: float, seconds: float, *, off_mm: float = 0.0) -> CarriageLag:
-    """Of carriages that follow a planned swing late, and are measured off by this much."""
     carriages = CarriageLag()
     for tick in range(round(seconds / PERIOD_S)):
         now_s = tick * PERIOD_S

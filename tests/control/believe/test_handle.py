@@ -20,7 +20,6 @@ def watched(
     model_N: Callable[[float], float],
     watch: HandleWatch | None = None,
 ) -> HandleWatch:
-    """A watch after readings that are functions of time, which goes on from the reading before."""
     watch = watch or HandleWatch()
     from_s = watch.heard_s
     for reading in range(1, round(duration_s / PERIOD_S) + 1):
@@ -34,7 +33,6 @@ def still(now_s: float) -> float:
 
 
 def swinging(now_s: float) -> float:
-    """A force, or what the model gives at the gap."""
     return 1.5 + 0.2 * math.sin(math.tau * now_s)
 
 

@@ -30,8 +30,6 @@ def element() -> Element:
 
 @pytest.fixture(scope="session")
 def follow(element: Element) -> Callable[..., ElementMemory]:
-    """Return what an element remembers of being found like that, every half second."""
-
     def remembering(*measured: Measured, memory: Memory = MEMORY) -> ElementMemory:
         remembered = ElementMemory(memory, element.nominal, element.field, GAPS_MM)
         for place, each in enumerate(measured):
@@ -42,7 +40,6 @@ def follow(element: Element) -> Callable[..., ElementMemory]:
 
 
 def found(gap_mm: float, *, depth_mm: float = 0.0, is_homed: bool = True) -> Measured:
-    """A device at that gap whose handle has not moved, or with a finger in its pad."""
     handle = Handle(depth_mm, 0.0, Turn(1.0, 0.0, 0.0))
     return Measured(1, is_homed, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
 

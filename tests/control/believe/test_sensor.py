@@ -29,7 +29,6 @@ MODEL_N = 1.0871
 "What the model says at the gap of `moving`."
 NEW_WAY = {"handle": Handle(MOBILISED_MM, 42.0, Turn(-1.0, 0.0, 100.0), 42.0)}
 CLOSER = {"gap_mm": 70.0, "handle_mm": 110.0, "handle": Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, 110.0), 42.0)}
-"A closer gap, once the handle has gone on."
 
 
 def force_N(believe: Believe) -> float:
@@ -38,7 +37,6 @@ def force_N(believe: Believe) -> float:
 
 @pytest.fixture
 def known(planner: Planner, hear: Callable[..., Planner], moving) -> Planner:
-    """A device that has slid for two seconds, and is as the model says."""
     return hear(planner, 2.0, moving())
 
 

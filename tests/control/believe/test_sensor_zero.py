@@ -61,7 +61,6 @@ def strokes(
         ),
         # one reversal is enough where the sensor is not taken for tared
         (0.3, {"number": 2, "is_tared": False}, 0.01, 0.03),
-        # the force may be another after it
         (0.1, {"number": 2, "is_tared": False, "scale": 1.2, "model_N": (0.8, 1.9)}, 0.01, 0.03),
     ],
 )

@@ -28,7 +28,6 @@ KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
 
 
 def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit = UNSEEN) -> SlowFriction:
-    """After readings of `share` times what was expected at that rate."""
     slow = SlowFriction(BOUNDS)
     slow.followed_N = 1.5
     for _ in range(round(seconds / PERIOD_S)):
@@ -87,7 +86,7 @@ def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
     assert slow.followed_N == pytest.approx(2.0 * (1.0 - math.exp(-1.0)), rel=1e-9)
     slow.follow(0.3, reach_mm)
     assert slow.followed_N == pytest.approx(0.3)
-    slow.follow(1.0, 0.0)  # the way back bends the bristles as well
+    slow.follow(1.0, 0.0)
     assert slow.followed_N > 0.3
 
 

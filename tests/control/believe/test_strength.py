@@ -47,7 +47,6 @@ def test_one_force_is_right_where_it_was_shown_and_uncertain_elsewhere() -> None
     assert fit.force_N(0.7) == pytest.approx(0.91, abs=0.01)
     assert fit.deviation_N(0.7) < 0.07
     assert fit.deviation_N(2.0) > 2.0 * fit.deviation_N(0.7)
-    # what the device really gives lies within what it is taken to give
     assert abs(fit.force_N(2.0) - 2.6) < SURE * fit.deviation_N(2.0)
 
 
@@ -170,7 +169,6 @@ KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)
 
 
 def heard(off_N: float, seconds: float, learns: tuple[bool, bool] = (True, True)) -> Strength:
-    """A known device after readings that are off by this much from the model's 1.5 N."""
     strength = Strength(0.5, BOUNDS, learns)
     strength.forget(KNOWN)
     for noise_N in np.random.default_rng(2).normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():

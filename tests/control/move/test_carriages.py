@@ -36,8 +36,8 @@ def test_skew_pulls_the_carriages_together(make_bench) -> None:
 
 def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running) -> None:
     running.step(running.plan(80.0, gap_speed_mm_s=-10.0), count=60)
-    # the reference has come to where the plan leads in CARRY_S, although the plan is much older, and closes in on it
-    # with the plan's own speed, which the closing speed makes up for APPROACH_S away
+    # the reference closes in on where the plan leads in CARRY_S with the plan's own speed, which the closing speed
+    # makes up for APPROACH_S away
     lag_s = EXCHANGE_S + electrical_time_s(CONFIG.motor)
     led_mm = 80.0 - 10.0 * (CARRY_S + lag_s)
     assert running.move.reference.gap_mm == pytest.approx(led_mm - 10.0 * APPROACH_S, abs=0.02)

@@ -143,7 +143,6 @@ def test_margins_are_numbers_at_every_corner_of_what_is_accepted(motor: Motor, g
 
 
 def closed_loop_radius(motor: Motor, position: Position) -> float:
-    """Spectral radius of the closed loop, from its characteristic polynomial: above 1 it diverges."""
     plant = zero_order_hold(motor, PERIOD_S)
     share = PERIOD_S / (position.derivative_filter_s + PERIOD_S)
     integral = np.poly1d([PERIOD_S / position.integral_time_s, 0.0])

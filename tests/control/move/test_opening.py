@@ -16,8 +16,6 @@ LATCHED = {"mode": DeviceMode.LATCHED, "switches": Switches(0)}
 
 
 class Opens:
-    """A device that is to open, looked at every millisecond; faults are latched as the core does."""
-
     def __init__(self, measure) -> None:
         self._measure, self.ticks = measure, 0
         self.opening = Opening(CONFIG, load_scene("coronary"))
@@ -28,7 +26,6 @@ class Opens:
         self.safety = self.safety.ask(DeviceRequest.RETRACT)
 
     def look(self, seconds: float, start_mm: float = -20.0, speed_mm_s: float = 0.0, **changes: object) -> float | None:
-        """Return after how many seconds a fault shows."""
         for step in range(1, round(seconds * 1e3) + 1):
             self.ticks += 1
             at_mm = min(start_mm + 1e-3 * step * speed_mm_s, 0.0)

@@ -16,7 +16,6 @@ MAX_MM_S2 = LIMITS.gap_acceleration_mm_s2
 NO_LOAD_MM_S = 2.0 * full_speed_mm_s(Config().motor)
 SPEEDS = Speeds(NO_LOAD_MM_S, LIMITS.gap_speed_mm_s, LIMITS.gap_speed_mm_s)
 HALF_COUNT_MM = 0.5 * 8.0 / 4480.0
-"No encoder sees less."
 
 
 def followed(
@@ -26,7 +25,6 @@ def followed(
     speeds: Speeds = SPEEDS,
     floor_mm: float = -math.inf,
 ) -> Iterator[Reference]:
-    """The reference after each of these targets, a period apart, from rest."""
     reference = Reference(start_mm)
     for target in targets:
         reference, _, _ = follow(MAX_MM_S2, reference, target, dt_s, speeds, floor_mm)

@@ -14,8 +14,6 @@ PERIOD_S = 1e-3
 CONFIG = Config()
 TIMEOUT_S = CONFIG.device.measurement_timeout_ms * 1e-3
 
-# -- the device and its streams ------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("bit", DeviceFault)
 def test_a_fault_of_the_device_is_ours(running, bit: DeviceFault) -> None:
@@ -86,19 +84,16 @@ def test_a_sensor_that_stays_doubted_is_a_fault(running) -> None:
     assert running.run_into(Fault.SENSOR, running.plan(80.0, sensor_doubted_s=1.01 * SENSOR_FAULT_S)) == 1
 
 
-# -- where the carriages are ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_skew(running, side: float) -> None:
     def apart(skew_mm: float) -> dict[str, float]:
         return {"left_mm": -7.5 + side * skew_mm / 2.0, "right_mm": -7.5 - side * skew_mm / 2.0}
 
     allowed_mm = CONFIG.limits.skew_fault_mm
-    for part in range(1, 41):  # no faster than carriages do
+    for part in range(1, 41):
         running.step(**apart(0.98 * allowed_mm * part / 40.0))
     running.step(count=20, **apart(0.98 * allowed_mm))
-    for back_mm in (0.008, 0.016, 0.024, 0.032):  # as the loop wants it, so that nothing goes the wrong way
+    for back_mm in (0.008, 0.016, 0.024, 0.032):
         running.step(**apart(0.98 * allowed_mm - back_mm))
     running.step(count=20, **apart(0.98 * allowed_mm - back_mm))
     assert not running.faults
@@ -155,9 +150,6 @@ def test_a_switch_that_is_newer_than_the_position_says_nothing(running) -> None:
     open_now = Switches.HOMED | Switches.RIGHT_OPEN
     running.silent(running.measure(last, switches=open_now, reported_s=running.now_s), 20)
     assert not running.faults
-
-
-# -- how they move -------------------------------------------------------------------------------------------------
 
 
 def test_a_gap_that_does_not_follow(make_bench) -> None:
@@ -235,9 +227,6 @@ def test_a_force_that_is_too_much_again_and_again_is_a_fault(running) -> None:
             break
         assert Limit.OVER_FORCE not in limits or tick % 120 <= 60
     assert running.faults == (Fault.OVER_FORCE,)
-
-
-# -- the wire and the clock ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
