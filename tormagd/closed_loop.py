@@ -31,7 +31,7 @@ from tormagd.simulation.plant import Truth
 
 Array = npt.NDArray[np.float64]
 HOMING_S: Final = 10.0
-"Longer than the slowest homing from a closed gap."
+"The slowest homing takes less."
 SEARCH_S: Final = 0.012
 "Of a search beside the plans: a period of the thesis's 83 Hz."
 MAX_UNREAD_BYTES: Final = 4096

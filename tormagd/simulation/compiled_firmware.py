@@ -48,7 +48,7 @@ class CParameters(ctypes.Structure):
 
 
 class CSensors(ctypes.Structure):
-    """struct tormag_sensors, in the order of `Sensors`; its counters wrap around at 32 bits"""
+    """struct tormag_sensors, in the order of `Sensors`"""
 
     _fields_ = [
         ("left_counts", ctypes.c_int32),
@@ -99,7 +99,6 @@ def _library() -> ctypes.CDLL:
 
 
 def _sizes(library: ctypes.CDLL) -> list[int]:
-    """Return the bytes of the C device, and of the structures for parameters, sensors and view."""
     sizes = (ctypes.c_size_t * 4)()
     library.tormag_bridge_sizes(sizes)
     return list(sizes)
@@ -110,7 +109,7 @@ class CompiledFirmware:
 
     def __init__(self, plant: PlantParameters) -> None:
         library = _library()
-        # the C struct lives in an array of doubles, for their alignment
+        # for alignment
         self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
         library.tormag_device_init(self._device, ctypes.byref(parameters_of(plant)))
         self._output: Output = OFF
@@ -161,7 +160,7 @@ class CompiledFirmware:
 
     @property
     def output(self) -> Output:
-        """The state of both bridges: the same object until it changes, so `is` tells whether it has."""
+        """The same object until it changes, so `is` tells whether it has."""
         view = self._view()
         output = Output(view.left_duty, view.right_duty, view.enabled)
         if output != self._output:

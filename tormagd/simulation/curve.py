@@ -14,7 +14,7 @@ class Curve:
         self._values = values
 
     def at(self, x: float) -> float:
-        """Return the value at `x`; beyond both ends the outermost pieces are continued."""
+        """Return the value at `x`; beyond both ends the outermost pieces go on."""
         place = (x - self._start) * self._per_unit
         index = int(place)
         if index < 0:

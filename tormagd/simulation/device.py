@@ -38,19 +38,18 @@ from tormagd.simulation.plant import Plant, Truth
 BITS_PER_BYTE: Final = 10  # start, eight data bits, stop
 DEFAULT_BAUD: Final = 1_000_000
 FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware | EmulatedFirmware]
-"Makes what boots: `Firmware`, its rules in C, or these on their processor."
+"What boots: `Firmware`, its rules in C, or these on their processor."
 BYTES: Final = 0
-"The function of bytes on a serial line, for a firmware that reads frames itself."
+"The function of bytes on a serial line."
 WEAR: Final = 4.0
 JUMP_MM: Final = 4.0
-"By how much an encoder leaps."
 WATCHDOG_S: Final = 0.1
 "A firmware that hangs is reset after this time."
 HOT_C: Final = 70.0
 JAMMED_N: Final = 1e5
 "More drag than any motor overcomes."
 MAX_BACKLOG_BYTES: Final = 65_536
-"What both ends' buffers and the adapter between them hold; more is lost, as on a real port."
+"What the buffers hold; more is lost, as on a real port."
 STANDING: Final = frozenset(
     {
         *("worn_gearbox", "motor_dead_left", "motor_reversed_left", "duties_reversed", "overheated"),
@@ -58,17 +57,16 @@ STANDING: Final = frozenset(
         *("other_schema", "commands_vanish", "answers_half", "state_crc", "no_state", "no_sense", "no_status"),
     }
 )
-"Faults without a size or state of their own, looked up where they show."
+"Faults that are looked up where they show."
 OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed", "opening"})
 SILENCES: Final = {FUNCTION[State]: "no_state", FUNCTION[Sense]: "no_sense", FUNCTION[Status]: "no_status"}
-"The fault that keeps a function's messages from being sent."
 DRIVE: Final = bytes((FUNCTION[Drive],))
 LEFT_OPEN: Final = 1
 RIGHT_OPEN: Final = 2
 LEFT_CLOSED: Final = 4
 RIGHT_CLOSED: Final = 8
 END_SWITCHES: Final = [Switches(bits) for bits in range(16)]
-"Flags by the sum of their bits: they are made here, not in a tick."
+"Flags are made here, not in a tick."
 
 
 @final
@@ -98,7 +96,7 @@ class MessageDevice:
         self._boot = boot
         self.outbox: deque[Packet] = deque()
         self.undecodable = 0
-        "Payloads that arrived and were no message."
+        "Payloads that were no message."
         self._faults: deque[Fault] = deque(sorted(faults, key=attrgetter("at_s")))
         self._jitter = random.Random(f"reply jitter {seed}")
         self._jitter_s = parameters.firmware.reply_jitter_us * 1e-6
@@ -153,7 +151,6 @@ class MessageDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When a message arrives, an answer leaves, or the firmware ticks next."""
         event_s = self._tick_due_s
         if self._inbox:
             event_s = min(event_s, self._inbox[0].time_s)
@@ -167,7 +164,7 @@ class MessageDevice:
             self._time_s = time_s
 
     def _drive_bridges(self) -> None:
-        """Put the firmware's output at the motors, in steps of the PWM, as supply and faults let it."""
+        """Put the firmware's output at the motors, as supply and faults let it."""
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
@@ -203,7 +200,7 @@ class MessageDevice:
             self._send(time_s, status)
 
     def _deliver(self, time_s: float, packet: Packet) -> None:
-        """Give the firmware a packet, and queue its answer with the device's jitter."""
+        """Give the firmware a packet, and queue its answer with jitter."""
         if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
         if "answers_half" in self._struck and _is_drive(packet):
@@ -288,7 +285,6 @@ class MessageDevice:
         self._tick_due_s = time_s + TICK_S / self._rate
 
     def _encoders(self, left_rad: float, right_rad: float) -> tuple[int, int]:
-        """Return the encoders' counts since power-on, faults included."""
         stuck = self._stuck_left
         left_counts = math.floor(left_rad * self._counts_per_rad) if stuck is None else stuck
         return (
@@ -321,7 +317,6 @@ class MessageDevice:
         self._drive_bridges()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
-        """Begin `fault`, as `faults.KNOWN` describes it."""
         if fault.name in STANDING:
             self._struck.add(fault.name)
         match fault.name:
@@ -366,14 +361,14 @@ class MessageDevice:
             self._drive_bridges()
 
     def _run_clock_at(self, time_s: float, rate: float) -> None:
-        """Let the firmware's clock run at `rate` device seconds a second from now on."""
+        """Let the firmware's clock run at `rate` from now on."""
         self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
         self._rate = rate
         self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
 
 
 class SerialDevice(Protocol):
-    """What a host has of a device behind a serial line: a `VirtualDevice`, or something in front of one."""
+    """A `VirtualDevice`, or something in front of one."""
 
     @property
     def messages(self) -> MessageDevice:
@@ -387,7 +382,7 @@ class SerialDevice(Protocol):
         """Take the bytes that the host writes at `now_s`."""
 
     def transmit(self, now_s: float) -> bytes:
-        """Let time pass until `now_s`, and return the bytes that have left the line since the last call."""
+        """Return the bytes that have left the line by `now_s` since the last call."""
 
 
 @final
@@ -421,7 +416,6 @@ class VirtualDevice:
         return self._decoder.statistics
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """Let time pass until `now_s`, and take the bytes that the host writes then."""
         self.messages.advance(now_s)
         start_s = max(now_s, self._receiver_free_s)
         room = MAX_BACKLOG_BYTES - math.ceil((start_s - now_s) / self._byte_s)
@@ -437,7 +431,7 @@ class VirtualDevice:
         self._receiver_free_s = start_s + taken * self._byte_s
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`, and queue what the device sends as frames on the line."""
+        """Queue what the device has sent by `now_s` as frames on the line."""
         self.messages.advance(now_s)
         outbox = self.messages.outbox
         while outbox:
@@ -449,13 +443,12 @@ class VirtualDevice:
             self._line.append((start_s, frame))
 
     def transmit(self, now_s: float) -> bytes:
-        """Let time pass until `now_s`, and return the bytes that have left the line since the last call."""
         self.advance(now_s)
         out: list[bytes] = []
         line, byte_s = self._line, self._byte_s
         while line:
             start_s, data = line[0]
-            # a millionth of a byte of tolerance: sums of times are not exact
+            # sums of times are not exact
             done = int((now_s - start_s) / byte_s + 1e-6)
             if done < len(data):
                 if done > 0:
@@ -468,7 +461,6 @@ class VirtualDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When a frame ends on the line, or something happens in the device next."""
         event_s = self.messages.next_event_s
         if self._line:
             start_s, data = self._line[0]
@@ -482,7 +474,6 @@ def _is_drive(packet: Packet) -> bool:
 
 
 def _stretches(data: bytes) -> list[bytes]:
-    """Return `data` cut behind each delimiter, with which a frame has arrived."""
     if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
         return [data]
     *ended, rest = data.split(DELIMITER)

@@ -16,7 +16,7 @@ from tormagd.simulation.warmth import Warmth
 
 @final
 class TorqueElement:
-    """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristle deflection, temperature."""
+    """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristles, temperature."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         self._dt_s = dt_s
@@ -35,7 +35,7 @@ class TorqueElement:
         series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
         self._relax = series.discretise(dt_s)
 
-        # the device has been standing at this gap for long before the power came
+        # the device has been at this gap for long before the power came
         self._memory = series.relaxed(self._force.at(self._field.moment_Tm))
         self._deflection_mm = 0.0
         self.force_N = 0.0
@@ -58,11 +58,10 @@ class TorqueElement:
         self.kinetic_N = max(relaxed_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """Return the friction with which the step begun by `prepare` would end at this speed."""
+        """Return the friction with which the step would end at this speed."""
         return self._friction.advance(self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
-        """End the step that `prepare` began."""
         self.force_N, self._deflection_mm = self._friction.advance(
             self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s
         )

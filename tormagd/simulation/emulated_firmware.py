@@ -33,7 +33,7 @@ from tormagd.simulation.firmware import OFF, Answer, Output, Sensors
 from tormagd.simulation.parameters import PlantParameters
 
 CYCLES_PER_S: Final = 25e6
-"Of the timers that the firmware has its time from."
+"Of the firmware's timers."
 MACHINE: Final = (
     *("-M", "mps2-an386", "-display", "none", "-nodefaults"),
     # an instruction takes a nanosecond of the machine's time, a sleep none of the computer's
@@ -62,7 +62,7 @@ class _PinsOut(ctypes.Structure):
 
 
 class EmulatedFirmware:
-    """One device's firmware on its processor from its boot on, with the interface of `Firmware`."""
+    """One device's firmware on its processor, with the interface of `Firmware`."""
 
     def __init__(self, plant: PlantParameters) -> None:
         program, emulator = build(Target.MPS2), debian_tool("qemu-system-arm")
@@ -96,7 +96,7 @@ class EmulatedFirmware:
         return self.hear(time_s, frame, sensors)
 
     def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
-        """Let bytes arrive, at most one whole frame, and return what was answered to them."""
+        """Let at most one whole frame arrive, and return what was answered."""
         answer = Answer.NONE
         for start in range(0, len(data), MAX_BYTES):
             messages = self._wake(time_s, sensors, data[start : start + MAX_BYTES])
@@ -140,7 +140,7 @@ class EmulatedFirmware:
         return INSTRUCTIONS_PER_CYCLE * int(self._pins.busy)
 
     def _answer(self, messages: list[Message]) -> Answer:
-        """Keep what the firmware has sent in one wake, and return what answer it is."""
+        """Keep what the firmware has sent, and return what answer it is."""
         answer = Answer.NONE
         match messages:
             case [State() as state, Sense() as sense, *rest]:
@@ -156,7 +156,7 @@ class EmulatedFirmware:
         return answer
 
     def _wake(self, time_s: float, sensors: Sensors, data: bytes = b"") -> list[Message]:
-        """Let the firmware sleep until `time_s`, then act on its sensors and at most MAX_BYTES of `data`."""
+        """Let the firmware sleep until `time_s`, then act on its sensors and `data`."""
         cycles = round(time_s * CYCLES_PER_S)
         record = _PinsIn(seen(sensors), cycles - self._cycles, len(data))
         self._pins = pins = self._told(bytes(record), data)

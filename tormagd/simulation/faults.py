@@ -46,8 +46,6 @@ class FaultError(ValueError):
 
 
 class Fault(NamedTuple):
-    """One fault, and when it begins in seconds since power-on."""
-
     name: str
     at_s: float = 0.0
     percent: float = 0.0

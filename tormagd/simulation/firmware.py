@@ -47,8 +47,8 @@ MAX_TEMPERATURE_C: Final = 60.0
 VERSION: Final = (1, 0)
 SERIAL_NUMBER: Final = 1
 
-# An operation on flags makes new ones in a microsecond, and looking up an enumeration's member takes a fifth of one:
-# what every tick needs is made and named here
+# looking up an enumeration's member takes a fifth of a microsecond, an operation on flags a whole one: what every tick
+# needs is made here
 HOMED_SWITCHES: Final = [Switches(bits) | Switches.HOMED for bits in range(16)]
 CLOSED_SWITCHES: Final = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
 NO_FAULT: Final = DeviceFault(0)
@@ -63,7 +63,7 @@ DRIVES_OFF: Final = DriveMode.OFF
 
 @final
 class Sensors(Value):
-    """What the electronics measure at one time. Encoder counts are since boot, positive opening."""
+    """What the electronics measure. Encoder counts are since boot, positive opening."""
 
     def __init__(
         self,
@@ -102,8 +102,6 @@ OFF: Final = Output(0.0, 0.0, enabled=False)
 
 
 class Answer(Enum):
-    """What the firmware answers to a received message."""
-
     NONE = auto()
     IDENTITY = auto()
     MEASUREMENT = auto()
@@ -116,7 +114,7 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 
 @final
 class Firmware:
-    """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall."""
+    """One device's firmware from its boot on. Times are device time, seconds since boot, and never fall."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm
@@ -150,7 +148,7 @@ class Firmware:
         if isinstance(message, Drive):
             return self._drive(time_s, message, sensors)
         if isinstance(message, Hello):
-            # accepted whatever it was before, so that a new host starts from a known nonce
+            # a new host starts from a known nonce
             self._nonce = message.nonce
             self._compatible = message.schema_hash == SCHEMA_HASH and message.protocol_version == PROTOCOL_VERSION
             if not self._compatible:
@@ -212,7 +210,7 @@ class Firmware:
         return True
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick: the motion under way and the watches, which may latch faults."""
+        """Run one 1 kHz tick: the motion under way and the watches."""
         if self.mode is RUN:
             self._tick_run(time_s, sensors)
         elif self._motors_on:
@@ -223,7 +221,6 @@ class Firmware:
         return None if self._ticks % STATUS_TICKS else self.status(sensors)
 
     def _tick_run(self, time_s: float, sensors: Sensors) -> None:
-        """Watch a run: any fault is latched, ends it and opens the gap."""
         left_mm, right_mm = self._positions_mm(sensors)
         fault = self._causes(time_s, sensors)
         if time_s - self._drive_s > COMMAND_TIMEOUT_S:
@@ -238,7 +235,6 @@ class Firmware:
         self.output = self._bounded(self.output, sensors)
 
     def _tick_motion(self, time_s: float, sensors: Sensors) -> None:
-        """Advance homing or retraction by one tick, and end it where it is done."""
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
         homing = isinstance(motion, HomingMotion)
@@ -255,7 +251,7 @@ class Firmware:
         if outcome is Outcome.MOVING:
             return
         if outcome is Outcome.REVERSED:
-            # opening is what it cannot do: friction holds the gap where it is
+            # friction holds the gap where it is
             self.faults |= DeviceFault.HOMING_FAILED
             self._rest(time_s, LATCHED)
             return
@@ -281,7 +277,7 @@ class Firmware:
 
     @staticmethod
     def _bounded(output: Output, sensors: Sensors) -> Output:
-        """Return `output` without an opening duty for a carriage at its open switch, which must not run into the stop."""
+        """Keep a carriage at its open switch from running into the stop."""
         if not sensors.switches:
             return output
         return Output(
@@ -291,7 +287,7 @@ class Firmware:
         )
 
     def _fail(self, time_s: float, fault: DeviceFault, sensors: Sensors) -> None:
-        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves."""
+        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move."""
         self.faults |= fault
         if not self._motors_on and DeviceFault.UNCOMMANDED_MOTION not in fault:
             self._rest(time_s, LATCHED)
@@ -314,7 +310,7 @@ class Firmware:
         )
 
     def _rest(self, time_s: float, mode: DeviceMode) -> None:
-        """Open the bridges, end the motion, and enter `mode`; LATCHED also makes the device unhomed."""
+        """Open the bridges and enter `mode`; LATCHED also makes the device unhomed."""
         self.mode = mode
         self.output = OFF
         self._motion = None
@@ -328,7 +324,6 @@ class Firmware:
         return self.mode is not IDLE and self.mode is not LATCHED
 
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
-        """Return the faults whose cause is there now, whatever the device does."""
         causes = NO_FAULT
         if not MIN_SUPPLY_V <= sensors.supply_V <= MAX_SUPPLY_V:
             causes |= DeviceFault.SUPPLY
@@ -351,7 +346,7 @@ class Firmware:
         self._right_calm_s = time_s
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
-        """Return how far the carriages have moved from where they rested; the further of the two counts."""
+        """Return how far a carriage has moved from where it rested."""
         if time_s - self._watch_since_s < COASTING_S:
             return 0.0
         left, right = sensors.left_counts, sensors.right_counts
@@ -393,7 +388,7 @@ class Firmware:
         )
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return State and Sense of that moment, and advance State's counter."""
+        """Return State and Sense, and advance State's counter."""
         left_mm, right_mm = self._positions_mm(sensors)
         self._state_counter = (self._state_counter + 1) % 256
         return (

@@ -18,7 +18,7 @@ PRESSES_AT_S: Final = 10.0
 PRESSING_MM_S: Final = 1.0
 EXACT_N: Final = 1e-9
 ROUNDS: Final = 100
-"How exactly, and in how many rounds at most, a step of a hand that feels is solved."
+"How exactly, and in how many rounds at most, a felt step is solved."
 RECORDED = {"t_s": TIME, "position_mm": (-1e6, 1e6, "mm")}
 KNOWN = (
     "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], felt[=KEY=VALUE,...], "
@@ -27,19 +27,19 @@ KNOWN = (
 
 
 class HandError(ValueError):
-    """A hand specification or recording that cannot be used; the message says what is allowed."""
+    """A hand specification or recording that cannot be used."""
 
 
 class Hand(Protocol):
     """Prescribed motion of the roller's surface, or of a finger into a pad."""
 
     def position_mm(self, time_s: float) -> float:
-        """Return the travel of the roller's surface since time 0, or the finger's depth."""
+        """Return the travel of the roller's surface, or the finger's depth."""
 
 
 @final
 class SteadyHand(Value):
-    """A hand that turns at a constant speed: 42 mm/s at the 20 rpm of the thesis's measurements."""
+    """A hand that turns at a constant speed, by default the thesis's 20 rpm."""
 
     def __init__(self, rpm: float = DEFAULT_RPM) -> None:
         self.rpm: Final = rpm
@@ -50,7 +50,7 @@ class SteadyHand(Value):
 
 @final
 class ReversingHand(Value):
-    """A hand that goes forth, rests, goes back and rests, in smooth strokes of 30 mm."""
+    """A hand that goes forth, rests, goes back and rests, in smooth strokes."""
 
     def __init__(self, period_s: float = DEFAULT_PERIOD_S) -> None:
         self.period_s: Final = period_s
@@ -65,7 +65,7 @@ class ReversingHand(Value):
 
 @final
 class PressingHand(Value):
-    """The dummy finger of the thesis's pulse experiment, which presses `depth_mm` into the pad at 1 mm/s."""
+    """The finger of the thesis's pulse experiment, which presses into the pad at 1 mm/s."""
 
     def __init__(self, depth_mm: float = DEFAULT_DEPTH_MM) -> None:
         self.depth_mm: Final = depth_mm
@@ -76,7 +76,7 @@ class PressingHand(Value):
 
 @final
 class RecordedHand(Value):
-    """Recorded motion, linear between its points, standing before the first and after the last."""
+    """Recorded motion, linear between its points, standing before and after them."""
 
     def __init__(self, times_s: tuple[float, ...], positions_mm: tuple[float, ...]) -> None:
         self.times_s: Final = times_s
@@ -95,9 +95,7 @@ class RecordedHand(Value):
 
 @final
 class StrokingHand(Value):
-    """A hand that rests for 10 s, until the device is homed, then pushes to `reach_mm`, rests, withdraws, rests, and so
-    on.
-    """
+    """A hand that rests until the device is homed, then pushes, rests, withdraws, rests, and so on."""
 
     def __init__(self, push_mm_s: float, reach_mm: float, rest_s: float) -> None:
         self.push_mm_s: Final = push_mm_s
@@ -113,7 +111,7 @@ class StrokingHand(Value):
 
 @final
 class Impedance(Value):
-    """The mass that moves with the handle, and the spring and damper of the hand behind that mass."""
+    """The mass that moves with the handle, and the hand's spring and damper behind it."""
 
     def __init__(self, mass_kg: float, stiffness_N_mm: float, damping_N_s_mm: float) -> None:
         self.mass_kg: Final = mass_kg
@@ -123,7 +121,7 @@ class Impedance(Value):
 
 @final
 class FeltHand:
-    """A hand that feels: spring and damper draw its mass towards an intended motion, while the friction resists."""
+    """A hand that feels: spring and damper draw its mass towards an intended motion, while friction resists."""
 
     def __init__(self, intended: Hand, impedance: Impedance, lets_go_s: float = math.inf) -> None:
         self._intended = intended
@@ -133,7 +131,7 @@ class FeltHand:
         self._place_mm = intended.position_mm(0.0)
         self.speed_mm_s = 0.0
         self.force_N = 0.0
-        "Mean force of spring and damper on the mass in the last step."
+        "Mean force of spring and damper in the last step."
 
     def position_mm(self, time_s: float) -> float:
         """Return the intended place; `moved_mm` gives the real one."""
@@ -193,7 +191,7 @@ _SIZED: dict[str, tuple[Callable[..., Hand], float, float]] = {
     "reversing": (ReversingHand, 0.1, 1000.0),
     "pressing": (PressingHand, 0.1, 6.0),
 }
-"A hand with one size: its class, and the least and greatest size."
+"Its class, and the least and greatest size."
 _FELT: dict[str, tuple[float, float, float]] = {
     "mass_kg": (0.1, 0.001, 20.0),
     "stiffness_N_mm": (0.4, 0.0, 100.0),
@@ -202,11 +200,11 @@ _FELT: dict[str, tuple[float, float, float]] = {
     "reach_mm": (20.0, 0.1, 1000.0),
     "rest_s": (1.0, 0.0, 1000.0),
 }
-"A size of a hand that feels: its default, least and greatest."
+"Default, least and greatest size."
 
 
 def parse_hand(spec: str) -> Hand:
-    """Return the hand that the command-line word `spec`, one of KNOWN, stands for. Raises HandError."""
+    """Return the hand that the command-line word `spec` stands for. Raises HandError."""
     name, _, value = spec.partition("=")
     if name in _SIZED:
         hand, low, high = _SIZED[name]
@@ -241,7 +239,7 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
 
 
 def read_recording(path: Path) -> RecordedHand:
-    """Read a hand's motion from a CSV file with the columns t_s and position_mm. Raises HandError."""
+    """Read a hand's motion from a CSV file. Raises HandError."""
     try:
         table = read_table(path, RECORDED)
     except ForceFileError as error:

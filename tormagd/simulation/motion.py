@@ -32,8 +32,6 @@ LATE_S: Final = 0.5  # to turn round, to taper, to settle at the switch
 
 @final
 class Carriage(Value):
-    """What the firmware knows of one carriage."""
-
     def __init__(self, position_mm: float, at_open_end: bool, current_A: float) -> None:
         self.position_mm: Final = position_mm
         self.at_open_end: Final = at_open_end
@@ -49,14 +47,13 @@ class Outcome(Enum):
 
 @final
 class Ramp:
-    """A position ramp that leads one carriage at a bounded speed, and the duty that follows the ramp."""
+    """A position ramp that leads one carriage, and the duty that follows it."""
 
     def __init__(self, position_mm: float, lead_mm_rev: float) -> None:
         self._reference_mm = position_mm
         self._full_speed_mm_s = NO_LOAD_REV_S * lead_mm_rev
 
     def duty(self, position_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Advance the ramp at `speed_mm_s`, and return the duty for the carriage."""
         reference_mm = self._reference_mm + speed_mm_s * dt_s
         self._reference_mm = min(max(reference_mm, position_mm - RAMP_LEAD_MM), position_mm + RAMP_LEAD_MM)
         duty = speed_mm_s / self._full_speed_mm_s + RAMP_GAIN_PER_MM * (self._reference_mm - position_mm)
@@ -77,7 +74,6 @@ class CarriageOpening:
         self.outcome = Outcome.MOVING
 
     def step(self, time_s: float, dt_s: float, carriage: Carriage, speed_mm_s: float) -> None:
-        """Advance by one tick, and set `duty` and `outcome`."""
         if self.outcome is Outcome.FAILED:
             return
         if carriage.at_open_end:
@@ -102,7 +98,7 @@ class CarriageOpening:
 
 @final
 class Retraction:
-    """Opens the gap: brings both carriages to their open switches, each as far as it comes."""
+    """Brings both carriages to their open switches, each as far as it comes."""
 
     def __init__(
         self,
@@ -130,14 +126,13 @@ class Retraction:
         return Outcome.FAILED in [opening.outcome for opening in self._openings]
 
     def is_late(self, time_s: float) -> bool:
-        """Tell whether the motion has taken longer than the whole stroke takes a device that can open."""
+        """Tell whether the motion takes longer than the whole stroke takes a device that can open."""
         return time_s > self._late_s
 
     def is_reversed(self, carriages: tuple[Carriage, Carriage]) -> bool:
         return True in [opening.went_back(each) for opening, each in zip(self._openings, carriages, strict=True)]
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Advance both carriages by one tick, set `duties`, and return the outcome."""
         for opening, carriage in zip(self._openings, carriages, strict=True):
             opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))
         outcomes = [opening.outcome for opening in self._openings]
@@ -148,7 +143,7 @@ class Retraction:
     def _bounded_mm_s(self, carriage: Carriage) -> float:
         if not self._tapered:
             return self._speed_mm_s
-        # beyond where its switch should have been the zero is wrong, as after an encoder's leap: it searches there
+        # beyond where its switch should have been the zero is wrong: it searches there
         most_mm_s = self._speed_mm_s if carriage.position_mm < 0.0 else SEARCH_SHARE * self._speed_mm_s
         return min(most_mm_s, CREEP_MM_S + TAPER_PER_S * abs(carriage.position_mm))
 
@@ -178,12 +173,11 @@ class HomingMotion:
 
     @property
     def zeros_mm(self) -> tuple[float, float]:
-        """Encoder positions at which the open switches closed; 0 for one that was not found."""
+        """Where the open switches closed; 0 for one that was not found."""
         left_mm, right_mm = self._edges_mm
         return left_mm or 0.0, right_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Advance by one tick, set `duties`, and return the outcome."""
         if time_s >= self._deadline_s:
             return Outcome.FAILED
         if self._search is None:

@@ -18,14 +18,14 @@ PLANTS_INSERT = "MRE-50-40"
 _PLANTS = resources.files(__package__) / "plants"
 
 PlantError = ConfigError
-"A plant file that cannot be used: the message names the file, the key path, the value and what is allowed."
+"A plant file that cannot be used: the message names key, value and what is allowed."
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Share = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
 class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
-    """The MRE insert around the shaft, as in tables 2.3 and 2.4 of the thesis."""
+    """The MRE insert, as in tables 2.3 and 2.4 of the thesis."""
 
     shear_modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
     relative_permeability: Annotated[float, Meta(ge=1.0, le=10.0)]
@@ -33,8 +33,6 @@ class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Friction(Struct, frozen=True, forbid_unknown_fields=True):
-    """Contact of insert and shaft."""
-
     static_to_kinetic: Annotated[float, Meta(ge=1.0, le=3.0)]
     stribeck_speed_mm_s: Positive
     presliding_stiffness_N_mm: Positive
@@ -51,7 +49,7 @@ class Field(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
-    """Prony terms of an elastomer: each share of a force step dies away with its time constant."""
+    """Prony terms: each share of a force step dies away with its time constant."""
 
     fractions: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
     times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
@@ -67,8 +65,8 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """A tactile pad between plates, in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked
-    pad at small strain.
+    """A tactile pad in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked pad at small
+    strain.
     """
 
     cip_percent: Annotated[float, Meta(ge=0.0, le=60.0)]
@@ -91,7 +89,7 @@ class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """The element of the second plant; `SecondElement` states the laws of these constants."""
+    """The element of the second plant: see `SecondElement`."""
 
     concentration: Annotated[float, Meta(ge=1.0, le=3.0)]
     without_field_N: NotNegative
@@ -120,7 +118,7 @@ class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
-    """How the insert's temperature affects the force, and how fast the insert begins to warm."""
+    """How temperature affects the force, and how fast the insert begins to warm."""
 
     force_percent_K: Annotated[float, Meta(ge=-5.0, le=5.0)]
     drift_K_h: Annotated[float, Meta(ge=0.0, le=20.0)]
@@ -143,9 +141,7 @@ class Motor(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Gear(Struct, frozen=True, forbid_unknown_fields=True):
-    """One gearbox. The mesh loses 1 - `efficiency` of the torque above `output_friction_Nm`, which the no-load current
-    shows.
-    """
+    """The mesh loses 1 - `efficiency` of the torque above `output_friction_Nm`, which the no-load current shows."""
 
     ratio: Annotated[float, Meta(ge=1.0)]
     efficiency: Annotated[float, Meta(gt=0.0, le=1.0)]
@@ -153,8 +149,6 @@ class Gear(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Screw(Struct, frozen=True, forbid_unknown_fields=True):
-    """Lead screw, nut and guide of each carriage."""
-
     lead_mm: Annotated[float, Meta(gt=0.0, le=50.0)]
     friction_coefficient: Annotated[float, Meta(ge=0.0, le=1.0)]
     drag_left_N: NotNegative
@@ -164,7 +158,7 @@ class Screw(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
-    """Drive stage and encoders; counts are per turn of the gearbox output."""
+    """Encoder counts are per turn of the gearbox output."""
 
     encoder_counts_per_rev: Annotated[int, Meta(ge=16, le=1_000_000)]
     supply_V: Annotated[float, Meta(gt=0.0, le=25.0)]
@@ -238,9 +232,9 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     firmware: FirmwareTiming
     assumed: Assumed = Assumed()
     pad: PadParameters | None = None
-    "In the place of insert and shaft; `elastomer`, `friction` and `relaxation` are then unused."
+    "In the place of insert and shaft, whose tables are then unused."
     second: SecondParameters | None = None
-    "In the place of the insert; `elastomer`, `friction`, `relaxation` and `field` are then unused."
+    "In the place of the insert, whose tables and `field` are then unused."
 
     def __post_init__(self) -> None:
         limit_A = self.electronics.current_limit_A
@@ -261,7 +255,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Between(Struct, frozen=True, forbid_unknown_fields=True):
-    """A plant file with a pad or the second plant's element. `carriages` names the plant with all the other parts."""
+    """A plant file with another element. `carriages` names the plant with all the other parts."""
 
     carriages: str
     pad: PadParameters | None = None
@@ -285,7 +279,7 @@ def plant_names() -> tuple[str, ...]:
 
 
 def load_plant(path_or_name: str | Path) -> PlantParameters:
-    """Read a plant by the name of a packaged one, such as `sample_1`, or from a TOML file. Raises PlantError."""
+    """Read a packaged plant by its name, such as `sample_1`, or a TOML file. Raises PlantError."""
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)
     if isinstance(read, PlantParameters):
@@ -295,7 +289,7 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
-    """Return the plant with the insert called `name` in the place of its own."""
+    """Return the plant with another insert."""
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
     own = plant.elastomer
     fitted = Elastomer(

@@ -23,7 +23,7 @@ T = TypeVar("T")
 PERIOD_S: Final = 2e-3
 VALID_MS: Final = 100.0
 FORCE, WAY, LAW = MODES = ("force", "way", "law")
-"A setpoint says the tip's force, the force of each way, or the law by which the force follows the handle."
+"The tip's force, the force of each way, or the law by which the force follows the handle."
 VESSEL: Final = Friction(presliding_stiffness_N_mm=2.0, viscous_N_s_mm=0.0, static_ratio=1.2, stribeck_speed_mm_s=2.0)
 "An assumption: the tip sticks, and slips at less force."
 
@@ -40,7 +40,7 @@ class Felt(NamedTuple):
 
 
 class Patient:
-    """A robot's tip that follows the handle with a first-order lag, in a vessel with an elastic wall, which may beat."""
+    """A robot's tip that follows the handle late, in a vessel with an elastic wall, which may beat."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class Patient:
         self._contact_mm: float | None = None
 
     def update(self, time_s: float, handle_mm: float) -> Felt:
-        """Advance to `time_s` with the handle at `handle_mm`, and return what the tip feels."""
+        """Advance to `time_s`, and return what the tip feels."""
         if math.isnan(self._time_s):
             self._time_s, self._start_mm, self._robot_mm, self._tip_mm = time_s, handle_mm, handle_mm, handle_mm
         dt_s, self._time_s = time_s - self._time_s, time_s
@@ -89,7 +89,7 @@ class Patient:
 
 
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
-    """Return the fields of a setpoint that says what the tip feels, in one of MODES."""
+    """Return the fields of a setpoint that says what the tip feels."""
     if mode == FORCE:
         return {"servo_cf": abs(felt.force_N)}
     fields: dict[str, Any] = {"servo_cf": felt.wall_N + felt.friction_N}
@@ -105,7 +105,7 @@ def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
 
 
 class NetworkDelay(Generic[T]):
-    """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage."""
+    """One direction of a network: a delay, jitter on top, losses in bursts, and one outage."""
 
     def __init__(
         self,
@@ -136,7 +136,7 @@ class NetworkDelay(Generic[T]):
             heapq.heappush(self._under_way, (arrives_s, self._sent, time_s, value))
 
     def arrived(self, time_s: float) -> list[tuple[float, T]]:
-        """Return when it was sent, and the value, of all that has arrived since the last call."""
+        """Return the time of sending and the value of all that has arrived since the last call."""
         found = []
         while self._under_way and self._under_way[0][0] <= time_s:
             found.append(heapq.heappop(self._under_way)[2:])

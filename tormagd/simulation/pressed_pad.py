@@ -17,7 +17,7 @@ MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
 
 @final
 class PressedPad:
-    """The worked, rested pad between the magnets, with its state: magnetic branch, conditioning, temperature."""
+    """The worked, rested pad between the magnets, with its state."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         if plant.pad is None:
@@ -37,7 +37,7 @@ class PressedPad:
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
-        """Advance by one step that ends at `time_s` and `gap_mm`, with the finger pressing at `speed_mm_s`."""
+        """Advance by one step that ends at `time_s` and `gap_mm`."""
         field_mT = MT_PER_TM * self._field.advance(gap_mm)
         depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)
         speed_mm_s = min(max(speed_mm_s, -FASTEST_MM_S), FASTEST_MM_S)

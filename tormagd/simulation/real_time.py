@@ -15,13 +15,13 @@ from tormagd.simulation.plant import Truth
 LATE_S = 2e-3
 "From here on a wake-up is late: two firmware ticks."
 SLIP_S = 5e-3
-"From here on the device's time stands still instead, because the process did not run, as no microcontroller would."
+"From here on the device's time stands still instead, because the process did not run."
 TRUTH_PERIOD_S = 1e-3
 TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C,kinetic_N\n"
 
 
 class PacedDevice(Protocol):
-    """A device with its wire, run by calls; times are seconds from power-on and never fall."""
+    """A device with its wire; times are seconds from power-on and never fall."""
 
     @property
     def truth(self) -> Truth:
@@ -43,7 +43,7 @@ class Door(Protocol):
         """What a host opens."""
 
     def descriptors(self) -> Sequence[int]:
-        """Return the file descriptors that become readable when something comes from a host."""
+        """Return the file descriptors to wait on for hosts."""
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
         """Hand the device what has come, and hosts what the device has sent by `now_s`."""
@@ -53,16 +53,14 @@ class Door(Protocol):
 
 
 class Punctuality(NamedTuple):
-    """How well real time was kept."""
-
     late: int
     worst_s: float
     slipped_s: float
 
 
 def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: TextIO | None = None) -> Punctuality:
-    """Run `device` behind `door` in real time until `stopped()`, and return how well real time was kept."""
-    # nothing made so far will die: keep the collector from walking it while the device runs
+    """Run `device` behind `door` in real time until `stopped()`, and return how well that was kept."""
+    # keeps the collector from walking what will not die while the device runs
     gc.freeze()
     power_on_s = time.monotonic()
     realtime_ns = time.time_ns()

@@ -19,7 +19,7 @@ from tormagd.simulation.parameters import PlantParameters, SecondParameters
 from tormagd.simulation.warmth import Warmth
 
 RESTED_S: Final = 1000.0
-"How long the handle has been standing when the power comes."
+"How long the handle has stood when the power comes."
 
 
 def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) -> float:
@@ -35,13 +35,13 @@ def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) 
 
 
 def fresh_N(field_mT: float, second: SecondParameters) -> float:
-    """Return the kinetic friction of the fresh, cool element at the reference speed."""
+    """Return the fresh, cool element's kinetic friction at the reference speed."""
     saturation = math.tanh(field_mT / second.saturating_mT)
     return second.without_field_N + second.saturated_N * saturation * saturation
 
 
 def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> float:
-    """Return the friction at this speed and contact age over that of steady sliding at the reference speed."""
+    """Return the friction over that of steady sliding at the reference speed."""
     reference_mm_s, slow_mm_s = second.reference_mm_s, second.slow_mm_s
     reference_age = second.renewed_mm / reference_mm_s / second.ageing_s
     faster = math.log((slow_mm_s + abs(speed_mm_s)) / (slow_mm_s + reference_mm_s))
@@ -87,7 +87,7 @@ class SecondElement:
         self.kinetic_N = max((1.0 - second.creeping_share) * driving_N + self._creeping_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """Return the friction with which the step begun by `prepare` would end at this speed."""
+        """Return the friction with which the step would end at this speed."""
         return self._slid(speed_mm_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
@@ -111,7 +111,7 @@ class SecondElement:
         return force_N, age_s, springs_mm
 
     def _magnetised_mT(self, gap_mm: float) -> float:
-        """Move the plays to the field at `gap_mm`, and return that field with their hysteresis."""
+        """Move the plays, and return the field with their hysteresis."""
         second = self._second
         field_mT = shaft_field_mT(gap_mm, self._plant, second.concentration)
         found_mT = field_mT

@@ -8,7 +8,7 @@ from tormagd.simulation.parameters import PlantParameters
 
 @final
 class Warmth:
-    """Temperature of the elastomer: it rises exponentially from the ambient temperature towards the warmest."""
+    """Temperature of the elastomer, which rises exponentially from the ambient to the warmest."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self._force_per_K: Final = plant.thermal.force_percent_K / 100.0
