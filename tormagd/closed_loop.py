@@ -75,12 +75,10 @@ class VirtualPort:
         self._unread = b""
 
     def open(self) -> Self:
-        """Drop all bytes that wait for their reader, and begin with a new codec."""
         self.stream, self._unread = FrameStream(), b""
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let the device run until `now_s`."""
         self.now_s = now_s
         self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
 
@@ -89,12 +87,10 @@ class VirtualPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the valid messages in the bytes that wait."""
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
 
     def send(self, message: Message) -> None:
-        """Put one message on the device's line."""
         self.device.receive(self.now_s, self.stream.pack(message))
 
     def close(self) -> None:
@@ -111,13 +107,11 @@ class VirtualBus:
         self._unread: list[CanFrame] = []
 
     def open(self) -> Self:
-        """Drop all frames that wait for their reader, and begin with a new codec."""
         self.stream = CanStream(DEFAULT_NODE)
         self._unread.clear()
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let bus and device run until `now_s`."""
         self.now_s = now_s
         arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
         self._unread = [*self._unread, *arrived][-MAX_UNREAD_FRAMES:]
@@ -133,7 +127,6 @@ class VirtualBus:
         return self.stream.unpack_all(arrived)
 
     def send(self, message: Message) -> None:
-        """Put one message on the bus as a frame."""
         identifier, data = self.stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
 
@@ -204,7 +197,6 @@ class ClosedLoop:
         self._port.advance(self.now_s)
 
     def command(self, name: str) -> None:
-        """Carry out an operator's command under the present conditions."""
         self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
@@ -215,7 +207,6 @@ class ClosedLoop:
     def run(
         self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
     ) -> Iterable[Sample]:
-        """Run the ticks of the next `duration_s` one by one, and yield their samples."""
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
@@ -243,7 +234,7 @@ class ClosedLoop:
         return planner.planned
 
     def _answer_question(self, planner: Planner, now_s: float) -> None:
-        """Answer the pending question once SEARCH_S is over, as a search in a process of its own would."""
+        """Answer the pending question once SEARCH_S is over."""
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
             planner.answered(planner.aim.answer_to(asked))
@@ -260,7 +251,7 @@ class ClosedLoop:
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
-    """Return a publisher in virtual time: a function from the time to the newest setpoint."""
+    """Return a function from the time to the newest setpoint of a publisher."""
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()
     sent = 0

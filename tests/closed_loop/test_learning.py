@@ -108,7 +108,6 @@ def test_a_term_that_is_left_out_does_not_act_though_a_preview_tells_what_comes(
 Maker = Callable[..., ClosedLoop]
 LOW_N, HIGH_N = 0.7, 2.0
 REST_S, HOLD_S = 12.0, 12.0
-"The trim knows the device before the step; the elastomer's shortest time constant is 8 s."
 TRIMMED_S = 3.0
 PERIOD_S = 0.01
 

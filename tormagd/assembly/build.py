@@ -42,7 +42,6 @@ MIN_GAIN_MARGIN_DB = 4.0
 SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
 SOURCES += ("tormagd/hardware", "tormagd/control", "tormagd/assembly")
 SENSED_N = 0.001
-"One step of the force sensor's message."
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "Friction holds the gap to within four counts of the encoders."
 STANDBY_N = 0.3
@@ -171,7 +170,6 @@ def _pad(finger: Finger, model: ForceModel) -> tuple[ElementContact, FieldOfGap,
 
 
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
-    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`."""
     fitted, metres = scene.insert, 1e-3
     geometry = Geometry(
         fitted.inner_radius_mm * metres,
@@ -218,7 +216,6 @@ def _stable_margins(config: Config) -> Margins:
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
-    """Raise ConfigError where the voltage cannot open the scene's closed gap."""
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
     needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
     max_V = config.position.duty_limit * motor.supply_V / 2.0
@@ -277,7 +274,6 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
-    """Return the smallest difference of force that the device makes and measures."""
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
@@ -306,7 +302,6 @@ def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
 
 
 def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
-    """Return what ideal carriages at the gap's speed miss of the scene's signal."""
     if scene.signal is None:
         return None
     # a scene whose greatest force is out of reach is asked for what is in reach

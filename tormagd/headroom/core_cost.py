@@ -63,7 +63,6 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
-    """Repeat one plan and one step a beat, and return the processor time of each."""
     found = CoreCost([], [])
     ended = asyncio.Event()
 

@@ -43,7 +43,6 @@ def work() -> tuple[float, float, int]:
 
 
 def machine_us(repetitions: int = REPETITIONS) -> float:
-    """Return the median processor time of one round of `work`."""
     work()
     taken_ns = []
     for _ in range(repetitions):

@@ -68,12 +68,10 @@ class Known:
     def __init__(self, ranges: tuple[tuple[float, float], ...], span_N: float) -> None:
         self.lows: Final = [low for low, _ in ranges]
         self.highs: Final = [high for _, high in ranges]
-        # a feature that never varied counts as a share of its magnitude
         self.scales: Final = [(high - low) or max(abs(low), 1.0) for low, high in ranges]
         self.span_N: Final = span_N
 
     def excess(self, place: int, value: float) -> float:
-        """Return how far a feature lies outside its range, as a share of the range."""
         outside = max(self.lows[place] - value, value - self.highs[place])
         return outside / self.scales[place] if outside > 0.0 else 0.0
 

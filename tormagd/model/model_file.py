@@ -119,8 +119,6 @@ class PhysicalLayers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """The force of an insert over the four `FEATURES`."""
-
     metadata: ModelMetadata
     hidden_weight: Array
     hidden_bias: Array

@@ -20,7 +20,7 @@ class DomainError(ValueError):
         self.allowed = allowed
 
     def __reduce__(self) -> tuple[type["DomainError"], tuple[str, object, str]]:
-        # one raised in a process pool's worker would be rebuilt from its text, and break the pool
+        # an error rebuilt from its text would break a process pool
         return type(self), (self.variable, self.value, self.allowed)
 
 
@@ -30,7 +30,7 @@ def require_that(condition: bool, variable: str, value: object, allowed: str) ->
 
 
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:
-    """Raise `DomainError` unless `value`, or every element of it, is in [low, high]."""
+    """Raise `DomainError` unless every element of `value` is in [low, high]."""
     if isinstance(value, float | int):
         if low <= value <= high:
             return

@@ -11,7 +11,6 @@ from typing import ClassVar, TypeAlias
 from tormagd.physics.errors import Real, require
 
 REFERENCE_PERMEABILITY = 4.0
-"At which both field laws were fitted."
 
 PAD_RADIUS_M = 8.55e-3
 "a / R at this radius is the mean field in a tactile pad between the magnets."

@@ -38,7 +38,6 @@ class Geometry:
 
 
 TORMAG = Geometry(inner_radius_m=0.004, outer_radius_m=0.011, thickness_m=0.020, roller_radius_m=0.020)
-"Table 2.2 of the thesis."
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,6 @@ class Friction(Value):
         self.stribeck_speed_mm_s: Final = stribeck_speed_mm_s
 
     def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
-        """Return the steady level g(v) of the dry part."""
         ratio = speed_mm_s / self.stribeck_speed_mm_s
         return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))
 

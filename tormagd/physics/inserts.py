@@ -52,8 +52,6 @@ class Matrix(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Insert(Struct, frozen=True, forbid_unknown_fields=True):
-    """Fractions are of volume; the shear modulus is without field."""
-
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
     shore_hardness: _Hardness
     cip_fraction: _Fraction

@@ -21,7 +21,7 @@ MAX_GAP_PER_EDGE = 50.0
 
 @dataclass(frozen=True, slots=True)
 class CuboidMagnet:
-    """One block, magnetised along its thickness, which is the axis that joins the two."""
+    """One block, magnetised along its thickness, the axis that joins the two."""
 
     width_m: float
     depth_m: float
@@ -39,7 +39,7 @@ def attraction_N(gap_mm: Real, magnet: CuboidMagnet) -> Real:
     require("gap_mm", gap_mm, MIN_GAP_MM, MAX_GAP_PER_EDGE * min(edges_m) * 1e3)
     gap_m = np.asarray(gap_mm, dtype=np.float64) * 1e-3
     thickness_m = magnet.thickness_m
-    # distances between the magnets' charged faces, each with its sign, and the lateral offsets
+    # distances between charged faces, each with its sign, and the lateral offsets
     axial = ((gap_m, 1.0), (gap_m + thickness_m, -2.0), (gap_m + 2.0 * thickness_m, 1.0))
     across = ((0.0, 1.0), (magnet.width_m, -1.0))
     along = ((0.0, 1.0), (magnet.depth_m, -1.0))

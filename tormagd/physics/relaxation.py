@@ -2,8 +2,8 @@
 
     F = (1 - sum g_i) F0 + sum g_i h_i           dh_i/dt = dF0/dt - h_i / tau_i
 
-F0 is the force without memory. After a step F starts at F0, and relaxes to (1 - sum g_i) F0. A fall after a long rest
-at a high F0 can leave F below zero, where contact is lost: the caller has to bound a brake's level at zero.
+F0 is the force without memory. A fall after a long rest at a high F0 can leave F below zero, where contact is lost: the
+caller has to bound a brake's level at zero.
 """
 
 import math
@@ -13,7 +13,7 @@ from firmware_protocol.value import Value
 from tormagd.physics.errors import DomainError, require, require_that
 
 PronyState: TypeAlias = tuple[float, ...]
-"The last driving force, then one branch force h_i for each time constant."
+"The last driving force, then the h_i."
 
 MAX_FORCE_N: Final = 1e9
 MAX_STEP_S: Final = 1e9
@@ -35,7 +35,6 @@ class PronyStep(Value):
         self.gains: Final = gains
 
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
-        """Return the force, N, and the state after one step."""
         if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
             require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         if len(state) != len(self.fractions) + 1:
@@ -50,7 +49,6 @@ class PronyStep(Value):
         return force_N, tuple(following)
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
-        """Return the step of equal length for other fractions."""
         return PronyStep(fractions, self.decays, self.gains)
 
 

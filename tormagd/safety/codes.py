@@ -16,8 +16,6 @@ class Reaction(StrEnum):
 
 
 class Position(StrEnum):
-    """What is known of the carriages' positions after a fault."""
-
     KEPT = "kept"
     LOST_HERE = "lost"
     LOST_THERE = "given up by the device"
@@ -25,8 +23,6 @@ class Position(StrEnum):
 
 
 class Explanation(NamedTuple):
-    """What a person needs to know about a fault or limit, and how soon the safe reaction begins."""
-
     cause: str
     remedy: str
     reaction: Reaction = Reaction.HELD

@@ -30,8 +30,6 @@ class OperatingState(StrEnum):
 
 
 class Event(StrEnum):
-    """What may change the operating state."""
-
     ENABLE = "enable"
     DISABLE = "disable"
     PAUSE = "pause"
@@ -310,7 +308,7 @@ _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
     """Return `state` in FAULT with the new `faults` latched and the device asked to open."""
-    if not faults:  # as nearly always, a thousand times a second
+    if not faults:
         return state
     new = [fault for fault in faults if fault not in state.faults]
     if not new:
@@ -337,7 +335,7 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
     event = Event(name)
     row = TRANSITIONS[event, state.operating_state]
     if isinstance(row, Refusal):
-        if not conditions.connected:  # a missing device is told first, whatever else is in the way
+        if not conditions.connected:
             require(CONNECTED, state, conditions)
         raise RefusedError(row.code, _refused(row, state), row.remedy)
     for guard in row.guards:
@@ -357,7 +355,6 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 
 
 def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
-    """Raise RefusedError where `guard` does not hold in `state` under `conditions`."""
     message = guard.refuses(state, conditions)
     if message:
         is_told_better = guard is CONNECTED and conditions.remedy
@@ -365,7 +362,6 @@ def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
 
 
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
-    """Return the commands that lead from `state` to ENABLED."""
     if state.operating_state is ENABLED:
         return ()
     if state.operating_state is PAUSED:

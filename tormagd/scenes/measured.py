@@ -29,8 +29,6 @@ class Share(Struct, frozen=True):
 
 
 class Tried(Struct, frozen=True):
-    """The force error of a scene's own signal served in one way, on each of the three samples."""
-
     way: OperatingPoint
     rms_N: tuple[float, ...]
 
@@ -40,8 +38,6 @@ class Tried(Struct, frozen=True):
 
 
 class WorstDevice(Struct, frozen=True):
-    """The worst device of a group in one situation."""
-
     group: str
     device: str
     signal: str

@@ -28,8 +28,6 @@ _SHIPPED = resources.files(__package__)
 
 
 class Force(Strict, frozen=True):
-    """The forces that the task asks for, and how closely they must be rendered."""
-
     least_N: Annotated[float, Meta(ge=0.0, le=1_000.0)]
     "Below the device's F_min the task gets F_min."
     most_N: Annotated[float, Meta(gt=0.0, le=1_000.0)]
@@ -102,7 +100,6 @@ class Budget(Strict, frozen=True):
     """What the control of the scene may cost, as `tormagctl scene check` says."""
 
     core_share: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
-    "Of one processor's time, for steps and plans."
     delay_ms: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
     "How old setpoints may be when they are followed (`SOURCE_LATE`): the budget of the whole way."
 
