@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float64]
 HOMING_S: Final = 10.0
 "The slowest homing takes less."
 SEARCH_S: Final = 0.012
-"Of a search beside the plans: a period of the thesis's 83 Hz."
+"A search beside the plans takes a period of the thesis's 83 Hz."
 MAX_UNREAD_BYTES: Final = 4096
 "Bytes that a serial port keeps for a program that does not read."
 MAX_UNREAD_FRAMES: Final = 512

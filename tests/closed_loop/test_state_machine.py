@@ -43,12 +43,12 @@ from tormagd.simulation.plant import Truth
 UP, DOWN = "to the daemon", "to the device"
 SLOWEST = 0.7
 TIMEOUT_MS = 51
-"By when a device that hears no Drive has left RUN."
+"A device that hears no Drive has left RUN by then."
 SILENT_MS = {FUNCTION[State]: 52, FUNCTION[Status]: 102, FUNCTION[Sense]: 102}
-"By when the daemon drives no more without this stream (docs/states.md)."
+"The daemon stops driving by then without this stream (docs/states.md)."
 ASKED_MS = 5
 RECONNECTED_MS = 6_000
-"By when a device that was reset has been found, asked to open, and is open."
+"A device that was reset has been found, asked to open, and is open by then."
 MODE_AT = 6
 OPEN_MM, OPENED_MM, UNHOMED_MM_S, TURNED_MS = 95.0, 93.5, 8.0, 300.0
 "How slowly a device without a zero opens, and what turning round takes."

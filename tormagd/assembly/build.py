@@ -47,14 +47,14 @@ SETTLES_MM = 4.0 * 8.0 / 4480.0
 STANDBY_N = 0.3
 "A hand may feel this much over the open gap's force of a brake that waits."
 DEPTHS = 9
-"At which a pad's force is checked for whether it rises."
+"A pad's force is checked at this many depths for whether it rises."
 LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
 "How much of a scene's signal is looked at, how often a second, and how often in a period."
 SEVERAL_BRANCHES = named("nearest", neighbours=16, reason="the force falls with the field somewhere")
 "With fewer neighbours answers jump between branches; more gain little (docs/tactile.md)."
 IN_PORTRAIT = Choice("portrait", 0.0, 0, "the scene requires no rate: force over gap is one table")
 BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most exact")
-"At every tolerance and network size: docs/inverse_trade.md."
+"It is so at every tolerance and network size: docs/inverse_trade.md."
 
 
 ROUNDED_UP = 1.005
@@ -65,7 +65,7 @@ class Core(NamedTuple):
     """All that control of one scene needs, immutable. `planner` and `stepper` make the parts that keep state."""
 
     config: Config
-    "With the scene's own gap speed."
+    "It has the scene's own gap speed."
     scene: Scene
     element: Element
     margins: Margins

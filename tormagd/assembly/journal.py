@@ -44,11 +44,11 @@ CONNECTED = "connected"
 "A conversation began or ended. READ and WROTE are in `keeping`."
 STATE, MISSING = "state", "missing"
 MAX_ENTRIES = 4_096
-"When so many entries were not taken, MISSING takes their place."
+"When this many entries were not taken, MISSING takes their place."
 
 _LENGTH = struct.Struct(">I")
 _NONE = b"\xdd" + _LENGTH.pack(0)
-"In msgpack's form with a length of four bytes."
+"An empty array whose length has four bytes."
 
 Entry = str | TickRecord | tuple[Any, ...]
 

@@ -21,9 +21,9 @@ from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceBounds
 VERSION = 1
 MAX_BYTES = 4_096
 WARMTH_SD = 0.04
-"Of the scale between two days: 0.7 % a kelvin, for a room 6 K warmer or colder (plant card)."
+"The scale differs by this between two days: 0.7 % a kelvin, for a room 6 K warmer or colder (plant card)."
 RELAXED_SD_N = 0.06
-"Of the offset, for an elastomer that has rested since."
+"The offset differs by this where the elastomer has rested since."
 ZERO_LASTS_S = 600.0
 "The sensor may have drifted since an older zero, or was tared."
 

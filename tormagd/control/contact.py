@@ -11,7 +11,7 @@ from tormagd.control.records import Measured, TimedSetpoint
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
 
 ROLLER_RATE_MM_S: Final = 42.0
-"At the thesis's 20 rpm: the portrait is drawn for a handle in motion."
+"The thesis turns at 20 rpm; the portrait is drawn for a handle in motion."
 CREEP_MM_S: Final = 0.5
 "A slower handle is planned for at this rate, because its friction is static."
 GONE_BACK_MM: Final = 0.01

@@ -38,7 +38,7 @@ from tormagd.physics.errors import DomainError, require_that
 
 Array: TypeAlias = NDArray[np.float64]
 Ranges: TypeAlias = dict[str, tuple[float, float]]
-"Of each feature and of `force_N`, by name."
+"The range of each feature and of `force_N`, by name."
 
 FORMAT = "tormagd-force-model-1"
 MAX_HIDDEN = 4096

@@ -6,7 +6,7 @@ from pathlib import Path
 from tormagd.named_file import named, shipped
 
 AUTO = "auto"
-"In a scene: the model of its insert, or else of all inserts of its matrix."
+"A scene gets the model of its insert, or else of its matrix."
 _FOLDER, _ENDING = resources.files(__package__) / "models", ".safetensors"
 
 

@@ -16,7 +16,7 @@ from tormagd.physics.errors import Real, require
 MU0_H_M = 4e-7 * math.pi
 MIN_GAP_MM = 0.01
 MAX_GAP_PER_EDGE = 50.0
-"Of the shortest edge; beyond it the corner terms cancel too far."
+"The corner terms cancel too far beyond this many shortest edges."
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ class Transition(NamedTuple):
     source: OperatingState
     target: OperatingState
     reason: str
-    "For the log."
+    "What the log says."
     guards: tuple[Guard, ...] = ()
     "The first that does not hold is told."
     request: DeviceRequest = DeviceRequest.NONE

@@ -38,7 +38,7 @@ class Force(Strict, frozen=True):
     release_N_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.0
     "How fast the force is let go, or passes to another publisher's."
     most_release_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 20.0
-    "How fast it may be lost, whatever fails."
+    "The limit whatever fails."
     standby_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
     "Where the brake waits while less is asked: nearer to the forces that come, and felt as drag."
 
@@ -62,9 +62,9 @@ class Signal(Strict, frozen=True):
     bandwidth_hz: Annotated[float, Meta(gt=0.0, le=100.0)] | UnsetType = UNSET
     "Each rise and each fall is half a period of a cosine of this frequency."
     step_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
-    "Of each rise and fall; by default the whole range."
+    "The height of each rise and fall; by default the whole range."
     hold_s: Annotated[float, Meta(ge=0.0, le=86_400.0)] | UnsetType = UNSET
-    "After each rise and each fall."
+    "The rest after each rise and fall."
     is_known_ahead: bool = False
     "The publisher sends what comes as a preview."
     setpoint_hz: Annotated[float, Meta(ge=MIN_SETPOINT_HZ, le=1_000.0)] | UnsetType = UNSET
@@ -92,7 +92,7 @@ class Finger(Strict, frozen=True):
     """How a finger presses into the pad. The model must have been trained on it."""
 
     depth_mm: Annotated[float, Meta(gt=0.0, le=20.0)]
-    "For which the forces are asked; a finger that is less deep gets the gap of this depth."
+    "The forces are asked for at this depth; a finger that is less deep gets its gap."
     most_mm_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 1.0
 
 
@@ -154,7 +154,7 @@ class Solver(Strict, frozen=True):
 
     name: str = AUTO
     step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET
-    "Of the grid over the field."
+    "The step of the grid over the field."
     neighbours: Annotated[int, Meta(ge=1, le=64)] | UnsetType = UNSET
     "Points of the grid that compete for the answer."
 

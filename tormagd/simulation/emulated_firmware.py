@@ -33,7 +33,7 @@ from tormagd.simulation.firmware import OFF, Answer, Output, Sensors
 from tormagd.simulation.parameters import PlantParameters
 
 CYCLES_PER_S: Final = 25e6
-"Of the firmware's timers."
+"The rate of the firmware's timers."
 MACHINE: Final = (
     *("-M", "mps2-an386", "-display", "none", "-nodefaults"),
     # an instruction takes a nanosecond of the machine's time, a sleep none of the computer's
@@ -41,7 +41,7 @@ MACHINE: Final = (
 )
 INSTRUCTIONS_PER_CYCLE: Final = 40
 MAX_BYTES: Final = 64
-"Of the link, at one wake."
+"The link carries no more at one wake."
 END_S: Final = 5.0
 
 

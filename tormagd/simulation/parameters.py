@@ -14,7 +14,7 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import require
 
 PLANTS_INSERT = "MRE-50-40"
-"Of the committed samples."
+"The committed samples have it."
 _PLANTS = resources.files(__package__) / "plants"
 
 PlantError = ConfigError

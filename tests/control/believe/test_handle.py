@@ -10,7 +10,7 @@ from tormagd.exact import plain
 
 PERIOD_S = 0.002
 STIFFEST_N_MM = 12.0
-"Of a believable elastomer."
+"No believable elastomer is stiffer."
 
 
 def watched(

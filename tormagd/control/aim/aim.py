@@ -60,7 +60,7 @@ class Aim:
     element_mT: float = 0.0
     "Of several fields that give a force, the nearest to this is taken."
     question: Question | None = None
-    "For a search beside the plans; None where plans search themselves."
+    "None where plans search themselves."
     answer: Answer
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:

@@ -96,7 +96,6 @@ class Forecast:
     "-inf before the first setpoint."
     force_N: float
     time_s: float
-    "Of the newest point of the grid."
     history: bytes
     "The forces on the grid, float64, newest last."
     from_s: float

@@ -51,7 +51,7 @@ class Governor:
     above_N: float
     "`asked_N` less the device's least force, as that was known then."
     stamp_s: float
-    "Of the setpoint that the force follows; -inf without one."
+    "-inf where the force follows no setpoint."
     slope_N_s: float
     last_N: float
     "The newest setpoint's force, within what the scene allows."
@@ -66,7 +66,7 @@ class Governor:
     expected_N: float | None
     "What the lagging gap should give by now on its path; None where it follows no path."
     law_N: float | None
-    "Asked for at the place `law_mm` by a wall, or on the ramp from one; None without either."
+    "The force asked at the place `law_mm` by a wall, or on the ramp from one."
     law_mm: float
     blend_N: float
     "What is left of the ramp from one wall to another, or to none."

@@ -32,7 +32,7 @@ SPEEDING_UP_S: Final = 0.025
 NEAR_S: Final = 0.18
 "What the gap reaches within this time is near."
 FLATTEST_N_MM: Final = 1e-3
-"For forces that hardly depend on the gap."
+"The least weight's slope, for forces that hardly depend on the gap."
 
 
 @final

@@ -15,12 +15,12 @@ class Acted:
     """The number of ticks in which each limit of the output has acted."""
 
     rate: int = 0
-    "On the speed of the gap's reference."
+    "The speed of the gap's reference was limited."
     slew: int = 0
-    "On the acceleration of the gap's reference."
+    "The acceleration of the gap's reference was limited."
     not_finite: int = 0
     range: int = 0
-    "On a duty."
+    "A duty was limited."
 
 
 @final

@@ -22,7 +22,7 @@ from tormagd.scenes.scene import Scene
 WEAK_MM: Final = 1.0
 "Carriages that are further behind have weaker motors than believed."
 EXCHANGE_S: Final = 0.0015
-"From a duty to its effect in the encoders' report: one period of exchange, and half a period of holding."
+"A duty shows in the encoders' report after one period of exchange and half a period of holding."
 COULOMB_SPEED_MM_S: Final = 0.5
 "The friction feed-forward fades below this reference speed."
 RESTING_MM_S: Final = 0.02

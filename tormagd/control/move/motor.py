@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 PULL_STATED_MM: Final = 45.0
 "The gap for which `motor.pull_V` is stated."
 MAX_MARGIN_DB: Final = 200.0
-"Of a loop that no gain makes swing or, negative, that swings with every gain."
+"No gain makes such a loop swing or, negative, every gain does."
 PULL_DEPTH_MM: Final = 32.0
 "Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
 

@@ -49,7 +49,7 @@ class Opening:
     left_mm: float = 0.0
     right_mm: float = 0.0
     left_late_s: float = 0.0
-    "Against the device's own speed."
+    "How late the carriage is against the device's own speed."
     right_late_s: float = 0.0
     reported_s: float = 0.0
     waits_s: float = 0.0

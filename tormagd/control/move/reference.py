@@ -10,7 +10,7 @@ from tormagd.control.records import Plan
 CARRY_S: Final = 0.012
 "A plan's gap is carried on for no more than three inference periods."
 APPROACH_S: Final = 0.01
-"Of the last stretch: with less the reference would chase every quantum of its target."
+"With less the reference would chase every quantum of its target."
 MIN_BRAKING: Final = 0.2
 "Share of the acceleration that is left to brake with, however hard the target turns."
 

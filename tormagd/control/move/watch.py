@@ -22,14 +22,14 @@ STILL_MM_S: Final = 0.5
 STARTS_OVER: Final = 1.25
 "Static over kinetic friction: a start from rest may take this many times the greatest force."
 OVER_N: Final = 0.1
-"The error of the sensor."
+"An allowance for the sensor's error."
 OVER_HELD_S: Final = 0.03
 OVER_FAULT_S: Final = 0.1
 "A force over the ceiling opens the gap after the first, and is a fault after the second."
 OVER_FADES: Final = 0.25
-"The time over the ceiling falls by this much per second below it."
+"The time over the ceiling falls by this much per second while the force is below."
 SENSOR_FAULT_S: Final = 2.0
-"Of sliding, without a sensor that is believed: forces are then only as good as the model."
+"A sensor that is not believed for this long of sliding leaves forces only as good as the model."
 SENSE_FAULT_S: Final = 0.1
 STATUS_FAULT_S: Final = 0.1
 "Status comes every 20 ms, Sense with every State."
@@ -43,7 +43,7 @@ TOO_SLOW_SHARE: Final = 0.8
 CLOCK_OFF: Final = 0.01
 CLOCK_FAULT: Final = 0.1
 STALL_SHARE: Final = 0.8
-"A shorter stall of the host did not let the device's timeout expire."
+"Of the device's timeout: a shorter stall of the host did not let it expire."
 
 _DEVICE_RUN: Final = DeviceMode.RUN
 
