@@ -133,7 +133,8 @@ class Phases:
             self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
-        """Run one part and keep its times; return False, and keep none, where it returned False: it had nothing to do."""
+        """Run one part and keep its times; return False, and keep none, where it returned False: it had
+        nothing to do."""
         start_ns = self._clock_ns()
         try:
             is_done = part(beat) is not False

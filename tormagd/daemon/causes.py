@@ -85,7 +85,8 @@ class Causes:
         measurement: Measurement | None,
         now_s: float,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of `limits`."""
+        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of
+        `limits`."""
         told = {
             Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered",
             Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}",

@@ -268,7 +268,8 @@ class Daemon:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     async def _open_gap(self) -> None:
-        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the beat goes on."""
+        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the
+        beat goes on."""
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S

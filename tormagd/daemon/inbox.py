@@ -158,7 +158,8 @@ class SetpointInbox:
             log.warning("%s", self._news.popleft())
 
     def told(self, now_s: float) -> dict[Limit, Explanation]:
-        """Return explanations of the limits about sources, as things are now, whether the limits are in force or not."""
+        """Return explanations of the limits about sources, as things are now, whether the limits are in
+        force or not."""
         holder = self._sources.get(self.holder)
         if holder is None:
             return {}

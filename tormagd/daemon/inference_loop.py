@@ -53,7 +53,8 @@ class InferenceLoop:
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
-        """Plan for the inbox's newest setpoint if one has come (`is_asked`) or if a plan is due, as `planner.planned`."""
+        """Plan for the inbox's newest setpoint if one has come (`is_asked`) or if a plan is due, as
+        `planner.planned`."""
         period_ns = self.timing.period_ns
         # counted from when beats are due, not when they begin: lateness does not lower the rate
         if not is_asked and beat.due_ns < self._due_ns:

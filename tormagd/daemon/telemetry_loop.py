@@ -118,7 +118,8 @@ class TelemetryLoop:
         self._reported_s = -math.inf
 
     def record(self, _beat: Beat) -> None:
-        """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing."""
+        """Keep the record of the control tick that just ran, for recording and black box; before the first
+        do nothing."""
         control = self._control
         if control.output is None or control.used is None:
             return
@@ -200,7 +201,8 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answer requests that waited at the last snapshot, for a limited time; return False where none was answered."""
+        """Answer requests that waited at the last snapshot, for a limited time; return False where none was
+        answered."""
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
@@ -283,7 +285,8 @@ class TelemetryLoop:
             yield from (self._way.to_duty, *self._phases.spent.values())
 
     def _answer(self, request: Request) -> Any:
-        """Return the result of a request: for `status` and `describe` a report, for any other what `command` returns."""
+        """Return the result of a request: for `status` and `describe` a report, for any other what
+        `command` returns."""
         if request.command == "status":
             # built once for everybody who asks in this period
             if self._status is None:
@@ -335,7 +338,8 @@ class TelemetryLoop:
         }
 
     def _add_mark(self, text: object) -> dict[str, Any]:
-        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns` and `text`."""
+        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns`
+        and `text`."""
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
             raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")
@@ -373,7 +377,8 @@ class TelemetryLoop:
         return {"source": source, "instead_of": before}
 
     def _build_status(self, newest: Telemetry) -> Status:
-        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and remedies."""
+        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and
+        remedies."""
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device

@@ -32,7 +32,8 @@ class Topics:
         self._passed_over: tuple[str, int] | None = None
 
     def publish(self, beat: Beat) -> bool:
-        """Publish a verdict where one is new, and the handle's motion where it is due; return False where neither was."""
+        """Publish a verdict where one is new, and the handle's motion where it is due; return False where
+        neither was."""
         listeners = self._endpoint.listeners
         is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
         return (listeners.has(MOTION_TOPIC) and self._publish_motion(beat)) or is_said
@@ -48,7 +49,8 @@ class Topics:
         return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
-        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without a device."""
+        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without
+        a device."""
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
             return False

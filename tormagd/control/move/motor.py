@@ -104,7 +104,8 @@ def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
 
 
 def margins(motor: Motor, position: Position, period_s: float) -> Margins:
-    """Return the margins of one carriage's position loop as it is computed: PID and its filter in z, H(z), and a delay."""
+    """Return the margins of one carriage's position loop as it is computed: PID and its filter in z,
+    H(z), and a delay."""
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)
     plant = zero_order_hold(motor, period_s)
