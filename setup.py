@@ -44,8 +44,7 @@ COMPILED = {
         *("pressed_pad", "hand", "plant", "motion", "firmware", "device"),
     ),
     "tormagd/daemon": (
-        *("rate_group", "beat", "sequence", "stamp_unit", "source_clock", "source_manner", "hold", "playout", "inbox"),
-        *("tally", "allowance", "arrivals", "requests", "telemetry", "way", "topics"),
+        *("rate_group", "beat", "source", "inbox", "tally", "allowance", "arrivals", "requests", "telemetry", "way", "topics"),
         *("control_loop", "inference_loop", "black_box", "telemetry_loop"),
     ),
     "tormagd/lab": ("ideal_actuator",),

@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "config": {"toml_file"},
     "output": set(),
     "command_line": {"named_file", "output"},
+    "drawing": set(),
     "exact": set(),
     "following": set(),
     "keeping": set(),
@@ -42,7 +43,7 @@ MAY_IMPORT = {
     | FILES
     | {"command_line", "following", "output", "keys", "keeping", "slices"}
     | {"inverse", "scenes", "safety", "hardware", "control", "assembly"},
-    "recording": FILES | {"following", "output", "keeping"},
+    "recording": FILES | {"drawing", "following", "output", "keeping"},
     "dashboard": {"following", "output", "recording", "safety"},
     "commission": {"config", "control", "dashboard", "safety"},
     "ctl": FILES
@@ -125,6 +126,12 @@ def test_a_room_imports_only_what_stands_left_of_it():
             continue
         rooms = {room(tuple(name.split("."))) for name in imported(path)} - {None}
         assert rooms <= MAY_IMPORT[here] | {here}, path
+
+
+def test_what_draws_takes_matplotlib_from_one_place():
+    imports = re.compile(r"^ *(from|import) matplotlib\b", re.MULTILINE)
+    paths = [path for path in (*sources(), *TOOLS.rglob("*.py")) if imports.search(path.read_text(encoding="utf-8"))]
+    assert paths == [ROOT / "tormagd/drawing.py"]
 
 
 @pytest.mark.parametrize("here", TOOL_ROOMS)

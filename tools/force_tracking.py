@@ -209,7 +209,8 @@ def compared(found: Followed, best: Bound, start_s: float) -> Json:
 
 
 def samples(pool: Executor) -> Json:
-    """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S."""
+    """The pulse on the three samples and the second plant, with and without preview: the whole of it,
+    and after TRIM_S."""
     rows, played, names = [], pulse_signal(PULSE_S), judging(0)
     cases = [(name, preview_s) for name in names for preview_s in (PREVIEW_S, 0.0)]
     runs, bounds = (

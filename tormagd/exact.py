@@ -132,7 +132,8 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
 
 
 def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
-    """Yield path and value of each plain value in `data`, depth first; `path` is that of `data`, empty for the whole."""
+    """Yield path and value of each plain value in `data`, depth first; `path` is that of `data`, empty
+    for the whole."""
     if not isinstance(data, dict | list | tuple):
         yield path, data
         return

@@ -431,7 +431,8 @@ class Host:
                 raise Unmet(f"on the way to left {left_mm:+.1f} mm, right {right_mm:+.1f} mm: {seen}")
 
     def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] | None = None) -> float:
-        """Send no Drive in RUN for a time, then a Drive RUN; return how long the device's clock says that this was, s."""
+        """Send no Drive in RUN for a time, then a Drive RUN; return how long the device's clock says that
+        this was, s."""
         self.next_status(Beat.RUN)
         self.pass_time(self.random.randrange(20) * PERIOD_S, Beat.RUN)
         self._answered(Beat.RUN)

@@ -18,7 +18,7 @@ from tormagd.ctl.status import firmware_text, status_text
 from tormagd.scenes.scene import load_scene
 from tormagd_client.messages import LinkReport, Status
 
-SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}
+SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply, then tormagctl arm"}
 IN_FAULT = {"operating_state": "FAULT", "faults": ["SUPPLY"], "fault_details": [SUPPLY]}
 STOPPED = {"code": "STOPPED", "cause": "somebody gave the stop command", "remedy": "clear-fault"}
 STANDS = {"code": "NOT_OPENING", "cause": "it stands", "remedy": "remove the insert by hand"}
@@ -91,7 +91,7 @@ ANSWERS: dict[str, list[Row]] = {
         (IN_FAULT | {"arm": ARMED | {"error": A_FAULT}}, {}, 4, ["tormagctl arm: home\n", "it came back"]),
     ],
     "--json home": [
-        (IN_FAULT | {"is_busy": True}, {}, 4, ['"code":"fault"', '"hint":"check the power supply"']),
+        (IN_FAULT | {"is_busy": True}, {}, 4, ['"code":"fault"', "supply, then tormagctl clear-fault"]),
         *NOT_UNDERSTOOD,
     ],
     **{f"--json {command}": UNDONE for command in ("enable", "disable", "pause", "resume", "stop")},
@@ -150,7 +150,7 @@ def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_d
 
     fake_daemon.answers["clear-fault"] = clear
     fake_daemon.says(operating_state="FAULT", faults=["STOPPED"])
-    assert "fault cleared. next: tormagctl arm" in ctl(*fake_daemon.at, "clear-fault").ended(0).out
+    assert "fault cleared; nothing moves before tormagctl arm" in ctl(*fake_daemon.at, "clear-fault").ended(0).out
     assert (fake_daemon.commands[:2], set(fake_daemon.commands[2:])) == (["status", "clear-fault"], {"status"})
 
 

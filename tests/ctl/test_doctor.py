@@ -215,14 +215,19 @@ def test_a_port_that_is_not_there_is_missed(good):
     assert "does not exist" in checks.port(Config(), Machine(good)).found
 
 
-@pytest.mark.parametrize(
-    ("name", "verdict", "found"),
-    [("minicom", "fail", "minicom (process 4242)"), ("tormagd", "ok", "tormagd (process 4242)")],
-)
-def test_only_another_program_takes_the_port_away(good, machine, name, verdict, found):
+@pytest.mark.parametrize("name", ["tormagd", "python", "sh"])  # of an interpreter's path that is short, spaced, long
+def test_the_daemon_that_answers_holds_its_port_by_whatever_name(good, machine, told, name):
     machine.process(4242, name, "/dev/ttyUSB0")
-    finding = checks.port_holder(Config(), Machine(good))
-    assert (finding.verdict, finding.found) == (verdict, found)
+    holder = told(process_id=4242)["port holder"]
+    assert (holder["verdict"], holder["found"]) == ("ok", "tormagd (process 4242)")
+
+
+@pytest.mark.parametrize(("daemon_id", "remedy"), [(1, "end it, or"), (None, "end it, unless it is the daemon, or")])
+def test_another_program_takes_the_port_away(good, machine, daemon_id, remedy):
+    machine.process(4242, "tormagd", "/dev/ttyUSB0")
+    finding = checks.port_holder(Config(), Machine(good), daemon_id)
+    assert (finding.verdict, finding.found) == ("fail", "tormagd (process 4242)")
+    assert finding.remedy == f"{remedy} give tormagd another port"
 
 
 def test_who_made_a_pseudo_terminal_is_not_its_holder(good, machine):

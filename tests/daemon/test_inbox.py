@@ -10,10 +10,8 @@ from hypothesis import given, strategies as st
 
 from tormagd.config import Sources
 from tormagd.control.records import TimedSetpoint, Wall
-from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
-from tormagd.daemon.source_clock import AHEAD_S, SETTLED_S
-from tormagd.daemon.stamp_unit import FACTORS
+from tormagd.daemon.source import AHEAD_S, FACTORS, SETTLED_S
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, SourceReport, decode, encode
@@ -76,7 +74,7 @@ class Publishing:
 
     def passed_over(self) -> tuple[tuple[str, int], tuple[str, int] | None]:
         """Who is followed, and who was passed over, each with its number."""
-        followed = self.inbox.playout.in_force
+        followed = self.inbox.in_force
         return (followed.source, followed.seq), self.inbox.passed_over()
 
     def of(self, source: str) -> SourceReport:
@@ -116,6 +114,14 @@ def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over
     assert (publishing.send(0, 2.0, at_s=0.051), publishing.force_N) == (True, 2.0)
 
 
+def test_a_new_run_begins_a_ramp_also_where_its_first_messages_are_refused(publishing: Publishing) -> None:
+    publishing.send(100, valid_for_ms=1_000.0)
+    for number in range(60):
+        publishing.send(number, 2.0, "a", -2.0, at_s=0.01 + number * 0.005, valid_for_ms=1_000.0)
+        assert publishing.newest.holder == (publishing.force_N == 2.0)
+    assert publishing.force_N == 2.0
+
+
 # -- who holds the brake -------------------------------------------------------------------------------------------
 
 
@@ -130,13 +136,20 @@ def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over
     ],
 )
 def test_what_is_listed_goes_before_what_comes_later_or_is_not(holder: str, other: str, passed: bool) -> None:
-    found = {
-        "while it is fresh": is_passed(Hold(holder), other, PRIORITY, is_stale=False),
-        "once it is stale": is_passed(Hold(holder), other, PRIORITY, is_stale=True),
-        "where it was given the brake": is_passed(Hold(holder, is_given=True), other, PRIORITY, is_stale=False),
-        "where nobody is listed": is_passed(Hold(holder), other, (), is_stale=False),
-    }
-    assert list(found.values()) == [passed, True, False, False], found
+    found = []
+    for priority, is_given, at_s in (
+        (PRIORITY, False, 0.0),
+        (PRIORITY, False, 0.1),
+        (PRIORITY, True, 0.0),
+        ((), False, 0.0),
+    ):
+        publishing = Publishing(priority)
+        publishing.send(1, 1.0, holder)
+        if is_given:
+            publishing.inbox.give(holder, 0.0)
+        found.append(publishing.send(1, 2.0, other, at_s=at_s))
+    # while it is fresh, once it is stale, where it was given the brake, where nobody is listed
+    assert found == [passed, True, False, False]
 
 
 def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is_stale(
@@ -172,7 +185,7 @@ def test_a_limit_that_is_over_is_over(publishing: Publishing) -> None:
 
 def test_a_source_that_is_late_itself_takes_nothing_over(publishing: Publishing) -> None:
     publishing.send(1, 1.0, "a")
-    assert (publishing.send(1, 2.0, "b", 0.06, at_s=0.2), publishing.inbox.hold.source) == (False, "a")
+    assert (publishing.send(1, 2.0, "b", 0.06, at_s=0.2), publishing.inbox.holder) == (False, "a")
 
 
 def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None:
@@ -248,7 +261,9 @@ def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock
     assert (publishing.send(1, 2.0, "a", -AHEAD_S - 0.001), publishing.counters()) == (False, (0, 1, 0))
     with pytest.raises(RefusedError, match="nothing that is still valid"):
         publishing.inbox.give("a", publishing.now_s)
-    assert "51 ms ahead" in str(publishing.inbox.last_refusal)
+    assert "0.051 s ahead of this clock: allowed are 0.05 s ahead and 86400 s behind" in str(
+        publishing.inbox.last_refusal
+    )
     assert publishing.send(2, 2.0, "a", -AHEAD_S - 0.001, at_s=SETTLED_S)
     # of a source that is known, it is the clock; and no setpoint is younger than its arrival
     assert publishing.send(1, 1.0, "b", 0.0, valid_for_ms=1.0) is False
@@ -271,7 +286,7 @@ def test_stamps_in_another_unit_are_refused_by_name_and_take_no_brake(
         assert not publishing.send(number, 1.5, "a", stamp_ns=publishing.realtime_ns // FACTORS[unit])
         if number >= 9:
             assert f"of 'a' counts {unit}: send ns since 1970" in (publishing.inbox.last_refusal or "")
-    assert (publishing.inbox.hold.source, publishing.inbox.newest) == ("", None)
+    assert (publishing.inbox.holder, publishing.inbox.newest) == ("", None)
     found = publishing.of("a")
     assert (found.cause, found.clock_behind_ms) == (f"its stamps count {unit}, and are refused", None)
     assert (publishing.send(30, 1.5, "a"), publishing.of("a").clock_behind_ms) == (True, 0.0)
@@ -337,7 +352,7 @@ def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> No
         publishing.now_s += 0.01
     assert len(publishing.inbox.report(publishing.now_s).sources) == SOURCES
     assert publishing.inbox.accepted + publishing.inbox.refused == 2_000
-    assert (publishing.send(1, 1.5, "patient"), publishing.inbox.hold.source) == (True, "patient")
+    assert (publishing.send(1, 1.5, "patient"), publishing.inbox.holder) == (True, "patient")
 
 
 @pytest.mark.parametrize(
@@ -414,11 +429,11 @@ def test_every_message_is_counted_once_and_no_source_takes_the_brake_from_one_th
     for source, seq, age_s, force_N, elapsed_s, session in events:
         publishing.now_s += elapsed_s
         before = publishing.inbox.newest
-        held = publishing.inbox.hold.source
+        held = publishing.inbox.holder
         is_newest = publishing.send(seq, force_N, source, age_s, session=session)
         assert is_newest == (publishing.inbox.newest is not before)
         if is_newest:
-            assert (publishing.force_N, publishing.inbox.hold.source) == (force_N, source)
+            assert (publishing.force_N, publishing.inbox.holder) == (force_N, source)
             assert publishing.newest.stamp_s <= publishing.now_s
             if before is not None and held != source:
                 assert publishing.now_s - before.stamp_s > before.valid_for_s

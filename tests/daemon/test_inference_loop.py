@@ -10,9 +10,8 @@ from tormagd.assembly.build import Core
 from tormagd.assembly.journal import AFRESH, PLAN, Journal
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.beat import Beat
-from tormagd.daemon.inbox import SetpointInbox
+from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.playout import Taken
 from tormagd.physics.errors import DomainError
 
 US = 1_000
@@ -94,7 +93,7 @@ def test_what_the_daemon_does_before_its_first_beat_is_no_stall_of_planning(rig:
 def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(core: Core, error: Exception) -> None:
     rig = Rig(core)
     inbox, rejected = rig.inbox, TimedSetpoint(1.0, 0.0, 0.1)
-    inbox.playout.in_force = Taken(rejected, "a", 1)
+    inbox.in_force = Taken(rejected, "a", 1, 0.0)
     rig.search.error = error
     rig.beat(is_asked=True)
     assert (rig.failed.call_count, inbox.newest, inbox.refused) == (1, None, 1)

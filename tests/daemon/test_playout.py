@@ -40,10 +40,10 @@ class Listening:
             while coming and coming[0][0] <= now_s:
                 _, seq = coming.pop(0)
                 self.take(now_s, seq, seq * PERIOD_S)
-            self.inbox.playout.update(now_s)
+            self.inbox.hand_on(now_s)
             newest = self.inbox.newest
             if newest is not None and newest is not before:
-                self.followed.append((now_s, newest.stamp_s, newest.force_N))
+                self.followed.append((now_s, self.inbox.in_force.stamp_s, newest.force_N))
 
 
 @given(seed=st.integers(0, 2**32), playout_ms=st.sampled_from([5.0, 60.0, 200.0]))
@@ -56,6 +56,17 @@ def test_each_setpoint_is_followed_a_stated_time_after_its_stamp(seed: int, play
     assert all(-1e-9 <= late_s - playout_ms * 1e-3 < TICK_S + 1e-9 for late_s, _ in found)
     report = listening.inbox.report(1.0).playout
     assert (report.playout_ms, report.setpoints, report.late) == (playout_ms, listening.inbox.accepted, 0)
+
+
+def test_what_is_held_back_is_for_the_planner_as_if_it_had_been_meant_that_much_later() -> None:
+    held, at_once = Listening(60.0), Listening(0.0)
+    assert not held.take(5.0, 1, 4.99)
+    assert at_once.take(5.0, 1, 4.99)
+    assert held.inbox.hand_on(5.0501)
+    meant, played = at_once.inbox.newest, held.inbox.newest
+    assert (played.stamp_s, played.valid_for_s) == pytest.approx((meant.stamp_s + 0.06, meant.valid_for_s - 0.06))
+    assert meant.replaced(stamp_s=played.stamp_s, valid_for_s=played.valid_for_s) == played
+    assert held.inbox.in_force.stamp_s == meant.stamp_s
 
 
 def test_what_comes_too_late_is_followed_at_once_and_counted() -> None:
@@ -100,17 +111,17 @@ def test_nothing_that_waits_outlives_a_scene_or_another_holder(core: Core) -> No
     inbox = listening.inbox
     assert not listening.take(0.0, 1, 0.0)
     inbox.begin_scene(core.scene)
-    assert not inbox.playout.update(0.06)
+    assert not inbox.hand_on(0.06)
     assert not listening.take(0.1, 2, 0.1)
     inbox.sources = Sources(priority=("b",), playout_ms=0.0)
     assert listening.take(0.11, 1, 0.11, "b"), "a playout that was taken away holds nothing that comes"
-    assert inbox.playout.in_force.source == "b"
-    assert not inbox.playout.update(0.2)
+    assert inbox.in_force.source == "b"
+    assert not inbox.hand_on(0.2)
 
 
 def test_a_flood_is_held_in_bounds() -> None:
     listening = Listening(200.0)
     for seq in range(5_000):
         listening.take(seq * 1e-5, seq, seq * 1e-5)
-    assert listening.inbox.playout.update(0.3)
-    assert listening.inbox.playout.in_force.seq == 4_999
+    assert listening.inbox.hand_on(0.3)
+    assert listening.inbox.in_force.seq == 4_999

@@ -23,7 +23,7 @@ from tormagd.assembly.build import Core
 from tormagd.closed_loop import VirtualPort
 from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, load_calibration
 from tormagd.daemon import daemon as daemon_module, telemetry_loop
-from tormagd.daemon.beat import KERNEL, Delay
+from tormagd.daemon.beat import KERNEL, Beat, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.hardware.backend import BackendError
 from tormagd.physics.errors import DomainError
@@ -396,6 +396,24 @@ def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.L
     assert [group.report().grade for group in groups] == ["good"] * 3
     assert (daemon._control.timing.runs, daemon._control.timing.merged) == (200, 0)
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+@pytest.mark.parametrize(("late_ms", "ran_ms", "is_blamed"), [(8, 0, True), (8, 4, False), (1, 0, False)])
+def test_a_silence_of_the_device_is_put_down_to_a_host_that_kept_the_loop_waiting(
+    alone: Running, late_ms: int, ran_ms: int, is_blamed: bool
+) -> None:
+    daemon, stepper, causes = alone.daemon, alone.daemon._control.stepper, alone.daemon._causes
+    daemon._phases._cpu_ns = lambda: daemon._phases._cpu_before_ns + ran_ms * 1_000_000
+    for at_ns in range(10_000_000_000, 11_000_000_000, 50_000_000):
+        daemon._receive(Beat(at_ns - 1_000_000, at_ns, late_ms - 1))
+    stepper.time_s = 10.95
+    causes.tell((Fault.LINK_LOST, Fault.SKEW), stepper, None)
+    told = [
+        *causes.of_faults(["LINK_LOST", "SKEW"]),
+        *(row for now_s in (10.95, 12.0) for row in causes.of_limits(["DEVICE_SILENT"], "", {}, None, now_s)),
+    ]
+    names_host = ["waiting for 160 ms of the last second, 8 ms at once; " in each.cause for each in told]
+    assert names_host == ["doctor" in each.remedy for each in told] == [is_blamed, False, is_blamed, False]
 
 
 def test_a_fault_is_told_with_what_was_known_when_it_was_latched(

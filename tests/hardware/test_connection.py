@@ -126,7 +126,8 @@ class Bench:
         self.asked_of: int | None = None
         self.accepted_before = 0
         self.seen = [LinkState.CLOSED]
-        self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose)
+        self.host = ""
+        self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose, lambda _now_s: self.host)
 
     @property
     def now_s(self) -> float:
@@ -209,6 +210,7 @@ def bench() -> Bench:
         (False, {"is_mute": True, "is_babbling": True}, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
         (True, {"is_there": False}, 1, LinkState.LOST, "unplugged", "cable"),
         (True, {"is_mute": True}, 82, LinkState.LOST, "no message for 80 ms", "cable"),
+        (True, {"is_mute": True, "host": "this host slept"}, 82, LinkState.LOST, "80 ms; this host slept", "doctor"),
         (True, {"is_bus_off": True}, 1, LinkState.LOST, "bus-off", "termination"),
     ],
 )

@@ -44,7 +44,7 @@ setpoints = st.builds(
     displacement_mm=displacements,
     rate_mm_s=rates,
     preview_N=st.lists(forces, max_size=256).map(tuple),
-    preview_dt_ms=st.floats(0.0, 1_000.0, exclude_min=True),
+    preview_dt_ms=st.floats(0.1, 1_000.0),
 )
 values = st.recursive(
     st.none()
@@ -173,6 +173,7 @@ def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> Non
         ({"preview_N": [1.0, "2"], "preview_dt_ms": 2.0}, "preview_N"),
         ({"preview_N": [1.0]}, "preview_dt_ms = None"),
         ({"preview_N": [1.0], "preview_dt_ms": 0.0}, "preview_dt_ms = 0.0"),
+        ({"preview_N": [1.0], "preview_dt_ms": 5e-324}, "preview_dt_ms = 5e-324: allowed is 0.1..1000 ms"),
         ({"preview_N": [1.0], "preview_dt_ms": math.inf}, "preview_dt_ms = inf"),
         ({"contact": WALL | {"handle_mm": 10_001.0}}, "contact.handle_mm = 10001.0: allowed is -10000..10000"),
         ({"contact": WALL | {"handle_mm": math.nan}}, "contact.handle_mm = nan: allowed is -10000..10000"),

@@ -56,7 +56,7 @@ V1: dict[type[msgspec.Struct], str] = {
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver roller_radius_mm uptime_s least_N "
     "most_N trim device profile least_gap_mm link setpoints peers "
     "rates phases_us late_ticks_by fault_details limit_details newest_stall not_granted way "
-    "black_box output next_commands is_open following arm scene_change calibration",
+    "black_box output next_commands is_open following arm scene_change calibration process_id",
     FollowingReport: "rms_N aligned_rms_N delay_ms",
     messages.ArmReport: "given is_over error",
     messages.SceneReport: "scene is_over error",

@@ -4,8 +4,11 @@ import contextlib
 import errno
 import json
 import math
+import os
 import resource
 import shutil
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -257,6 +260,19 @@ def test_pictures_in_each_format(written, tmp_path, suffix):
     target = tmp_path / f"a{suffix}"
     save_plot(figure(RecordingFile(written).overview, "x"), target)
     assert target.stat().st_size > 5_000
+
+
+@pytest.mark.parametrize(
+    "said",
+    ["MPLBACKEND=module://matplotlib_inline.backend_inline", "MPLBACKEND=no", "HOME=/proc", "MPLCONFIGDIR=/proc"],
+)
+def test_nothing_that_other_programs_are_told_spoils_a_picture(written, tmp_path, said):
+    (tmp_path / "matplotlibrc").write_bytes(b"text.usetex: True\n\xff")
+    name, _, value = said.partition("=")
+    draw = "import sys; from tormagd.ctl.main import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-P", "-c", draw, "plot", str(written), "-o", "a.png"]
+    subprocess.run(command, env=os.environ | {name: value, "MATPLOTLIBRC": "."}, cwd=tmp_path, check=True, timeout=60)
+    assert (tmp_path / "a.png").stat().st_size > 5_000
 
 
 def test_other_formats_and_empty_recordings_are_refused(written, tmp_path):

@@ -16,9 +16,8 @@ from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.black_box import header
-from tormagd.daemon.inbox import SetpointInbox
+from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.playout import Taken
 from tormagd.daemon.telemetry import tick_record
 from tormagd.inverse.solution import Answer, Question
 from tormagd.keeping import Part
@@ -32,14 +31,13 @@ from tormagd_client.messages import TickRecord
 
 COLUMNS = TickRecord.__struct_fields__
 PART_TICKS, SNAPSHOT_TICKS = 20, 500
-PLAYOUT_S = 0.02
 NS = 1_000_000_000
 
 
 def asked(now_s: float) -> TimedSetpoint:
-    """A pulse at 250 Hz, played out."""
-    stamp_s = math.floor((now_s - PLAYOUT_S) * 250.0) / 250.0
-    return TimedSetpoint(1.3 + 0.3 * math.sin(math.tau * 1.2 * stamp_s), stamp_s, 0.1, playout_s=PLAYOUT_S)
+    """A pulse at 250 Hz."""
+    stamp_s = math.floor(now_s * 250.0) / 250.0
+    return TimedSetpoint(1.3 + 0.3 * math.sin(math.tau * 1.2 * stamp_s), stamp_s, 0.1)
 
 
 class Flight:
@@ -122,7 +120,7 @@ class Flight:
     def _drain(self, setpoint: TimedSetpoint | None) -> bool:
         """Whether it is a new one."""
         before = self._inbox.newest
-        self._inbox.playout.in_force = None if setpoint is None else Taken(setpoint, "a", 0)
+        self._inbox.in_force = None if setpoint is None else Taken(setpoint, "a", 0, setpoint.stamp_s)
         return setpoint is not None and (before is None or setpoint.stamp_s > before.stamp_s)
 
     def _fail(self) -> None:

@@ -44,7 +44,6 @@ faults = st.lists(st.sampled_from(Fault), max_size=3, unique=True).map(tuple)
 
 
 def refusal(state: SafetyState, name: str, present: Conditions = READY) -> RefusedError:
-    """Why a command is refused."""
     with pytest.raises(RefusedError) as caught:
         command(state, name, 0.0, present)
     assert caught.value.message
@@ -83,7 +82,7 @@ def test_starts_disabled_and_asks_nothing() -> None:
 def test_what_a_command_wants_and_has_not_is_said(name: str, changes: dict[str, bool | float], code: str) -> None:
     refused = refusal(SafetyState(), name, READY.replaced(**changes))
     assert refused.code == code
-    assert code != "device_latched" or refused.hint == "tormagctl arm"
+    assert code != "device_latched" or refused.hint == (ARM if name == "enable" else CLEAR)
 
 
 @pytest.mark.parametrize(
@@ -111,19 +110,19 @@ def test_only_a_missing_device_has_a_remedy_of_its_own() -> None:
 
 OPENED = (DISABLED, DeviceRequest.RETRACT)
 STOPPED = (FAULT, DeviceRequest.RETRACT)
-ARM = "tormagctl arm"
+ARM, CLEAR = "tormagctl arm", "tormagctl clear-fault"
 TAKEN: dict[str, tuple[OperatingState | tuple[OperatingState, DeviceRequest] | str, ...]] = {
     # in DISABLED, ENABLED, PAUSED, FAULT
     "enable": (ENABLED, "nothing to do", "tormagctl resume", ARM),
-    "disable": (OPENED, OPENED, OPENED, ARM),
-    "pause": (ARM, PAUSED, "nothing to do", ARM),
+    "disable": (OPENED, OPENED, OPENED, CLEAR),
+    "pause": ("nothing to do", PAUSED, "nothing to do", CLEAR),
     "resume": (ARM, "nothing to do", ENABLED, ARM),
-    "home": ((DISABLED, DeviceRequest.HOME), "tormagctl disable", "tormagctl disable", ARM),
+    "home": ((DISABLED, DeviceRequest.HOME), "tormagctl disable", "tormagctl disable", CLEAR),
     "stop": (STOPPED, STOPPED, STOPPED, STOPPED),
     "clear-fault": (DISABLED, ENABLED, PAUSED, DISABLED),
-    "use-scene": (DISABLED, "tormagctl disable", "tormagctl disable", ARM),
+    "use-scene": (DISABLED, "tormagctl disable", "tormagctl disable", CLEAR),
 }
-"""Where each command leads and what it asks of the device, or what is hinted at where it is refused."""
+"Where each command leads and what it asks of the device, or the hint where it is refused."
 
 
 @pytest.mark.parametrize("present", OperatingState)
@@ -286,7 +285,6 @@ class Operating(RuleBasedStateMachine):
             return None
 
     def _check_request(self, before: SafetyState) -> None:
-        """A request number stands for one request, and only ever goes up, by one."""
         assert 0 <= self.state.request_number - before.request_number <= 1
         if self.state.request_number == before.request_number:
             assert self.state.request is before.request
@@ -329,9 +327,6 @@ def test_the_next_commands_of_each_fault_are_taken_and_arm_it(fault: Fault) -> N
         if name == "home":
             is_homed, state = True, homed_again(state, is_homed=False)
     assert (state.operating_state, next_commands(state, is_homed)) == (OperatingState.ENABLED, ())
-
-
-# -- codes: each one is explained, and every fault bit of the firmware has its own -------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
-
+from tormagd.drawing import Axes
 from tormagd.lab.pages import figures_of, stamp, subplots, table
 
 ROOT = Path(__file__).parents[2]

@@ -90,7 +90,8 @@ def weight(known: Known) -> Course[list[Finding]]:
 
 
 def way_back(_known: Known) -> Course[list[Finding]]:
-    """Disable the device, which opens the gap, and look whether the carriages meet their switches where they left them."""
+    """Disable the device, which opens the gap, and look whether the carriages meet their switches where
+    they left them."""
     ticks = yield from given("disable", _is_idle, OPENING_S)
     at = []
     for side in SIDES:

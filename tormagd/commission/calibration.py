@@ -47,7 +47,8 @@ def calibration(report: Report, config: Config) -> str:
 
 
 def _position(config: Config) -> list[str]:
-    """Return the lines of the table [position], with the stiffest gains that are robust around the motor of `config`."""
+    """Return the lines of the table [position], with the stiffest gains that are robust around the
+    motor of `config`."""
     position = config.position
     grid = itertools.product(DERIVATIVE_TIMES_S, (position.derivative_filter_s,), (position.integral_time_s,))
     period_s = 1.0 / config.rates.control_hz

@@ -23,7 +23,8 @@ TICK_S = 1e-3
 
 
 class Corners(NamedTuple):
-    """How far the motor's parameters may be off, as a share, and the loop's periods, s, at which margins have to hold."""
+    """How far the motor's parameters may be off, as a share, and the loop's periods, s, at which
+    margins have to hold."""
 
     share: float = 0.3
     periods_s: Sequence[float] = (0.8 * TICK_S, TICK_S, 1.2 * TICK_S)
@@ -42,7 +43,8 @@ class Tuning(NamedTuple):
 
 
 def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, float]:  # noqa: B008  # immutable
-    """Return the least margins of the position loop over every corner: `gain_margin_dB`, `phase_margin_deg`, `corners`."""
+    """Return the least margins of the position loop over every corner: `gain_margin_dB`,
+    `phase_margin_deg`, `corners`."""
     gain, phase = [], []
     factors = (1.0 - corners.share, 1.0 + corners.share)
     for chosen in itertools.product(factors, repeat=len(corners.parameters)):

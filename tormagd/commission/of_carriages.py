@@ -70,7 +70,8 @@ def nominals(motor: Motor) -> dict[str, float]:
 
 
 def carriages(known: Known) -> Course[list[Finding]]:
-    """Go slowly, jump and swing over the range, with the device enabled and its handle moved, and return 15 findings."""
+    """Go slowly, jump and swing over the range, with the device enabled and its handle moved, and
+    return 15 findings."""
     levels_N = [known.force_N(share) for share in JUMP_SHARES]
     yield from ready(levels_N[0])
     times_s, forces_N = (0.0, SLOW_S, 2.0 * SLOW_S), (levels_N[0], known.most_N, levels_N[0])
@@ -127,7 +128,8 @@ def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
 
 
 def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
-    """Return a carriage's swing at `at_Hz` over half of the gap reference's: its size and, as its angle, its lead, rad."""
+    """Return a carriage's swing at `at_Hz` over half of the gap reference's: its size and, as its
+    angle, its lead, rad."""
     times_s = ticks["monotonic_s"] - ticks["monotonic_s"][0]
     whole = (times_s >= 1.0 / at_Hz) & (times_s < math.floor(SINE_S * at_Hz) / at_Hz)
     turning = np.exp(-2j * math.pi * at_Hz * times_s[whole])

@@ -177,7 +177,8 @@ def memory(known: Known) -> Course[list[Finding]]:
 
 
 def require_sliding(ticks: Columns) -> None:
-    """Raise StoppedError where the handle moved, either way, for less than MIN_SLIDING of the ticks, or there are none."""
+    """Raise StoppedError where the handle moved, either way, for less than MIN_SLIDING of the ticks, or
+    there are none."""
     rates = ticks["handle_rate_mm_s"]
     share = float(np.mean(np.abs(rates) >= MOVING_MM_S)) if rates.size else 0.0
     if share < MIN_SLIDING:

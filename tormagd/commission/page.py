@@ -13,7 +13,8 @@ KIT = "python -m firmware_protocol.conformance PORT --json > FILE, then --confor
 
 
 def page_of(report: Report) -> str:
-    """Return the HTML page of `report`: how it ended, the kit's checks that did not pass, and a row for each finding."""
+    """Return the HTML page of `report`: how it ended, the kit's checks that did not pass, and a row for
+    each finding."""
     title = f"Commissioning of device {report.serial_number}"
     before = f"; the last one began {_date(report.last_ns)}" if report.last_ns else ""
     parts = [

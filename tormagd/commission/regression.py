@@ -6,7 +6,8 @@ from tormagd.commission.finding import SURE, Array
 
 
 def sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
-    """Return the covariance (p x p) of least-squares coefficients by the sandwich over blocks (Liang and Zeger 1986)."""
+    """Return the covariance (p x p) of least-squares coefficients by the sandwich over blocks (Liang
+    and Zeger 1986)."""
     labels, index = np.unique(blocks, return_inverse=True)
     scores = np.zeros((len(labels), jacobian.shape[1]))
     np.add.at(scores, index, jacobian * residual[:, None])
@@ -26,6 +27,7 @@ def solved(rows: Array, target: Array, blocks: Array) -> tuple[Array, Array]:
 
 
 def fitted(rows: Array, target: Array, blocks: Array) -> tuple[Array, Array]:
-    """Fit `target` (n) by `rows` (n x p) as `solved`; return the coefficients and the half widths of their intervals."""
+    """Fit `target` (n) by `rows` (n x p) as `solved`; return the coefficients and the half widths of
+    their intervals."""
     values, covariance = solved(rows, target, blocks)
     return values, SURE * np.sqrt(np.diag(covariance))

@@ -57,7 +57,8 @@ class Stopped(msgspec.Struct, frozen=True):
 
 
 def due(steps: Sequence[Step], known: Known, done: Mapping[str, Findings]) -> list[Step]:
-    """Return which of `steps` are to be run, in order: those not `done`, or `always` run, and `weight` only with one."""
+    """Return which of `steps` are to be run, in order: those not `done`, or `always` run, and `weight`
+    only with one."""
     without = {"weight"} if known.weight_N is None else set()
     return [step for step in steps if step.always or step.name not in done.keys() | without]
 

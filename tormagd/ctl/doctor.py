@@ -118,7 +118,7 @@ def judged(
 ) -> Outcome:
     """Return the report on a machine, on the daemon `known` there, and on the headroom `found`."""
     if isinstance(known, Running):
-        findings = (*of_daemon(known), *(check(_in_force(known), machine) for check in OF_MACHINE))
+        findings = (*of_daemon(known, machine), *(check(_in_force(known), machine) for check in OF_MACHINE))
     else:
         findings = tuple(check(config, machine) for check in CHECKS)
     if isinstance(known, ClientError):
@@ -143,8 +143,8 @@ def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Sever
     return Finding(name, Severity.OK, found) if is_good else Finding(name, otherwise, found, remedy)
 
 
-def of_daemon(known: Running) -> tuple[Finding, ...]:
-    """Return findings on what a daemon says of itself: that it runs, its build, its link, and its device's calibration."""
+def of_daemon(known: Running, machine: Machine) -> tuple[Finding, ...]:
+    """Return findings on what a daemon says of itself: that it runs, its build, its link and port, its calibration."""
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
     findings = [
@@ -164,6 +164,7 @@ def of_daemon(known: Running) -> tuple[Finding, ...]:
     device = f"{link.port}: {link.state}{link.cause and f': {link.cause}'}"
     is_there = link.state == "RUNNING"
     findings.append(_finding("device port", is_there, device, link.remedy or "tormagctl firmware", Severity.FAIL))
+    findings.append(port_holder(known.config, machine, status.process_id))
     calibration = status.calibration
     found = calibration.refusal or calibration.file or "none: the device runs by the configuration"
     findings.append(_finding("calibration", not calibration.refusal, found, RECOMMISSION))
@@ -419,19 +420,18 @@ def port(config: Config, machine: Machine) -> Finding:
     )
 
 
-def port_holder(config: Config, machine: Machine) -> Finding:
-    """Judge whether a process other than tormagd has the port open: FAIL, naming each, else OK."""
+def port_holder(config: Config, machine: Machine, daemon_id: int | None = None) -> Finding:
+    """Judge whether a process other than the daemon `daemon_id` has the port open: FAIL, naming each, else OK."""
     name = config.device.port
     target = machine.resolved(name)
-    others = machine.holders([target])[0][target] if name.startswith("/") else []
+    holders = machine.holders([target])[0][target] if name.startswith("/") else []
     if target.startswith("/dev/pts/"):  # whoever made a pseudo-terminal has it open as well
         locking = machine.lock_owners(target)
-        others = [(pid, comm) for pid, comm in others if pid in locking]
-    strangers = [f"{comm} (process {pid})" for pid, comm in others if not comm.startswith("tormagd")]
-    if strangers:
-        return Finding("port holder", Severity.FAIL, ", ".join(strangers), "end it, or give tormagd another port")
-    found = f"tormagd (process {others[0][0]})" if others else "nobody that this user may see"
-    return Finding("port holder", Severity.OK, found)
+        holders = [(pid, comm) for pid, comm in holders if pid in locking]
+    found = ", ".join(f"{comm} (process {pid})" for pid, comm in holders if pid != daemon_id)
+    remedy = f"end it{'' if daemon_id else ', unless it is the daemon'}, or give tormagd another port"
+    nobody = f"tormagd (process {daemon_id})" if holders else "nobody that this user may see"
+    return _finding("port holder", not found, found or nobody, remedy, Severity.FAIL)
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:
@@ -455,7 +455,7 @@ def build(config: Config, machine: Machine) -> Finding:
 
 
 Check = Callable[[Config, Machine], Finding]
-OF_CALLER: tuple[Check, ...] = (build, scheduling, memory_lock, run_directory, port)
+OF_CALLER: tuple[Check, ...] = (build, scheduling, memory_lock, run_directory, port, port_holder)
 "Checks of the caller's rights and installation, which stand for a daemon that the caller starts."
 OF_MACHINE: tuple[Check, ...] = (
     preemption,
@@ -466,7 +466,6 @@ OF_MACHINE: tuple[Check, ...] = (
     swap,
     huge_pages,
     autogroup,
-    port_holder,
     usb_latency,
 )
 CHECKS = (*OF_CALLER, *OF_MACHINE)

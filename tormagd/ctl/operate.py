@@ -21,7 +21,7 @@ DONE: dict[str, tuple[str, tuple[str, ...]]] = {
     "resume": ("resumed", ("ENABLED",)),
     "stop": ("stopped and latched; the gap opens. tormagctl arm when it is safe to go on", ("FAULT",)),
     # while nothing is latched there is nothing to clear
-    "clear-fault": ("fault cleared. next: tormagctl arm", ("DISABLED", "ENABLED", "PAUSED")),
+    "clear-fault": ("fault cleared; nothing moves before tormagctl arm", ("DISABLED", "ENABLED", "PAUSED")),
 }
 "By command, what it has done, and the operating states that show it."
 STOPPED_WITHOUT_DEVICE = (
@@ -160,16 +160,17 @@ def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tupl
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
-def require_no_fault(state: Status, what: str) -> None:
-    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to do; else return."""
+def require_no_fault(state: Status, what: str, then: str = "tormagctl clear-fault") -> None:
+    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to
+    do; else return."""
     if state.operating_state != "FAULT":
         return
     # what the device met says more than that somebody stopped it
     told = sorted(state.fault_details, key=lambda each: each.code == "STOPPED")
-    first = told[0] if told else Explained("FAULT", "see tormagctl status", "")
+    first = told[0] if told else Explained("FAULT", "see tormagctl status", "tormagctl arm")
     raise CommandError(
         Exit.FAULT,
         "fault",
         f"{what}: {', '.join(state.faults) or first.code}: {first.cause}",
-        first.remedy or "tormagctl arm",
+        first.remedy.replace("tormagctl arm", then),
     )

@@ -32,7 +32,8 @@ def scene(
     plant: str | None = None,
     **recorded: Any,
 ) -> Outcome:
-    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new."""
+    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene,
+    except for new."""
     named = name or config.scene
     if action == "new":
         if name is None:
@@ -78,7 +79,8 @@ def use_scene(client: "Client", name: str) -> Outcome:
     if change.error is not None:
         raise CommandError(Exit.REFUSED, change.error.code, change.error.cause, change.error.remedy)
     result = {"scene": state.scene, "fingerprint": state.scene_fingerprint, "is_homed": state.is_homed}
-    return Outcome(result, f"scene {state.scene} runs until the daemon is started anew. next: tormagctl arm")
+    text = f"scene {state.scene} runs until the daemon is started anew; nothing moves before tormagctl arm"
+    return Outcome(result, text)
 
 
 def list_scenes() -> Outcome:
@@ -108,7 +110,8 @@ def as_toml(tables: dict[str, Any]) -> str:
 
 
 def torque_range(scene: Scene) -> str:
-    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft, mNm, in words."""
+    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft,
+    mNm, in words."""
     radius_mm, force = scene.roller_radius_mm, scene.force
     if radius_mm is None:
         return ""

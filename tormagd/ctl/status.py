@@ -144,7 +144,8 @@ def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
 
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
-    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and unit of each."""
+    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and
+    unit of each."""
     return ", ".join(
         f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
         for name, it in belief.items()

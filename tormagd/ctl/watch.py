@@ -26,7 +26,8 @@ SPOILING = ("RANGE", "F_MAX")
 
 
 class Fate(msgspec.Struct, frozen=True):
-    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and what held them."""
+    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and
+    what held them."""
 
     accepted: int
     rendered_share: float | None
@@ -58,7 +59,7 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
     """Return why the setpoints of `source` are not rendered, as an error (REFUSED) that the caller may raise; None
     while they are."""
-    require_no_fault(status, "the device is in FAULT")
+    require_no_fault(status, "the device is in FAULT", "tormagctl arm")
     if status.operating_state != "ENABLED":
         return CommandError(
             Exit.REFUSED,

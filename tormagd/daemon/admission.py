@@ -273,7 +273,8 @@ class Admission:
             self._count_oversize(known.name, address)
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
-        """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many."""
+        """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as
+        one too many."""
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
         was_asked = (
@@ -295,7 +296,8 @@ class Admission:
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
     def _count_oversize(self, name: str, address: str) -> None:
-        """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget that leaving."""
+        """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget
+        that leaving."""
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
         # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
         # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes

@@ -94,6 +94,10 @@ class Phases:
         """Note that the device was driven in time: processor time for the next `blame` counts from now."""
         self._cpu_before_ns = self._cpu_ns()
 
+    def ran_ns(self) -> int:
+        """Return this thread's processor time since it last drove the device."""
+        return self._cpu_ns() - self._cpu_before_ns
+
     def blame(self, due_ns: int) -> Delay:
         """Return the delay of the device since `due_ns`, and the part that took most of it."""
         done_ns = self._clock_ns()
@@ -105,7 +109,7 @@ class Phases:
             shares[name] += max(0, min(end_ns, done_ns) - max(start_ns, due_ns))
         shares[KERNEL] = took_ns - shares.total()
         culprit, share_ns = shares.most_common(1)[0]
-        waited_ns = took_ns - (self._cpu_ns() - self._cpu_before_ns)
+        waited_ns = took_ns - self.ran_ns()
         if waited_ns > took_ns / 2:
             culprit, share_ns = KERNEL, waited_ns
         self.on_time()
@@ -129,7 +133,8 @@ class Phases:
             self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
-        """Run one part and keep its times; return False, and keep none, where it returned False: it had nothing to do."""
+        """Run one part and keep its times; return False, and keep none, where it returned False: it had
+        nothing to do."""
         start_ns = self._clock_ns()
         try:
             is_done = part(beat) is not False

@@ -29,7 +29,8 @@ class Beside:
         "Whether the process was found to have ended, or this end is closed."
 
     def send(self, data: bytes) -> bool:
-        """Send one packet without waiting, and return whether the socket took it, which does not say that it was read."""
+        """Send one packet without waiting, and return whether the socket took it, which does not say that
+        it was read."""
         try:
             self.socket.send(data)
         except ConnectionError:
@@ -39,7 +40,8 @@ class Beside:
         return not self.is_gone
 
     def receive(self, wait_s: float = 0.0) -> bytes | None:
-        """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process has ended."""
+        """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process
+        has ended."""
         try:
             if wait_s:
                 select.select([self.socket], [], [], wait_s)

@@ -1,6 +1,8 @@
 """Causes of faults and limits, in the figures of the moment at which they came up."""
 
 import logging
+import math
+from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -11,17 +13,26 @@ from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd_client.messages import Explained, StallReport
 
+WAITED_SHARE = 0.1
+"A host that kept the control loop waiting for more of the last second is to blame for a silence, not device or cable."
+SILENCES = {
+    *("LINK_LOST", "MEASUREMENT_STALE", "SENSE_STALE", "STATUS_STALE", "LINK_DEGRADED", "DEVICE_COMMAND_TIMEOUT"),
+    "DEVICE_SILENT",
+}
+"Faults and limits of messages that do not come, or come late."
+
 log = logging.getLogger(__name__)
 
 
 class Causes:
-    """Remembers the newest stall of the control loop, and the cause of each latched fault in figures."""
+    """Remembers how the control loop was kept waiting, and the cause of each latched fault in figures."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
         self.stall: StallReport | None = None
         "The newest stall of the control loop; None before the first."
-        self._told: dict[str, str] = {}
+        self._told: dict[Fault, Explanation] = {}
+        self._waits: deque[tuple[float, float]] = deque(maxlen=1_000)
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:
         """Set `stall` where the step that just ran has taken its own delay for a stall; else change nothing."""
@@ -29,29 +40,42 @@ class Causes:
         if sight.stalled_s == stepper.time_s and (known is None or known.ms != stall_ms):
             self.stall = StallReport(stall_ms, delay.culprit)
 
+    def note_wait(self, now_s: float, wait_s: float) -> None:
+        """Note that the control loop was not given the processor for the last `wait_s`, or since the last such wait."""
+        last_s = self._waits[-1][0] if self._waits else -math.inf
+        self._waits.append((now_s, min(wait_s, now_s - last_s)))
+
+    def host(self, now_s: float) -> str:
+        """Say how long this host kept the control loop waiting; empty for WAITED_SHARE of the last second or less."""
+        waits_s = [min(wait_s, at_s + 1.0 - now_s) for at_s, wait_s in self._waits if now_s - at_s < 1.0]
+        if sum(waits_s) <= WAITED_SHARE:
+            return ""
+        return (
+            f"this host kept the control loop waiting for {sum(waits_s) * 1e3:.0f} ms of the last second, "
+            f"{max(waits_s) * 1e3:.0f} ms at once"
+        )
+
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
         """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes."""
         figures = {} if measurement is None else _figures(stepper, measurement)
-        for fault in faults:
-            self._told.pop(fault, None)
-            if fault in figures:
-                self._told[fault] = f"{FAULTS[fault].cause}: {figures[fault]}"
-        if Fault.HOST_STALL in faults:
-            opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
-            self._told[Fault.HOST_STALL] = f"{self._stood_still()}; {opened}"
-        if Fault.MEASUREMENT_STALE in faults and measurement is not None:
+        causes = {fault: f"{FAULTS[fault].cause}: {figure}" for fault, figure in figures.items()}
+        opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
+        causes[Fault.HOST_STALL] = f"{self._stood_still()}; {opened}"
+        if measurement is not None:
             silent_ms, behind_ms = (stepper.time_s - measurement.received_s) * 1e3, measurement.delay_s * 1e3
-            self._told[Fault.MEASUREMENT_STALE] = (
+            causes[Fault.MEASUREMENT_STALE] = (
                 f"the device had sent no new state for {silent_ms:.0f} ms"
                 if silent_ms > behind_ms
                 else f"the device was {behind_ms:.0f} ms behind with the commands that it obeyed"
             )
+        told = {fault: FAULTS[fault]._replace(cause=causes.get(fault, FAULTS[fault].cause)) for fault in faults}
+        self._told |= _blamed(told, self.host(stepper.time_s), FAULTS[Fault.HOST_STALL])
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
         """Return each fault with its cause and its remedy, in the order of `faults`."""
-        return _explained(faults, FAULTS, self._told)
+        return _explained(faults, {**FAULTS, **self._told})
 
     def of_limits(
         self,
@@ -59,8 +83,10 @@ class Causes:
         replaced: str,
         of_sources: Mapping[Limit, Explanation],
         measurement: Measurement | None,
+        now_s: float,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of `limits`."""
+        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of
+        `limits`."""
         told = {
             Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered",
             Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}",
@@ -68,11 +94,26 @@ class Causes:
         if measurement is not None:
             told[Limit.LINK_DEGRADED] = f"{LIMITS[Limit.LINK_DEGRADED].cause}: {measurement.link}"
             told[Limit.CLOCK] = f"{LIMITS[Limit.CLOCK].cause}: {measurement.link.clock_drift:+.1%}"
-        return _explained(limits, {**LIMITS, **of_sources}, told)
+        known = {
+            **LIMITS,
+            **{limit: LIMITS[limit]._replace(cause=cause) for limit, cause in told.items()},
+            **of_sources,
+        }
+        return _explained(limits, _blamed(known, self.host(now_s), LIMITS[Limit.HOST_STALL]))
 
     def _stood_still(self) -> str:
         stall = self.stall
         return "" if stall is None else f"the control loop stood still for {stall.ms:.0f} ms ({stall.culprit})"
+
+
+def _blamed(known: dict[Any, Explanation], host: str, stall: Explanation) -> dict[Any, Explanation]:
+    """Return `known`; where `host` is not empty, SILENCES begin their cause with it and have the remedy of `stall`."""
+    if not host:
+        return known
+    silences = {code: row for code, row in known.items() if code in SILENCES}
+    return known | {
+        code: row._replace(cause=f"{host}; {row.cause}", remedy=stall.remedy) for code, row in silences.items()
+    }
 
 
 def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
@@ -90,7 +131,5 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
     }
 
 
-def _explained(
-    codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str]
-) -> tuple[Explained, ...]:
-    return tuple(Explained(str(code), told.get(code, table[code].cause), table[code].remedy) for code in codes)
+def _explained(codes: Iterable[str], table: Mapping[Any, Explanation]) -> tuple[Explained, ...]:
+    return tuple(Explained(str(code), table[code].cause, table[code].remedy) for code in codes)

@@ -70,7 +70,7 @@ class Daemon:
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
-        self._connection = Connection(config.device, open_backend, lambda: self._control.lose_link())
+        self._connection = Connection(config.device, open_backend, lambda: self._control.lose_link(), self._causes.host)
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources, keys)
         self._endpoint.inbox.begin_scene(core.scene)
         self._keys = keys
@@ -173,7 +173,11 @@ class Daemon:
         if beats := heartbeat.beats():  # none at a spurious wake-up
             self._phases.run(heartbeat.due_ns, beats - 1)
 
-    def _receive(self, _beat: Beat) -> None:
+    def _receive(self, beat: Beat) -> None:
+        period_ns = self._control.timing.period_ns
+        late_ns = beat.start_ns - beat.due_ns + beat.merged * period_ns
+        if late_ns > period_ns:
+            self._causes.note_wait(beat.start_ns * 1e-9, (late_ns - self._phases.ran_ns()) * 1e-9)
         self._connection.receive(time.monotonic())
         self._endpoint.arrivals.look()
 
@@ -264,7 +268,8 @@ class Daemon:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     async def _open_gap(self) -> None:
-        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the beat goes on."""
+        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the
+        beat goes on."""
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S

@@ -122,10 +122,11 @@ class Endpoint:
             else:
                 data = b"" if frame.more else frame.bytes
                 is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
-        return self.inbox.playout.update(time.monotonic()) or is_newer
+        return self.inbox.hand_on(time.monotonic()) or is_newer
 
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
-        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its first part."""
+        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its
+        first part."""
         self._send(self._telemetry, "telemetry", *topic, encode(message))
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:

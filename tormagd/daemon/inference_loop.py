@@ -53,13 +53,25 @@ class InferenceLoop:
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
-        """Make a plan if a setpoint has come (`is_asked`) or if one is due; else do nothing."""
+        """Plan for the inbox's newest setpoint if one has come (`is_asked`) or if a plan is due, as
+        `planner.planned`."""
         period_ns = self.timing.period_ns
         # counted from when beats are due, not when they begin: lateness does not lower the rate
         if not is_asked and beat.due_ns < self._due_ns:
             return
         start_ns = self._clock_ns()
-        self._make_plan(start_ns * 1e-9, measured, is_followed)
+        now_s, setpoint, beside = start_ns * 1e-9, self._inbox.newest, self.beside
+        answer = None if beside is None else beside.answer()
+        if answer is not None:
+            self._journal.answered(answer)
+            self.planner.answered(answer)
+        self._journal.planned(now_s, setpoint)
+        try:
+            self.planner.plan(now_s, setpoint, measured, is_followed)
+        except PLAN_ERRORS as error:
+            self._begin_afresh(now_s, error)
+        if beside is not None:
+            beside.ask(self.planner.question)
         self.timing.record(beat.due_ns, start_ns, self._clock_ns())
         # what was missed is not made up for
         is_regular = not is_asked and beat.due_ns - self._due_ns < period_ns
@@ -75,21 +87,6 @@ class InferenceLoop:
         if is_made:
             self._journal.foresaw()
         return is_made
-
-    def _make_plan(self, now_s: float, measured: Measured | None, is_followed: bool) -> None:
-        """Take the search's newest answer, plan at `now_s` for the inbox's newest setpoint, and ask the next question."""
-        setpoint, beside = self._inbox.newest, self.beside
-        answer = None if beside is None else beside.answer()
-        if answer is not None:
-            self._journal.answered(answer)
-            self.planner.answered(answer)
-        self._journal.planned(now_s, setpoint)
-        try:
-            self.planner.plan(now_s, setpoint, measured, is_followed)
-        except PLAN_ERRORS as error:
-            self._begin_afresh(now_s, error)
-        if beside is not None:
-            beside.ask(self.planner.question)
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
         """Reset the planner at `now_s` after a plan or forecast that failed, withdraw the setpoint, and call

@@ -34,7 +34,8 @@ class Histogram:
         self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
-        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0, and so does NaN."""
+        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0, and
+        so does NaN."""
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s
             self._before, self._now = self._now, [0] * _BINS
@@ -123,7 +124,8 @@ class RateGroup:
                 self.stalls += 1
 
     def report(self) -> RateReport:
-        """Return counts and worst lateness since the start, and rate, grade and percentiles over one to two horizons."""
+        """Return counts and worst lateness since the start, and rate, grade and percentiles over one to two
+        horizons."""
         since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"
         if self._newest_ns > since.time_ns:

@@ -41,7 +41,8 @@ class SceneChange:
         self._changing.add_done_callback(asyncio.Task.result)
 
     async def _change(self, scene: str) -> None:
-        """Build the core and put it in place, if the device is still not in use; note in `newest` and log how it ended."""
+        """Build the core and put it in place, if the device is still not in use; note in `newest` and log
+        how it ended."""
         error = None
         try:
             core = await self._build(scene)

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,12 +118,13 @@ class TelemetryLoop:
         self._reported_s = -math.inf
 
     def record(self, _beat: Beat) -> None:
-        """Keep the record of the control tick that just ran, for recording and black box; before the first do nothing."""
+        """Keep the record of the control tick that just ran, for recording and black box; before the first
+        do nothing."""
         control = self._control
         if control.output is None or control.used is None:
             return
         self._left -= 1
-        self._way.ticked(control.stepper.time_s, control.used)
+        self._way.ticked(control.stepper.time_s, control.used, self._endpoint.inbox.sources.playout_ms * 1e-3)
         timing = control.timing
         record = tick_record(
             control.stepper,
@@ -199,7 +201,8 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answer requests that waited at the last snapshot, for a limited time; return False where none was answered."""
+        """Answer requests that waited at the last snapshot, for a limited time; return False where none was
+        answered."""
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
@@ -236,13 +239,13 @@ class TelemetryLoop:
         return is_homed(self._connection.measurement, self._control.stepper.measured)
 
     def _snapshot(self, now_s: float) -> Telemetry:
-        newest = self._endpoint.inbox.newest
+        in_force = self._endpoint.inbox.in_force
         return snapshot(
             self._ticks[-1],
             self.timing.runs,
             self._is_homed(),
             self.is_busy(),
-            None if newest is None else now_s - newest.stamp_s,
+            None if in_force is None else now_s - in_force.stamp_s,
             beliefs(self._inference.planner, self._control.stepper, now_s, self._core.scene.terms),
             self.topics.handle(),
             self.topics.verdict(),
@@ -282,7 +285,8 @@ class TelemetryLoop:
             yield from (self._way.to_duty, *self._phases.spent.values())
 
     def _answer(self, request: Request) -> Any:
-        """Return the result of a request: for `status` and `describe` a report, for any other what `command` returns."""
+        """Return the result of a request: for `status` and `describe` a report, for any other what
+        `command` returns."""
         if request.command == "status":
             # built once for everybody who asks in this period
             if self._status is None:
@@ -334,7 +338,8 @@ class TelemetryLoop:
         }
 
     def _add_mark(self, text: object) -> dict[str, Any]:
-        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns` and `text`."""
+        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns`
+        and `text`."""
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
             raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")
@@ -366,13 +371,14 @@ class TelemetryLoop:
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
         inbox = self._endpoint.inbox
-        before = inbox.hold.source
+        before = inbox.holder
         inbox.give(source, time.monotonic())
         log.info("the brake is given to the source %r", source)
         return {"source": source, "instead_of": before}
 
     def _build_status(self, newest: Telemetry) -> Status:
-        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and remedies."""
+        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and
+        remedies."""
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device
@@ -412,7 +418,7 @@ class TelemetryLoop:
             least_gap_mm=round(plan.min_gap_mm, 2),
             fault_details=self._causes.of_faults(safety.faults),
             limit_details=self._causes.of_limits(
-                newest.limits, outside, self._endpoint.inbox.told(now_s), self._control.measurement
+                newest.limits, outside, self._endpoint.inbox.told(now_s), self._control.measurement, now_s
             ),
             newest_stall=self._causes.stall,
             not_granted=self._not_granted,
@@ -422,6 +428,7 @@ class TelemetryLoop:
             scene_change=self._scene_change.newest,
             is_open=self.is_open(),
             following=self._following.report(),
+            process_id=os.getpid(),
         )
 
     def _arm_report(self) -> ArmReport | None:

@@ -32,7 +32,8 @@ class Topics:
         self._passed_over: tuple[str, int] | None = None
 
     def publish(self, beat: Beat) -> bool:
-        """Publish a verdict where one is new, and the handle's motion where it is due; return False where neither was."""
+        """Publish a verdict where one is new, and the handle's motion where it is due; return False where
+        neither was."""
         listeners = self._endpoint.listeners
         is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
         return (listeners.has(MOTION_TOPIC) and self._publish_motion(beat)) or is_said
@@ -44,11 +45,12 @@ class Topics:
 
     def verdict(self) -> Verdict | None:
         """Return the verdict on the newest setpoint, as things are now; None without a setpoint."""
-        in_force = self._endpoint.inbox.playout.in_force
+        in_force = self._endpoint.inbox.in_force
         return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
-        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without a device."""
+        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without
+        a device."""
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
             return False
@@ -65,7 +67,7 @@ class Topics:
 
     def _publish_verdicts(self) -> bool:
         """Publish the verdict on the setpoint in force, and on one refused because another source holds the brake."""
-        in_force, is_said = self._endpoint.inbox.playout.in_force, False
+        in_force, is_said = self._endpoint.inbox.in_force, False
         # a setpoint is a new object, even where its source begins its numbers anew
         if in_force is not None and in_force is not self._judged:
             self._judged, is_said = in_force, True

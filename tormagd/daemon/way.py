@@ -25,14 +25,14 @@ class Way:
         self.to_duty = Histogram()
         self._stamp_s = -math.inf
 
-    def ticked(self, now_s: float, used: Plan) -> None:
+    def ticked(self, now_s: float, used: Plan, playout_s: float) -> None:
         """Count in `to_duty` the delay of a setpoint at its first control tick, at `now_s`, along the plan `used` for
         it."""
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
             if stamp_s > -math.inf:  # -inf: the plan follows no setpoint
-                self.to_duty.add(now_s, (now_s - stamp_s) * 1e6)
+                self.to_duty.add(now_s, (now_s - stamp_s + playout_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float, budget: Budget) -> WayReport:
         """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known."""

@@ -122,7 +122,8 @@ def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
 
 
 def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each quantity that was believed and acted at any recording's end: its name, and a text for each."""
+    """Return a row for each quantity that was believed and acted at any recording's end: its name, and
+    a text for each."""
     found = []
     for each in of:
         end_ns = each.overview.end_ns

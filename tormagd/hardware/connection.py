@@ -32,6 +32,8 @@ _REMEDIES = {
     LinkState.LOST: "check cable and supply; it is tried again",
 }
 
+_REMEDY_OF_HOST = "run `tormagctl doctor`; look for load on this machine; it is tried again"
+
 log = logging.getLogger(__name__)
 
 
@@ -51,9 +53,15 @@ class Traffic(Protocol):
 class Connection:
     """The connection to one device, over as many openings of its port as it takes."""
 
-    def __init__(self, device: Device, open_backend: Callable[[], Backend], on_loss: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        device: Device,
+        open_backend: Callable[[], Backend],
+        on_loss: Callable[[], None],
+        host: Callable[[float], str] = lambda now_s: "",
+    ) -> None:
         """Begin closed."""
-        self._device, self._open_backend, self._on_loss = device, open_backend, on_loss
+        self._device, self._open_backend, self._on_loss, self._host = device, open_backend, on_loss, host
         self._backend: Backend | None = None
         self._stream: Stream | None = None
         self._link: DeviceLink | None = None
@@ -176,9 +184,11 @@ class Connection:
         if self.traffic is not None and self._stream is not None:
             self.traffic.wrote(now_s, sent, heard.unsent)
         link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
-        self._notice()
         if link.state is LinkState.LOST:
-            self._lose(now_s, link.cause, "")
+            host = self._host(now_s)
+            self._lose(now_s, "; ".join(filter(None, (link.cause, host))), host and _REMEDY_OF_HOST)
+        else:
+            self._notice()
 
     def close(self) -> None:
         """Close the port; it stays closed until `open`."""
@@ -240,6 +250,7 @@ class Connection:
         """End the conversation as lost for `cause`, close the port, and wait in LOST until it is opened again."""
         assert self._link is not None, "only an open port can be lost"
         self._link.lose(cause)
+        self._remedy = remedy
         self._notice()
         self._unfinished = self._link.pending
         self._release()

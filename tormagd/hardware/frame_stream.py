@@ -25,7 +25,8 @@ class FrameStream:
         return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
-        """Return a message's frame, with the next sequence number, 0..255, and keep it in `sent` until the next call."""
+        """Return a message's frame, with the next sequence number, 0..255, and keep it in `sent` until the
+        next call."""
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         self.sent = frame

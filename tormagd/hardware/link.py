@@ -198,7 +198,8 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Renew `quality`, which the measurement carries from then on, from the backend's counters, where that is due."""
+        """Renew `quality`, which the measurement carries from then on, from the backend's counters, where
+        that is due."""
         if self._quality_watch.is_due(now_s):
             counts = Counts(self._drives, self._states, frames, damaged, unsent)
             self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)

@@ -111,7 +111,8 @@ class RoundTrip:
 
     @property
     def usual_s(self) -> float:
-        """The median of the newest USUAL_OF round trips, or of fewer while there are fewer, s; 0 while none is known."""
+        """The median of the newest USUAL_OF round trips, or of fewer while there are fewer, s; 0 while none
+        is known."""
         ordered_s = sorted(list(self._recent)[-USUAL_OF:])
         return ordered_s[len(ordered_s) // 2] if ordered_s else 0.0
 
@@ -167,7 +168,8 @@ class DeviceClock:
         return self._fit
 
     def _turn(self, host_s: float) -> None:
-        """End the window and begin the next at `host_s`: keep the least delayed State, if one came, and renew `drift`."""
+        """End the window and begin the next at `host_s`: keep the least delayed State, if one came, and
+        renew `drift`."""
         if self._least[0] < math.inf:
             self._windows.append(self._least)
             self._is_fitted = False

@@ -32,7 +32,8 @@ class SerialOptions(Strict, frozen=True):
 
 
 def open_serial(device: Device, options: SerialOptions) -> SerialPort:
-    """Open `device.port` exclusively at `options.baud`, with its driver's latency timer at 1 ms where that can be set."""
+    """Open `device.port` exclusively at `options.baud`, with its driver's latency timer at 1 ms where
+    that can be set."""
     try:
         port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()

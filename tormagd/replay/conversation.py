@@ -44,7 +44,8 @@ def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None
 
 
 class Conversation:
-    """The recorded conversation with the device run again: a `Connection`, and the backend that gives it what was read."""
+    """The recorded conversation with the device run again: a `Connection`, and the backend that gives
+    it what was read."""
 
     def __init__(self, frame: int) -> None:
         self._connection: Connection | None = None

@@ -39,7 +39,8 @@ class Recorded(NamedTuple):
 
 
 def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
-    """Check a black box's header and return its contents; its model will be looked for where it was, then in `beside`."""
+    """Check a black box's header and return its contents; its model will be looked for where it was,
+    then in `beside`."""
     header = box.header
     missing = [name for name in NEEDED if name not in header]
     if missing:

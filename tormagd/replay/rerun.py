@@ -34,7 +34,7 @@ UNTAKEN = (
 "What the core may raise for values that it never makes itself."
 SETPOINT = tuple[
     float, float, float, float | None, float | None, tuple[float, ...], float, int, tuple[Limit, ...], float | None,
-    float, Any,
+    Any,
 ]  # fmt: skip
 NOT_THE_CORES = 1
 "Number of leading columns that the core does not make: `t_ns`, from the clock."
@@ -59,7 +59,8 @@ QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s"
 
 
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
-    """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a plan without one."""
+    """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a
+    plan without one."""
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
     return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
 
@@ -274,7 +275,8 @@ class _Running:
 
 
 def measurement_of(record: TickRecord) -> Measurement | None:
-    """Return the measurement that a tick's step was given; None where the record's `measurement`, its number, is None."""
+    """Return the measurement that a tick's step was given; None where the record's `measurement`, its
+    number, is None."""
     if record.measurement is None:
         return None
     numbers = {name: getattr(record, column) for name, column in MEASURED.items()}
@@ -292,7 +294,8 @@ def measurement_of(record: TickRecord) -> Measurement | None:
 
 
 def name_of(entry: Any) -> str:
-    """Return a black box entry's name, a word by itself or at the head of a list; empty for a tick and anything else."""
+    """Return a black box entry's name, a word by itself or at the head of a list; empty for a tick and
+    anything else."""
     if isinstance(entry, str):
         return entry
     if isinstance(entry, list) and entry and isinstance(entry[0], str):

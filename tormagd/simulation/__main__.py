@@ -3,7 +3,7 @@
 import signal
 
 if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    # what follows takes half a second to load: until `main` sees to it, Ctrl-C may simply end the process
+    # what follows takes half a second to load: until `main` sees to it, Ctrl-C may end the process
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import argparse
@@ -38,7 +38,8 @@ FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come."""
+    """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says
+    where hosts come."""
     command = parser()
     options = command.parse_args(arguments)
     ask_for_slices()  # a real device has a processor of its own

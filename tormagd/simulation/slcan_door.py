@@ -75,7 +75,8 @@ class SlcanDoor(Pty):
         self._adapter = SlcanAdapter()
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device the host's frames, and the host the adapter's answers and the device's frames until `now_s`."""
+        """Hand the device the host's frames, and the host the adapter's answers and the device's frames
+        until `now_s`."""
         out = b""
         if readable:
             out, frames = self._adapter.feed(self.read())

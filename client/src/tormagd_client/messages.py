@@ -22,6 +22,7 @@ MAX_MESSAGE_BYTES = 16_384  # a setpoint with the longest preview is under 3 kB;
 MAX_SOURCE_CHARACTERS = 64
 MAX_MARK_CHARACTERS = 200
 MAX_PREVIEW_SAMPLES = 256
+MIN_PREVIEW_DT_MS, MAX_PREVIEW_DT_MS = 0.1, 1_000.0  # no loop runs faster, and a closer one has a slope without measure
 MAX_FORCE_N = 1_000.0  # a value no brake of this size can mean; `ask` keeps to the scene's own range
 MAX_VALIDITY_MS = 60_000.0
 MAX_DISPLACEMENT_MM = 2.0  # since the handle last turned: friction is mobilised there, and more means nothing
@@ -84,8 +85,8 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         _require_within("withdraw_cf", self.withdraw_cf, 0.0, MAX_FORCE_N)
         spacing = self.preview_dt_ms
         if self.preview_N is not None or spacing is not None:
-            is_spacing = spacing is not None and 0.0 < spacing <= 1_000.0
-            require(is_spacing, "preview_dt_ms", spacing, "above 0, to 1000 ms")
+            is_spacing = spacing is not None and MIN_PREVIEW_DT_MS <= spacing <= MAX_PREVIEW_DT_MS
+            require(is_spacing, "preview_dt_ms", spacing, f"{MIN_PREVIEW_DT_MS:g}..{MAX_PREVIEW_DT_MS:g} ms")
         if self.preview_N is not None:
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
             require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)
@@ -444,6 +445,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     arm: ArmReport | None = None
     scene_change: SceneReport | None = None
     calibration: CalibrationReport = CalibrationReport()
+    process_id: int | None = None
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from tormagd.drawing import Figure
 from tormagd.lab.arrays import Array, Json
 from tormagd.lab.pages import subplots, table, write_page
 from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT, Trained

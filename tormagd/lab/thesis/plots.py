@@ -3,9 +3,8 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
+from tormagd.drawing import Axes, Figure
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.optimisation import Design, Problem
 from tormagd.lab.design.phase_portrait import Region

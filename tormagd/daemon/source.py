@@ -1,0 +1,451 @@
+"""One publisher of setpoints: which of its messages count, how old they are, and how evenly they come.
+
+No number keeps a publisher out. A message that does not follow the newest may be the first of a new run, which shows
+itself in a few messages. A message's lateness, our time less its stamp, is the offset of its clock plus the time on the
+way. None arrives before it was sent, those of one publisher do not overtake each other, and clocks drift slowly. So the
+least lateness is the offset plus the constant part of the way, and what is above is delay. From one side these two
+cannot be told apart: up to MAX_WAY_S counts as the way.
+
+No I/O and no clock: times are arguments.
+"""
+
+import math
+import time
+from enum import Enum
+from typing import NamedTuple, final
+
+from msgspec import UNSET
+
+from tormagd.config import MAX_PLAYOUT_MS
+from tormagd.control.ask.governor import AHEAD_S as SLOPE_S
+from tormagd.daemon.rate_group import Histogram
+from tormagd.hardware.connection import clock_report
+from tormagd.hardware.link_statistics import WINDOW_S as LINE_S, DeviceClock
+from tormagd.safety.codes import Explanation, Limit
+from tormagd.scenes.scene import Scene
+from tormagd_client.messages import ClockReport, MessageError, Setpoint, SourceReport
+
+LONGEST_JUMP = 1_000
+"Steps by which `seq` may run ahead at once: more of them missing is no loss, it is another run, or a wrong number."
+RUN = 3
+"So many messages in a row, each newer than the one before, are a run of their own."
+STRAYS_S = 1.0
+"RUN strays within this time, with messages of the run between them, are a second publisher of the same name."
+
+FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
+"ns in what publishers send instead."
+FAR_S = 86_400.0
+"Stamps of such another unit are years away; nearer ones are of a clock. No setpoint is older than this."
+LOOKED_AT, MIN_S = 8, 0.005
+"Messages, and time, that it takes to see how fast far stamps run."
+SLOW = 0.03
+"Share of our clock's rate: no clock runs so slow, also one that was never set."
+
+MAX_WAY_S = 0.2
+"""A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take."""
+MAX_LATE_S = 1.0
+"""A least lateness between the two may be either: the clock is corrected by it, and the limits of sources count it as
+the way."""
+AHEAD_S = 0.05
+"A stamp may be this far ahead before its clock has shown itself; a clock that is further off than this is wrong."
+SETTLED_S = 0.2
+"A new publisher's clock is believed to be wrong once its stamps have said so for this long: a backlog is drained."
+STEP_S = 0.005
+"Stamps of one publisher that run back by more than this prove that its clock was set back."
+DRIFT = 500e-6
+"No clock drifts faster, and no faster rise of the envelope is taken for drift."
+FORGOTTEN_S = 5.0
+"After a longer silence the clock may have been set by any amount."
+JITTER_SHARE = 1.0 / 16.0
+"Of each new difference, as in RFC 3550."
+MAX_DRIFT_PPM = 100.0
+"A clock that drifts faster than quartz does is named."
+NEVER_SET_NS = 946_684_800 * 10**9
+"The year 2000, in which nobody publishes: a clock that begins in 1970 has not been set."
+SURE_WINDOWS = 20
+"Half seconds that a clock's line needs before its scatter says how sure its slope is."
+STEP_NAMED_S = 60.0
+"A clock that was set is named for so long."
+
+WINDOW_S, MIN_MESSAGES = 1.0, 4
+"Least time and least messages that are judged together."
+MAX_LOST = 0.05
+SPREAD_S = 0.02
+"By more than this from message to message a delay shows in the force: what the slope carries over is 50 ms."
+SLACK = 1.25
+"A publisher's own timer may be so much slower than it is meant to be."
+PLAYOUT_STEP_MS = 10
+"A playout that is told as a remedy is rounded up to this."
+
+
+class Order(Enum):
+    """How a message stands to those taken before it."""
+
+    NEWER = "newer"
+    RESTARTED = "restarted"
+    "The first of a new run: the publisher says so by a `session` above every earlier one."
+    REPLACED = "replaced"
+    "The first of a new run that does not say so."
+    STRAY = "stray"
+    "Old, repeated, of a run that is over, or of one that has not shown itself yet."
+
+
+@final
+class Sequence:
+    """Follows a publisher's count `seq` through restarts. `session` is None where the publisher states none."""
+
+    def __init__(self, session: int | None, seq: int) -> None:
+        self.session, self.seq = session, seq
+        self.lost = self.missing = 0
+        "Messages missing in `seq`, of all and before the newest, counted where the publisher counts by ones."
+        self.restarts = 0
+        self._latest_session = session
+        self._step = 0
+        self._stray_session, self._stray_seq, self._in_row = session, seq, 0
+        self._strays, self._strays_since_s = 0, 0.0
+
+    def order(self, now_s: float, session: int | None, seq: int, *, is_over: bool) -> Order:
+        """Judge one message by its numbers, and follow it unless it is a stray."""
+        if session == self.session and seq > self.seq:
+            step = seq - self.seq
+            known = self._step
+            if known == 0 or step <= LONGEST_JUMP * known or is_over:
+                self.missing = min(step, LONGEST_JUMP) - 1 if known == 1 else 0
+                self.lost += self.missing
+                if known == 0 or step < known:
+                    self._step = step
+                self.seq, self._in_row = seq, 0
+                return Order.NEWER
+        if session is not None and (self._latest_session is None or session > self._latest_session):
+            self._latest_session = session
+            return self._begin(session, seq, Order.RESTARTED)
+        is_in_row = self._in_row > 0 and session == self._stray_session and seq > self._stray_seq
+        self._in_row = self._in_row + 1 if is_in_row else 1
+        self._stray_session, self._stray_seq = session, seq
+        is_repeated = session == self.session and seq == self.seq
+        if self._in_row >= RUN or (is_over and not is_repeated):
+            return self._begin(session, seq, Order.REPLACED)
+        if now_s - self._strays_since_s > STRAYS_S:
+            self._strays, self._strays_since_s = 0, now_s
+        self._strays += 1
+        return Order.STRAY
+
+    def is_doubled(self, now_s: float) -> bool:
+        """Tell whether two publishers seem to use this name at once: RUN strays or more within STRAYS_S."""
+        return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
+
+    def _begin(self, session: int | None, seq: int, order: Order) -> Order:
+        """Follow a new run from this message, count a restart, and return `order`."""
+        self.session, self.seq, self._step = session, seq, 0
+        self._in_row = self._strays = self.missing = 0
+        self.restarts += 1
+        return order
+
+
+@final
+class SourceClock:
+    """Estimates one publisher's clock offset and the delay of its messages, from stamps and arrivals."""
+
+    def __init__(self) -> None:
+        self.offset_s = 0.0
+        "How far the clock is behind ours, s, as far as it can be told."
+        self.way_s = 0.0
+        "The constant part of the way, as far as it can be told."
+        self.jitter_s = 0.0
+        "How much the delay varies from message to message: RFC 3550's interarrival jitter."
+        self.steps = 0
+        "How often the clock was seen to be set."
+        self.stepped_s = 0.0
+        "By how much the clock was set last, forward positive."
+        self.stepped_at_s = -math.inf
+        "When the clock was last seen to be set; -inf before."
+        self._lateness_s = self._leaked_s = 0.0
+        self._heard_s: float | None = None
+        self._settles_s: float | None = None
+        self.line = DeviceClock()
+        "The line through the last half minute, or since the clock was set."
+
+    @property
+    def is_settled(self) -> bool:
+        return self._settles_s is None
+
+    @property
+    def is_wrong(self) -> bool:
+        return self.is_settled and not -AHEAD_S <= self.offset_s <= AHEAD_S
+
+    @property
+    def hidden_s(self) -> float:
+        return self.offset_s if 0.0 < self.offset_s < MAX_LATE_S and not self.steps else 0.0
+
+    def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
+        """Take the message that came at `now_s`, and return its delay, s."""
+        if self._heard_s is None:
+            self._begin(now_s, lateness_s)
+        else:
+            self._follow(now_s, lateness_s, now_s - self._heard_s, is_continued)
+        self._heard_s, self._lateness_s = now_s, lateness_s
+        self.line.add(now_s, now_s - lateness_s)
+        if self._settles_s is not None:
+            if now_s < self._settles_s:
+                return lateness_s
+            self._settle()
+        return max(lateness_s - self.offset_s, 0.0)
+
+    def wrong(self, now_s: float, stamp_ns: int, fit: ClockReport | None) -> str:
+        """Return what is wrong with the clock, by its newest stamp and its line `fit`; empty where nothing is."""
+        causes = []
+        if self.is_wrong and stamp_ns < NEVER_SET_NS:
+            causes.append(f"it was never set (it says {time.gmtime(stamp_ns * 1e-9).tm_year}), and is corrected")
+        elif self.is_wrong:
+            side = "behind" if self.offset_s > 0.0 else "ahead of"
+            or_way = " (or its way takes that long)" if self.offset_s > 0.0 and not self.steps else ""
+            causes.append(f"it is {abs(self.offset_s):.3f} s {side} this machine's{or_way}, and is corrected")
+        if now_s - self.stepped_at_s < STEP_NAMED_S:
+            way, often = "forward" if self.stepped_s > 0.0 else "back", f", the last of {self.steps} times"
+            causes.append(f"it was set {way} by {abs(self.stepped_s):.3f} s{often if self.steps > 1 else ''}")
+        if fit is not None and fit.windows >= SURE_WINDOWS:
+            # standard deviation of the slope, ppm, of a line through evenly spaced points
+            sd_ppm = fit.residual_us * math.sqrt(12.0 / fit.windows) / (fit.windows * LINE_S)
+            if abs(fit.drift_ppm) - 3.0 * sd_ppm > MAX_DRIFT_PPM:
+                causes.append(f"it runs {abs(fit.drift_ppm):.0f} ppm {'fast' if fit.drift_ppm > 0.0 else 'slow'}")
+        return "; ".join(causes)
+
+    def _begin(self, now_s: float, lateness_s: float) -> None:
+        """Begin with nothing known but this lateness, and a new line; the counts of steps stay."""
+        self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
+        self._settles_s = now_s + SETTLED_S
+        self.line = DeviceClock()
+        if -AHEAD_S <= lateness_s <= MAX_WAY_S:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Count the offset as known; one that a way can take becomes the constant part of the way."""
+        self._settles_s = None
+        if 0.0 < self.offset_s <= MAX_WAY_S:
+            self.offset_s, self.way_s = 0.0, self.offset_s
+
+    def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
+        """Update offset, way and jitter from a message that came `gap_s` after the last, both on our clock."""
+        rise_s = lateness_s - self._lateness_s
+        if not is_continued or gap_s > FORGOTTEN_S:
+            above_s = lateness_s - self.offset_s - self.way_s
+            if not -STEP_S <= above_s <= MAX_WAY_S:
+                self._begin(now_s, lateness_s)
+                return
+        elif rise_s > gap_s + STEP_S:
+            # sent later but stamped earlier, which no delay explains. The way is taken to be as before
+            self.offset_s += rise_s
+            self._set(now_s, -rise_s)
+        else:
+            self.jitter_s += JITTER_SHARE * (abs(rise_s) - self.jitter_s)
+            leak_s = DRIFT * gap_s
+            self.offset_s += leak_s
+            self._leaked_s += leak_s
+        fall_s = self.offset_s + self.way_s - lateness_s
+        if fall_s >= 0.0:
+            self._fall(now_s, fall_s)
+
+    def _fall(self, now_s: float, fall_s: float) -> None:
+        """Lower offset and way by `fall_s`, not negative: the message was less late than both of them together."""
+        granted_s = min(fall_s, self._leaked_s)
+        self.offset_s -= granted_s
+        self._leaked_s -= granted_s
+        shorter_s = min(fall_s - granted_s, self.way_s)
+        self.way_s -= shorter_s
+        ahead_s = fall_s - granted_s - shorter_s
+        was_hidden = self.hidden_s > 0.0
+        self.offset_s -= ahead_s
+        if ahead_s > STEP_S and self.is_settled and not (was_hidden and self.hidden_s > 0.0):
+            self._set(now_s, ahead_s)
+
+    def _set(self, now_s: float, by_s: float) -> None:
+        """Count that the clock was set by `by_s`, forward positive, and begin its line anew."""
+        self.steps += 1
+        self.stepped_s, self.stepped_at_s = by_s, now_s
+        self.line = DeviceClock()
+
+
+class Needs(NamedTuple):
+    """What the scene wants of a publisher: how many setpoints a second, and how old they may be when they come."""
+
+    setpoint_hz: float = 1.0 / SLOPE_S
+    delay_s: float = MAX_LATE_S
+
+
+def needs_of(scene: Scene) -> Needs:
+    """Return what a scene needs of its publisher."""
+    stated = UNSET if scene.signal is None else scene.signal.setpoint_hz
+    delay_ms = scene.budget.delay_ms
+    return Needs(
+        Needs().setpoint_hz if stated is UNSET else stated,
+        Needs().delay_s if delay_ms is UNSET else delay_ms * 1e-3,
+    )
+
+
+@final
+class Source:
+    """One publisher. `judge` takes its messages; the newest is `setpoint`, meant at `stamp_s` on our clock."""
+
+    def __init__(self, setpoint: Setpoint) -> None:
+        self.setpoint = setpoint
+        self.heard_s = self.stamp_s = -math.inf
+        self.sequence, self.clock = Sequence(setpoint.session, setpoint.seq), SourceClock()
+        self.delays = Histogram()
+        self.accepted = self.refused = 0
+        self.found: dict[Limit, Explanation] = {}
+        self.cause = self.remedy = ""
+        self._fit: ClockReport | None = None
+        self._is_named = False
+        self._begun = Order.NEWER
+        self._unit = ""
+        self._far, self._far_s, self._far_ns = 0, 0.0, 0
+        "Messages with far stamps that are looked at; arrival and stamp of the first."
+        self._began_s: float | None = None
+        self._sent_s = 0.0
+        self._window: list[tuple[int, float, float]] = []
+
+    def judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int, playout_s: float, needs: Needs) -> Order:
+        """Judge a message, and make it the newest of its source unless it is a stray, or a MessageError refuses it."""
+        order = Order.NEWER
+        if self.heard_s > -math.inf:
+            is_over = self.is_stale(now_s)
+            order = self.sequence.order(now_s, setpoint.session, setpoint.seq, is_over=is_over)
+            if order is Order.STRAY:
+                return order
+            if order is not Order.NEWER:
+                self._begun = order
+        self.heard_s = now_s
+        self._require_ns(setpoint, now_s, realtime_ns)
+        lateness_s = (realtime_ns - setpoint.stamp_ns) * 1e-9
+        delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is not Order.REPLACED)
+        if not -AHEAD_S <= delay_s <= FAR_S:
+            raise MessageError(
+                f"stamp_ns is {abs(delay_s):.3f} s {'ahead of' if delay_s < 0.0 else 'behind'} this clock: allowed are "
+                f"{AHEAD_S:g} s ahead and {FAR_S:.0f} s behind, until the clock of its source has shown itself"
+            )
+        self.setpoint, self.stamp_s = setpoint, now_s - max(delay_s, 0.0)
+        order, self._begun = self._begun, Order.NEWER
+        if order is not Order.NEWER:
+            self._began_s, self.found = None, {}
+        if self.clock.is_settled:
+            self.delays.add(now_s, delay_s * 1e6)
+            self._note_manner(now_s, delay_s, playout_s, needs)
+        return order
+
+    def is_stale(self, now_s: float) -> bool:
+        """Tell whether the newest setpoint is no longer valid at `now_s`; True also before the first one was taken."""
+        return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
+
+    def refresh(self, now_s: float) -> bool:
+        """Update the percentiles of `delays`, and `cause` and `remedy`; return True if something is newly wrong."""
+        self.delays.refresh()
+        self._fit = self.clock.line.fit()
+        self.cause = self.remedy = ""
+        if self._unit in FACTORS:
+            self.cause, self.remedy = f"its stamps count {self._unit}, and are refused", _in_ns(self._unit)
+        elif not self.clock.is_settled:
+            self.cause = "its stamps are far from this machine's clock: it is watched which of the two it is"
+            self.remedy = "wait a moment"
+        elif wrong := self.clock.wrong(now_s, self.setpoint.stamp_ns, self._fit):
+            self.cause, self.remedy = f"its clock: {wrong}", "keep the clocks of both machines by chrony or ptp4l"
+        was_named, self._is_named = self._is_named, self.clock.is_settled and bool(self.cause)
+        return self._is_named and not was_named
+
+    def report(self, now_s: float, state: str) -> SourceReport:
+        """Return its report, with `state` while its newest setpoint is valid, and the figures of the last `refresh`."""
+        clock, sequence, is_known = self.clock, self.sequence, self.clock.is_settled and self.stamp_s > -math.inf
+        return SourceReport(
+            state="stale" if self.is_stale(now_s) else state,
+            silent_ms=round((now_s - self.heard_s) * 1e3, 1),
+            session=sequence.session,
+            seq=sequence.seq,
+            accepted=self.accepted,
+            refused=self.refused,
+            lost=sequence.lost,
+            restarts=sequence.restarts,
+            delay_us=self.delays.report,
+            jitter_us=round(clock.jitter_s * 1e6, 1),
+            clock_behind_ms=round(clock.offset_s * 1e3, 3) if is_known else None,
+            clock_steps=clock.steps,
+            clock=clock_report(self._fit),
+            cause=self.cause,
+            remedy=self.remedy,
+        )
+
+    def _require_ns(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
+        """Raise MessageError where the stamps do not count ns, or where this is not known yet."""
+        stamp_ns = setpoint.stamp_ns
+        if abs(realtime_ns - stamp_ns) < FAR_S * 1e9:
+            self._unit, self._far = "ns", 0
+        else:
+            if self._far == 0:
+                self._far_s, self._far_ns = now_s, stamp_ns
+            self._far += 1
+            past_s = now_s - self._far_s
+            if self._far >= LOOKED_AT and past_s >= MIN_S:
+                is_slow = (stamp_ns - self._far_ns) * 1e-9 < SLOW * past_s
+                nearest = min(FACTORS, key=lambda unit: abs(stamp_ns * FACTORS[unit] - realtime_ns))
+                self._unit, self._far = nearest if is_slow else "ns", 0
+        if self._unit == "ns":
+            return
+        if self._unit:
+            raise MessageError(
+                f"stamp_ns = {stamp_ns} of {setpoint.source!r} counts {self._unit}: {_in_ns(self._unit)}"
+            )
+        raise MessageError(
+            f"stamp_ns = {stamp_ns} of {setpoint.source!r} is days from this clock: allowed is less until "
+            f"{LOOKED_AT} messages show whether it counts ns"
+        )
+
+    def _note_manner(self, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
+        """Note how the newest setpoint came, and judge the window that it fills."""
+        sent_s, missing = now_s - delay_s, self.sequence.missing
+        spacing_s, self._sent_s = (sent_s - self._sent_s) / (1 + missing), sent_s
+        if self._began_s is None:
+            self._began_s, self._window = now_s, []
+            return
+        self._window.append((missing, spacing_s, max(delay_s, playout_s)))
+        if now_s - self._began_s >= WINDOW_S and len(self._window) >= MIN_MESSAGES:
+            self.found = self._judged(playout_s, needs)
+            self._began_s, self._window = now_s, []
+
+    def _judged(self, playout_s: float, needs: Needs) -> dict[Limit, Explanation]:
+        """Return what is wrong in a full window, with cause and remedy; empty where nothing is."""
+        lost, received, hidden_s = sum([each[0] for each in self._window]), len(self._window), self.clock.hidden_s
+        late_s = [each[2] for each in self._window]
+        found = {}
+        if lost > MAX_LOST * (received + lost):
+            found[Limit.SOURCE_LOSS] = Explanation(
+                f"{lost / (received + lost):.0%} of its setpoints are lost on the way",
+                "look for the lossy part of the network",
+            )
+        preview_s = len(self.setpoint.preview_N or ()) * (self.setpoint.preview_dt_ms or 0.0) * 1e-3
+        most_s, spacings_s = max(SLACK / needs.setpoint_hz, preview_s), [each[1] for each in self._window]
+        if 2 * len([each_s for each_s in spacings_s if each_s > most_s]) > received:
+            spacing_s = sorted(spacings_s)[(received - 1) // 2]
+            found[Limit.SOURCE_SELDOM] = Explanation(
+                f"it sends {1.0 / spacing_s:.1f} setpoints a second, and the scene needs {needs.setpoint_hz:g}",
+                "send more often, or a preview_N that reaches to the next one",
+            )
+        mean_s = sum(late_s, 0.0) / len(late_s) + hidden_s
+        if mean_s > needs.delay_s:
+            is_held = playout_s > 0.0 and playout_s + hidden_s > needs.delay_s
+            found[Limit.SOURCE_LATE] = Explanation(
+                f"its setpoints are {mean_s * 1e3:.0f} ms late, and the scene allows {needs.delay_s * 1e3:.0f}",
+                f"{'lower sources.playout_ms, ' if is_held else ''}take a shorter way, set the clocks by chrony, or "
+                "send a preview_N of that length",
+            )
+        least_s, most_s = min(late_s), max(late_s)
+        if most_s - least_s > SPREAD_S:
+            playout_ms = math.ceil(most_s * 1e3 / PLAYOUT_STEP_MS) * PLAYOUT_STEP_MS
+            found[Limit.SOURCE_JITTER] = Explanation(
+                f"its setpoints are {(least_s + hidden_s) * 1e3:.0f} to {(most_s + hidden_s) * 1e3:.0f} ms late",
+                f"set sources.playout_ms = {playout_ms}, which delays every setpoint to that, or take a steadier way"
+                if playout_ms <= MAX_PLAYOUT_MS
+                else "send a preview_N that is longer than that differs, or take a steadier way",
+            )
+        return found
+
+
+def _in_ns(unit: str) -> str:
+    return f"send ns since 1970 (CLOCK_REALTIME): {FACTORS[unit]} times as much"
