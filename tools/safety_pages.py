@@ -86,10 +86,9 @@ def matrix_page(record: dict[str, Any]) -> str:
     for (fault, named, reaction, leads_out), alike in lines.items():
         name = fault if buses[fault] == 1 else f"{fault} ({alike[0]['bus']})"
         safe_s = [cell["seconds"] for cell in alike if cell["seconds"] is not None]
-        told = f"{reaction}, {max(safe_s):.3f} s" if safe_s else reaction
-        made.setdefault(leads_out, []).append((name, named, told))
-    columns = ("fault", "named as", "reaction, safe after")
-    return _MATRIX_HEAD + says + "\n".join(f"## Leads out: {by}\n\n{table(columns, of)}" for by, of in made.items())
+        row = (name, named, f"{reaction}, {max(safe_s):.3f} s" if safe_s else reaction)
+        made.setdefault(leads_out, [("fault", "named as", "reaction, safe after")]).append(row)
+    return _MATRIX_HEAD + says + "\n".join(f"## Leads out: {by}\n\n{table(of[0], of[1:])}" for by, of in made.items())
 
 
 def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
