@@ -10,7 +10,6 @@ import logging
 import os
 import socket
 import struct
-import time
 from collections import Counter, deque
 from functools import partial
 from typing import Any
@@ -28,10 +27,6 @@ from tormagd_client.keys import fingerprint
 CONNECTIONS = 200
 CONNECTIONS_PER_PEER = 160
 "Connections allowed to one endpoint, and to one address or process. More are cut off as soon as they are accepted."
-PEERS = 32
-"Refused peers that are counted apart."
-RECONNECT_S = 0.5
-"A peer that was cut off comes back within this time (libzmq's default is 0.1 s)."
 GUARDED = {
     zmq.ZAP_ENFORCE_DOMAIN: 1,
     zmq.HANDSHAKE_IVL: 2_000,
@@ -49,7 +44,6 @@ WATCHED = (
     | zmq.EVENT_DISCONNECTED
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
 _CREDENTIALS = struct.Struct("3i")
 
@@ -79,47 +73,11 @@ class _Connections:
         self.name, self.endpoint, self.is_guarded = name, endpoint, is_guarded
         self.monitor = endpoint.get_monitor_socket(WATCHED)
         self.addresses: dict[int, str] = {}
-        self.admitted: Counter[str] = Counter()
-        self.turned_away: deque[str] = deque(maxlen=CONNECTIONS)
-        "Addresses whose keys were refused, and whose connections are not closed yet."
-        self.untold = 0
-        "Peers of refused keys that libzmq has not rejected yet."
-        self.taken_for_one: deque[str] = deque(maxlen=CONNECTIONS)
-        "Addresses of peers that left in the handshake and were counted as one of these."
+        self.answered: Counter[str] = Counter()
+        "How many connections of an address were answered, let in or not, when libzmq asked about their keys."
         self.failed: str | None = None
         "Why the handshake failed of the connection that is closed next, as libzmq does at once; None: it did not fail."
         self.cut: set[int] = set()
-
-    def told(self) -> str | None:
-        """Note that libzmq has rejected a peer for its key, and return whom the caller has to count as refused for
-        that."""
-        if self.untold:
-            self.untold -= 1
-            return None
-        address = self.taken_for_one.pop() if self.taken_for_one else ""
-        self.turned_away.append(address)
-        return address
-
-    def left_untold(self, address: str) -> bool:
-        """Tell whether a peer that broke off its handshake was counted already, when its key was refused."""
-        if not self.untold or (taken := self.left(address)) is None:
-            return False
-        self.untold -= 1
-        self.taken_for_one.append(taken)
-        return True
-
-    def gone(self) -> str:
-        still = Counter(self.addresses.values())
-        return next((address for address, count in self.admitted.items() if count > still[address]), "")
-
-    def left(self, address: str) -> str | None:
-        """Remove one entry of `address` from `turned_away`, and return it; None where there is none."""
-        if not address and self.turned_away:  # the peer had gone before its address was read
-            return self.turned_away.popleft()
-        if address not in self.turned_away:
-            return None
-        self.turned_away.remove(address)
-        return address
 
 
 class Admission:
@@ -128,11 +86,7 @@ class Admission:
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
         self._keys, self._arrivals = keys, arrivals
         self.allowed: Allowed = keys.allowed if keys else {}
-        self.refusals = Tally(PEERS, "refused %d peers, the newest at %s", self.name)
-        self.left: deque[tuple[str, float]] = deque(maxlen=64)
-        "Addresses of publishers that left after a complete handshake, and when."
-        self.oversize = 0
-        "How often such a publisher came back at once: it had been cut off for a message that was too long."
+        self.refusals = Tally("refused %d peers, the newest at %s", self.name)
         self._endpoints: dict[str, _Connections] = {}
         # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
         self._zap = context.socket(zmq.ROUTER)
@@ -226,14 +180,10 @@ class Admission:
             self._arrivals.touch(self._zap)
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
-        """Tell whether the key `public` may use the endpoint `name`, and count the answer."""
-        known = self._endpoints[name]
+        """Tell whether the key `public` may use the endpoint `name`; count one that may not, with the reason."""
+        self._endpoints[name].answered[address] += 1
         if self.has_role(public, MAY[name]):
-            self._count_oversize(name, address)
-            known.admitted[address] += 1
             return True
-        known.turned_away.append(address)
-        known.untold += 1
         listed = self.allowed.get(public)
         reason = "key not listed" if listed is None else f"role not allowed: {', '.join(sorted(listed.roles))}"
         self.refusals.add(name, Peer(address, public), reason)
@@ -251,64 +201,34 @@ class Admission:
             elif kind == zmq.EVENT_DISCONNECTED:
                 self._admit()  # a question about its key may still wait: it is counted once
                 self._disconnected(known, value)
-            elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                other = known.told()
-                if other is not None:
-                    self.refusals.add(known.name, Peer(other), PLAIN)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
-            elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
+            else:
                 known.failed = PLAIN if known.is_guarded else "left in the handshake"
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
         """Note a new connection and its address, and end it where its address or its endpoint has too many."""
         address = known.addresses[descriptor] = _address(descriptor)
-        if not address:
-            return
         of_address = sum(each == address for each in known.addresses.values())
-        if of_address > CONNECTIONS_PER_PEER or len(known.addresses) > CONNECTIONS:
+        if address and (of_address > CONNECTIONS_PER_PEER or len(known.addresses) > CONNECTIONS):
             known.cut.add(descriptor)
             _end(descriptor, address)
-        elif not known.is_guarded:
-            self._count_oversize(known.name, address)
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
         """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as
         one too many."""
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
-        was_asked = (
-            known.left(address) is not None if failed is None else failed == PLAIN and known.left_untold(address)
-        )
         if descriptor in known.cut:
             known.cut.discard(descriptor)
             failed = "too many connections"
-        if was_asked:
-            return  # counted when its key was refused
-        if failed is None and not address:  # a quick one: answered, and gone before its address was read
-            address = known.gone()
-        if failed is None and (not known.is_guarded or known.admitted[address]):
-            known.admitted -= Counter((address,))
-            if known.name == "setpoint" and address:
-                self.left.append((address, time.monotonic()))
+        elif failed is None and not address:  # a quick one: answered, and gone before its address was read
+            still = Counter(known.addresses.values())
+            address = next((each for each, count in known.answered.items() if count > still[each]), "")
+        if failed is None and (not known.is_guarded or known.answered[address]):
+            known.answered -= Counter((address,))
         else:
-            # libzmq closes a peer of an old ZMTP version without an event of its own
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
-
-    def _count_oversize(self, name: str, address: str) -> None:
-        """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget
-        that leaving."""
-        # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
-        # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
-        # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
-        if name != "setpoint":
-            return
-        since_s = time.monotonic() - RECONNECT_S
-        for left in self.left:
-            if left[0] == address and left[1] > since_s:
-                self.left.remove(left)
-                self.oversize += 1
-                return
 
 
 def _address(descriptor: int) -> str:

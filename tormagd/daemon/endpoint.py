@@ -53,8 +53,6 @@ TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket in one beat at most, and for how long."
 ANSWERS_NS = 300_000
 "For how long requests are answered in one beat."
-PEERS = 16
-"Peers whose messages were not read that are counted apart."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
@@ -98,7 +96,7 @@ class Endpoint:
         self._subscriptions = {
             name: Allowance(SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST) for name in ("telemetry", "recording")
         }
-        self._drops = Tally(PEERS, "%d messages were not read, the newest at %s", self.admission.name)
+        self._drops = Tally("%d messages were not read, the newest at %s", self.admission.name)
         self.listeners = Listeners()
 
     def take_setpoints(self) -> bool:
@@ -163,13 +161,13 @@ class Endpoint:
         self.admission.refusals.tell(now_s)
 
     def report(self) -> PeersReport:
-        """Return the connections of each endpoint, refused peers, and peers whose messages were dropped."""
+        """Return the connections of each endpoint, and since the start the peers refused and the messages dropped."""
         return PeersReport(
             connections=self.admission.connections(),
             refused=self.admission.refusals.total,
             dropped=self._drops.total,
             refusals=self.admission.refusals.report(),
-            drops=tuple(sorted(self._drops.report(), key=lambda each: -each.count)),
+            drops=self._drops.report(),
         )
 
     def close(self) -> None:

@@ -176,7 +176,7 @@ class SetpointInbox:
             if source.refresh(now_s):
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
-    def report(self, now_s: float, oversize: int = 0) -> SetpointReport:
+    def report(self, now_s: float) -> SetpointReport:
         """Return counts, the last refusal, and each source's `seq`, with REPORTED full reports: the holder's, and those
         of the newest others."""
         newest = sorted(self._sources, key=lambda name: (name != self.holder, -self._sources[name].heard_s))
@@ -186,7 +186,6 @@ class SetpointInbox:
             accepted=self.accepted,
             refused=self.refused,
             dropped=self.dropped,
-            oversize=oversize,
             last_refusal=self.last_refusal,
             newest_source=self.holder,
             sources={name: source.sequence.seq for name, source in self._sources.items()},

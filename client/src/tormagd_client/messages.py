@@ -272,7 +272,7 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
     accepted: int
     refused: int
     dropped: int
-    oversize: int
+    oversize: int = 0
     last_refusal: str | None
     newest_source: str
     sources: dict[str, int]
@@ -355,7 +355,7 @@ class StallReport(msgspec.Struct, frozen=True):
 
 
 class PeerReport(msgspec.Struct, frozen=True):
-    """A peer that was refused, or whose messages were dropped: where, who, why, and how often."""
+    """A peer that was refused, or whose messages were dropped: where, who, why, and how often in a row."""
 
     endpoint: str
     address: str
@@ -365,7 +365,7 @@ class PeerReport(msgspec.Struct, frozen=True):
 
 
 class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Connections by endpoint, peers that were refused, and messages that were dropped unread."""
+    """Connections by endpoint, and since the start the peers refused and the messages dropped unread."""
 
     connections: dict[str, int] = msgspec.field(default_factory=dict)
     refused: int = 0
