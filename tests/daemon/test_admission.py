@@ -73,9 +73,9 @@ class Rig:
         self.peers.append(made)
         return made
 
-    def dial(self) -> socket.socket:
-        """A stranger at the setpoints' TCP port, who has said nothing yet."""
-        port = int(self.addresses["setpoint"].rsplit(":", 1)[1])
+    def dial(self, name: str = "setpoint") -> socket.socket:
+        """A stranger at a TCP port, who has said nothing yet."""
+        port = int(self.addresses[name].rsplit(":", 1)[1])
         return socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
 
     def until(self, reached: Callable[[], Any], what: str = "reached") -> None:
@@ -320,6 +320,25 @@ def test_an_address_has_so_many_connections_and_no_more(rig: Rig, monkeypatch: p
     publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
     rig.until(lambda: publisher.poll(0))
     assert CONNECTIONS_PER_PEER > 100
+
+
+@over_tcp
+def test_those_that_say_nothing_keep_nobody_out_and_cut_nobody_off(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(admission, "CONNECTIONS_PER_PEER", 5)
+    consoles: list[zmq.Socket[bytes]] = []
+    with contextlib.ExitStack() as strangers:
+        for refused in (0, 7, 18):
+            rig.until(lambda refused=refused: rig.endpoint.report().refused >= refused, "cut off")  # type: ignore[misc]
+            consoles.append(rig.peer(zmq.DEALER, "control", rig.pair("console")))
+            for console in consoles:
+                console.send(request("status"))
+                rig.until(partial(console.poll, 0), "answered")
+                console.recv_multipart()
+            for _ in range(12):
+                strangers.enter_context(rig.dial("control"))
+    assert caplog.text.count("127.0.0.1 makes more connections to control than 5") == 1
 
 
 @over_tcp

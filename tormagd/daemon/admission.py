@@ -10,6 +10,7 @@ import logging
 import os
 import socket
 import struct
+import time
 from collections import Counter, deque
 from functools import partial
 from typing import Any
@@ -18,15 +19,23 @@ import zmq
 import zmq.utils.monitor
 from zmq.utils import z85
 
+from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.arrivals import Arrivals
-from tormagd.daemon.tally import Peer, Tally
+from tormagd.daemon.door import Door
+from tormagd.daemon.tally import Peer, Tally, shown
 from tormagd.keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
 
 CONNECTIONS = 200
 CONNECTIONS_PER_PEER = 160
-"Connections allowed to one endpoint, and to one address or process. More are cut off as soon as they are accepted."
+"Connections allowed to one endpoint, and to one address or process. For one more, another is cut off."
+CLOSING = 8
+"Connections that were cut off and are not closed yet; while there are so many, nobody is let in."
+TOLD_S = 60.0
+"How often a process that makes too many connections is named in the log."
+UPDATE_NS = 100_000
+"For how long events are handled in one slice."
 GUARDED = {
     zmq.ZAP_ENFORCE_DOMAIN: 1,
     zmq.HANDSHAKE_IVL: 2_000,
@@ -40,7 +49,9 @@ GUARDED = {
 AT_ONCE = 8
 "Events taken in one slice at most."
 WATCHED = (
-    zmq.EVENT_ACCEPTED
+    zmq.EVENT_LISTENING
+    | zmq.EVENT_ACCEPTED
+    | zmq.EVENT_ACCEPT_FAILED
     | zmq.EVENT_DISCONNECTED
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
@@ -77,7 +88,21 @@ class _Connections:
         "How many connections of an address were answered, let in or not, when libzmq asked about their keys."
         self.failed: str | None = None
         "Why the handshake failed of the connection that is closed next, as libzmq does at once; None: it did not fail."
-        self.cut: set[int] = set()
+        self.heard: set[int] = set()
+        "Connections by which a message has come."
+        self.cut: dict[int, str] = {}
+        "Addresses of connections that were cut off and are not closed yet."
+        self.door: Door
+
+    def crowded(self, address: str) -> int | None:
+        """Return the connection to cut off, now that one of `address` has come; None where there is room."""
+        of = Counter(self.addresses.values())
+        if of[address] <= CONNECTIONS_PER_PEER:
+            if len(self.addresses) <= CONNECTIONS:
+                return None
+            address = of.most_common(1)[0][0]
+        theirs = [descriptor for descriptor, each in self.addresses.items() if each == address]
+        return next((descriptor for descriptor in theirs if descriptor not in self.heard), theirs[-1])
 
 
 class Admission:
@@ -93,6 +118,7 @@ class Admission:
         self._zap.linger = 0
         self._zap.bind("inproc://zeromq.zap.01")
         self._parts = deque([(self._zap, self._admit)])
+        self._crowds = Allowance(1.0 / TOLD_S, 1.0)
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
@@ -111,17 +137,27 @@ class Admission:
         self._parts.append((known.monitor, partial(self._watch, known)))
         self._arrivals.watch(known.monitor)
 
+    def bound(self, name: str) -> None:
+        """Bound the connections of the endpoint `name` from now on."""
+        self._watch(self._endpoints[name])
+
+    def hear(self, name: str, descriptor: int) -> None:
+        """Note that a message has come by the connection `descriptor` of the endpoint `name`."""
+        self._endpoints[name].heard.add(descriptor)
+
     def update(self) -> bool:
-        """Handle up to AT_ONCE waiting events of one socket, the next in turn that has any; return False where none
-        has."""
+        """Handle waiting events, AT_ONCE of each socket, for about UPDATE_NS; return False where there are none."""
         # in turn: who knocks at one endpoint without pause must not keep everybody from the others
+        until_ns, is_done = time.monotonic_ns() + UPDATE_NS, False
         for _ in range(len(self._parts)):
             self._parts.rotate()
             events, handle = self._parts[0]
             if self._arrivals.has(events):
                 handle()
-                return True
-        return False
+                is_done = True
+                if time.monotonic_ns() > until_ns:
+                    break
+        return is_done
 
     def close(self) -> None:
         """Stop watching the connections."""
@@ -196,8 +232,13 @@ class Admission:
                 return
             event = zmq.utils.monitor.recv_monitor_message(known.monitor, zmq.NOBLOCK)
             kind, value = event["event"], event["value"]
-            if kind == zmq.EVENT_ACCEPTED:
+            if kind == zmq.EVENT_LISTENING:
+                known.door = Door(value)
+            elif kind == zmq.EVENT_ACCEPTED:
+                known.door.is_open = False
                 self._accepted(known, value)
+            elif kind == zmq.EVENT_ACCEPT_FAILED:
+                known.door.is_open = False
             elif kind == zmq.EVENT_DISCONNECTED:
                 self._admit()  # a question about its key may still wait: it is counted once
                 self._disconnected(known, value)
@@ -205,23 +246,32 @@ class Admission:
                 known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
             else:
                 known.failed = PLAIN if known.is_guarded else "left in the handshake"
+            if len(known.cut) < CLOSING:
+                known.door.open()
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
-        """Note a new connection and its address, and end it where its address or its endpoint has too many."""
+        """Note a new connection and its address."""
         address = known.addresses[descriptor] = _address(descriptor)
-        of_address = sum(each == address for each in known.addresses.values())
-        if address and (of_address > CONNECTIONS_PER_PEER or len(known.addresses) > CONNECTIONS):
-            known.cut.add(descriptor)
-            _end(descriptor, address)
+        cut = known.crowded(address)
+        if cut is None:
+            return
+        address = known.cut[cut] = known.addresses.pop(cut)
+        _end(cut, address)
+        if self._crowds.grants(Peer(address), time.monotonic()):
+            log.warning(
+                "%s makes more connections to %s than %d, or than the %d of all: what is beyond is cut off; "
+                "next: end it, or let it use one socket for all its messages",
+                *(shown(address), known.name, CONNECTIONS_PER_PEER, CONNECTIONS),
+            )
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
         """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as
         one too many."""
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
+        known.heard.discard(descriptor)
         if descriptor in known.cut:
-            known.cut.discard(descriptor)
-            failed = "too many connections"
+            address, failed = known.cut.pop(descriptor), "too many connections"
         elif failed is None and not address:  # a quick one: answered, and gone before its address was read
             still = Counter(known.addresses.values())
             address = next((each for each, count in known.answered.items() if count > still[each]), "")

@@ -181,7 +181,13 @@ class Endpoint:
         """Return a new socket of this `kind`, guarded where `endpoints` says so, bound to `address`, with bounded
         queues."""
         made = self._context.socket(kind)
-        options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
+        options = {
+            zmq.LINGER: 0,
+            zmq.BACKLOG: 512,
+            zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES,
+            zmq.SNDHWM: 1_000,
+            zmq.RCVHWM: 1_000,
+        }
         if kind == zmq.XPUB:
             options |= {zmq.RCVHWM: SUBSCRIPTIONS, zmq.XPUB_VERBOSER: 1}  # each one, not only the first of a topic
         for option, value in options.items():
@@ -194,6 +200,7 @@ class Endpoint:
                 self._files.append(file)
                 made.setsockopt(zmq.USE_FD, file.listener.detach())
             made.bind(address)
+            self.admission.bound(name)
         except zmq.ZMQError as error:
             raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}; name another") from error
         except OSError as error:
@@ -220,6 +227,8 @@ class Endpoint:
                 self.admission.cut_off(name, peer.address)
 
     def _sender(self, frame: zmq.Frame, name: str) -> Peer:
+        """Return the peer that sent a message, with its key where the endpoint is guarded."""
+        self.admission.hear(name, int(frame.get(zmq.SRCFD)))
         key = str(frame.get("User-Id")) if name in self._guarded else ""
         return Peer(str(frame.get("Peer-Address")), key)
 
