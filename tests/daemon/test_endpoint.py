@@ -316,6 +316,47 @@ def test_commands_are_answered_in_bounded_portions_and_in_their_order(rig: Rig) 
     assert [request.id for request in rig.answered] == list(range(count))
 
 
+@pytest.mark.parametrize(
+    "envelope",
+    [
+        [],
+        [b""],
+        [b"\0\0\0\7", b""],
+        [b"a client's name", b"\0\0\0\7", b""],
+        [b"\0abcd", b"\0efgh"],
+        [b"x" * 255] * 15 + [b""],
+    ],
+    ids=range(6),
+)
+def test_a_reply_has_the_envelope_of_its_request(rig: Rig, envelope: list[bytes]) -> None:
+    client = rig.connect(zmq.DEALER, "control")
+    for name in ("stop", "status"):
+        client.send_multipart([*envelope, command(name)])
+        rig.until(lambda: client.poll(0) > 0, lambda: rig.take_and_serve(rig.answer))
+        *returned, reply = client.recv_multipart()
+        assert (returned, decode(reply, Reply).ok) == (envelope, True)
+    assert [each.command for each in rig.answered] == ["stop", "status"]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [command("stop")] * 2,
+        [b"", command("stop"), command("stop")],
+        [b"x" * 256, b"", command("stop")],
+        [b"x"] * 16 + [b"", command("stop")],
+        [b"topic", command("stop")],
+        [b"", b"", command("stop")],
+    ],
+    ids=range(6),
+)
+def test_a_request_of_several_parts_is_none(rig: Rig, parts: list[bytes]) -> None:
+    client = rig.connect(zmq.DEALER, "control")
+    client.send_multipart(parts)
+    assert rig.serve(client, never).error.code == "bad_request"
+    assert rig.is_answered()
+
+
 # -- what goes first -----------------------------------------------------------------------------------------------
 
 

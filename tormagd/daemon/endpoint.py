@@ -51,6 +51,8 @@ SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. One that says more is cut off, and may connect again."
 TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket in one beat at most, and for how long."
+HOPS, LONGEST_ROUTING_ID = 16, 255
+"Parts of an envelope, and bytes of each, at most."
 ANSWERS_NS = 300_000
 "For how long requests are answered in one beat."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
@@ -238,12 +240,16 @@ class Endpoint:
             self._is_in_parts_of_request = self._control.recv(zmq.NOBLOCK, copy=False).more
             return None
         envelope = [self._control.recv(zmq.NOBLOCK)]
+        hops: list[bytes] = []
         part = self._control.recv(zmq.NOBLOCK, copy=False)
-        if part.more and not part.bytes:  # the delimiter of a REQ socket
-            envelope.append(b"")
+        while part.more and hops[-1:] != [b""] and len(hops) < HOPS and len(part) <= LONGEST_ROUTING_ID:
+            hops.append(part.bytes)
             part = self._control.recv(zmq.NOBLOCK, copy=False)
         self._is_in_parts_of_request = part.more
-        data = b"" if part.more else part.bytes
+        data = b""
+        if hops[-1:] == [b""] or all(len(hop) == 5 and hop[0] == 0 for hop in hops):
+            envelope += hops
+            data = b"" if part.more else part.bytes
         return Waiting(envelope, data, self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
