@@ -111,6 +111,9 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
         ("[sources]\npriority = ['']", "$.sources.priority", "['']", ">= 1"),
         ("[sources]\npriority = ['a', 'a']", "sources.priority", "('a', 'a')", "different printable names"),
         ('[sources]\npriority = ["\\u001b[2J"]', "sources.priority", "x1b", "different printable names"),
+        ("[sources.keys]\nrobot = ['0123']", "sources.keys.robot", "('0123',)", "tormagctl keys show"),
+        ("[sources.keys]\nrobot = []", "sources.keys.robot", "()", "one or more"),
+        ("[sources.keys]\na = ['0123:4567:89ab:cdef']", "sources.keys", "['a']", "none where endpoints.setpoint asks"),
         # orders that cannot be
         ("[rates]\ncontrol_hz = 200\ninference_hz = 250", "rates.inference_hz = 250", "250", "rates.control_hz = 200"),
         ("[rates]\ntelemetry_hz = 60", "rates.telemetry_hz = 60", "60", "rates.control_hz = 1000"),

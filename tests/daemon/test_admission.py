@@ -13,7 +13,7 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.config import Config
+from tormagd.config import Config, Sources
 from tormagd.daemon import admission
 from tormagd.daemon.admission import CONNECTIONS_PER_PEER, PLAIN
 from tormagd.daemon.endpoint import Endpoint
@@ -279,6 +279,23 @@ def test_a_stranger_gets_nothing_but_the_greeting_and_its_mechanism(rig: Rig, se
             assert got[12:32] == b"CURVE".ljust(20, b"\0")
     rig.until(lambda: rig.endpoint.report().refused == 1, "refused")
     assert rig.newest() == ("setpoint", reason, "")
+
+
+def test_who_may_publish_sends_under_no_name_that_another_key_has(rig: Rig) -> None:
+    listed = {"a": (fingerprint(rig.pair("robot").public), fingerprint(STRANGER.public))}
+    rig.endpoint.inbox.sources = Sources(keys=listed)
+    generate("other", rig.keys, rig.keys / "publish")
+    rig.endpoint.admission.let_in(rig.ring.load_allowed())
+    inbox = rig.endpoint.inbox
+    for name, count in (("other", (0, 1)), ("robot", (1, 1))):
+        publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair(name))
+        rig.until(partial(publisher.poll, 0))
+        publisher.send(setpoint(1))
+        rig.until(lambda count=count: (inbox.accepted, inbox.refused) == count)  # type: ignore[misc]
+    assert inbox.last_refusal == (
+        f"source 'a' from the key {fingerprint(rig.pair('other').public)}: allowed by sources.keys is "
+        f"{', '.join(listed['a'])}"
+    )
 
 
 # -- lists that change ---------------------------------------------------------------------------------------------

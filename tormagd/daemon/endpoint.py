@@ -8,6 +8,7 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import zmq
@@ -24,6 +25,7 @@ from tormagd.daemon.tally import Peer, Tally
 from tormagd.keys import KeyRing
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
+from tormagd_client.keys import fingerprint
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
@@ -60,6 +62,7 @@ OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
 
+_fingerprint = cache(fingerprint)
 Answer = Callable[[Request], Any]
 "Returns the result, as plain data or packed already, or raises RefusedError."
 
@@ -121,7 +124,8 @@ class Endpoint:
                 self._drops.add("setpoint", peer, OFF_THE_LIST)
             else:
                 data = b"" if frame.more else frame.bytes
-                is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
+                key = peer.key and _fingerprint(peer.key)
+                is_newer = self.inbox.take(data, now_s, realtime_ns, key) or is_newer
         return self.inbox.hand_on(time.monotonic()) or is_newer
 
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:

@@ -78,10 +78,15 @@ class SetpointInbox:
         self._told_s = -NEWS_S
         self._turn = 0
 
-    def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
+    def take(self, data: bytes, now_s: float, realtime_ns: int, key: str = "") -> bool:
         """Decode and judge one message, and count it; return True if another setpoint is in force after it."""
         try:
             setpoint = decode(data, Setpoint)
+            allowed = self.sources.keys.get(setpoint.source, (key,))
+            if key not in allowed:
+                raise MessageError(
+                    f"source {setpoint.source!r} from the key {key}: allowed by sources.keys is {', '.join(allowed)}"
+                )
             if not self.has_way:
                 _refuse_way(setpoint)
             name = setpoint.source
