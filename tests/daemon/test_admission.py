@@ -89,6 +89,7 @@ class Rig:
             self.endpoint.serve(self.answer, 4)
             self.endpoint.admission.update()
             self.endpoint.tell(time.monotonic())
+            self.endpoint.hear()
             self.endpoint.publish_ticks([(1,)], ("a",))
             time.sleep(0.002)
 
@@ -173,13 +174,13 @@ def test_who_was_answered_and_left_before_it_was_seen_was_not_refused(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(admission, "_address", lambda _descriptor: "")
-    answered = rig.endpoint.admission._endpoints["control"].answered
+    admitted = rig.endpoint.admission._endpoints["control"].admitted
     for _ in range(3):
         console = rig.peer(zmq.DEALER, "control", rig.pair("console"))
         console.send(request("status"))
         rig.until(lambda: rig.answered and rig.answered.pop())
         console.close()
-        rig.until(lambda: not answered.total(), "gone")
+        rig.until(lambda: not admitted.total(), "gone")
     assert rig.endpoint.report().refused == 0
 
 

@@ -17,7 +17,7 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.daemon.endpoint import DRAIN, SETPOINT_BURST, Endpoint
+from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
 from tormagd.daemon.requests import WAITING_PER_CLIENT
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.endpoints import Endpoints
@@ -128,6 +128,7 @@ class Rig:
 
     def tell(self) -> None:
         """Publishes on both sockets."""
+        self.endpoint.hear()
         self.endpoint.publish(TELEMETRY)
         self.endpoint.publish_ticks([(1,)], ("a",))
 
@@ -221,7 +222,12 @@ def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
     subscriber.setsockopt(zmq.RCVHWM, 1)
     subscriber.subscribe(b"")
     rows = [tuple(range(30))] * 100
-    rig.until(lambda: subscriber.poll(5) > 0, lambda: rig.endpoint.publish_ticks(rows, ("a",)))
+
+    def tell() -> None:
+        rig.endpoint.hear()
+        rig.endpoint.publish_ticks(rows, ("a",))
+
+    rig.until(lambda: subscriber.poll(5) > 0, tell)
     for _ in range(5_000):
         rig.endpoint.publish_ticks(rows, ("a", "b"))
     assert msgpack.unpackb(subscriber.recv()) == {"v": VERSION, "columns": ["a"], "rows": [list(range(30))] * 100}
@@ -469,6 +475,22 @@ def test_a_client_that_asks_too_much_is_dropped_and_others_are_answered(rig: Rig
     other.send(command("status", 7))
     assert rig.serve(other, rig.answer).id == 7
     assert rig.drops() == [("control", OURSELVES, "", "sent too much")]
+
+
+def test_a_client_that_says_stop_without_pause_is_cut_off_and_what_it_said_is_forgotten(rig: Rig) -> None:
+    flood = rig.context.socket(zmq.DEALER)
+    flood.setsockopt(zmq.SNDHWM, 0)
+    flood.setsockopt(zmq.RECONNECT_IVL, 60_000)
+    flood.connect(rig.addresses["control"])
+    for number in range(5_000):
+        flood.send(command("stop", number))
+    rig.take_until(lambda: rig.endpoint.report().dropped > 0 and rig.endpoint.report().connections["control"] == 0)
+    assert [request.id for request in rig.answered] == list(range(len(rig.answered)))
+    assert FIRST_BURST < len(rig.answered) < 2_500
+    flood.close(linger=0)
+    operator = rig.connect(zmq.DEALER, "control")
+    operator.send(command("stop", "operator"))
+    rig.take_until(lambda: operator.poll(0) > 0)
 
 
 @pytest.mark.parametrize("name", ["telemetry", "recording"])

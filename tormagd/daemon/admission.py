@@ -7,11 +7,11 @@ of the beat.
 
 import contextlib
 import logging
-import os
 import socket
 import struct
 import time
 from collections import Counter, deque
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -34,6 +34,8 @@ CLOSING = 8
 "Connections that were cut off and are not closed yet; while there are so many, nobody is let in."
 TOLD_S = 60.0
 "How often a process that makes too many connections is named in the log."
+SHUT_NS = 100_000_000
+"How long nobody is let in to an endpoint at which somebody said too much."
 UPDATE_NS = 100_000
 "For how long events are handled in one slice."
 GUARDED = {
@@ -46,6 +48,8 @@ GUARDED = {
     zmq.TCP_KEEPALIVE_CNT: 4,
 }
 "Options of a guarded socket; times are in ms and s."
+LEFT, READ = 16, 65_536
+"Reads of what a peer that is cut off has sent, and bytes of each."
 AT_ONCE = 8
 "Events taken in one slice at most."
 WATCHED = (
@@ -84,8 +88,9 @@ class _Connections:
         self.name, self.endpoint, self.is_guarded = name, endpoint, is_guarded
         self.monitor = endpoint.get_monitor_socket(WATCHED)
         self.addresses: dict[int, str] = {}
-        self.answered: Counter[str] = Counter()
-        "How many connections of an address were answered, let in or not, when libzmq asked about their keys."
+        self.admitted: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        "How many open connections of an address were let in, or not, when libzmq asked about their keys."
         self.failed: str | None = None
         "Why the handshake failed of the connection that is closed next, as libzmq does at once; None: it did not fail."
         self.heard: set[int] = set()
@@ -93,6 +98,8 @@ class _Connections:
         self.cut: dict[int, str] = {}
         "Addresses of connections that were cut off and are not closed yet."
         self.door: Door
+        self.shut_ns = 0
+        "Until then, of the monotonic clock, nobody more is let in."
 
     def crowded(self, address: str) -> int | None:
         """Return the connection to cut off, now that one of `address` has come; None where there is room."""
@@ -149,6 +156,9 @@ class Admission:
         """Handle waiting events, AT_ONCE of each socket, for about UPDATE_NS; return False where there are none."""
         # in turn: who knocks at one endpoint without pause must not keep everybody from the others
         until_ns, is_done = time.monotonic_ns() + UPDATE_NS, False
+        for known in self._endpoints.values():
+            if len(known.cut) < CLOSING and until_ns > known.shut_ns:
+                known.door.open()
         for _ in range(len(self._parts)):
             self._parts.rotate()
             events, handle = self._parts[0]
@@ -195,10 +205,12 @@ class Admission:
                 if self._endpoints[name].is_guarded:
                     self.cut_off(name)
 
-    def cut_off(self, name: str, whose: str = "") -> None:
-        """Shut down the connections from the address `whose` to the endpoint `name`; an empty `whose` ends all."""
+    def cut_off(self, name: str, whose: int | str | None = None) -> None:
+        """Shut down a connection to the endpoint `name`, those of an address, or, None, all."""
+        if isinstance(whose, str):
+            self._endpoints[name].shut_ns = time.monotonic_ns() + SHUT_NS
         for descriptor, address in self._endpoints[name].addresses.items():
-            if address == whose or not whose:
+            if whose in (None, descriptor, address):
                 _end(descriptor, address)
 
     def _admit(self) -> None:
@@ -217,9 +229,11 @@ class Admission:
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
         """Tell whether the key `public` may use the endpoint `name`; count one that may not, with the reason."""
-        self._endpoints[name].answered[address] += 1
+        known = self._endpoints[name]
         if self.has_role(public, MAY[name]):
+            known.admitted[address] += 1
             return True
+        known.refused[address] += 1
         listed = self.allowed.get(public)
         reason = "key not listed" if listed is None else f"role not allowed: {', '.join(sorted(listed.roles))}"
         self.refusals.add(name, Peer(address, public), reason)
@@ -240,14 +254,13 @@ class Admission:
             elif kind == zmq.EVENT_ACCEPT_FAILED:
                 known.door.is_open = False
             elif kind == zmq.EVENT_DISCONNECTED:
-                self._admit()  # a question about its key may still wait: it is counted once
+                self._arrivals.touch(self._zap)  # a question about its key may have come just now: it is counted once
+                self._admit()
                 self._disconnected(known, value)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
             else:
                 known.failed = PLAIN if known.is_guarded else "left in the handshake"
-            if len(known.cut) < CLOSING:
-                known.door.open()
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
         """Note a new connection and its address."""
@@ -272,30 +285,43 @@ class Admission:
         known.heard.discard(descriptor)
         if descriptor in known.cut:
             address, failed = known.cut.pop(descriptor), "too many connections"
-        elif failed is None and not address:  # a quick one: answered, and gone before its address was read
-            still = Counter(known.addresses.values())
-            address = next((each for each, count in known.answered.items() if count > still[each]), "")
-        if failed is None and (not known.is_guarded or known.answered[address]):
-            known.answered -= Counter((address,))
+        elif failed in (None, PLAIN) and not address:  # a quick one: answered, and gone before its address was read
+            gone = known.admitted - Counter(known.addresses.values())
+            address = next(iter(+known.refused or gone), "")
+        if failed in (None, PLAIN) and known.refused[address]:
+            known.refused -= Counter((address,))
+        elif failed is None and (not known.is_guarded or known.admitted[address]):
+            known.admitted -= Counter((address,))
         else:
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
 
 
 def _address(descriptor: int) -> str:
     """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`."""
-    try:
-        with socket.socket(fileno=os.dup(descriptor)) as connection:
-            if connection.family == socket.AF_UNIX:
-                made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-                process, user, group = _CREDENTIALS.unpack(made)
-                return f"localhost:{user}:{group}:{process}"
-            return str(connection.getpeername()[0])
-    except OSError:
-        return ""
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        if connection.family == socket.AF_UNIX:
+            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+            process, user, group = _CREDENTIALS.unpack(made)
+            return f"localhost:{user}:{group}:{process}"
+        return str(connection.getpeername()[0])
+    return ""
 
 
 def _end(descriptor: int, address: str) -> None:
     """Shut down the connection `descriptor`, unless its peer is no longer `address`: descriptors are used again."""
-    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
-        if _address(connection.fileno()) == address:
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        if _address(descriptor) == address:
             connection.shutdown(socket.SHUT_RDWR)
+            for _ in range(LEFT):
+                if not connection.recv(READ, socket.MSG_DONTWAIT):
+                    return
+
+
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """Yield `descriptor` as a socket, which stays open."""
+    connection = socket.socket(fileno=descriptor)
+    try:
+        yield connection
+    finally:
+        connection.detach()
