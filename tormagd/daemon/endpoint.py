@@ -138,7 +138,8 @@ class Endpoint:
         return self.inbox.hand_on(time.monotonic()) or is_newer
 
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
-        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its first part."""
+        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its
+        first part."""
         with contextlib.suppress(zmq.Again):
             self._telemetry.send_multipart([*topic, encode(message)], zmq.NOBLOCK)
         self.arrivals.touch(self._telemetry)
