@@ -1,7 +1,7 @@
-"""One typed, validated configuration.
+"""One typed, validated configuration: a TOML file, or the defaults.
 
-A TOML file, or the defaults. Unknown keys, wrong types, NaN and infinities, values out of range and impossible
-orderings are refused. The error names the key's path, the value and what is allowed.
+Unknown keys, wrong types, NaN and infinities, values out of range and impossible orderings are refused. The error names
+the key's path, the value and what is allowed.
 """
 
 import re
@@ -15,9 +15,9 @@ from tormagd.toml_file import checked as checked, convert, convert_as, placed, t
 from tormagd_client.endpoints import ConfigError, Endpoints, Strict, require_usable
 from tormagd_client.printable import require
 
-MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
+MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms); slower is not worth running
 MAX_LISTED = 8
-"Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
+"Fewer sources than are kept apart, so that an unlisted one is heard too."
 MAX_PLAYOUT_MS = 200.0
 "Half of what the whole way from sensor to force may take."
 _FINGERPRINT = re.compile("[0-9a-f]{4}(:[0-9a-f]{4}){3}")
@@ -310,7 +310,7 @@ class Calibration(Strict, frozen=True):
 
 
 def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
-    """Return `config` with what the calibration file `path` states in place of its own motor, position and trim."""
+    """Return `config` with the motor, position and trim of the calibration file `path`."""
     found = convert(path, Calibration)
     stated = msgspec.to_builtins(found)
     try:
