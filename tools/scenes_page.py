@@ -1,4 +1,4 @@
-"""docs/scenes.md and its pictures, from what `benchmark.py scenes` measured; nothing is measured here."""
+"""Writes docs/scenes.md and its pictures from what `benchmark.py scenes` measured."""
 
 import sys
 from pathlib import Path
@@ -16,11 +16,10 @@ from tormagd.scenes.signal import asked
 DOCS, PICTURE, TRADE = ROOT / "docs", Path("images") / "scenes.png", Path("images") / "scenes_trade.png"
 DRAWN_S, DRAWN_HZ = 12.0, 100
 COLOURS = 10
-"Of Matplotlib, which then begins with them anew."
+"Matplotlib's colours, which then repeat."
 
 
 def main() -> int:
-    """Write the page and its pictures; 0."""
     (DOCS / "scenes.md").write_text(page(), encoding="utf-8")
     draw_asked(DOCS / PICTURE)
     draw_trade(DOCS / TRADE, measured())
@@ -28,7 +27,6 @@ def main() -> int:
 
 
 def page() -> str:
-    """The whole page."""
     file = measured()
     known = {scene.name: scene for scene in file.scenes}
     parts = [
@@ -99,7 +97,7 @@ def _row(name: str, found: MeasuredScene, file: Measurements) -> list[str]:
 
 
 def taken(file: Measurements, way: OperatingPoint) -> str:
-    """What a way takes of a processor, %."""
+    """Return what a way takes of a processor, %."""
     share = file.share(way)
     return "?" if share is None else f"{100.0 * share.daemon:.0f} %"
 
@@ -120,12 +118,10 @@ def _ways(file: Measurements) -> str:
 
 
 def core_of(name: str) -> Core:
-    """The core of a shipped scene."""
     return build_core(Config(scene=name), load_scene(name))
 
 
 def draw_trade(path: Path, file: Measurements) -> None:
-    """Errors as shares of the tolerance over the daemon's share, a colour for each way."""
     figure, axes = subplots((9.0, 4.5))
     middles = []
     for share in sorted(file.shares, key=lambda each: each.daemon):
@@ -146,7 +142,6 @@ def draw_trade(path: Path, file: Measurements) -> None:
 
 
 def draw_asked(path: Path) -> None:
-    """What the scenes ask for over time."""
     figure, axes = subplots((9.0, 4.5))
     for number, name in enumerate(shipped_scenes()):
         stated = load_scene(name)

@@ -1,4 +1,4 @@
-"""What `benchmark inverse --write` leaves behind: a page and its plot."""
+"""The page and the plot that `benchmark inverse --write` leaves behind."""
 
 from pathlib import Path
 from typing import Any
@@ -57,14 +57,12 @@ ones](guides/insert.md#the-shipped-models).
 
 
 def write(result: dict[str, Any]) -> None:
-    """Rewrites page and plot."""
     text = page(result)
     plot(result, figures_of(text))
     PAGE.write_text(text, encoding="utf-8")
 
 
 def page(result: dict[str, Any]) -> str:
-    """docs/inverse_trade.md."""
     shown = [row for row in result["variants"] if row["pareto"] or row["hidden"] == USUAL_HIDDEN]
     stars = [
         row
@@ -81,7 +79,7 @@ def page(result: dict[str, Any]) -> str:
 
 
 def plot(result: dict[str, Any], figures: list[str]) -> None:
-    """Two panels over p50: the solver's error at one network, and the plant's error for every network."""
+    """Draw two panels over p50: the solver's error at one network, and the plant's for every network."""
     figure, (left, right) = subplots((11, 5), 1, 2)
     rows = result["variants"]
     _scatter(left, [row for row in rows if row["hidden"] == USUAL_HIDDEN], "solver_mae_mT")

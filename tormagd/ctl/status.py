@@ -30,7 +30,7 @@ OLD_MS = 1_000.0
 "An older setpoint may still be valid; its age is shown."
 SURE_WINDOWS = 20
 "A clock's drift is shown once it is fitted over this many windows: ten seconds."
-SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
+SETPOINT_COUNTS = ("accepted", "refused", "dropped")
 LINK_COUNTS = ("losses", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 LINK_COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")
 
@@ -95,7 +95,7 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
         *_said("peers     ", peers.dropped and f"{peers.dropped} messages not read", colour.yellow),
         *(
             f"          {it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason} ({it.count})"
-            for it in (*peers.refusals[-1:], *peers.drops[:1])
+            for it in (*peers.refusals, *peers.drops)
         ),
     ]
 

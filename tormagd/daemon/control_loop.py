@@ -1,6 +1,7 @@
 """The control loop, a phase of every beat: step on the newest measurement and plan, and drive."""
 
 import logging
+import math
 import time
 
 from tormagd.assembly.journal import Journal
@@ -13,6 +14,9 @@ from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, RefusedError, reason
+
+REPEATED_S = 1.0
+"How often a command that changes nothing is logged."
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +34,7 @@ class ControlLoop:
         self.arming: Arming | None = None
         "What the newest `arm` has done; None before the first."
         self._known_faults: tuple[Fault, ...] = ()
+        self._told: dict[str, tuple[float, int]] = {}
 
     def drive(self, beat: Beat, plan: Plan) -> None:
         """Step the core along `plan` with the newest measurement, and send its output to the device."""
@@ -67,7 +72,8 @@ class ControlLoop:
             log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
 
     def _give(self, name: str, conditions: Conditions) -> None:
-        """Give an operator's command to the core under `conditions`, note it in the journal, and log it if taken."""
+        """Give an operator's command to the core under `conditions`, note it in the journal, and log it if taken, one
+        that changes nothing every REPEATED_S."""
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
             self.stepper.command(name, now_s, conditions)
@@ -75,7 +81,12 @@ class ControlLoop:
             self._journal.commanded(name, now_s, conditions, is_refused=True)
             raise
         self._journal.commanded(name, now_s, conditions, is_refused=False)
-        log.info("%s: %s", name, reason(name, source))
+        told_s, count = self._told.get(name, (-math.inf, 0))
+        if source is self.stepper.safety.operating_state and now_s - told_s < REPEATED_S:
+            self._told[name] = told_s, count + 1
+            return
+        self._told[name] = now_s, 0
+        log.info("%s: %s%s", name, reason(name, source), f"; {count} times more before" if count else "")
 
     def latch(self, fault: Fault) -> None:
         """Latch a fault that was found outside the step, and note it in the journal."""

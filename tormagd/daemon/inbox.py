@@ -78,10 +78,15 @@ class SetpointInbox:
         self._told_s = -NEWS_S
         self._turn = 0
 
-    def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
+    def take(self, data: bytes, now_s: float, realtime_ns: int, key: str = "") -> bool:
         """Decode and judge one message, and count it; return True if another setpoint is in force after it."""
         try:
             setpoint = decode(data, Setpoint)
+            allowed = self.sources.keys.get(setpoint.source, (key,))
+            if key not in allowed:
+                raise MessageError(
+                    f"source {setpoint.source!r} from the key {key}: allowed by sources.keys is {', '.join(allowed)}"
+                )
             if not self.has_way:
                 _refuse_way(setpoint)
             name = setpoint.source
@@ -176,7 +181,7 @@ class SetpointInbox:
             if source.refresh(now_s):
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
-    def report(self, now_s: float, oversize: int = 0) -> SetpointReport:
+    def report(self, now_s: float) -> SetpointReport:
         """Return counts, the last refusal, and each source's `seq`, with REPORTED full reports: the holder's, and those
         of the newest others."""
         newest = sorted(self._sources, key=lambda name: (name != self.holder, -self._sources[name].heard_s))
@@ -186,7 +191,6 @@ class SetpointInbox:
             accepted=self.accepted,
             refused=self.refused,
             dropped=self.dropped,
-            oversize=oversize,
             last_refusal=self.last_refusal,
             newest_source=self.holder,
             sources={name: source.sequence.seq for name, source in self._sources.items()},

@@ -8,8 +8,9 @@ import msgspec
 from tormagd.config import Config
 from tormagd_client.printable import require
 
-LIVE = frozenset({"sources.priority", "sources.playout_ms", "realtime.watchdog_ms"})
-"Keys that nothing but the loop that looks at them knows. From all others something was built at the start."
+LIVE = "realtime.watchdog_ms", "sources."
+"""Keys, or how they begin, that nothing but the loop that looks at them knows. From all others something was built at
+the start."""
 
 
 class Reread(NamedTuple):
@@ -35,8 +36,8 @@ def reread(running: Config, read: Config) -> Reread:
         sources=read.sources,
         realtime=msgspec.structs.replace(running.realtime, watchdog_ms=watchdog_ms),
     )
-    taken = tuple(key for key in differing if key in LIVE)
-    return Reread(config, taken, tuple(key for key in differing if key not in LIVE))
+    taken = tuple(key for key in differing if key.startswith(LIVE))
+    return Reread(config, taken, tuple(key for key in differing if not key.startswith(LIVE)))
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:

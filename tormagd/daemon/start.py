@@ -13,7 +13,7 @@ from tormagd.config import Config, load_config
 from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.daemon import Daemon
 from tormagd.daemon.profiles import state_folder
-from tormagd.daemon.realtime import prepare
+from tormagd.daemon.realtime import prepare, raise_open_files
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.hardware.backend import Backend, choose, installed
 from tormagd.keys import KeyRing
@@ -60,6 +60,7 @@ async def _run(
     options: argparse.Namespace,
 ) -> None:
     """Start the processes of black box and search, make this thread a real-time one, and run the daemon to its end."""
+    raise_open_files()
     # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     known = {} if folder is None else header(config, core)

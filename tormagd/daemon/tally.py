@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from tormagd_client.messages import PeerReport
 
-OTHERS = "others"
 NEWS_S = 10.0
 "At most one log line in this time."
 
@@ -21,40 +20,34 @@ class Peer(NamedTuple):
 
 
 class Tally:
-    """Counts refusals by endpoint, peer and reason. `line` is the log's format, for a count and the newest entry."""
+    """Counts refusals, and keeps the newest: endpoint, peer, reason, and how often it came in a row."""
 
-    def __init__(self, most: int, line: str, name: Callable[[str], str]) -> None:
-        self.most, self._line, self._name = most, line, name
-        self.total = self._told = 0
+    def __init__(self, line: str, name: Callable[[str], str]) -> None:
+        self._line, self._name = line, name
+        self.total = self._told = self._in_a_row = 0
         self._tell_s = 0.0
-        self._counts: dict[tuple[str, Peer, str], int] = {}
+        self._newest = "", Peer(""), ""
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
-        """Count one more refusal of `peer` at `endpoint` for `reason`, all of which make up its entry."""
+        """Count one more refusal of `peer` at `endpoint` for `reason`, which becomes the newest."""
+        newest = endpoint, peer, reason
+        self._in_a_row = self._in_a_row + 1 if newest == self._newest else 1
+        self._newest = newest
         self.total += 1
-        self._add((endpoint, peer, reason), 1)
-        if len(self._counts) > self.most:
-            first = next(each for each in self._counts if each[1].address != OTHERS)
-            self._add((first[0], Peer(OTHERS), first[2].split(":")[0]), self._counts.pop(first))
 
     def report(self) -> tuple[PeerReport, ...]:
-        """Return the entries, the one counted last at the end; keys and addresses as people know them."""
-        return tuple(
-            PeerReport(endpoint, shown(peer.address), peer.key and self._name(peer.key), reason, count)
-            for (endpoint, peer, reason), count in self._counts.items()
-        )
+        """Return the newest refusal, key and address as people know them; empty before the first."""
+        endpoint, peer, reason = self._newest
+        key = peer.key and self._name(peer.key)
+        return (PeerReport(endpoint, shown(peer.address), key, reason, self._in_a_row),) if self.total else ()
 
     def tell(self, now_s: float) -> None:
-        """Log, as a warning, the number of refusals since the last line, and the newest entry; at most one line in
-        NEWS_S."""
+        """Log the number of refusals since the last line, and the newest, as a warning; at most one line in NEWS_S."""
         if self.total > self._told and now_s >= self._tell_s:
-            it = self.report()[-1]
+            (it,) = self.report()
             newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
             log.warning(self._line, self.total - self._told, newest)
             self._told, self._tell_s = self.total, now_s + NEWS_S
-
-    def _add(self, entry: tuple[str, Peer, str], count: int) -> None:
-        self._counts[entry] = self._counts.pop(entry, 0) + count
 
 
 def shown(address: str) -> str:
