@@ -187,7 +187,7 @@ def _table_3_2(data: Json) -> str:
     return (
         f"## Table 3.2: structural optimisation\n\n{data['note']} Gap speeds, mm/s: {speeds}. Differential evolution "
         "and then COBYQA, beside SLSQP from the same starts. At a fast gap a small elastomer covers everything; at the "
-        "thesis's speed the last percent costs ten to twenty times as much. Minima of the thesis's cost, Eq. 39, cover "
+        "thesis's speed the best one is some forty times as large. Minima of the thesis's cost, Eq. 39, cover "
         f"only {percent(corner[0])} and {percent(corner[1])}, because it punishes both sides of the required "
         "corner.\n\n" + table(columns, rows) + "\n![Optimised portraits](reproduction/figure_3_4.png)\n\n"
         "The thesis's designs by the same measures, over its five starts:\n\n"

@@ -260,8 +260,8 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
     return {
         "as_built": rows,
         "pulse": _pulse_cloud(gap_speeds_mm_s),
-        "note": "Gap speeds: the thesis's; that of the rise from 10 to 90% of a step of 10 mm, measured on the "
-        "simulated device (the thesis's future work 7); the fastest. R_o 11, t 20, s_max 95 mm, G0 300 kPa, mu_r 3.8, "
+        "note": "Gap speeds: the thesis's, the simulated device's in a step of 10 mm (the thesis's future work 7), the "
+        "fastest. R_o 11, t 20, s_max 95 mm, G0 300 kPa, mu_r 3.8, "
         "mu_d 0.2, power field law. The thesis's coverage is of regions drawn by hand around points it does not print.",
     }
 
