@@ -50,7 +50,7 @@ SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 UNREAD = {"setpoint": (4_096, 32), "telemetry": (512, 2), "recording": (512, 2), "control": (8_192, 16)}
 """Bytes of a message at most, and messages of one peer that wait in libzmq; more wait with the peer. libzmq works off
 all subscriptions that wait in this thread: a thousand would make a tick late (`tools/endure.py siege`)."""
-UNSENT = {zmq.SUB: 1, zmq.XPUB: 100, zmq.ROUTER: 16}
+UNSENT: dict[int, int] = {zmq.SUB: 1, zmq.XPUB: 100, zmq.ROUTER: 16}
 "Messages for one peer that wait in libzmq; what is more is dropped."
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. One that says more is cut off, and may connect again."
