@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
-from tormagd.recording.black_box import read_black_box
+from tormagd.recording.black_box import is_tick, read_black_box
 from tormagd.recording.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring
 
 PATIENCE_S = 60.0
@@ -52,6 +52,11 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
         assert ring.bytes == sum(len(each.entries) for each in parts) <= 200
         assert parts[-1].time_s - parts[0].time_s <= 5.0
         assert parts[-1].time_s == now_s
+
+
+def test_a_list_that_begins_with_a_number_is_a_tick() -> None:
+    entries = ([1, 2.0], [], ["step", 1], [True], [1.0], (1, 2), "step", 1)
+    assert [is_tick(entry) for entry in entries] == [True, *[False] * 7]
 
 
 class Process:
