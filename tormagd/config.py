@@ -226,7 +226,7 @@ class Recordings(Strict, frozen=True):
     most_MB: Annotated[float, Meta(gt=0.0, le=1e8)] = 20_000.0
     "The folder's budget: the oldest unmarked go first."
     most_days: Annotated[float, Meta(gt=0.0, le=36_500.0)] = 30.0
-    "The same for age."
+    "The same for age, before the newest; what is before a pause of over three days goes by `most_MB` alone."
     free_MB: Annotated[float, Meta(ge=1.0, le=1e8)] = 500.0
     "Stays free on that disk, for black boxes and profiles."
     one_tick_of: Annotated[int, Meta(ge=1, le=1_000)] = 1
