@@ -20,7 +20,6 @@ MAX_LISTED = 8
 "Fewer sources than are kept apart, so that an unlisted one is heard too."
 MAX_PLAYOUT_MS = 200.0
 "Half of what the whole way from sensor to force may take."
-_FINGERPRINT = re.compile("[0-9a-f]{4}(:[0-9a-f]{4}){3}")
 
 
 class Device(Strict, frozen=True):
@@ -71,7 +70,7 @@ class Sources(Strict, frozen=True):
         )
         for name, keys in self.keys.items():
             require(
-                keys != () and all(map(_FINGERPRINT.fullmatch, keys)),
+                keys != () and all(re.fullmatch("[0-9a-f]{4}(:[0-9a-f]{4}){3}", key) for key in keys),
                 f"sources.keys.{name}",
                 keys,
                 "fingerprints as tormagctl keys show says them, one or more",

@@ -33,11 +33,6 @@ class Arrivals:
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
         """Tell whether a message waits in a watched socket; False for one that is not watched."""
-        if socket in self._ready and not is_readable(socket):
+        if socket in self._ready and not int(socket.get(_EVENTS)) & _POLLIN:
             self._ready.discard(socket)
         return socket in self._ready
-
-
-def is_readable(socket: "zmq.Socket[bytes]") -> bool:
-    """Tell whether a message waits in `socket`, watched or not."""
-    return bool(int(socket.get(_EVENTS)) & _POLLIN)
