@@ -19,7 +19,8 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def door(listening: int) -> tuple[int, int, int]:
-    """Return what `let_in` takes: the epoll set in which the descriptor `listening` is watched, itself, its data there."""
+    """Return what `let_in` takes: the epoll set in which the descriptor `listening` is watched, itself,
+    its data there."""
     entry = re.compile(rf"^tfd: +{listening} +events: +(\w+) +data: +(\w+)", re.MULTILINE)
     for _ in range(1_000):  # libzmq's thread takes up a new socket in its own time
         for path in Path("/proc/self/fdinfo").iterdir():
