@@ -1,4 +1,4 @@
-"""Which of the daemon's sockets hold messages: one system call a beat, however many sockets there are."""
+"""Finds which of the daemon's sockets hold messages, with one system call a beat however many sockets there are."""
 
 import select
 
@@ -16,7 +16,6 @@ class Arrivals:
         self._ready: set[zmq.Socket[bytes]] = set()
 
     def watch(self, socket: "zmq.Socket[bytes]") -> None:
-        """Watch `socket`, too."""
         self._ready.add(socket)
         descriptor = int(socket.fileno())
         self._sockets[descriptor] = socket
@@ -28,16 +27,15 @@ class Arrivals:
             self._ready.add(self._sockets[descriptor])
 
     def touch(self, socket: "zmq.Socket[bytes]") -> None:
-        """Count `socket` as ready after a send through it: the send has cleared its signal."""
+        """Count `socket` as ready after a send through it: sending clears its signal."""
         self._ready.add(socket)
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
-        """Tell whether a message waits in a watched socket; False for one that is not watched."""
+        """Tell whether a message waits in a watched socket."""
         if socket in self._ready and not is_readable(socket):
             self._ready.discard(socket)
         return socket in self._ready
 
 
 def is_readable(socket: "zmq.Socket[bytes]") -> bool:
-    """Tell whether a message waits in `socket`, watched or not."""
     return bool(int(socket.get(_EVENTS)) & _POLLIN)

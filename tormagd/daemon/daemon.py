@@ -40,11 +40,10 @@ from tormagd_client.endpoints import ConfigError
 
 NS = 1_000_000_000
 OPENING_LOOK_S = 0.02
-"How often the end of the opening is looked for: Status comes as often."
 SWITCH_S = 1e-4
-"For so long another thread may keep the interpreter's lock while this one waits for it; Python's own is 5 ms."
+"How long another thread may keep the interpreter's lock from this one; Python's own value is 5 ms."
 LONGEST_RETRACT_S = 10.0
-"A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
+"The firmware needs 3 s for a full stroke; if it cannot retract, it reports that itself."
 NAMED_S = 0.5
 "By then a gap that does not open is a fault, and in the log."
 
@@ -52,7 +51,7 @@ log = logging.getLogger(__name__)
 
 
 class Daemon:
-    """The daemon: runs one scene on one device until it is told to end. Create it inside the event loop."""
+    """Runs one scene on one device until it is told to end. Create it inside the event loop."""
 
     def __init__(
         self,
@@ -66,7 +65,7 @@ class Daemon:
         beside: SearchProcess | None = None,
         config_file: str | None = None,
     ) -> None:
-        """Bind the endpoints and put the loops together; the device is opened in `run`."""
+        """Bind the endpoints and put the loops together; `run` opens the device."""
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
@@ -170,7 +169,7 @@ class Daemon:
         log.info("tormagd has ended")
 
     def _beat(self, heartbeat: Heartbeat) -> None:
-        if beats := heartbeat.beats():  # none at a spurious wake-up
+        if beats := heartbeat.beats():  # a spurious wake-up has none
             self._phases.run(heartbeat.due_ns, beats - 1)
 
     def _receive(self, beat: Beat) -> None:
@@ -188,7 +187,6 @@ class Daemon:
         self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
 
     def _drive(self, beat: Beat) -> None:
-        """Drive the device along the newest plan."""
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
         if timing.delay_ns > timing.period_ns:
@@ -198,13 +196,12 @@ class Daemon:
             self._phases.on_time()
         if faults := control.new_faults():
             self._causes.tell(faults, control.stepper, control.measurement)
-            with contextlib.suppress(RefusedError):  # where none is kept
+            with contextlib.suppress(RefusedError):  # no black box is kept
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
 
     async def _build(self, scene: str) -> Core:
-        """Build the core of another scene at the running rates, in another thread; wait for a profile that is being
-        written."""
-        # in a thread: no beat waits for it
+        """Build the core of another scene at the running rates, once pending profiles are written."""
+        # in a thread, so that no beat waits
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
         if core.element.is_beside or self._inference.beside is not None:
             raise ConfigError(f"scene {core.scene.name}: a search beside the plans begins with the daemon: restart it")
@@ -215,7 +212,7 @@ class Daemon:
         self._control.command("use-scene", self._telemetry.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
-        """Replace the running core by `core`, made for `scene`, as `_run_core` does."""
+        """Run `core`, made for `scene`; what was learned is kept if model and insert are the same."""
         before, learned = self._core, self._inference.planner.believe.learned()
         self._calibrations.configured = msgspec.structs.replace(self._calibrations.configured, scene=scene)
         self._run_core(msgspec.structs.replace(self._config, scene=scene), core)
@@ -243,7 +240,7 @@ class Daemon:
 
     async def _reload(self) -> None:
         """Read keys and configuration again, and take over what may change while control runs."""
-        # in threads: no beat waits for a file
+        # in threads, so that no beat waits
         try:
             if self._keys is None:
                 log.info("no list of keys to read again: there is no endpoints.curve")
@@ -268,7 +265,7 @@ class Daemon:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     async def _open_gap(self) -> None:
-        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the beat goes on."""
+        """Open the gap, and wait for it up to LONGEST_RETRACT_S while the beat goes on."""
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S

@@ -8,13 +8,12 @@ from tormagd_client.messages import PeerReport
 
 OTHERS = "others"
 NEWS_S = 10.0
-"At most one log line in this time."
 
 log = logging.getLogger(__name__)
 
 
 class Peer(NamedTuple):
-    """A peer: its host, or the process at a local socket, as libzmq names it; and its key, empty without one."""
+    """A peer: its host or local process, as libzmq names it, and its key if it has one."""
 
     address: str
     key: str = ""
@@ -30,7 +29,7 @@ class Tally:
         self._counts: dict[tuple[str, Peer, str], int] = {}
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
-        """Count one more refusal of `peer` at `endpoint` for `reason`, all of which make up its entry."""
+        """Count one more refusal; beyond `most` entries, the oldest one is merged with others."""
         self.total += 1
         self._add((endpoint, peer, reason), 1)
         if len(self._counts) > self.most:
@@ -38,15 +37,14 @@ class Tally:
             self._add((first[0], Peer(OTHERS), first[2].split(":")[0]), self._counts.pop(first))
 
     def report(self) -> tuple[PeerReport, ...]:
-        """Return the entries, the one counted last at the end; keys and addresses as people know them."""
+        """Return the entries, the newest last, with keys and addresses as people know them."""
         return tuple(
             PeerReport(endpoint, shown(peer.address), peer.key and self._name(peer.key), reason, count)
             for (endpoint, peer, reason), count in self._counts.items()
         )
 
     def tell(self, now_s: float) -> None:
-        """Log, as a warning, the number of refusals since the last line, and the newest entry; at most one line in
-        NEWS_S."""
+        """Log the refusals since the last line and the newest entry, at most once in NEWS_S."""
         if self.total > self._told and now_s >= self._tell_s:
             it = self.report()[-1]
             newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
@@ -58,7 +56,7 @@ class Tally:
 
 
 def shown(address: str) -> str:
-    """Return a peer's address, as libzmq names it, for people: the host, or `process N of user N`."""
+    """Return libzmq's address of a peer for people: the host, or `process N of user N`."""
     if address.startswith("localhost:"):
         _, user, _, process = address.split(":")
         return f"process {process} of user {user}"
