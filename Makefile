@@ -93,7 +93,7 @@ check: $(VENV)/.dev
 	$(BIN)/python -P -m ruff check .
 	$(BIN)/python -P -m ruff format --check .
 	$(BIN)/python -P -m mypy
-	$(BIN)/python -P tools/prose.py
+	$(BIN)/python -P tools/house.py
 	$(SITE) --site-dir build/checked_site
 
 # the documentation as a site, in build/site

@@ -1,8 +1,8 @@
-"""The part of the build that pyproject.toml cannot say: the core is compiled where a compiler and Python's headers are.
+"""Compiles the core where a compiler and Python's headers are.
 
-The very `.py` that people read are compiled by mypyc. Where that cannot be, they run as they are, with the same results
-to the bit and a fifth of the speed; `firmware_protocol/build.py` says which. TORMAG_COMPILE=require makes it an error
-not to compile, TORMAG_COMPILE=skip does not try.
+mypyc compiles the very `.py` that people read. Where that cannot be, they run as they are, with the same results to the
+bit and a fifth of the speed; `firmware_protocol/build.py` says which. With TORMAG_COMPILE=require, failure to compile
+is an error; with TORMAG_COMPILE=skip, compiling is not tried.
 """
 
 import json
@@ -52,7 +52,7 @@ COMPILED = {
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]
 GROUP = "firmware_protocol.core"
-"What all of it is linked into, so that calls between modules are calls between C functions."
+"One library of all modules, so that calls between them are calls between C functions."
 RECORD = Path("firmware_protocol/core.json")
 REQUIRE, SKIP, AUTO = "require", "skip", "auto"
 
@@ -62,7 +62,7 @@ if wanted not in (REQUIRE, SKIP, AUTO):
 
 
 def missing() -> str:
-    """What a compiled core lacks here; empty where nothing does."""
+    """Return what a compiled core lacks here."""
     if wanted == SKIP:
         return "TORMAG_COMPILE=skip"
     compiler = os.environ.get("CC", sysconfig.get_config_var("CC") or "cc").split()[0]
@@ -75,7 +75,7 @@ def missing() -> str:
 
 
 class BuildCore(build_ext):
-    """Compiles, or records why not: an interpreter that could not be told would leave its user guessing."""
+    """Compiles, or records why not."""
 
     def run(self) -> None:
         lacking = missing()
@@ -96,7 +96,6 @@ class BuildCore(build_ext):
         self._record(lacking)
 
     def _take(self, extensions: list[Extension]) -> None:
-        """Goes on with these extensions as if they had been known from the beginning."""
         where = self.build_lib, self.build_temp, self.inplace, self.editable_mode
         self.distribution.ext_modules = extensions
         self.initialize_options()
@@ -106,10 +105,10 @@ class BuildCore(build_ext):
     def _translated(self) -> list[Extension]:
         from mypyc.build import mypycify
 
-        # what the core takes from the client is typed there, wherever the client is or will be installed
+        # the core's types from the client are found there, wherever the client is installed
         os.environ["MYPYPATH"] = str(Path("client/src").resolve())
         Path(self.build_temp).mkdir(parents=True, exist_ok=True)
-        # the core takes nothing from torch, whose types, where it is installed, take longer to read than all else
+        # torch's types take longer to read than all else, and the core needs none of them
         settings = Path(self.build_temp, "mypy.ini")
         settings.write_text("[mypy]\n[mypy-torch.*]\nfollow_imports = skip\n")
         options = [f"--config-file={settings}", "--ignore-missing-imports", f"--cache-dir={self.build_temp}/mypy"]
@@ -124,14 +123,14 @@ class BuildCore(build_ext):
         for extension in extensions:
             # where mypyc puts the headers of all files
             extension.include_dirs.append(str(Path(self.build_temp, RECORD.parent)))
-            # a warning of another compiler is no reason to go without; and both builds round alike only without fusing.
-            # hidden: a call into another of the C files is a direct one, which makes a tick a tenth faster
+            # another compiler's warning must not stop the build, and both builds round alike only without fused
+            # multiplications. Hidden: calls between the C files are direct, which makes a tick a tenth faster
             kept = [option for option in extension.extra_compile_args if option != "-Werror"]
             extension.extra_compile_args = [*kept, "-ffp-contract=off", "-fvisibility=hidden"]
         return extensions
 
     def build_extensions(self) -> None:
-        """Compiles the C files on every processor, where distutils takes one after the other; then links them."""
+        """Compile the C files on every processor, where distutils takes one after the other; then link them."""
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for extension in self.extensions:
                 extension.extra_objects = [pool.submit(self._object, c, extension) for c in extension.sources]
@@ -151,7 +150,7 @@ class BuildCore(build_ext):
         return compiled
 
     def _record(self, lacking: str) -> None:
-        # without a build, too: what an earlier one left beside the sources is not to be imported
+        # even without a build: an earlier one's modules beside the sources must not be imported
         sources = {source: zlib.crc32(Path(source).read_bytes()) for source in SOURCES}
         known = {"python": EXTENSION_SUFFIXES[0], "interpreted": lacking, "sources": sources}
         places = [RECORD] if self.inplace or self.editable_mode else []
@@ -164,6 +163,6 @@ class BuildCore(build_ext):
 
 setup(
     cmdclass={"build_ext": BuildCore},
-    # a stand-in: what really is built is only known once the sources have been translated
+    # a stand-in: the extensions are known only once the sources have been translated
     ext_modules=[Extension(f"{GROUP}__mypyc", sources=[])],
 )

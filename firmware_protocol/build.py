@@ -1,8 +1,8 @@
 """Which build of the core runs: compiled, or the very same files interpreted.
 
 Both give the same results to the bit. `pip install` compiles where a compiler and Python's headers are (setup.py), and
-records what it compiled. After an edit of any source all of the core is interpreted, with a warning, because compiled
-modules know each other's insides. TORMAG_COMPILED=0 does so for one process, without a warning. `tormagd --version`,
+records what it compiled. After an edit of any source the whole core is interpreted, with a warning, because compiled
+modules know each other's insides; TORMAG_COMPILED=0 does so for one process, without a warning. `tormagd --version`,
 `status` and `doctor` say which build runs.
 """
 
@@ -23,12 +23,9 @@ SWITCH = "TORMAG_COMPILED"
 _HERE = Path(__file__).parent
 REMEDY = "install it again with pip where a C compiler and Python's headers are"
 COST = "a tick takes about five times as long as compiled"
-"What an interpreted core costs; its results are the same."
 
 
 class Build(NamedTuple):
-    """Whether the core is compiled; where it is not, why."""
-
     is_compiled: bool
     reason: str
 
@@ -37,7 +34,7 @@ class Build(NamedTuple):
 
 
 class FromSource:
-    """A finder for `sys.meta_path` that loads the given modules from their sources, never from what was compiled."""
+    """A finder for `sys.meta_path` that loads the given modules from their sources."""
 
     def __init__(self, modules: frozenset[str]) -> None:
         self._modules = modules
@@ -45,7 +42,6 @@ class FromSource:
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return the spec of a module's source file; None for another module, and where the source is missing."""
         if fullname not in self._modules or path is None:
             return None
         sources = [Path(folder, fullname.rpartition(".")[2]).with_suffix(".py") for folder in path]
@@ -54,7 +50,7 @@ class FromSource:
 
 
 def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
-    """Return which build of the packages in `root` may run, and the names of the modules that were compiled."""
+    """Return which build of the packages in `root` may run, and the compiled modules' names."""
     try:
         record = json.loads((root / "firmware_protocol" / "core.json").read_bytes())
         sources: dict[str, int] = record["sources"]
@@ -76,7 +72,7 @@ def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
 
 
 def check_sum(path: Path) -> int:
-    """Return the CRC-32 of a source file, -1 where it cannot be read."""
+    """Return the CRC-32 of a source file, or -1 if it cannot be read."""
     try:
         return zlib.crc32(path.read_bytes())
     except OSError:
@@ -85,7 +81,7 @@ def check_sum(path: Path) -> int:
 
 @cache
 def settle() -> Build:
-    """Decide which build this process runs, and return it; call this before any module of the core is imported."""
+    """Decide which build this process runs; call this before any module of the core is imported."""
     build, modules = judged(_HERE.parent, os.environ.get(SWITCH))
     if not build.is_compiled and modules:
         sys.meta_path.insert(0, FromSource(modules))

@@ -2,13 +2,12 @@
 
 from typing import Final
 
-CRC8_POLYNOMIAL: Final = 0x1D  # SAE J1850: Hamming distance 3 over the 64 bits it guards here
+CRC8_POLYNOMIAL: Final = 0x1D  # SAE J1850: Hamming distance 3 over the 64 bits that it guards here
 CRC8_INITIAL: Final = 0xFF
 CRC8_FINAL_XOR: Final = 0xFF
 
 
 def _crc8_table() -> bytes:
-    """Return the register after each of the 256 bytes, from a register of 0."""
     table = []
     for byte in range(256):
         register = byte
@@ -20,11 +19,10 @@ def _crc8_table() -> bytes:
 
 
 CRC8_TABLE: Final = _crc8_table()
-"The register after a byte, by the register before the byte XOR the byte."
+"The register after a byte, by (register before) XOR byte."
 
 
 def crc8(data: bytes) -> int:
-    """Return the CRC-8/SAE-J1850 of `data`."""
     register = CRC8_INITIAL
     for byte in data:
         register = CRC8_TABLE[register ^ byte]

@@ -58,11 +58,11 @@ __all__ = [
 
 
 class EncodeError(ValueError):
-    """A message or frame cannot be put on the wire. The text names the signal, its value and what is allowed."""
+    """A message or frame cannot be put on the wire; the text names the signal, its value and what is allowed."""
 
 
 class DecodeError(ValueError):
-    """Bytes from the wire are not a message. The text names what was expected and what was received."""
+    """Bytes from the wire are not a message; the text names what was expected and what was received."""
 
     def __init__(self, text: str = "", name: str = "", check: str = "") -> None:
         super().__init__(text)
@@ -73,7 +73,7 @@ _BY_TYPE: Final[dict[type[object], Layout]] = {layout.message: layout for layout
 _BY_FUNCTION: Final[dict[int, Layout]] = {layout.function: layout for layout in LAYOUTS}
 
 FUNCTION: Final[dict[type[Message], int]] = {layout.message: layout.function for layout in LAYOUTS}
-"""The function code of each message: the serial frame's first byte, and the upper part of the CAN identifier."""
+"""The serial frame's first byte, and the upper part of the CAN identifier."""
 
 
 def can_identifier(function: int, node: int = 1) -> int:
@@ -84,12 +84,14 @@ def can_identifier(function: int, node: int = 1) -> int:
 
 
 def period(message: type[Message], signal: str) -> float:
-    """Return the period of a wrapping signal of a message, in the signal's unit (mm, s)."""
+    """Return the period of a wrapping signal, in the signal's unit (mm, s)."""
     return {s.name: s.period for s in _BY_TYPE[message].signals if s.wraps}[signal]
 
 
 def encode(message: Message) -> bytes:
-    """Return the payload of a message; physical values go to the nearest step, wrapping signals modulo their period."""
+    """Return a message's payload; values go to the nearest step, wrapping signals modulo their period. Raises
+    EncodeError.
+    """
     try:
         payload = wire.pack(message)
     except (TypeError, ValueError, OverflowError, struct.error) as error:  # not a number, NaN, infinite
@@ -100,7 +102,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(function: int, payload: bytes | bytearray) -> Message:
-    """Return the message in the payload of a function."""
+    """Return the message in the payload of a function. Raises DecodeError."""
     data = payload if isinstance(payload, bytes) else bytes(payload)
     message = wire.unpack(function, data)
     if message is None:
@@ -109,7 +111,7 @@ def decode(function: int, payload: bytes | bytearray) -> Message:
 
 
 def _misfit(message: Message) -> EncodeError:
-    """Return the error of a message that does not fit the wire: it names the first value that does not fit."""
+    """Return the error that names the first value that does not fit."""
     layout = _BY_TYPE.get(type(message))
     if layout is None:
         return EncodeError(f"{message!r} is not a message of this protocol")
@@ -124,16 +126,15 @@ def _misfit(message: Message) -> EncodeError:
 
 
 def _fits(signal: Signal, value: Any) -> bool:
-    """Tell whether a signal can carry a value; never raises."""
     try:
         step = round(value / signal.scale) if signal.type is float else index(value)
-    except (TypeError, ValueError, OverflowError):  # not a number, NaN, infinite
+    except (TypeError, ValueError, OverflowError):
         return False
     return signal.wraps or signal.lowest <= step <= signal.highest
 
 
 def _no_message(function: int, payload: bytes) -> DecodeError:
-    """Return the error of bytes that are no message: for function, length, CRC-8 or the first step out of range."""
+    """Return the error of bytes that are no message."""
     layout = _BY_FUNCTION.get(function)
     if layout is None:
         return DecodeError(f"function {function}: known are {', '.join(map(str, _BY_FUNCTION))}", check="function")

@@ -10,12 +10,12 @@ from typing import Any, Final, NamedTuple
 import cantools
 
 DBC: Final = Path(__file__).with_name("tormag.dbc")
-NODE: Final = 1  # the node whose identifiers the DBC lists
+NODE: Final = 1  # whose identifiers the DBC lists
 STRUCT_CODES: Final = {8: "b", 16: "h", 32: "i"}
 
 
 class SchemaError(ValueError):
-    """The DBC states something that the byte layout of this protocol does not allow. The text says what and where."""
+    """The DBC states something that the byte layout of this protocol does not allow; the text says what and where."""
 
 
 class SignalSource(NamedTuple):
@@ -37,13 +37,11 @@ class SignalSource(NamedTuple):
 
     @property
     def struct_code(self) -> str:
-        """The code of the signal's integer in the module `struct`."""
         code = STRUCT_CODES[self.length]
         return code if self.signed else code.upper()
 
     @property
     def python_type(self) -> str:
-        """The type of the Python field: float for a quantity, int for a bare number, else the enumeration's name."""
         if self.type_name:
             return self.type_name
         return "float" if self.unit or self.scale != 1 else "int"
@@ -77,13 +75,11 @@ class MessageSource(NamedTuple):
 
 
 class Schema(NamedTuple):
-    """Everything the generated files are made of."""
-
     version: int
     messages: tuple[MessageSource, ...]
 
     def canonical_layout(self) -> str:
-        """Return the text whose SHA-256 is the schema hash: all that decides bytes and their meaning, no comments."""
+        """Return the text that is hashed: all that decides bytes and their meaning, without comments."""
         lines = [f"protocol {self.version}"]
         for message in self.messages:
             lines.append(f"message {message.name} {message.frame_id} {message.length} {message.sender}")
@@ -97,18 +93,16 @@ class Schema(NamedTuple):
         return "\n".join(lines) + "\n"
 
     def schema_hash(self) -> int:
-        """Return the first four bytes, big-endian, of the SHA-256 of the canonical layout."""
         return int.from_bytes(hashlib.sha256(self.canonical_layout().encode("ascii")).digest()[:4], "big")
 
 
 def steps_held(length: int, signed: bool) -> tuple[int, int]:
-    """Return the least and the greatest step that an integer of `length` bits holds."""
+    """Return the least and the greatest value of an integer of `length` bits."""
     span = 1 << length
     return (-span // 2, span // 2 - 1) if signed else (0, span - 1)
 
 
 def read_schema(path: Path = DBC) -> Schema:
-    """Read the schema of a DBC file, its messages by rising identifier."""
     database: Any = cantools.database.load_file(path, database_format="dbc", strict=True)
     kinds = database.dbc.attribute_definitions["Kind"].choices
     messages = tuple(_message(message, kinds) for message in sorted(database.messages, key=lambda m: int(m.frame_id)))
@@ -116,7 +110,6 @@ def read_schema(path: Path = DBC) -> Schema:
 
 
 def _message(message: Any, kinds: list[str]) -> MessageSource:
-    """Return a cantools message as a MessageSource; `kinds` are the names of the attribute Kind."""
     signals = tuple(_signal(message.name, signal, kinds) for signal in sorted(message.signals, key=lambda s: s.start))
     if message.frame_id & 0xF != NODE or not 1 <= message.frame_id >> 4 <= 0x7F or message.is_extended_frame:
         raise SchemaError(f"{message.name}: {message.frame_id:#x} is not (function << 4) | {NODE} in 11 bits")
@@ -140,7 +133,6 @@ def _message(message: Any, kinds: list[str]) -> MessageSource:
 
 
 def _signal(message_name: str, signal: Any, kinds: list[str]) -> SignalSource:
-    """Return a cantools signal as a SignalSource; `kinds` are the names of the attribute Kind."""
     where = f"{message_name}.{signal.name}"
     attributes = signal.dbc.attributes
     kind = kinds[attributes["Kind"].value] if "Kind" in attributes else "Number"
@@ -156,7 +148,7 @@ def _signal(message_name: str, signal: Any, kinds: list[str]) -> SignalSource:
     storage = steps_held(signal.length, signal.is_signed)
     if steps[0] < storage[0] or steps[1] > storage[1] or (kind == "Wrapping" and steps != storage):
         raise SchemaError(f"{where}: steps {steps} do not fit, or for a wrapping signal do not fill, {storage}")
-    # The codec checks enumerations and flags by range, so their values must leave no gap.
+    # the codec checks enumerations and flags by range, so their values must leave no gap
     if kind == "Enumeration" and (sorted(choices) != list(range(len(choices))) or steps != (0, len(choices) - 1)):
         raise SchemaError(f"{where}: an enumeration counts from 0 without a gap, and its range says so")
     if kind == "Flags" and (sorted(choices) != [1 << bit for bit in range(len(choices))] or steps != (0, sum(choices))):

@@ -16,23 +16,23 @@ DELIMITER: Final = b"\x00"
 CRC_INITIAL: Final = 0xFFFF
 CRC_FINAL_XOR: Final = 0xFFFF
 CRC_RESIDUE: Final = 0x1D0F
-"""Register after data and their own CRC. It is not 0: with 0, a zero more or less at the end would not show."""
+"""Register after data and their own CRC. It is not 0, so a zero more or less at the end shows."""
 CRC_LENGTH: Final = 2
 HEADER_LENGTH: Final = 2
 MAX_PAYLOAD: Final = 8
 OVERTAKEN: Final = 16
-"A frame whose sequence is behind the newest by less than this was overtaken or repeated, or its sender began anew."
+"A frame whose sequence is behind the newest by less was overtaken or repeated, or its sender began anew."
 ALL_MISSING: Final = (1 << (OVERTAKEN - 1)) - 1
 MAX_ENCODED: Final = 1 + HEADER_LENGTH + MAX_PAYLOAD + CRC_LENGTH
 """Longest frame before its delimiter; under 254 bytes, COBS adds exactly one."""
 _BYTES: Final = [bytes((byte,)) for byte in range(256)]
 _DISTANCES: Final = _BYTES[1:-1]
-"""By the length of a run without zeros, the byte that COBS puts before the run."""
+"""The byte that COBS puts before a run without zeros, by the run's length."""
 
 
 @final
 class Frame(Value):
-    """One frame that arrived whole. Its payload need not be a message: `codec.decode` checks that."""
+    """One frame that arrived whole. Its payload may still be no message."""
 
     def __init__(self, function: int, sequence: int, payload: bytes) -> None:
         self.function: Final = function
@@ -42,8 +42,6 @@ class Frame(Value):
 
 @final
 class FramingStatistics(Value):
-    """Counters of a FrameDecoder since it was made. The decoder's own object goes on counting; a copy does not."""
-
     __match_args__ = ("bytes", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 
     def __init__(
@@ -57,24 +55,22 @@ class FramingStatistics(Value):
     ) -> None:
         self.bytes = bytes
         self.frames = frames
-        """Frames returned by `feed`."""
         self.corrupt = corrupt
         """Stretches between two delimiters that were not a frame."""
         self.lost = lost
-        """Frames missing from the sequence, also those that arrived corrupt; not those that were only overtaken."""
+        """Frames missing from the sequence, including corrupt ones, but not overtaken ones."""
         self.repeated = repeated
-        """Frames with the sequence number of the frame before."""
         self.resynchronisations = resynchronisations
-        """Times a frame was found again after something corrupt."""
+        """Frames found again after something corrupt."""
         self.unsent = 0
-        """Sent frames that the port did not take at once; the writer to the port counts them."""
+        """Sent frames that the port did not take at once."""
         self.refused: dict[str, str] = {}
-        """Why the newest refused one was refused, by "frame" or the name of a message."""
+        """Why the newest was refused, by "frame" or the name of a message."""
 
 
 @final
 class Succession:
-    """A count of the numbers that are missing from a sequence modulo 256."""
+    """Counts the numbers that are missing from a sequence modulo 256."""
 
     __match_args__: ClassVar = ("_missing", "newest")
     __slots__ = __match_args__
@@ -84,7 +80,7 @@ class Succession:
         self._missing = 0  # of the OVERTAKEN before the newest, a bit each, the nearest lowest
 
     def lost(self, number: int) -> int:
-        """Take the next number that came; return the change in how many are missing."""
+        """Take the next number; return the change in how many are missing."""
         ahead = (number - self.newest) % 256
         if ahead == 1:  # as nearly always
             self.newest = number
@@ -116,7 +112,7 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(data: bytes) -> bytes | None:
-    """Return the bytes that `cobs_encode` made `data` from; None if its distances do not end where it does."""
+    """Invert `cobs_encode`; None if the distances do not end where `data` does."""
     length = len(data)
     if length == 0:
         return b""
@@ -130,7 +126,6 @@ def cobs_decode(data: bytes) -> bytes | None:
 
 
 def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
-    """Return one frame with its delimiter."""
     if not (0 <= function <= 0xFF and 0 <= sequence <= 0xFF and len(payload) <= MAX_PAYLOAD):
         raise EncodeError(
             f"frame of function {function}, sequence {sequence}, {len(payload)} bytes: "
@@ -143,7 +138,7 @@ def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
 
 @final
 class FrameDecoder:
-    """Decoder of a byte stream, in pieces of any size, into frames."""
+    """Decodes a byte stream, in pieces of any size, into frames."""
 
     __match_args__: ClassVar = ("_last", "_pending", "_succession", "_synchronised", "statistics")
     __slots__ = __match_args__
@@ -170,12 +165,12 @@ class FrameDecoder:
                 if frame is not None:
                     frames.append(frame)
         if rest:
-            # One byte over the longest frame is kept, enough to know it for too long when its end comes.
+            # one byte over the longest frame is kept, enough to know at its end that it is too long
             self._pending = (self._pending + rest[: MAX_ENCODED + 1])[: MAX_ENCODED + 1]
         return frames
 
     def _accept(self, encoded: bytes) -> Frame | None:
-        """Count the bytes between two delimiters, and return their frame; None for a corrupt or repeated one."""
+        """Count the bytes between two delimiters, and return their frame, unless it is corrupt or repeated."""
         statistics = self.statistics
         frame = _parse(encoded)
         if frame is None:
@@ -198,7 +193,7 @@ class FrameDecoder:
 
 
 def _why_refused(encoded: bytes) -> str:
-    """Return which check the bytes of a corrupt frame did not pass, in a word or two."""
+    """Return in a few words which check a corrupt frame failed."""
     if len(encoded) > MAX_ENCODED:
         return f"over {MAX_ENCODED} bytes"
     body = cobs_decode(encoded)
@@ -208,7 +203,6 @@ def _why_refused(encoded: bytes) -> str:
 
 
 def _parse(encoded: bytes) -> Frame | None:
-    """Return the frame in the bytes between two delimiters; None where they are too long, too short or damaged."""
     if len(encoded) > MAX_ENCODED:
         return None
     body = cobs_decode(encoded)

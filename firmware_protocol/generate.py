@@ -1,7 +1,7 @@
-"""Generate the Python modules, the message tables of `README.md`, the C codec and the golden vectors from `tormag.dbc`.
+"""Generates the Python modules, the README's message tables, the C codec and the golden vectors from `tormag.dbc`.
 
-`python -m firmware_protocol.generate` writes them. With `--check` nothing is written: the exit code is 1, with the
-difference on stdout, if what is committed is not what the DBC gives.
+`python -m firmware_protocol.generate` writes them. With `--check` it only compares: it prints the difference from the
+committed files, and the exit code is 1 if there is one.
 """
 
 import argparse
@@ -20,7 +20,6 @@ TABLE_END: Final = "<!-- generated from tormag.dbc: end -->"
 
 
 def markdown_tables(schema: Schema) -> str:
-    """Return the message tables of the README in Markdown, with the markers around them."""
     lines = [TABLE_BEGIN, f"Protocol version {schema.version}, schema hash `{schema.schema_hash():08X}`.", ""]
     for message in schema.messages:
         lines += [
@@ -38,7 +37,6 @@ def markdown_tables(schema: Schema) -> str:
 
 
 def _markdown_row(signal: SignalSource) -> str:
-    """Return a signal's row: its bytes, name, wire type, values and meaning."""
     first, last = signal.start // 8, (signal.start + signal.length) // 8 - 1
     place = f"{first}" if first == last else f"{first}-{last}"
     wire_type = f"{'i' if signal.signed else 'u'}{signal.length}"
@@ -54,7 +52,7 @@ def _markdown_row(signal: SignalSource) -> str:
 
 
 def generated_files(room: Path) -> dict[Path, str]:
-    """Return the text that each generated file of a folder should have, by its path; writes nothing."""
+    """Return the text that each generated file of a folder should have, by its path."""
     schema = read_schema(room / DBC.name)
     readme = (room / "README.md").read_text(encoding="utf-8")
     before, begin, rest = readme.partition(TABLE_BEGIN)
@@ -68,7 +66,6 @@ def generated_files(room: Path) -> dict[Path, str]:
 
 
 def main(arguments: list[str] | None = None, room: Path = DBC.parent) -> int:
-    """Write the generated files of a folder that are out of date, or with `--check` print how they differ."""
     parser = argparse.ArgumentParser(prog="python -m firmware_protocol.generate", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is out of date")
     check: bool = parser.parse_args(arguments).check

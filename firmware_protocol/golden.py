@@ -1,7 +1,7 @@
 """Golden vectors: bytes that every implementation of the wire must produce, read and refuse.
 
-Nothing here uses this package's codec or framing. Payloads are packed by cantools, the CRCs are computed bit by bit,
-and frames are stuffed by the `cobs` package. What a receiver must make of a damaged stream is written down by hand.
+They are independent of this package's codec and framing: cantools packs the payloads, the CRCs are computed bit by bit,
+and the `cobs` package stuffs the frames. What a receiver must make of a damaged stream is written down by hand.
 """
 
 import json
@@ -22,7 +22,7 @@ Json = dict[str, Any]
 
 
 def bitwise_crc8(data: bytes) -> int:
-    """Return the CRC-8/SAE-J1850 of `data`, straight from its definition."""
+    """Return the CRC-8/SAE-J1850, straight from its definition."""
     register = 0xFF
     for byte in data:
         register ^= byte
@@ -32,7 +32,7 @@ def bitwise_crc8(data: bytes) -> int:
 
 
 def bitwise_crc16(data: bytes) -> int:
-    """Return the CRC-16/GENIBUS of `data`, straight from its definition."""
+    """Return the CRC-16/GENIBUS, straight from its definition."""
     register = 0xFFFF
     for byte in data:
         register ^= byte << 8
@@ -42,7 +42,6 @@ def bitwise_crc16(data: bytes) -> int:
 
 
 def vector_files(schema: Schema, dbc: Path) -> dict[str, str]:
-    """Return the text of the vector files, by their names, for the messages of a schema that was read from `dbc`."""
     database = cantools.database.load_file(dbc, database_format="dbc", strict=True)
     valid = [vector for message in schema.messages for vector in _valid_payloads(message, database)]
     head = {"protocol_version": schema.version, "schema_hash": f"{schema.schema_hash():08X}"}
@@ -52,7 +51,6 @@ def vector_files(schema: Schema, dbc: Path) -> dict[str, str]:
 
 
 def _text(document: Json) -> str:
-    """Return a document as JSON with one vector a line, so that a changed vector is one changed line."""
     blocks = []
     for key, value in document.items():
         lines = ",\n".join(f"    {json.dumps(entry)}" for entry in value) if isinstance(value, list) else None
@@ -61,7 +59,7 @@ def _text(document: Json) -> str:
 
 
 def _valid_payloads(message: MessageSource, database: Any) -> Iterator[Json]:
-    """Yield payloads of a message: all signals at their least, all at their greatest, and RANDOM_VECTORS random."""
+    """Yield payloads of a message: all signals at their least, at their greatest, and at random."""
     generator = random.Random(f"{RANDOM_SEED} {message.name}")
     fields = message.fields
     cases = [tuple(signal.steps[0] for signal in fields), tuple(signal.steps[1] for signal in fields)]
@@ -83,7 +81,7 @@ def _valid_payloads(message: MessageSource, database: Any) -> Iterator[Json]:
 
 
 def _packed(message: MessageSource, steps: dict[str, int], database: Any) -> bytes:
-    """Return the payload of raw steps, with its CRC-8; a step out of range is packed too, if its bits hold it."""
+    """Return the payload of raw steps with its CRC-8, also of steps out of range."""
     checksum = {message.signals[-1].name: 0} if message.protected else {}
     target = database.get_message_by_name(message.name)
     payload = bytes(target.encode(steps | checksum, scaling=False, strict=False))
@@ -160,7 +158,7 @@ def _streams() -> list[Json]:
     short = _ended(bytes((3, 255, 0)))
     bare = _ended(b"\x00\x00")  # the CRC of nothing, and nothing
     another = _stuffed(8, 254, b"\x01")
-    # not with the longest payload, which a zero more makes too long, whatever the CRC says
+    # not the longest payload, which one zero more makes too long, whatever the CRC
     longer = _ended(_checked(3, 255, payload[:-1]) + b"\x00")
     shorter = _ended(next(body for n in range(256) if (body := _checked(3, 255, bytes((n,))))[-1] == 0)[:-1])
 

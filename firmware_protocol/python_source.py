@@ -1,7 +1,8 @@
 """The Python modules that are generated from tormag.dbc: enumerations, messages with their layouts, and their bytes.
 
 `wire.py` writes out for each message what `codec.py` would have to look up. Encoding or decoding a message is then a
-dozen operations on numbers, which a compiler makes native. The enumerations stand apart: they are not compiled.
+dozen operations on numbers, which a compiler makes native. The enumerations are a module of their own, which is not
+compiled.
 """
 
 import textwrap
@@ -47,7 +48,6 @@ def _enumerations(schema: Schema) -> dict[str, SignalSource]:
 
 
 def _import(module: str, names: list[str]) -> str:
-    """Return an import from a module of this package, broken where it is too long for a line."""
     line = f"from firmware_protocol.{module} import {', '.join(names)}\n"
     if len(line) <= LINE_WIDTH + 1:
         return line
@@ -98,7 +98,6 @@ def _layouts_module(schema: Schema) -> str:
 
 
 def _message(message: MessageSource) -> str:
-    """Return the class of a message, with its signals' comments."""
     fields = []
     for signal in message.fields:
         fields += [f"        # {line}\n" for line in textwrap.wrap(signal.comment, TEXT_WIDTH - 4)]
@@ -112,7 +111,6 @@ def _message(message: MessageSource) -> str:
 
 
 def _call(before: str, arguments: list[str], after: str = "") -> str:
-    """Return `before(arguments)after`, broken where it is too long for a line of a block."""
     whole = f"{before}({', '.join(arguments)}){after}"
     if len(whole) <= LINE_WIDTH - 4:
         return whole
@@ -123,7 +121,6 @@ def _call(before: str, arguments: list[str], after: str = "") -> str:
 
 
 def _layout(message: MessageSource) -> str:
-    """Return the `Layout` of a message, an entry of LAYOUTS."""
     signals = [
         f'Signal("{s.name}", {s.python_type}, {_number(s.scale)}, {_number(s.minimum)}, {_number(s.maximum)}'
         f"{', wraps=True' if s.kind == 'Wrapping' else ''}),"
@@ -145,7 +142,7 @@ def _number(value: float) -> str:
 
 
 def _wire_module(schema: Schema) -> str:
-    """Return wire.py: functions that pack and unpack each message, and their dispatch by type and by function."""
+    """Return wire.py: functions that pack and unpack each message, and their dispatch."""
     enumerations = _enumerations(schema)
     flags = [name for name, signal in enumerations.items() if signal.kind == "Flags"]
     members = "".join(
@@ -185,14 +182,13 @@ def _is_wide(signal: SignalSource) -> bool:
 
 
 def _crc(message: MessageSource, data: str) -> list[str]:
-    """Return the lines that compute the CRC-8 register over the function and the bytes `data` of a payload."""
+    """Return the lines that compute the CRC-8 register over the function and a payload's bytes `data`."""
     start = CRC8_TABLE[CRC8_INITIAL ^ message.function]
     lines = [f"crc = CRC8_TABLE[{_mask(start)} ^ {data}[0]]  # the register after the function, and the first byte"]
     return lines + [f"crc = CRC8_TABLE[crc ^ {data}[{place}]]" for place in range(1, message.length - 1)]
 
 
 def _pack(message: MessageSource) -> str:
-    """Return the function that packs a message, None where a value is out of range."""
     lines, steps = [], []
     for s in message.fields:
         name, (lowest, highest) = s.name, s.steps
@@ -228,7 +224,6 @@ def _pack(message: MessageSource) -> str:
 
 
 def _unpack(message: MessageSource) -> str:
-    """Return the function that unpacks a message, None for a wrong length, CRC-8 or value."""
     lines = [f"if len(data) != {message.length}:", "    return None"]
     if message.protected:
         last = message.length - 1
@@ -260,7 +255,6 @@ def _unpack(message: MessageSource) -> str:
 
 
 def _dispatch(schema: Schema) -> str:
-    """Return `pack` and `unpack`, which choose the function of the message."""
     packs = "".join(
         f"    if isinstance(message, {m.name}):\n        return pack_{m.name.lower()}(message)\n"
         for m in schema.messages

@@ -7,7 +7,7 @@ class Signal(NamedTuple):
     """One field of a payload: physical value = step * scale, with `step` the integer on the wire."""
 
     name: str
-    type: type[float]  # int and the enumerations are, to the type system, floats
+    type: type[float]  # the type system takes int and the enumerations for floats
     scale: float
     minimum: float
     maximum: float

@@ -2,8 +2,8 @@
 
 A value is a final class with a plain `__init__`, whose attributes are `Final`. Compiled, making and reading one take a
 few machine instructions, and assignments are refused; interpreted, it is faster than a named tuple. The fields are
-named once, by `__init__`, which assigns them in the order of its parameters. A value with attributes beside its
-parameters names its fields itself, in `__match_args__`.
+named once, by `__init__`, which assigns them in the order of its parameters. A value with further attributes names its
+fields in `__match_args__`.
 """
 
 from typing import Any, ClassVar, Self
@@ -36,7 +36,6 @@ class Value:
         return type(self), tuple([getattr(self, name) for name in self.__match_args__])
 
     def replaced(self, **changes: Any) -> Self:
-        """Return a copy with the given fields changed."""
         fields: dict[str, Any] = {name: getattr(self, name) for name in self.__match_args__}
         fields.update(changes)
         return type(self)(**fields)

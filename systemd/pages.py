@@ -1,4 +1,4 @@
-"""Completions and man pages of both commands, made from their argument parsers: python -P systemd/pages.py SHARE."""
+"""Makes completions and man pages of both commands from their argument parsers: python -P systemd/pages.py SHARE."""
 
 import gzip
 import sys
@@ -15,15 +15,15 @@ from tormagd.daemon.main import parser as daemon
 
 
 def page(parser: ArgumentParser) -> bytes:
-    """The man page in section 1, compressed; the same bytes for the same parser."""
+    """Return the man page in section 1, compressed; the same bytes for the same parser."""
     known = {"project_name": "tormagd", "version": __version__, "manual_title": "Haptic controller"}
     made = Manpage(parser, known, format="single-commands-section")
-    made.date = ""  # that of the build says nothing
+    made.date = ""  # the date of the build means nothing
     return gzip.compress(str(made).encode(), mtime=0)
 
 
 def main(share: Path) -> None:
-    """Writes all of them under `share`, in folders that are there."""
+    """Write all of them under `share`, in existing folders."""
     for shell, path in zip(
         SHELLS, ("bash-completion/completions/tormagctl", "zsh/site-functions/_tormagctl"), strict=True
     ):

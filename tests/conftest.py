@@ -1,9 +1,8 @@
 """What every test shares: a live test that the host spoiled is started again, twice at most.
 
-A live test joins processes and sockets in real time. Where the host takes the processor for longer than the device may
-be silent, device and daemon protect themselves, as they must, and the scenario is over. That is never told from the
-failure itself: the kernel's counters and bare timers on every processor say so (`tools/machines/host.py`), or it is a
-failure.
+If the host takes the processor for longer than the device may be silent, device and daemon protect themselves, and the
+scenario is over. Only the kernel's counters and bare timers on every processor (`tools/machines/host.py`) may blame the
+host; otherwise it is a failure.
 """
 
 import asyncio
@@ -24,25 +23,23 @@ from machines.host import HostWatch
 from firmware_protocol.c.build import BuildError, compiler, load_library
 from tormagd.slices import ask_for_slices
 
-# No test asserts a wall-clock duration, so none fails because the machine is slow. One commit has one verdict: a
-# property's cases are drawn from its source, and `make search` draws others; what it finds becomes an `@example`
+# No test asserts a wall-clock duration. One commit has one verdict: a property's cases are drawn from its source, and
+# `make search` draws others, whose finds become an `@example`
 UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("tormagd", UNHURRIED, derandomize=True, max_examples=40)
 settings.register_profile("search", UNHURRIED, print_blob=True, max_examples=200)
 settings.load_profile("tormagd")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # pytest-xdist's workers ignore Ctrl-C, as what runs in the background does, and what a test starts would inherit it
+    # pytest-xdist's workers ignore Ctrl-C, and what a test starts would inherit that
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ATTEMPTS = 3
 WATCHED_ABOVE = 51
-"FIFO priority of the bare timers, where it is allowed: one above the daemon's in the tests."
 WATCHED = pytest.StashKey[HostWatch]()
 
 
 @pytest.fixture
 def recordings() -> Path:
-    """The folder of measured data, which is not part of the repository."""
     folder = Path(os.environ.get("TORMAG_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip("no measured data: set TORMAG_DATA to its folder")
@@ -59,13 +56,11 @@ def c_compiler() -> str:
 
 @pytest.fixture(scope="session")
 def library(c_compiler: str) -> ctypes.CDLL:
-    """The firmware's C sources as a shared library."""
     return load_library()
 
 
 @pytest.fixture
 def usual_slices() -> Iterator[None]:
-    """What a test has asked the kernel for, the next one does not run with."""
     yield
     ask_for_slices(0)
 
@@ -76,7 +71,7 @@ class HostWarning(UserWarning):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Runs a test that is a coroutine; runs a live test, again after a failure that the host explains."""
+    """Run a coroutine test, and a live test again after a failure that the host explains."""
     call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
     if inspect.iscoroutinefunction(pyfuncitem.obj):
         asyncio.run(pyfuncitem.obj(**call))
@@ -106,7 +101,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def host_watch(config: pytest.Config) -> HostWatch:
-    """The bare timers of this session, which outlive a test: to start them for each costs more than some tests do."""
+    """Return the session's bare timers, because starting them costs more than some tests do."""
     if WATCHED not in config.stash:
         with contextlib.ExitStack() as stack:
             nowhere = stack.enter_context(Path(os.devnull).open("w"))
@@ -116,6 +111,5 @@ def host_watch(config: pytest.Config) -> HostWatch:
 
 
 def tmp_path_factory(item: pytest.Function) -> pytest.TempPathFactory:
-    """The session's factory of folders, for a test that did not ask for it."""
     factory: pytest.TempPathFactory = item._request.getfixturevalue("tmp_path_factory")
     return factory

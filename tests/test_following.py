@@ -19,14 +19,12 @@ def pulse_N(at_s: float) -> float:
 
 
 def ticks(lasts_s: float, late_s: float = 0.0, **changes: Any) -> Iterator[Any]:
-    """What a device does that is so late."""
     for k in range(round(lasts_s * HZ)):
         told = {"setpoint_cf": pulse_N(k / HZ), "measured_cf": pulse_N(k / HZ - late_s), "handle_mm": 20.0 * k / HZ}
         yield FOLLOWED | told | changes
 
 
 def reported(*runs: Iterable[Any]) -> Any:
-    """What a daemon says at the end of these runs."""
     following = Following(1.0 / HZ, 5.0)
     for run in runs:
         for tick in run:
@@ -36,7 +34,6 @@ def reported(*runs: Iterable[Any]) -> Any:
 
 
 def recorded(*runs: Iterable[Any]) -> Any:
-    """What a recording of them says."""
     builder = OverviewBuilder()
     for number, tick in enumerate(tick for run in runs for tick in run):
         builder.add(number * 20_000_000, True, tick)

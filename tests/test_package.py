@@ -9,7 +9,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = "tormagd", "firmware_protocol"
 DATA = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["package-data"]
 NOT_INSTALLED = {".py", ".so", ".md", ".pyc"}
-"Modules are installed by themselves, and pages are for the repository."
 MADE = {"firmware_protocol/core.json"}
 
 

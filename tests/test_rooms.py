@@ -1,4 +1,4 @@
-"""Imports go one way: each room may import only what stands here (and itself)."""
+"""Imports go one way: each room may import only what is listed here (and itself)."""
 
 import ast
 import re
@@ -11,9 +11,7 @@ ROOT = Path(__file__).parents[1]
 LOWEST = {"firmware_protocol", "config"}
 FILES = {"bounded_file", "named_file", "toml_file"}
 DECIDES = {"firmware_protocol", "config", "physics", "model", "inverse", "scenes", "safety", "hardware"}
-"""What the core is made of."""
 NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
-"""What all values are made of, and which build runs: they know nothing of any room, the protocol's included."""
 MAY_IMPORT = {
     "firmware_protocol": set(),
     "bounded_file": set(),
@@ -81,7 +79,7 @@ MAY_IMPORT = {
     "closed_loop": LOWEST | {"inverse", "control", "assembly", "hardware", "safety", "simulation"},
 }
 MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"entry"}
-"""The laboratory may import every room, and nothing imports it."""
+"""Nothing imports the laboratory."""
 TOOLS = ROOT / "tools"
 TOOL_ROOMS = {
     "machines": set(),
@@ -92,24 +90,21 @@ TOOL_ROOMS = {
     "endurance": {"machines"},
     "benchmarks": {"machines", "rendering"},
 }
-"""Of the tools; beside them stand the scripts, which no room imports."""
+"""Of the tools; no room imports the scripts beside them."""
 
 
 def sources() -> Iterator[Path]:
-    """Every module of the two packages."""
     for package in ("tormagd", "firmware_protocol"):
         yield from sorted((ROOT / package).rglob("*.py"))
 
 
 def room(parts: tuple[str, ...]) -> str | None:
-    """The room a module or an import stands in; None for what is not ours."""
     if parts[0] == "firmware_protocol":
         return "firmware_protocol"
     return parts[1] if parts[0] == "tormagd" and len(parts) > 1 and parts[1] in MAY_IMPORT else None
 
 
 def imported(path: Path) -> Iterator[str]:
-    """The full names that a module imports, also inside functions."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -1,4 +1,4 @@
-"""Short slices of the processor, as the kernel itself says that it gives them."""
+"""Short slices of the processor, as the kernel itself reports them."""
 
 import os
 import re
@@ -41,7 +41,6 @@ GIVES = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2])) >= (6, 12)
 
 
 def printed(script: str) -> list[str]:
-    """By a process of its own."""
     return subprocess.check_output([sys.executable, "-c", script], text=True).split()
 
 

@@ -1,8 +1,8 @@
-"""A bare timer: what this machine gives a thread that asks for nothing but to be woken in every control period.
+"""A bare timer: it shows what this machine gives a thread that only asks to be woken every control period.
 
-It has the daemon's heartbeat, event loop and scheduling, and no controller and no device: what it misses the daemon
-would have missed too. `benchmark loop` lets it carry the daemon's clients. Run as a script it stays on one processor
-until SIGTERM, and prints when it stood still.
+It has the daemon's heartbeat, event loop and scheduling, but no controller and no device: what it misses, the daemon
+would have missed too. `benchmark loop` lets it carry the daemon's clients. As a script it stays on one processor until
+SIGTERM, and prints when it stood still.
 """
 
 import argparse
@@ -21,7 +21,6 @@ from tormagd.headroom.bare_timer import NS, beat
 
 
 async def stalls_until_ended(realtime: RealTime) -> list[Stall]:
-    """Whatever kept a beat back for longer than a period, until SIGTERM or SIGINT."""
     prepare(realtime)
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -39,7 +38,7 @@ async def stalls_until_ended(realtime: RealTime) -> list[Stall]:
 
 
 def main() -> int:
-    """Beats on one processor; prints a line when it begins, and the stalls as JSON pairs of seconds at its end."""
+    """Beat on one processor; print a line when it begins, and at its end the stalls as JSON pairs of seconds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cpu", type=int, required=True, help="the processor it stays on")
     parser.add_argument("--fifo", type=int, default=0, help="SCHED_FIFO priority; 0, or refused: ordinary scheduling")

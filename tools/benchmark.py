@@ -1,8 +1,8 @@
 """Measurements of tormagd, one a subcommand. Each prints one JSON object with --json, a table otherwise.
 
-Each also says, as `machine_us`, what the interpreter and the processor were worth meanwhile: the time of a fixed loop
-of pure Python. A measurement is a module of `benchmarks` (`_` for `-`) with `add_arguments(parser)` and
-`measure(options)`, which returns the object.
+Each also says, as `machine_us`, how fast interpreter and processor were meanwhile: the time of a fixed loop of pure
+Python. A measurement is a module of `benchmarks` (`_` for `-`) with `add_arguments(parser)` and `measure(options)`,
+which returns the object.
 """
 
 import argparse
@@ -25,7 +25,7 @@ MEASUREMENTS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one measurement; returns 0, or 2 on a wrong command line."""
+    """Run one measurement; return 0, or 2 on a wrong command line."""
     parser = argparse.ArgumentParser(prog="benchmark.py", description=(__doc__ or "").splitlines()[0])
     measurements = parser.add_subparsers(dest="measurement", required=True)
     modules = {}

@@ -1,15 +1,14 @@
-"""What a hand feels that pushes into a wall and draws back: run and bound, in virtual time.
+"""What a hand feels when it pushes into a wall and draws back: run and bound, in virtual time.
 
     contact.py [--draws N] [--json] [--picture FILE.png]
 
-Onset: from when the wall's force at the handle's place reaches the waiting level W and 0.2 N to when the kinetic force
-does. Short: the share of that force that the run lacks when the bound has it. W is what carriages without inertia leave
-of the open gap, the scene's least force and its standby. RMS: kinetic force less the wall's, at least W, from the
-wall's place until the hand turns; less W after that. Held: how long the handle is held back by more than W and 0.1 N
-while the hand draws it back. Where another force or a wall is sent, its bound are the run's own motors, which only open
-from when the hand pulls. Devices are simulated: sample 1 was tuned on, the others judge. `--draws` are random walls,
-pushes and hands behind a network with jitter of 30 ms and 5 % loss in bursts. The band of the picture is the just
-noticeable difference of force, 10 % (Jones 1989); that of stiffness is 22 % (Jones and Hunter 1990).
+W is the waiting level: what the open gap, the scene's least force and its standby leave without inertia. *Onset* is the
+time from when the wall's force at the handle's place reaches W and 0.2 N until the kinetic force does; *short* is the
+share of that force that the run then lacks. *RMS* is the kinetic force less the wall's until the hand turns, then less
+W. *Held* is how long the handle is held back by more than W and 0.1 N while the hand draws it back. Where another force
+or a wall is sent, the bound are the run's own motors, which only open once the hand pulls. `--draws` are random walls,
+pushes and hands behind a network with 30 ms of jitter and 5 % loss in bursts. The picture's band is the just noticeable
+difference of force, 10 % (Jones 1989).
 """
 
 import argparse
@@ -50,9 +49,9 @@ ROUND_TRIPS_MS = (0.0, 100.0, 400.0)
 MODES = ("force", "force_standby", "way", "way_standby", "law", "law_standby")
 JITTER_MS, LOSS = 30.0, 0.05
 EARLY_TICKS = 20
-"Before the wall, what is exceeded for no longer does not count."
+"What is exceeded before the wall for no longer does not count."
 LATER_MS, WORSE, WORSE_N = 40.0, 1.1, 0.015
-"What has to hold of 95 %: onset, unless no hand tells the difference, and RMS, against the bound's."
+"Bounds for 95 %: onset, unless no hand tells the difference, and RMS, against the bound's."
 SWINGS_MM_S = 5.0
 DRAWN = {
     "force": "Forces are sent",
@@ -64,7 +63,6 @@ FORCE_JND = 0.10
 
 
 def cases() -> list[Case]:
-    """The matrix."""
     return [
         Case(device, hand, *touched, round_trip_ms, mode)
         for device, hand, touched, round_trip_ms, mode in product(DEVICES, HANDS_N_MM, TOUCHES, ROUND_TRIPS_MS, MODES)
@@ -72,7 +70,6 @@ def cases() -> list[Case]:
 
 
 def drawn(count: int) -> list[Case]:
-    """Random touches behind a bad network."""
     random = np.random.default_rng(2037)
     return [
         Case(
@@ -90,7 +87,6 @@ def drawn(count: int) -> list[Case]:
 
 
 def judged(case: Case) -> Json:
-    """The row of one case: run, bound, and what a gap without inertia would leave."""
     core = core_of(case)
     run, bound, infinite = rendered(case, core), ideal(case), ideal(case, has_motors=False)
     free = infinite.depth_mm < -0.5 * FREE_MM
@@ -129,30 +125,27 @@ def judged(case: Case) -> Json:
 
 
 def onset_short(run: Touch, bound: Touch, onset_N: float) -> float | None:
-    """The share of `onset_N` that the run lacks when the bound has it; None where the bound never does."""
+    """Return the share of `onset_N` that the run lacks when the bound has it."""
     has_it = bound.kinetic_N >= onset_N
     return 1.0 - float(run.kinetic_N[has_it.argmax()]) / onset_N if has_it.any() else None
 
 
 def free_drag_N(touch: Touch) -> float:
-    """What a handle feels on its way to the wall."""
     return float(touch.force_N[(touch.depth_mm < -2.0) & (touch.depth_mm > -0.5 * FREE_MM) & pushing(touch)].mean())
 
 
 def pushing(touch: Touch) -> Mask:
-    """The rows before the hand turns."""
     return np.asarray(touch.time_s < touch.time_s[-1] / 2.0)
 
 
 def rms_N(touch: Touch, wall_N_mm: float, waiting_N: float) -> float:
-    """Of the kinetic force against what should have been felt."""
     begins = int((touch.depth_mm >= 0.0).argmax())
     wanted_N = np.where(pushing(touch), np.maximum(wall_N_mm * touch.depth_mm, waiting_N), waiting_N)
     return rms((touch.kinetic_N - wanted_N)[begins:])
 
 
 def felt_stiffness_ratio(touch: Touch, wall_N_mm: float) -> float | None:
-    """The slope of what is felt over the handle's place behind the wall, over the wall's."""
+    """Return the slope of the felt force over the handle's place behind the wall, over the wall's."""
     inside = (touch.depth_mm > 0.0) & (touch.speed_mm_s > 1.0) & pushing(touch)
     if inside.sum() < 10:
         return None
@@ -160,26 +153,25 @@ def felt_stiffness_ratio(touch: Touch, wall_N_mm: float) -> float | None:
 
 
 def held_ms(touch: Touch, waiting_N: float) -> float:
-    """How long a brake that gives more than W holds the handle back while the hand draws it back."""
+    """Return how long a brake with more than W holds the handle back while the hand draws it back."""
     held = np.minimum(-touch.force_N, touch.kinetic_N) > waiting_N + HELD_N
     return float(held[~pushing(touch)].sum())
 
 
 def early_N(touch: Touch, waiting_N: float) -> float:
-    """Over W before the wall, for more than EARLY_TICKS."""
+    """Return the excess over W before the wall for more than EARLY_TICKS."""
     before = touch.kinetic_N[: int((touch.depth_mm >= 0.0).argmax())]
     return float(np.sort(before)[-EARLY_TICKS - 1] - waiting_N)
 
 
 def swings(touch: Touch) -> int:
-    """How often the handle turns, but for the hand's own turn: of a brake that holds it, twice on its bristles."""
+    """Return how often the handle turns besides the hand's own turn; a held one turns twice on its bristles."""
     moving = touch.speed_mm_s[np.abs(touch.speed_mm_s) > SWINGS_MM_S]
     return max(int((np.diff(np.sign(moving)) != 0.0).sum()) - 1, 0)
 
 
 def energy_error(touch: Touch) -> float:
-    """What of the hand's work is neither in the handle's motion nor taken by the brake, as a share of all that it
-    does."""
+    """Return the share of the hand's work that neither moves the handle nor is taken by the brake."""
     travel_mm = np.diff(touch.depth_mm)
     given = float(((touch.hand_N - touch.force_N)[1:] * travel_mm).sum())
     first_mm_s, last_mm_s = touch.speed_mm_s[[0, -1]]
@@ -188,7 +180,6 @@ def energy_error(touch: Touch) -> float:
 
 
 def kept(rows: list[Json]) -> Json:
-    """By mode, the shares of what has to hold, and the worst."""
     found: Json = {}
     for mode in dict.fromkeys(row["mode"] for row in rows):
         of_mode = [row for row in rows if row["mode"] == mode]
@@ -216,13 +207,11 @@ def kept(rows: list[Json]) -> Json:
 
 
 def spread(values: list[float]) -> Json:
-    """The median, what 95 % keep to, and the greatest; not a number where there is none."""
     shares = {"p50": 0.5, "p95": 0.95, "worst": 1.0}
     return {name: float(np.quantile(values or [math.nan], share)) for name, share in shares.items()}
 
 
 def draw(picture: Path) -> None:
-    """What was there and what was felt, of one wall in four ways."""
     figure, axes = subplots((11.0, 7.0), 2, 2, sharex=True, sharey=True)
     figure.suptitle("A wall of 0.25 N/mm, pushed at 30 mm/s over 100 ms, sample 2", fontsize=13)
     for axis, (mode, title) in zip(axes.flat, DRAWN.items(), strict=True):
@@ -244,7 +233,6 @@ def draw(picture: Path) -> None:
 
 
 def main() -> int:
-    """Exit code 0: all that has to hold does; else 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=0, metavar="N", help="random touches instead of the matrix")
     parser.add_argument("--json", action="store_true")

@@ -2,11 +2,11 @@
 
     publisher --ZeroMQ--> tormagd --serial, a pty--> virtual firmware --> plant
 
-Hardware is simulated. Each part is a process of its own, as it would be beside a console. `rendering/show.py` starts
-them and watches. `rendering/live_touch.py` has the hand, which decides nothing. This one judges the pulse and sums up.
-What is called rendered is the plant's friction force at the roller, never the controller's prediction. A show that the
-host disturbed is told as that, and started again; the same pulse in virtual time needs no host. At the end the ordered
-loops are shown, for some seconds each: the search in torch, and the thesis's own; they decide nothing.
+Hardware is simulated, each part in a process of its own. `rendering/show.py` starts and watches them,
+`rendering/live_touch.py` has the hand, and this script judges the pulse and sums up. Rendered is the plant's friction
+force at the roller, never the controller's prediction. A show that the host disturbed is reported as such and started
+again; the same pulse in virtual time needs no host. At the end the ordered loops (the search in torch, and the thesis's
+own) are shown for some seconds each; they do not count in the verdict.
 """
 
 import argparse
@@ -45,12 +45,9 @@ from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd_client.endpoints import ConfigError
 
 SHOWS = 3
-"The first, and two more where the host spoils one."
 MARGIN = 0.1
-"""The control loop may keep this much less of its periods than the worst bare timer: it computes, the timer does not.
-"""
+"""The control loop may keep this much less of its periods than the worst bare timer, because it computes."""
 MAX_SPACING = 1.5
-"""Time between the fastest ticks, periods, above which the software itself is slow."""
 THESIS_GAP_SPEED_MM_S = 8.33
 SCENES = Path(__file__).parents[1] / "examples" / "scenes"
 ORDERED = {"torch, one batch, 500 Hz": "torch", "thesis, row by row, 83 Hz, 8.33 mm/s": "thesis"}
@@ -65,15 +62,15 @@ CASES = (
 
 
 class Verdict(IntEnum):
-    """What a show says of the software; also the exit code of `make run`'s script."""
-
     MET = 0
     MISSED = 1
     HOST = 3
 
 
 def main() -> int:
-    """Runs the demonstration; 0: what the scene states was met, 1: missed, 3: the host left too little to say."""
+    """Run the demonstration; return 0 if the scene's bounds were met, 1 if missed, 3 if the host left too little to
+    say.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plant", default="sample_1", help="plant file or sample that plays the pulse (sample_1)")
     plant = parser.parse_args().plant
@@ -106,7 +103,7 @@ def main() -> int:
 
 
 def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
-    """The verdict on one show, and one sentence with cause and remedy where it is not MET."""
+    """Return the verdict on one show, and cause and remedy where it is not MET."""
     if isinstance(shown, Aborted):
         what, is_of_time = str(shown.error), shown.error.is_of_time
         by_host, otherwise = f", and the show ended early ({shown.error.cause})", what
@@ -127,12 +124,10 @@ def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
 
 
 def is_slow(scene: Scene, spacing_s: float) -> bool:
-    """Whether even the fastest ticks come late."""
     return spacing_s * scene.bandwidth.control_hz > MAX_SPACING
 
 
 def slow(spacing_s: float) -> str:
-    """What that means, and what to do."""
     return (
         f"even the fastest ticks came {spacing_s * 1e3:.1f} ms after the last, so the software is too slow here: "
         f"keep {RUN_DIR} and report it"
@@ -140,7 +135,6 @@ def slow(spacing_s: float) -> str:
 
 
 def checks(scene: Scene, shown: Shown) -> dict[str, bool]:
-    """What a show must keep, each with whether it did."""
     result = scored(shown.time_s, shown.asked_N, shown.rendered_N)
     inference, link = shown.status["rates"]["inference"], shown.status["link"]
     force, bandwidth = scene.force, scene.bandwidth
@@ -160,12 +154,10 @@ def checks(scene: Scene, shown: Shown) -> dict[str, bool]:
 
 
 def lost_frames(link: dict[str, Any]) -> int:
-    """Lost, corrupt and repeated ones."""
     return int(link["lost"] + link["corrupt"] + link["repeated"])
 
 
 def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> Rehearsals:
-    """Every case, on two processors."""
     done: Rehearsals = {}
     with concurrent.futures.ProcessPoolExecutor(max_workers=2) as pool:
         waiting = [pool.submit(rehearse, config, case, times_s, forces_N) for case in CASES]
@@ -180,7 +172,6 @@ def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> Rehearsals:
 
 @contextlib.contextmanager
 def folder(name: str) -> Iterator[None]:
-    """A show's own, beside the demonstration's."""
     path = Path("run") / name
     path.mkdir(parents=True, exist_ok=True)
     with contextlib.chdir(path):
@@ -188,7 +179,6 @@ def folder(name: str) -> Iterator[None]:
 
 
 def show_ordered() -> dict[str, Shown | Aborted]:
-    """Each ordered loop live, in a folder of its own beside the demonstration's."""
     done: dict[str, Shown | Aborted] = {}
     for label, name in ORDERED.items():
         with folder(name):
@@ -206,7 +196,6 @@ def conclude(
     sentence: str,
     seconds: float,
 ) -> int:
-    """Prints the summary, writes it and the picture; the exit code."""
     met = in_virtual_time = virtual_time_checks(scene, rehearsals)
     print_forces(shown, rehearsals)
     print_ordered(shown, ordered)
@@ -254,7 +243,6 @@ def conclude(
 
 
 def virtual_time_checks(scene: Scene, rehearsals: Rehearsals) -> dict[str, bool]:
-    """What the software must keep whatever the host does."""
     first, most_N = rehearsals.get(CASES[0]), scene.force.tolerance_rms_N
     return {
         "every case in virtual time done": len(rehearsals) == len(CASES),
@@ -263,7 +251,6 @@ def virtual_time_checks(scene: Scene, rehearsals: Rehearsals) -> dict[str, bool]
 
 
 def touch_told(scene: Scene, touched: dict[Wall, Touch] | Aborted) -> tuple[Json, list[str]]:
-    """What the hand felt of each wall, as figures and as lines; or what ended its show early."""
     if isinstance(touched, Aborted):
         _, sentence = judge(scene, touched)
         return {"ended_early": sentence}, [sentence]
@@ -280,7 +267,6 @@ def touch_told(scene: Scene, touched: dict[Wall, Touch] | Aborted) -> tuple[Json
 
 
 def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:
-    """What was asked, and the forces as a table."""
     deviations_mN = [found.since(PULSE_START_S).reference_sd_N * 1e3 for found in rehearsals.values()]
     deviation = f" (sd {deviations_mN[-1]:.0f} mN)" if deviations_mN else ""
     print(f"\nforce asked {MIN_N}..{MAX_N} N{deviation}, rendered by the plant:")
@@ -288,7 +274,6 @@ def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:
 
 
 def force_table(shown: Shown | Aborted, rehearsals: Rehearsals) -> list[str]:
-    """How well the forces were rendered: a heading, and a line for each case."""
     rows = {}
     if isinstance(shown, Shown):
         rows[f"real time, plant {shown.plant}"] = numbers(scored(shown.time_s, shown.asked_N, shown.rendered_N))
@@ -301,7 +286,6 @@ def force_table(shown: Shown | Aborted, rehearsals: Rehearsals) -> list[str]:
 
 
 def print_ordered(shown: Shown | Aborted, ordered: dict[str, Shown | Aborted]) -> None:
-    """The ordered loops beside the one that runs usually: forces, searches a second, plans, processor time."""
     print(f"\nthe field searched for otherwise, {ORDERED_PULSE_S:g} s of the pulse each, real time, plant sample 1:")
     for label, found in {"k-nearest, as above": shown, **ordered}.items():
         if isinstance(found, Aborted):
@@ -318,7 +302,6 @@ def print_ordered(shown: Shown | Aborted, ordered: dict[str, Shown | Aborted]) -
 
 
 def print_timing(shown: Shown) -> None:
-    """How time was kept, what the host took, and what held the force back."""
     control, inference = shown.status["rates"]["control"], shown.status["rates"]["inference"]
     late, spent = control["lateness_us"], control["exec_us"]
     print(
@@ -340,12 +323,11 @@ def print_timing(shown: Shown) -> None:
 
 
 def numbers(result: Tracking) -> str:
-    """RMS, worst error and variance accounted for."""
     return f"{result.rms_N * 1e3:5.1f} mN {result.worst_N * 1e3:5.0f} mN  {result.variance_accounted_for:6.3f}"
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # either way the processes of the show are ended
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so the show's processes are ended
     try:
         sys.exit(main())
     except KeyboardInterrupt:

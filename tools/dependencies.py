@@ -1,5 +1,4 @@
-"""The requirements of this project and some of its extras, for `pip install -r`: so they are fetched while the core is
-compiled."""
+"""Prints this project's requirements for `pip install -r`, so that they are fetched while the core is compiled."""
 
 import re
 import sys
@@ -10,8 +9,7 @@ PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
 
 def requirements(extras: list[str]) -> list[str]:
-    """What `pip install ./client '.[extras]'` would fetch, but for the project and its client, which no registry has to
-    give."""
+    """Return what `pip install ./client '.[extras]'` would fetch, without this project and its client."""
     project = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
     ours = re.compile(rf"{project['name']}\[(.*)\]")
     found = [requirement for requirement in project["dependencies"] if not requirement.startswith("tormagd-client==")]

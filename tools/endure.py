@@ -1,8 +1,8 @@
-"""What takes long and breaks things, one case at a time: does it hold?
+"""Runs long, destructive cases, one at a time: does it hold?
 
-The tests run the same cases with smaller counts. A case in real time says what its host took meanwhile. A fault that
-nobody asked for is held against the host where a bare timer stood still, too. That is for half of what a device waits.
-Exit status 0 if all held.
+The tests run the same cases with smaller counts. A case in real time reports what its host took meanwhile. An
+unexpected fault is blamed on the host if a bare timer, too, stood still for half of the time that a device waits. Exit
+status 0 if all held.
 """
 
 import argparse
@@ -22,8 +22,9 @@ DEVICE_WAITS_MS = 50.0
 
 
 class Case(NamedTuple):
-    """A module of `endurance`, how much is taken `in_full`, and what else its `run` wants. One `on_stand` wants a
-    daemon and a device before all else."""
+    """A module of `endurance`, how much is taken `in_full`, and what else its `run` needs. One `on_stand` needs a
+    daemon and a device.
+    """
 
     module: str
     in_full: int
@@ -43,7 +44,6 @@ CASES = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs a case and prints its figures; 0 if it held, 1 if not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     counts = ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items())
     parser.add_argument("case", choices=CASES)
@@ -61,7 +61,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measured(name: str, count: int, seed: int) -> dict[str, Any]:
-    """What a case came to."""
     case = CASES[name]
     run = import_module(f"endurance.{case.module}").run
     figures = _watched(run, count, seed) if case.on_stand else run(*case.more, count, seed)
@@ -69,7 +68,6 @@ def measured(name: str, count: int, seed: int) -> dict[str, Any]:
 
 
 def _watched(run: Callable[..., dict[str, Any]], count: int, seed: int) -> dict[str, Any]:
-    """On a stand, and what the host took meanwhile."""
     from endurance.stand import FIFO_PRIORITY, Stand
 
     with HostWatch(FIFO_PRIORITY + 10, sys.stderr) as watch:

@@ -4,11 +4,10 @@
     envelope.py --models [--json]
 
 Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this device
-brakes with its gap open at this speed. *Arrived* is 0.2 s after an ideal carriage would have. Devices are the three
-samples and random draws around sample 1 (plant card). Sample 1 and draws 0 to 39 were looked at while constants were
-chosen. Samples 2 and 3 and the draws from 40 on only judge. The second plant, of other structure, is told apart and
-keeps no bound. All devices are synthetic. `--models` asks only how near the model of each insert is to devices without
-a loop around it. These are samples 2 and 3 and draws 100 to 119.
+brakes with its gap open at this speed; *arrived* is 0.2 s after an ideal carriage would have. Devices are the three
+samples and random draws around sample 1 (plant card). Constants were chosen on sample 1 and draws 0 to 39; samples 2
+and 3 and draws from 40 on only judge. The second plant has another structure; it is shown apart and keeps no bound.
+`--models` compares the model of each insert with samples 2 and 3 and draws 100 to 119, without a loop.
 """
 
 import argparse
@@ -40,18 +39,16 @@ SETPOINT_S = 0.002
 ARRIVED_S = 0.2
 OVER_S = 0.05
 SETTLED_S = 2.0
-"Of sliding at one speed and one force: what is left then is an error, not a transition."
 SLIDING_MM, SLIDING_MM_S = 2.0, 0.4
 SLOWEST_MM_S = 4.9
 "Slower handles are counted apart: their friction is partly static."
 STILL_MM_S = 1e-6
 GAP_MM_S, GAP_MM_S2, STROKE_MM = 38.0, 1600.0, 30.0
-"An ideal carriage takes the way from 0.7 to 2 N, the longest asked for at once, with the configured speed."
+"An ideal carriage goes from 0.7 to 2 N, the longest way asked at once, with the configured speed."
 BOUNDS = {"over_N": 0.25, "over_sample_1_N": 0.15, "peak_N": 2.6, "settled_N": 0.1, "low_hold_faults": 0}
-"""What has to hold: bounds of the excess over what was asked, on any device and on sample 1."""
+"""Bounds of the excess over what was asked, on any device and on sample 1."""
 LOW_HOLD_S = 600.0
 LOW_N = (0.2, 0.5)
-"Forces under F_min."
 HELD_DRAWS = 20
 FORCES: dict[str, Levels] = {
     "steps": [(1.0, 0.0), (3.0, 0.7), (3.0, 2.0), (3.0, 0.7), (3.0, 2.0), (3.0, 1.5)],
@@ -60,7 +57,7 @@ FORCES: dict[str, Levels] = {
     "ladder at 0.8 N": [(1.0, 0.0), (41.0, 0.8)],
 }
 FORCES_OF_HANDS = {"ladder": ("ladder", "ladder at 0.8 N"), "1 mm/s": ("1 N",)}
-"Of the other hands it is the steps."
+"The other hands get the steps."
 SAID: tuple[tuple[float | None, float | None], ...] = (
     (0.0, None),
     (0.3, None),
@@ -69,12 +66,10 @@ SAID: tuple[tuple[float | None, float | None], ...] = (
     (None, 100.0),
     (None, -300.0),
 )
-"Handle motions that a setpoint may say it is meant for: displacement_mm, rate_mm_s."
+"Handle motions that a setpoint may state: displacement_mm, rate_mm_s."
 
 
 class Case(NamedTuple):
-    """One run: a device, a hand, the forces asked over time, and what the setpoints say besides."""
-
     device: str
     hand: str
     forces: str
@@ -83,8 +78,6 @@ class Case(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """What one run showed."""
-
     over_N: float
     under_N: float
     peak_N: float
@@ -96,7 +89,6 @@ class Figures(NamedTuple):
 
 
 def cases() -> Iterator[Case]:
-    """Every run."""
     for name in judging(DRAWS):
         for hand in HANDS:
             for forces in FORCES_OF_HANDS.get(hand, ("steps",)):
@@ -108,7 +100,6 @@ def cases() -> Iterator[Case]:
 
 
 def run(case: Case) -> Figures:
-    """One case in virtual time."""
     plant, legs, levels = device(case.device), HANDS[case.hand](), FORCES[case.forces]
     loop, force_N = armed_at_rest(plant, legs), asked_at(levels)
     start_s = loop.now_s
@@ -127,7 +118,6 @@ def run(case: Case) -> Figures:
 
 
 def step_figures(found: Followed) -> tuple[float, float, float] | None:
-    """Of the steps from 0.7 to 2 N; None where a fault ended the run before."""
     along_N, asked_N = found.along_N, found.asked_N
     begins = np.flatnonzero((np.diff(asked_N) > 1.0) & (asked_N[1:] == 2.0)) + 1
     if len(begins) < 2 or len(along_N) < begins[1] + 1000:
@@ -137,16 +127,15 @@ def step_figures(found: Followed) -> tuple[float, float, float] | None:
 
 
 def judged(found: Followed, open_N: Callable[[float], float]) -> Figures:
-    """The figures of a run, a row a millisecond; `open_N` is what the open gap brakes over the speed."""
     asked_N, speed_mm_s = found.asked_N, found.handle_mm_s
     floor_N = np.array([open_N(speed) for speed in np.abs(speed_mm_s).round(1).tolist()])
     error_N = found.along_N - np.maximum(asked_N, floor_N)
     waited_s = lasted_s(asked_N[1:] == asked_N[:-1])
-    # what has to be travelled is the gap's way between where it was when the force changed and where it comes to rest
+    # the distance is the gap's way from where it was when the force changed to where it comes to rest
     travel_s = STROKE_MM / GAP_MM_S + GAP_MM_S / GAP_MM_S2
     slides = sliding(found.handle_mm, speed_mm_s)
     arrived = slides & (waited_s > ARRIVED_S + travel_s)
-    # below what the open gap brakes there is nothing to fall short of
+    # below what the open gap brakes nothing can fall short
     is_reached = asked_N > floor_N
     even_s = lasted_s(np.abs(np.diff(speed_mm_s)) < 0.01 * np.abs(speed_mm_s[1:]) + 1e-3)
     steady = np.flatnonzero(slides & is_reached & (waited_s > SETTLED_S) & (even_s > SETTLED_S))[::100]
@@ -165,7 +154,7 @@ def judged(found: Followed, open_N: Callable[[float], float]) -> Figures:
 
 
 def lasting_N(excess_N: Array) -> float:
-    """The greatest that lasted for OVER_S."""
+    """Return the greatest excess that lasted for OVER_S."""
     window = round(OVER_S * 1e3)
     if len(excess_N) <= window:
         return -math.inf
@@ -173,7 +162,7 @@ def lasting_N(excess_N: Array) -> float:
 
 
 def lasted_s(is_same: Iterable[bool]) -> Array:
-    """For how long nothing has changed, by whether each millisecond but the first is as the one before."""
+    """Return for how many milliseconds nothing has changed."""
     lasted = [0.0]
     for same in is_same:
         lasted.append(lasted[-1] + 1e-3 if same else 0.0)
@@ -181,7 +170,7 @@ def lasted_s(is_same: Iterable[bool]) -> Array:
 
 
 def sliding(handle_mm: Array, speed_mm_s: Array) -> Mask:
-    """Where the handle has gone SLIDING_MM since it turned, and moves."""
+    """Return where the handle has gone SLIDING_MM since it turned, and moves."""
     found, turned_mm, direction = np.zeros(len(handle_mm), dtype=np.bool_), float(handle_mm[0]), 0.0
     for index, (position, speed) in enumerate(zip(handle_mm.tolist(), speed_mm_s.tolist(), strict=True)):
         if abs(speed) > STILL_MM_S and math.copysign(1.0, speed) != direction:
@@ -191,7 +180,7 @@ def sliding(handle_mm: Array, speed_mm_s: Array) -> Mask:
 
 
 def low_hold(name: str, asked_N: float) -> tuple[str, ...]:
-    """What is wrong with a force below F_min that is held for long: its faults, or that F_MIN was not shown."""
+    """Return what is wrong with a long hold below F_min: its faults, or that F_MIN was not shown."""
     loop = armed_at_rest(device(name), [(60.0, TURNED_MM_S)] * 11)
     is_shown = False
     for sample in loop.run(LOW_HOLD_S, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)):
@@ -202,7 +191,6 @@ def low_hold(name: str, asked_N: float) -> tuple[str, ...]:
 
 
 def measure() -> tuple[Json, list[tuple[Case, Figures]]]:
-    """Everything; the keys are those of the public contract, and `peak_N`, `settled_N`, `rows`."""
     asked, holds = list(cases()), list(product(judging(HELD_DRAWS), LOW_N))
     with ProcessPoolExecutor() as pool:
         low = pool.map(low_hold, *zip(*holds, strict=True))
@@ -231,7 +219,6 @@ def measure() -> tuple[Json, list[tuple[Case, Figures]]]:
 
 
 def worst(found: list[tuple[Case, Figures]]) -> Json:
-    """The greatest figures of these runs, and which of them a fault ended."""
     return {
         "over_N": max(figures.over_N for _, figures in found),
         "under_N": max(figures.under_N for _, figures in found),
@@ -244,23 +231,19 @@ def worst(found: list[tuple[Case, Figures]]) -> Json:
 
 
 def settled(found: list[tuple[Case, Figures]]) -> list[tuple[float, float, float]]:
-    """Speed, force and error of those that were asked for as it is."""
     as_it_is = [figures for case, figures in found if case.displacement_mm is None and case.rate_mm_s is None]
     return [point for figures in as_it_is for point in figures.settled]
 
 
 def missed(result: Json) -> list[str]:
-    """Which of the bounds that the envelope is to keep it does not."""
     return [f"{name} = {result[name]:.3f}: allowed is {most}" for name, most in BOUNDS.items() if result[name] > most]
 
 
 def row(case: Case, figures: Figures) -> Json:
-    """One run for JSON."""
     return case._asdict() | {name: getattr(figures, name) for name in ("over_N", "under_N", "peak_N", "limits")}
 
 
 def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None:
-    """Error over handle speed and asked force, once for the own sample and once for all the others."""
     figure, (own, others) = subplots((11.0, 5.0), 1, 2, sharex=True, sharey=True)
     for axes, title, is_own in ((own, "sample 1", True), (others, "samples 2, 3 and draws", False)):
         points = settled([(case, figures) for case, figures in found if (case.device == "sample_1") is is_own])
@@ -277,7 +260,6 @@ def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None
 
 
 def main() -> int:
-    """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")

@@ -1,7 +1,7 @@
-"""The long suites in full, a line of figures for each in docs/evidence/README.md: what `make test` only samples.
+"""Runs the long suites in full, of which `make test` only samples, and writes their figures to docs/evidence/README.md.
 
-Each part is a command that prints one JSON object and says by its exit status whether everything held. A part that
-fails stops no other. Exit status 0 if all held.
+Each part is a command that prints one JSON object and says by its exit status whether everything held. A failing part
+does not stop the others. Exit status 0 if all held.
 """
 
 import argparse
@@ -34,7 +34,8 @@ repeats one.
 
 class Part(NamedTuple):
     """One long suite: its command behind `python`, how its figures read in a line, and whether its exit status judges
-    them. All figures are kept, as NAME.json, where a page is made of them."""
+    them. Figures that a page is made of are kept as NAME.json.
+    """
 
     command: str
     says: str
@@ -94,7 +95,6 @@ PARTS = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the named parts, or all; returns 0 if all held, 1 if not, 2 on a wrong command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("part", nargs="*", choices=PARTS, metavar="PART", help=f"of {', '.join(PARTS)}; default all")
     options = parser.parse_args(arguments)
@@ -102,7 +102,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def collect(parts: Mapping[str, Part], folder: Path) -> int:
-    """Runs the parts one after the other and writes their lines into the table of the folder; the others stay."""
+    """Run the parts in order and write their lines into the folder's table."""
     page = folder / README
     rows = {line.split(" | ")[0]: line for line in page.read_text(encoding="utf-8").splitlines() if " | `" in line}
     failed = []
@@ -120,7 +120,6 @@ def collect(parts: Mapping[str, Part], folder: Path) -> int:
 
 
 def run(name: str, part: Part, folder: Path) -> tuple[str, str]:
-    """Whether a part held, as the table says it, and its figures in a line."""
     command, environment = [sys.executable, *shlex.split(part.command)], os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, env=environment, check=False)
     try:

@@ -1,13 +1,13 @@
-"""The fault matrix: each fault on a serial line and on a CAN bus, in virtual time. It shows its name, how it ends safe,
-and what leads out of it. Those are the commands that the daemon's own table names, before its cause has gone and after.
+"""The fault matrix: each fault on a serial line and on a CAN bus, in virtual time.
 
-Driven faults are injected at 1.8 N, and times count from then. The others are there from the beginning, and times count
-from the command `home`. What is safe is stated for each, and by when the reaction has to be on its way. It is what the
-table of codes says of the code that is named, or what the injection says itself. How fast the force is lost on the way
-is measured too: a force that vanishes at once is a hazard of its own.
+For each fault it shows the name, how it ends safe, and which of the daemon's commands lead out of it, before its cause
+has gone and after. Driven faults are injected at 1.8 N, and times count from then; the others are there from the
+beginning, and times count from the command `home`. What is safe, and by when the reaction must begin, is stated by the
+table of codes or by the injection itself. How fast the force is lost is measured too, because a force that vanishes at
+once is a hazard of its own.
 
-To recover, an operator does no more than to say `arm`, beside a publisher that goes on. Before the cause has gone that
-must come to nothing, or the fault be named all the while. Afterwards the force has to be followed again.
+To recover, an operator only says `arm`, beside a publisher that goes on. Before the cause has gone that must fail, or
+the fault be named all the while. Afterwards the force must be followed again.
 """
 
 import argparse
@@ -27,27 +27,24 @@ from tormagd.simulation.device import FirmwareKind
 from tormagd.simulation.firmware import Firmware
 
 INJECTED_S = 5.0
-"Virtual time of the injection: homed, enabled and settled by then."
 USUAL_S = 2.0
 WATCHED_S = 6.0
 CONNECTED_S = 0.5
 ARMING_S = 14.0
 MENDED_S = 1.5
-"A device that was silent is asked once a second who it is, and one that was reset is told so."
+"A silent device is asked once a second who it is, and a reset one is told so."
 PATIENCE_S = 12.0
-"It is said again for so long: a clock is judged over some seconds."
+"`arm` is repeated for so long: a clock is judged over some seconds."
 FOLLOWED_S = 4.0
 JUDGED_S = 1.0
-"The end of it, in which the force is to be what is asked and nothing to be told any more."
 SHOWN = (
     *("fault", "bus", "host_faults", "device_faults", "limits", "reaction", "named", "safe", "in_time", "recovered"),
     *("noticed_ms", "reacted_ms", "stated_ms", "open_ms", "loss_N_s", "tried", "recovery"),
 )
-"Of a cell, for a person."
 
 
 def main() -> int:
-    """Prints the matrix; returns 1 where a cell is not named, not safe, too late, or not recovered from."""
+    """Print the matrix; return 1 if a cell is not named, not safe, too late, or not recovered from."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
     parser.add_argument("--only", default="", metavar="TEXT", help="faults with this in their name")
@@ -68,7 +65,6 @@ def main() -> int:
 def inject(
     injection: Injection, plant: str, bus: str = SERIAL, watched_s: float = WATCHED_S, boot: FirmwareKind = Firmware
 ) -> tuple[Rig, Cell]:
-    """Runs one fault; also the rig, where it still lasts."""
     if not injection.is_driven:
         return _begin_with(injection, plant, bus, watched_s, boot)
     rig, watch = spoiled(injection, plant, bus, boot)
@@ -78,7 +74,6 @@ def inject(
 
 
 def spoiled(injection: Injection, plant: str, bus: str, boot: FirmwareKind = Firmware) -> tuple[Rig, Watch]:
-    """A rig that renders the force and is spoiled now, and who watches it."""
     rig = Rig(injection, plant, bus, INJECTED_S, boot)
     rig.loop.arm()
     usual: dict[str, None] = {}
@@ -90,7 +85,7 @@ def spoiled(injection: Injection, plant: str, bus: str, boot: FirmwareKind = Fir
 
 
 def _begin_with(injection: Injection, plant: str, bus: str, watched_s: float, boot: FirmwareKind) -> tuple[Rig, Cell]:
-    """Connects, homes and enables as far as the device lets one, and asks for the force then."""
+    """Connect, home and enable as far as the device allows, and then ask for the force."""
     rig = Rig(injection, plant, bus, 0.0, boot)
     rig.spoil(injection)
     rig.publisher.is_silent = True
@@ -117,7 +112,6 @@ def _is_taken(rig: Rig, watch: Watch, command: str) -> bool:
 
 
 def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
-    """The row with what came of the recovery, of a rig in which the fault may still last."""
     tried, is_held_back = "", True
     if not injection.passes and not rig.is_dead:
         tried, is_held_back = _before(rig, injection)
@@ -135,7 +129,6 @@ def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
 
 
 def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:
-    """What the recovery comes to while the cause lasts, and whether it is as it should be."""
     commands = next_commands(rig.safety, rig.is_homed)
     trouble = armed(rig, 0.0)
     if trouble:
@@ -150,7 +143,6 @@ def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:
 
 
 def _follow(rig: Rig) -> tuple[bool, set[str]]:
-    """Whether the force is as asked at the end of the next seconds, and which limits are told then."""
     off_N: list[float] = []
     told: set[str] = set()
     for _ in rig.run(FOLLOWED_S - JUDGED_S):
@@ -165,7 +157,6 @@ def _follow(rig: Rig) -> tuple[bool, set[str]]:
 
 
 def armed(rig: Rig, patience_s: float) -> str:
-    """Says `arm`, again and again for so long."""
     until_s = rig.loop.now_s + patience_s
     while True:
         commands, arming = next_commands(rig.safety, rig.is_homed), Arming(rig.loop.now_s, rig.safety.faults)

@@ -2,15 +2,13 @@
 
     force_tracking.py [CASE ...] [--json]
 
-How soon a device is known: `steps`, `creep` and `speeds`, of samples, second plant (its structure is another) and draws
-of the plant card. How well signals are followed: the `pulse` of `make run` on all of these, and in full on the
-`samples` and the second plant. There are 500 setpoints a second, with a preview of 70 ms and live. Recorded `signals`
-are from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a file, and live. Beside them
-stands what ideal carriages miss (`tormag-lab bound`), and beside `samples` what the same core does with carriages that
-lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are synthetic.
-
-Each case gives plain data. Nothing is removed from an error: no mean, no delay. A step has *arrived* ARRIVES_S after
-the device's ideal carriages would have brought the force.
+How soon a device is known: `steps`, `creep` and `speeds`, of samples, second plant and draws of the plant card. How
+well signals are followed: the `pulse` of `make run` on all of these, and in full on the `samples` and the second plant,
+at 500 setpoints a second, with a preview of 70 ms and live; and the recorded `signals` of the folder TORMAG_DATA, with
+a preview of 400 ms, as for a file that is played, and live. Beside them are what ideal carriages miss (`tormag-lab
+bound`), and beside `samples` the same core with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the
+second plant only judge. Errors are as they are, without any mean or delay taken out. A step has *arrived* ARRIVES_S
+after the device's ideal carriages would have brought the force.
 """
 
 import argparse
@@ -59,22 +57,19 @@ from tormagd.simulation.parameters import PlantParameters
 
 DRAWS = 40
 HIGH_N, LOW_N, ABOVE_N = 2.0, 0.7, 0.1
-"Steps begin at LOW_N, or ABOVE_N over what the open gap brakes where that is more."
+"Steps begin at LOW_N, or ABOVE_N over what the open gap brakes if that is more."
 ARRIVES_S, LATER_S = 0.25, 1.0
 IDEAL_N = 0.01
-"The ideal carriages have brought a force that is as close."
 STEPS = (("up", "down"), ("up again", "down again"), ("up known", "down known"))
-"Of a fresh device; the same after REST_S; and after it was started again with its profile."
+"Of a fresh device, after REST_S, and after a restart with its profile."
 STEP_S, REST_S = 3.0, 30.0
 RUNS_ON_S = 90.0
 CREEP_MM_S, CREPT_MM = 1.0, 10.0
 CREEP_N = (1.0, 2.0, 0.8)
 SPEEDS_MM_S = (1.0, 300.0, 100.0, 300.0, 42.0, 300.0, 1.0, 100.0, 42.0, 100.0, 1.0, 42.0, 1.0)
-"Each of four after each other."
 SPEED_S, SLID_S = 4.0, 1.0
 SPEEDS_N = (1.0, 2.0)
 START_N, RAMP_S, HOLD_S = 0.6, 1.0, 1.0
-"Of the approach to a signal."
 PULSE_S, DRAWN_PULSE_S = 20.0, 15.0
 PALPATION_SEEDS = 1, 2
 
@@ -83,8 +78,7 @@ PALPATION_SEEDS = 1, 2
 
 
 def course(plant: PlantParameters, legs: Legs, levels: Levels, shown: Learned = NOTHING_LEARNED) -> Followed:
-    """One run: the hand along its legs, the force along its levels, with a device that counts as having `shown` so much
-    of itself."""
+    """Run the hand along its legs and the force along its levels, with a device that has `shown` so much of itself."""
     loop, force_N = armed_at_rest(plant, legs, shown), asked_at(levels)
     begins_s = loop.now_s
     found = follow(
@@ -97,7 +91,7 @@ def course(plant: PlantParameters, legs: Legs, levels: Levels, shown: Learned = 
 
 
 def ideal_s(plant: PlantParameters, low_N: float) -> tuple[float, float]:
-    """After how long the ideal carriages have brought the force up to HIGH_N, and down again."""
+    """Return the time in which the ideal carriages bring the force up to HIGH_N, and down again."""
     brake, rest, hold = brake_of(plant), 0.3, 2.0
     levels = asked_at([(rest, low_N), (hold, HIGH_N), (hold, low_N)])
     time_s = 1e-3 * np.arange(round((rest + 2.0 * hold) * 1e3))
@@ -112,7 +106,6 @@ def ideal_s(plant: PlantParameters, low_N: float) -> tuple[float, float]:
 
 
 def step_figures(found: Followed, begins_s: float, ideal: float, direction: float) -> Json:
-    """Of one step."""
     arrives_s = begins_s + ideal + ARRIVES_S
     held = (found.time_s >= begins_s + ideal) & (found.time_s < begins_s + STEP_S)
     return {
@@ -123,7 +116,6 @@ def step_figures(found: Followed, begins_s: float, ideal: float, direction: floa
 
 
 def steps(name: str) -> Json:
-    """Up and down on a fresh device, the same after REST_S, and once it was started again with its profile."""
     plant = device(name)
     low_N = max(LOW_N, brake_of(plant).open_N(TURNED_MM_S) + ABOVE_N)
     up_s, down_s = ideal_s(plant, low_N)
@@ -141,8 +133,9 @@ def steps(name: str) -> Json:
 
 
 def creep(name: str) -> Json:
-    """A handle at CREEP_MM_S: of each force the error after CREPT_MM, from a handle that was faster before and from one
-    that never was."""
+    """Return the error of each force after CREPT_MM at CREEP_MM_S, from a handle that was faster before and from one
+    that never was.
+    """
     plant, result = device(name), {}
     hold_s = CREPT_MM / CREEP_MM_S + 2.0
     for key, lead in (("after speed", [(3.0, TURNED_MM_S)]), ("only", [])):
@@ -156,7 +149,7 @@ def creep(name: str) -> Json:
 
 
 def speeds(name: str) -> Json:
-    """Every speed after every other: the worst error from SLID_S on."""
+    """Return the worst error from SLID_S on, for every speed after every other."""
     plant, result = device(name), {}
     legs = [(SPEED_S, speed) for speed in SPEEDS_MM_S]
     for force_N in SPEEDS_N:
@@ -180,7 +173,6 @@ def track(
     *,
     is_ideal: bool = False,
 ) -> Followed:
-    """Plays a signal behind an approach; time counts from its first force."""
     loop = armed(build_core(Config(scene=scene)), plant, SteadyHand(), is_ideal=is_ideal)
     flat = np.array([0.0, 1.0 / RATE_HZ]), np.full(2, signal.force_N[0])
     approach_s, approach_N = with_approach(*flat, START_N, RAMP_S, HOLD_S)
@@ -192,24 +184,21 @@ def track(
     if found.faults:
         raise RuntimeError(f"{signal.name}: {', '.join(found.faults)} at {loop.now_s:.3f} s")
     asked = np.interp(found.time_s, signal.time_s, signal.force_N)
-    if not signal.is_known_ahead:  # what comes as an event holds until the next
+    if not signal.is_known_ahead:  # an event holds until the next
         asked = signal.force_N[np.searchsorted(signal.time_s, found.time_s, side="right") - 1]
     return found._replace(asked_N=asked)
 
 
 def ideal(name: str, signal: Signal) -> Bound:
-    """What a device's ideal carriages render of a signal."""
     return bound(device(name), signal.time_s, signal.force_N, is_held=not signal.is_known_ahead)
 
 
 def compared(found: Followed, best: Bound, start_s: float) -> Json:
-    """The figures from a time on, and the RMS errors of the ideal carriages since then."""
     least = best.figures(start_s)
     return found.since(start_s)._asdict() | {name: least[name] for name in ("no_delay_rms_N", "foresight_rms_N")}
 
 
 def samples(pool: Executor) -> Json:
-    """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S."""
     rows, played, names = [], pulse_signal(PULSE_S), judging(0)
     cases = [(name, preview_s) for name in names for preview_s in (PREVIEW_S, 0.0)]
     runs, bounds = (
@@ -237,14 +226,12 @@ def samples(pool: Executor) -> Json:
 
 
 def pulse(name: str) -> Json:
-    """The RMS error of the pulse of `make run` after TRIM_S, N, on an unseen device: with a preview and live."""
     played, previews_s = pulse_signal(DRAWN_PULSE_S), {"with preview": PREVIEW_S, "live": 0.0}
     runs = {key: track(device(name), played, "pulse", preview_s) for key, preview_s in previews_s.items()}
     return {key: found.since(TRIM_S).rms_N for key, found in runs.items()}
 
 
 def signals(pool: Executor) -> Json:
-    """The recorded signals and palpation on the three samples: those known ahead with preview, and all of them live."""
     found = recorded_signals()
     if not found:
         return {"rows": [], "note": "no recorded signals: TORMAG_DATA names no folder of them"}
@@ -277,7 +264,6 @@ CASES = (*OF_DEVICES, *OF_SIGNALS)
 
 
 def measure(case: str, pool: Executor) -> Json:
-    """One case."""
     if case in OF_SIGNALS:
         return OF_SIGNALS[case](pool)
     names = judging(DRAWS)
@@ -286,7 +272,7 @@ def measure(case: str, pool: Executor) -> Json:
 
 
 def worst(devices: dict[str, Json]) -> list[Json]:
-    """A row for each figure that devices have in common: the greatest without its sign, whose it is, and the median."""
+    """Return the greatest of each figure that devices have in common, whose it is, and the median."""
     sizes = {device: dict(_sizes(found)) for device, found in devices.items()}
     rows = []
     for figure in next(iter(sizes.values())):
@@ -298,7 +284,7 @@ def worst(devices: dict[str, Json]) -> list[Json]:
 
 
 def _sizes(found: object, name: str = "") -> Iterator[tuple[str, float]]:
-    """Every number in plain data, without its sign."""
+    """Yield the size of every number in plain data."""
     if isinstance(found, dict | list | tuple):
         for key, value in found.items() if isinstance(found, dict) else enumerate(found, 1):
             yield from _sizes(value, f"{name}, {key}".removeprefix(", "))
@@ -307,7 +293,6 @@ def _sizes(found: object, name: str = "") -> Iterator[tuple[str, float]]:
 
 
 def main() -> int:
-    """Measures and prints; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("cases", nargs="*", choices=(*CASES, "all"), default="all", help="default: all")
     parser.add_argument("--json", action="store_true", help="print JSON")

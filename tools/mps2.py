@@ -1,8 +1,7 @@
-"""The firmware on an emulated Cortex-M4, in virtual time: its figures, and the pulse of `make run` beside what the same
-sources do on this computer.
+"""The firmware on an emulated Cortex-M4, in virtual time: its figures, and its pulse beside the host build's.
 
-Instructions are those that QEMU has executed, to 40 in a wake, and no cycles: a Cortex-M4 takes one or more for each.
-The emulated UART takes any byte at once, so no baud rate is overrun.
+Instructions are those that QEMU has executed, to 40 in a wake. They are no cycles: a Cortex-M4 takes one or more for
+each. The emulated UART takes any byte at once, so no baud rate is overrun.
 """
 
 import argparse
@@ -32,20 +31,18 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 
 PULSE_S = 20.0
 MAX_N = 1e-3
-"The pulses may differ by so much."
 DRIVE = "Drive taken, State and Sense sent"
 
 
 @final
 class Counted(EmulatedFirmware):
-    """The program; it adds the instructions of its wakes to `counts`, by what they were for."""
+    """The program; it adds the instructions of its wakes to `counts`, by purpose."""
 
     def __init__(self, plant: PlantParameters, counts: defaultdict[str, list[int]]) -> None:
         super().__init__(plant)
         self.counts, self.unanswered = counts, 0
 
     def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
-        """As the program, counted."""
         answer = super().hear(time_s, data, sensors)
         if answer is Answer.MEASUREMENT:
             self.counts[DRIVE].append(self.instructions)
@@ -53,15 +50,13 @@ class Counted(EmulatedFirmware):
         return answer
 
     def tick(self, time_s: float, sensors: Sensors) -> object:  # type: ignore[override]
-        """As the program, counted."""
         status = super().tick(time_s, sensors)
         self.counts[f"tick in {self.mode.name}" + (", Status sent" if status else "")].append(self.instructions)
         return status
 
 
 def main() -> int:
-    """Prints the figures; returns 1 where the kit fails the program, a frame was dropped, or the pulses differ by more
-    than MAX_N."""
+    """Print the figures; return 1 if the kit fails the program, a frame was dropped, or the pulses differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pulses", type=int, choices=range(1, 181), default=1, metavar="N", help="of 20 s each")
     parser.add_argument("--kit", action="store_true", help="the conformance kit's checks instead")
@@ -91,7 +86,6 @@ def main() -> int:
 
 
 def is_passed(boot: FirmwareKind) -> bool:
-    """Whether every check of the conformance kit passes."""
     port = VirtualPort(VirtualDevice(load_plant("sample_1"), SteadyHand(), boot=boot))
     line, messages = SerialLine(port), port.device.messages
     host = Host(line, reset=lambda how: messages._reset(port.now_s()))
@@ -102,7 +96,6 @@ def is_passed(boot: FirmwareKind) -> bool:
 
 
 def is_followed(boot: FirmwareKind, pulses: int) -> bool:
-    """Whether the program renders the pulse as the host library does."""
     forces_N = np.tile(pulse_signal(PULSE_S).force_N, pulses)
     times_s = np.arange(forces_N.size) / RATE_HZ
     there_N, here_N = (
@@ -115,21 +108,19 @@ def is_followed(boot: FirmwareKind, pulses: int) -> bool:
 
 
 class VirtualPort:
-    """The device's serial port in virtual time, as the kit has one."""
+    """The device's serial port in virtual time, as the kit needs it."""
 
     def __init__(self, device: VirtualDevice) -> None:
         self.device, self._now_s = device, 0.0
 
     def now_s(self) -> float:
-        """The device's time."""
         return self._now_s
 
     def write(self, data: bytes) -> None:
-        """Hands bytes to the device."""
         self.device.receive(self._now_s, data)
 
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Lets time pass; what came, and when."""
+        """Let time pass; return what came, and when."""
         self._now_s = max(self._now_s, until_s)
         return [(self._now_s, self.device.transmit(self._now_s))]
 

@@ -1,26 +1,14 @@
-"""Numbers at their extremes: the force law against 50 digits, every stage of the core fed with what is no number,
-configurations at their ends.
+"""Numbers at their extremes: the force law against 50 digits, hostile inputs to every stage, extreme configurations.
 
-`stages` has a row for each stage of the core. `cases` are steps with NaN, infinities, denormals, zeros, largest floats,
-time that stands or goes back, and tables that do not rise. Of them some are `refused` by name, and after those that are
-`stated` a limit or a fault was told. `nonfinite` are numbers that came out, `swallowed` steps with NaN of which nothing
-was said, `unnamed` errors that name nothing. Of a stage with a `border` the cases are those that pass that check.
-`configurations` has each end of what is accepted, alone and in pairs. It is `refused`, or it `ran` for `--seconds` in
-virtual time, or a fault or a refusal to enable was `stated`. `travelled` is what must be 0: all `nonfinite`,
-`swallowed`, `unnamed` and `wrong`.
+Part `stages` feeds each stage of the core with NaN, infinities, denormals, largest floats, time that stands or goes
+back, and tables that do not rise. Steps are `refused` by name, or `stated`: a limit or a fault was told after them.
+`travelled` must be 0: numbers that came out `nonfinite`, `swallowed` steps with NaN of which nothing was said, and
+errors that are `unnamed` or `wrong`. `configurations` takes each end of what is accepted, alone and in pairs.
 
-`--json` prints one object. `cases` inputs are evaluated as arrays in float64 and float32. `reference_cases` of them are
-computed in 50 digits from the formulas as printed, and compared with the arrays' float64 and with plain floats. float32
-is compared with float64 at the same input, all cases.
-
-Allowed relative error, for force, stretch, slope and the round trip gap -> force -> gap: float64 1e-12. For float32 it
-is 1e-5 for lambda1 >= 0.7 and 3e-4 down to 0.05. In both it is 8 eps kappa where that is more, with kappa the condition
-number of the quantity there. Of the round trip, kappa is that of its worse half, since the radial moment between is
-rounded too: at the flat end of Eq. 7 the gap hardly shows in the force. `worst_rel_error` is over the cases where the
-plain bound holds.
-
-Exit status 0 if every error is allowed, nothing is NaN or infinite, nothing travelled, and the domain ends where it
-should; 1 otherwise.
+`cases` inputs are evaluated as arrays in float64 and float32, and `reference_cases` of them in 50 digits. The allowed
+relative error is 1e-12 in float64, in float32 1e-5 for lambda1 >= 0.7 and 3e-4 down to 0.05; 8 eps kappa if that is
+more, with kappa the condition number. `worst_rel_error` is over the cases of the plain bound. The exit status is 0 if
+every error is allowed, nothing travelled, and the domain ends where it should.
 """
 
 import argparse
@@ -50,16 +38,14 @@ from tormagd.physics.field import ThesisFieldLaw
 from tormagd.physics.force import brake_force_N, max_radial_moment_Tm
 
 BATCH = 500
-"""Inputs for each device."""
 CHUNK = 20
-"""Devices for each task of the pool."""
 WORKERS = 2
 FLOAT64_ALLOWED = 1e-12
 FLOAT64_EPS, FLOAT32_EPS = sys.float_info.epsilon, float(np.finfo(np.float32).eps)
 FLOAT32_ALLOWED = {"float32": 1e-5, "float32_soft": 3e-4}
 PRECISIONS = ("float64", *FLOAT32_ALLOWED)
 STIFF = 0.7
-"""lambda1 from which on float32 is held to the narrower bound."""
+"""lambda1 from which on float32 has the narrower bound."""
 
 
 COUNTS = ("cases", "reference_cases", "nonfinite", "refused", "misjudged")
@@ -74,19 +60,18 @@ class Worst(NamedTuple):
 
 @dataclass
 class Tally:
-    """Of one chunk, or of all; `counts` by COUNTS, `worst` by precision and quantity."""
+    """Counts of one chunk or of all, and the worst errors by precision and quantity."""
 
     counts: Counter[str] = field(default_factory=Counter)
     worst: dict[tuple[str, str], Worst] = field(default_factory=dict)
 
     def note(self, precision: str, quantity: str, errors: Array, plain: float, well: Array) -> None:
-        """Errors of some cases; allowed is `plain`, or `well`, what rounding makes of the case, if that is more."""
+        """Note errors; allowed is `plain`, or `well`, the rounding of the case, if that is more."""
         allowed = np.maximum(plain, well)
         worst = float(errors[allowed == plain].max(initial=0.0)), float((errors / allowed).max(initial=0.0))
         self._raise_to((precision, quantity), Worst(*worst))
 
     def add(self, other: "Tally") -> None:
-        """Merge another tally into this one."""
         self.counts.update(other.counts)
         for kind, worst in other.worst.items():
             self._raise_to(kind, worst)
@@ -97,14 +82,14 @@ class Tally:
 
 
 def evaluate(batch: Batch, x: FloatArray) -> tuple[Mask, dict[str, FloatArray]]:
-    """(admissible, every quantity at the admissible x), in the precision of x."""
+    """Return the admissible mask and every quantity at the admissible x, in the precision of x."""
     moment_Tm = x if batch.field is None else batch.field.radial_moment_Tm(x)
     admissible = moment_Tm <= max_radial_moment_Tm(batch.elastomer, batch.geometry)
     return admissible, quantities(batch, x[admissible])
 
 
 def quantities(batch: Batch, x: Any) -> dict[str, Any]:
-    """Every quantity at an array of admissible x; or at a plain float, as the control loop computes it."""
+    """Return every quantity at an array of admissible x, or at a plain float, as the control loop computes it."""
     law, device = batch.field, (batch.elastomer, batch.geometry)
     moment_Tm = x if law is None else law.radial_moment_Tm(x)
     values = {"moment": moment_Tm, "force": brake_force_N(moment_Tm, *device)}
@@ -120,7 +105,6 @@ def quantities(batch: Batch, x: Any) -> dict[str, Any]:
 
 
 def check_chunk(seed: int, devices: int, references: int) -> Tally:
-    """Draw `devices` batches and check them, `references` inputs of each in 50 digits."""
     rng = np.random.default_rng(seed)
     tally = Tally()
     for _ in range(devices):
@@ -137,7 +121,6 @@ def check_chunk(seed: int, devices: int, references: int) -> Tally:
 
 
 def nonfinite(values: dict[str, FloatArray]) -> int:
-    """How many of all quantities are not."""
     return sum(int((~np.isfinite(value)).sum()) for value in values.values())
 
 
@@ -205,12 +188,10 @@ def _compare_with_reference(
 
 
 def stage_row(place: int, episodes: int, seed: int) -> Row:
-    """One row of the table of stages."""
     return tried(stages()[place], episodes, seed)
 
 
 def of_core(options: argparse.Namespace) -> dict[str, Any]:
-    """What the core makes of such numbers; a part of the object that `--json` prints."""
     cases = drawn_ends(options.configurations, options.seed)
     with _pool(options.workers) as pool:
         rows = pool.map(stage_row, range(len(stages())), repeat(options.episodes), repeat(options.seed))
@@ -233,7 +214,6 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
-    """The checks of the physics; a part of the object that `--json` prints."""
     devices = -(-cases // BATCH)
     chunks = [min(CHUNK, devices - first) for first in range(0, devices, CHUNK)]
     each = -(-references // devices)
@@ -252,7 +232,6 @@ def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Runs the checks; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--cases", type=int, default=1_000_000, help="inputs of the physics, as arrays (%(default)s)")

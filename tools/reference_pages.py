@@ -1,6 +1,6 @@
 """Writes docs/reference: the configuration from the types in `tormagd/config.py`, the commands from their parsers.
 
-A test holds the pages to what they are made from. `python tools/reference_pages.py` after a change of either.
+Run `python tools/reference_pages.py` after a change of either; a test compares.
 """
 
 import argparse
@@ -41,14 +41,12 @@ BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "to {}", "lt": "under {}"}
 
 
 def main() -> int:
-    """Writes both pages."""
     for name, page in (("configuration.md", configuration_page()), ("commands.md", commands_page())):
         (FOLDER / name).write_text(page, encoding="utf-8")
     return 0
 
 
 def configuration_page() -> str:
-    """Every key with its default, what is allowed, and why."""
     parts = [_CONFIGURATION_HEAD]
     for heading, kind in (*tables(config.Config, ""), *BACKENDS.items()):
         says = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
@@ -58,7 +56,7 @@ def configuration_page() -> str:
 
 
 def tables(kind: type[msgspec.Struct], path: str) -> Iterator[tuple[str, type[msgspec.Struct]]]:
-    """The tables of a configuration with their names in the file, each before those in it."""
+    """Yield the tables of a configuration with their names in the file, each before those in it."""
     yield f"`[{path}]`" if path else "", kind
     for field in msgspec.structs.fields(kind):
         inner = config.table_in(field.type)
@@ -67,7 +65,6 @@ def tables(kind: type[msgspec.Struct], path: str) -> Iterator[tuple[str, type[ms
 
 
 def keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str, str]]:
-    """The keys of one table, without the tables in it."""
     says = _field_docs(kind)
     hints = get_type_hints(kind, include_extras=True)
     return [
@@ -78,7 +75,6 @@ def keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str, str]]:
 
 
 def commands_page() -> str:
-    """Every command and option."""
     parts = [_COMMANDS_HEAD]
     for parser in (daemon.parser(), ctl.parser(), simulation.parser(), conformance.parser()):
         parts.append(f"## {parser.prog}\n\n{parser.description}\n")
@@ -93,7 +89,6 @@ def commands_page() -> str:
 
 
 def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """The commands of a program by their names; of a command none."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             yield from action.choices.items()
@@ -109,8 +104,7 @@ def _options(parser: argparse.ArgumentParser) -> list[tuple[str, ...]]:
 
 
 def _called(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
-    """A positional argument's name, or an option with what it takes: alike for every Python, as the formatter's own
-    line is not."""
+    """Return an argument as every Python version shows it, unlike the formatter's own line."""
     if not action.option_strings:
         return formatter._format_args(action, formatter._get_default_metavar_for_positional(action))
     if action.nargs == 0:
@@ -128,7 +122,7 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
         return "-"
     value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
-    # TOML writes alike what JSON does, but for a table
+    # TOML writes as JSON does, except for a table
     return "`{}`" if isinstance(value, dict) else f"`{msgspec.json.encode(value).decode()}`"
 
 

@@ -1,8 +1,7 @@
-"""Writes docs/states.md from the tables of `tormagd/safety`, docs/fault-matrix.md from docs/evidence/faults.json, and
-docs/risk.html from both, the conformance kit and the test tree.
+"""Writes docs/states.md, docs/fault-matrix.md and docs/risk.html.
 
-Tests hold the pages to what they are made from: `python tools/safety_pages.py` after a change. It names the risk page's
-red rows.
+They come from the tables of `tormagd/safety`, docs/evidence/faults.json, the conformance kit and the test tree. Run
+`python tools/safety_pages.py` after a change; tests compare. It names the risk page's red rows.
 """
 
 import json
@@ -36,19 +35,18 @@ the [fault matrix](fault-matrix.md). `python tools/safety_pages.py` writes this 
 """
 _MATRIX_HEAD = """# Fault matrix
 
-What each fault comes to, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
-[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`, which also has all times.
+The effect of each fault, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
+[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`.
 
-Faults are put in while 1.8 ± 0.1 N are rendered at a turning handle; those of homing and of the start are there from
-the beginning. A row is of both buses, where they agree. *Safe after* is when the gap was open or at rest, or the limit
-was told. *Leads out* are the commands that the daemon names, once the cause has gone. Then the force is followed again
-within 0.15 N.
+Faults are injected while 1.8 ± 0.1 N are rendered at a turning handle, those of homing and of the start from the
+beginning. A row is for both buses if they agree. *Safe after* is when the gap was open or at rest, or the limit was
+told. The headings have the commands that the daemon names once the cause has gone. After them the force is followed
+again.
 
 """
 
 
 def main() -> int:
-    """Writes the pages, and names the red rows."""
     record = json.loads(EVIDENCE.read_text(encoding="utf-8"))
     try:
         risks = risk_rows(record)
@@ -64,17 +62,14 @@ def main() -> int:
 
 
 def risk_rows(record: dict[str, Any]) -> list[Row]:
-    """The rows of the risk page, of a run of the matrix."""
     return rows(named_tests(ROOT / "tests"), record["figures"]["cells"], judgement(DOCS / "risk.toml"))
 
 
 def states_page() -> str:
-    """The page of the tables."""
     return "".join((_STATES_HEAD, _diagram(), _transitions(), _guards(), _faults(), _limits())).rstrip() + "\n"
 
 
 def matrix_page(record: dict[str, Any]) -> str:
-    """The page of a run of the matrix."""
     cells = record["figures"]["cells"]
     kept = ", ".join(f"{sum(cell[name] for cell in cells)} {word}" for name, word in HELD.items())
     says = f"{len(cells)} cells on `{record['figures']['plant']}`, version {record['version']}: {kept}.\n\n"
@@ -82,21 +77,23 @@ def matrix_page(record: dict[str, Any]) -> str:
     for cell in cells:
         lines.setdefault((cell["fault"], *_outcome(cell)), []).append(cell)
     buses = Counter(fault for fault, *_ in lines)
-    made = []
+    made: dict[str, list[tuple[str, ...]]] = {}
     for (fault, named, reaction, leads_out), alike in lines.items():
         name = fault if buses[fault] == 1 else f"{fault} ({alike[0]['bus']})"
         safe_s = [cell["seconds"] for cell in alike if cell["seconds"] is not None]
-        made.append((name, named, reaction, f"{max(safe_s):.3f} s" if safe_s else "-", leads_out))
-    return _MATRIX_HEAD + says + table(("fault", "named as", "reaction", "safe after", "leads out"), made)
+        made.setdefault(leads_out, [("fault", "named as", "reaction, safe after")]).append(
+            (name, named, f"{reaction}, {max(safe_s):.3f} s" if safe_s else reaction)
+        )
+    return _MATRIX_HEAD + says + "\n".join(f"## Leads out: {by}\n\n{table(of[0], of[1:])}" for by, of in made.items())
 
 
 def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
     told = [*cell["host_faults"], *(f"device:{name}" for name in cell["device_faults"]), *cell["limits"]]
-    # what the device has latched is told by the daemon, too, unless that is dead
+    # the daemon tells what the device has latched, too, unless it is dead
     told = [name for name in told if name.replace("device:", "DEVICE_") not in told or not name.startswith("device:")]
     failed = [f"not {word}" for name, word in HELD.items() if not cell[name]]
     reaction = cell["expected"] + (f" (**{', '.join(failed)}**)" if failed else "")
-    return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "-"
+    return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "no command"
 
 
 def _diagram() -> str:

@@ -1,7 +1,7 @@
-"""mkdocs's hooks: the site is `docs`, and the pages that stand beside the code they tell of.
+"""mkdocs's hooks: the site is `docs`, and the pages beside the code that they describe.
 
-Links are written as they hold in the repository, where most are read. Here each is brought to where its file is on the
-site; the examples come along as files.
+Links are written for the repository, where most people read. Here each is changed to its file's place on the site; the
+examples are added as files.
 """
 
 import posixpath
@@ -25,11 +25,10 @@ BESIDE = (
 )
 EXAMPLES = "examples/**/*.*"
 _LINK = re.compile(r"(\]\(<?)(?!https?:|#)([^)#>]+)")
-"What a Markdown link begins with, and its path."
+"The beginning of a Markdown link, and its path."
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds what is not in `docs`."""
     examples = [path.relative_to(ROOT).as_posix() for path in ROOT.glob(EXAMPLES) if "node_modules" not in path.parts]
     for name in (*BESIDE, *examples):
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
@@ -37,7 +36,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links of the repository become links of the site."""
+    """Turn the repository's links into the site's."""
     here = page.file.src_uri
     folder = posixpath.dirname(here if here in BESIDE else DOCS + here)
 

@@ -3,4 +3,4 @@
 from firmware_protocol.build import settle
 from tormagd_client import __version__ as __version__
 
-settle()  # which build of the core runs, before anything of it is imported
+settle()  # chooses the core's build, before anything of it is imported

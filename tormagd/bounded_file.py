@@ -1,4 +1,4 @@
-"""Files that anybody may have made: nothing but a regular file is read, and never more than a given size.
+"""Files that anybody may have made: only a regular file is read, and never more than a given size.
 
 What is written replaces an earlier file in one step.
 """
@@ -13,12 +13,12 @@ from tormagd_client.regular_file import require_regular
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """Return all bytes of a regular file of at most `most_bytes`; a link is followed."""
+    """Return all bytes of a regular file of at most `most_bytes`, following links."""
     require_regular(path, most_bytes)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
         data = file.read(most_bytes + 1)
-    if len(data) > most_bytes:  # a file that grows, or one of the kernel's that does not know its size
+    if len(data) > most_bytes:  # a file that grows, or one of the kernel's without a size
         raise OSError(errno.EFBIG, f"allowed is a regular file of at most {most_bytes} bytes; this has more", str(path))
     return data
 

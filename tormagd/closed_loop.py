@@ -31,9 +31,9 @@ from tormagd.simulation.plant import Truth
 
 Array = npt.NDArray[np.float64]
 HOMING_S: Final = 10.0
-"Longer than the slowest homing from a closed gap."
+"The slowest homing takes less."
 SEARCH_S: Final = 0.012
-"Time from question to answer of a search beside the plans: a period of the thesis's 83 Hz."
+"A search beside the plans takes a period of the thesis's 83 Hz."
 MAX_UNREAD_BYTES: Final = 4096
 "Bytes that a serial port keeps for a program that does not read."
 MAX_UNREAD_FRAMES: Final = 512
@@ -66,7 +66,7 @@ class Sample(Value):
 
 
 class VirtualPort:
-    """Backend to the simulated device over serial bytes; `device` may be replaced by one that behaves badly."""
+    """Backend to the simulated device over serial bytes. `device` may be replaced by one that behaves badly."""
 
     def __init__(self, device: SerialDevice) -> None:
         self.now_s = 0.0
@@ -75,12 +75,10 @@ class VirtualPort:
         self._unread = b""
 
     def open(self) -> Self:
-        """Drop all bytes that wait for their reader, and return this port with a new codec."""
         self.stream, self._unread = FrameStream(), b""
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let the device run until `now_s`, which must not fall."""
         self.now_s = now_s
         self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
 
@@ -89,13 +87,10 @@ class VirtualPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the valid messages in the bytes that wait, oldest first, and drop these bytes; empty where nothing
-        waits."""
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
 
     def send(self, message: Message) -> None:
-        """Hand one message to the device's line at the time of the last `advance`."""
         self.device.receive(self.now_s, self.stream.pack(message))
 
     def close(self) -> None:
@@ -112,13 +107,11 @@ class VirtualBus:
         self._unread: list[CanFrame] = []
 
     def open(self) -> Self:
-        """Drop all frames that wait for their reader, and return this bus with a new codec."""
         self.stream = CanStream(DEFAULT_NODE)
         self._unread.clear()
         return self
 
     def advance(self, now_s: float) -> None:
-        """Let bus and device run until `now_s`, which must not fall."""
         self.now_s = now_s
         arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
         self._unread = [*self._unread, *arrived][-MAX_UNREAD_FRAMES:]
@@ -128,14 +121,12 @@ class VirtualBus:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the device's valid messages in the frames that wait, oldest first, and drop these frames; empty where
-        none wait."""
+        """Return the device's valid messages in the frames that wait."""
         arrived, self._unread = self._unread, []
         self.stream.received = []
         return self.stream.unpack_all(arrived)
 
     def send(self, message: Message) -> None:
-        """Hand one message to the bus as a frame at the time of the last `advance`."""
         identifier, data = self.stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
 
@@ -149,7 +140,6 @@ class ClosedLoop:
     def __init__(
         self, config: Config, stepper: Stepper, planner: Planner | None, device: SerialDevice | VirtualBus
     ) -> None:
-        """Connect the core with `device`, which is behind a serial line or comes with its bus."""
         self._config, self.stepper, self.planner = config, stepper, planner
         self._period_s = 1.0 / config.rates.control_hz
         self._inference_s = 1.0 / config.rates.inference_hz
@@ -173,7 +163,6 @@ class ClosedLoop:
 
     @device.setter
     def device(self, device: SerialDevice) -> None:
-        """The device at the other end of the serial line."""
         if isinstance(self._port, VirtualBus):
             raise TypeError("this device is on a bus")
         self._port.device = device
@@ -187,7 +176,7 @@ class ClosedLoop:
         return self.connection.measurement
 
     def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
-        """Run one control period, and return what happened in it: the device runs on, then read, plan, step and send."""
+        """Run one control period, and return what happened in it."""
         self._ticks += 1
         now_s = self.now_s
         self._port.advance(now_s)
@@ -208,11 +197,9 @@ class ClosedLoop:
         self._port.advance(self.now_s)
 
     def command(self, name: str) -> None:
-        """Carry out the operator's command `name` under the present conditions."""
         self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
-        """Return the conditions on which commands are taken or refused, as of now: after the newest tick."""
         doubted = self.planner is not None and self.planner.believe.sensor.is_doubted
         connection, stepper = self.connection, self.stepper
         return conditions(self.now_s, self._config, connection, stepper, self._output, sensor_doubted=doubted)
@@ -220,13 +207,11 @@ class ClosedLoop:
     def run(
         self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
     ) -> Iterable[Sample]:
-        """Run the ticks of the next `duration_s` one by one, and yield their samples: `duration_s` over the period,
-        rounded."""
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
     def arm(self, plan: Plan | None = None) -> None:
-        """Connect, home and enable, as an operator does; the ticks that this takes run at once."""
+        """Connect, home and enable, as an operator does."""
         self._until(lambda m: True, "answer", plan)
         self.command("home")
         self._until(lambda m: m.is_busy, "start homing", plan)
@@ -236,7 +221,7 @@ class ClosedLoop:
             raise RuntimeError(f"not enabled: {self.stepper.safety}")
 
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> Plan:
-        """Plan at `now_s` where the setpoint is new or the inference period is over; return the newest plan."""
+        """Plan where the setpoint is new or the inference period is over, and return the newest plan."""
         planner = self.planner
         if planner is None:
             raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
@@ -249,15 +234,14 @@ class ClosedLoop:
         return planner.planned
 
     def _answer_question(self, planner: Planner, now_s: float) -> None:
-        """Answer the pending question once SEARCH_S is over, as a search in a process of its own would; else do
-        nothing."""
+        """Answer the pending question once SEARCH_S is over."""
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
             planner.answered(planner.aim.answer_to(asked))
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
-        """Run ticks without a setpoint until `reached` is true of a measurement, at least one."""
+        """Run at least one tick, without a setpoint, until `reached` is true of a measurement."""
         for _ in range(round(HOMING_S / self._period_s)):
             self.tick(plan=plan)
             if self.measurement is not None and reached(self.measurement):
@@ -267,7 +251,7 @@ class ClosedLoop:
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
-    """Return a publisher in virtual time: a function from the time, s, to the newest setpoint, None before the first."""
+    """Return a function from the time to the newest setpoint of a publisher."""
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()
     sent = 0

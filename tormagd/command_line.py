@@ -1,4 +1,4 @@
-"""A command line that refuses in one sentence with the next step, and offers what may have been meant."""
+"""A command line that refuses in one sentence with the next step, and suggests what may have been meant."""
 
 import argparse
 import sys
@@ -14,7 +14,7 @@ UNKNOWN_OPTION = "unrecognized arguments: "
 
 
 class UsageError(Exception):
-    """What was given cannot be used: `message` says why, `hint` what to do next."""
+    """The command line cannot be used: `message` says why, `hint` what to do next."""
 
     def __init__(self, message: str, hint: str) -> None:
         super().__init__(message, hint)
@@ -22,12 +22,12 @@ class UsageError(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that raises UsageError in place of ending the process."""
+    """A parser that raises UsageError instead of ending the process."""
 
     options: tuple[str, ...] = ()
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError with this message, cut to LONGEST characters, and `PROGRAM --help` as the hint."""
+        """Raise UsageError with this message, cut to LONGEST characters."""
         if message.startswith(UNKNOWN_OPTION):
             known = self.options or tuple(self._option_string_actions)
             message += did_you_mean(message.removeprefix(UNKNOWN_OPTION).split()[0], known)

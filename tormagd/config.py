@@ -1,9 +1,10 @@
-"""One typed, validated configuration.
+"""One typed, validated configuration: a TOML file, or the defaults.
 
-A TOML file, or the defaults. Unknown keys, wrong types, NaN and infinities, values out of range and impossible
-orderings are refused. The error names the key's path, the value and what is allowed.
+Unknown keys, wrong types, NaN and infinities, values out of range and impossible orderings are refused. The error names
+the key's path, the value and what is allowed.
 """
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,11 +15,12 @@ from tormagd.toml_file import checked as checked, convert, convert_as, placed, t
 from tormagd_client.endpoints import ConfigError, Endpoints, Strict, require_usable
 from tormagd_client.printable import require
 
-MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
+MIN_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms); slower is not worth running
 MAX_LISTED = 8
-"Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
+"Fewer sources than are kept apart, so that an unlisted one is heard too."
 MAX_PLAYOUT_MS = 200.0
 "Half of what the whole way from sensor to force may take."
+_FINGERPRINT = re.compile("[0-9a-f]{4}(:[0-9a-f]{4}){3}")
 
 
 class Device(Strict, frozen=True):
@@ -49,10 +51,13 @@ class Device(Strict, frozen=True):
 
 
 class Sources(Strict, frozen=True):
-    """Who may hold the brake before whom, and how long setpoints are held back."""
+    """Who may hold the brake before whom, who may send under which name, and how long setpoints are held back."""
 
     priority: tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...] = ()
     "Names of sources. Each takes the brake over from those after it, and from all that are not listed."
+    keys: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
+    """Fingerprints of the keys that may send as a source, by its name. Any key that may publish may send under a name
+    that is not listed."""
     playout_ms: Annotated[float, Meta(ge=0.0, le=MAX_PLAYOUT_MS)] = 0.0
     "Setpoints are followed so long after their stamps, as evenly as they were stamped. 0: as soon as they come."
 
@@ -64,6 +69,13 @@ class Sources(Strict, frozen=True):
             names,
             f"at most {MAX_LISTED} different printable names",
         )
+        for name, keys in self.keys.items():
+            require(
+                keys != () and all(map(_FINGERPRINT.fullmatch, keys)),
+                f"sources.keys.{name}",
+                keys,
+                "fingerprints as tormagctl keys show says them, one or more",
+            )
 
 
 class Handle(Strict, frozen=True):
@@ -280,6 +292,12 @@ class Config(Strict, frozen=True):
             f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
         )
         require_usable(self.endpoints)
+        require(
+            not self.sources.keys or self.endpoints.is_guarded("setpoint"),
+            "sources.keys",
+            list(self.sources.keys),
+            "none where endpoints.setpoint asks for no keys; endpoints.curve.also_local lets it ask",
+        )
 
 
 class Calibration(Strict, frozen=True):
@@ -292,7 +310,7 @@ class Calibration(Strict, frozen=True):
 
 
 def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
-    """Return `config` with what the calibration file `path` states in place of its own motor, position and trim."""
+    """Return `config` with the motor, position and trim of the calibration file `path`."""
     found = convert(path, Calibration)
     stated = msgspec.to_builtins(found)
     try:

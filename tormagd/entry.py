@@ -1,4 +1,4 @@
-"""Where the installed commands begin: while one is loading, Ctrl-C ends the process, without a traceback."""
+"""Entry points of the installed commands: Ctrl-C while one is loading ends the process without a traceback."""
 
 import signal
 from collections.abc import Callable
@@ -6,13 +6,13 @@ from functools import partial
 from importlib import import_module
 
 INTERRUPTED = 130
-"""Exit code that a shell shows of a process ended by SIGINT."""
+"""The shell's exit code for a process that SIGINT ended."""
 
 
 def _run(module: str) -> int:
-    """Import `module`, run its `main` and return the exit code; Ctrl-C while importing ends the process."""
+    """Import `module`, run its `main` and return the exit code."""
     interrupt = signal.getsignal(signal.SIGINT)
-    if interrupt is signal.default_int_handler:  # a shell's background job ignores it, and goes on doing so
+    if interrupt is signal.default_int_handler:  # a shell's background job ignores it, and keeps doing so
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     main: Callable[[], int] = import_module(module).main
     try:
@@ -23,8 +23,5 @@ def _run(module: str) -> int:
 
 
 daemon = partial(_run, "tormagd.daemon.main")
-"`tormagd`."
 ctl = partial(_run, "tormagd.ctl.main")
-"`tormagctl`."
 lab = partial(_run, "tormagd.lab.main")
-"`tormag-lab`."

@@ -1,6 +1,6 @@
-"""Values as plain data, and back, with nothing lost: every float to the bit, every type by its name.
+"""Values as plain data and back, with nothing lost: every float to the bit, every type by its name.
 
-Plain data are what msgpack holds. Any other thing is a map with one key, its type's name:
+Plain data are what msgpack holds. Anything else is a map with one key, its type's name:
 
     a value        {"Turn": {"direction": 1.0, ...}}
     an enumerator  {"Limit": "RATE"}
@@ -20,24 +20,22 @@ LIST = "list"
 _AS_THEY_ARE = (float, int, bool, str, bytes, type(None))
 
 Kinds = Mapping[str, type[Value] | type[Enum]]
-"By name, the types that may come back."
+"The types that may come back, by name."
 
 
 _ENCODER = msgspec.msgpack.Encoder()
 
 
 class InexactError(ValueError):
-    """Plain data that stand for no value of a known kind: the message says which, and what is wrong with it."""
+    """Plain data that are not a value of a known kind."""
 
 
 def kinds(*types: type[Value] | type[Enum]) -> Kinds:
-    """Return these types by name; of two with one name the later counts."""
     return {each.__name__: each for each in types}
 
 
 def plain(thing: object) -> Any:
-    """Return `thing` as plain data: a value, or what changes in place, becomes a map of its fields, a tuple becomes a
-    list."""
+    """Return `thing` as plain data: objects become maps of their fields."""
     if type(thing) in _AS_THEY_ARE:
         return thing
     names = _fields(thing)
@@ -55,12 +53,11 @@ def plain(thing: object) -> Any:
 
 
 def _fields(thing: object) -> tuple[str, ...]:
-    """Return the names of the fields of `thing`, an object; empty for an enumerator and for what has none."""
     if isinstance(thing, Enum):
         return ()
     if hasattr(thing, "__match_args__"):
         return tuple(thing.__match_args__)
-    # a compiled class has neither annotations nor a dictionary, but says its attributes
+    # a compiled class has neither annotations nor a dictionary, but lists its attributes
     told = [vars(each).get("__mypyc_attrs__") or vars(each).get("__annotations__", ()) for each in type(thing).__mro__]
     return tuple(
         sorted({name for names in (*told, getattr(thing, "__dict__", ())) for name in names if name[0] != "_"})
@@ -68,8 +65,7 @@ def _fields(thing: object) -> tuple[str, ...]:
 
 
 def restored(data: Any, known: Kinds) -> Any:
-    """Return the value that `data` stand for, of the types in `known`; an array becomes a tuple, `{"list": [...]}` a
-    list."""
+    """Return the value of plain `data`, of the types in `known`; an array becomes a tuple."""
     if type(data) in _AS_THEY_ARE:
         return data
     if isinstance(data, list | tuple):
@@ -97,7 +93,7 @@ def restored(data: Any, known: Kinds) -> Any:
 
 
 def restore(thing: Any, data: Any, known: Kinds) -> None:
-    """Give `thing`, which changes in place, the fields that `data` stand for, in place."""
+    """Set the fields of the mutable `thing` from plain `data`."""
     name = type(thing).__name__
     fields = data.get(name) if isinstance(data, dict) else None
     if not isinstance(fields, dict) or set(fields) != set(_fields(thing)):
@@ -117,12 +113,12 @@ def restore(thing: Any, data: Any, known: Kinds) -> None:
 
 
 def packed(data: Any) -> bytes:
-    """Return plain data as msgpack: equal bytes for the same values, types and order, and for no others."""
+    """Return plain data as msgpack: equal bytes for equal values, types and order only."""
     return _ENCODER.encode(data)
 
 
 def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
-    """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with the value of each there."""
+    """Return where two plain data first differ, as in "measured.handle.rate_mm_s", with both values."""
     if packed(left) == packed(right):
         return None
     for (path, one), (other_path, other) in zip(_leaves("", left), _leaves("", right), strict=False):
@@ -132,7 +128,7 @@ def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
 
 
 def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
-    """Yield path and value of each plain value in `data`, depth first; `path` is that of `data`, empty for the whole."""
+    """Yield path and value of each plain value in `data`, depth first."""
     if not isinstance(data, dict | list | tuple):
         yield path, data
         return

@@ -1,4 +1,4 @@
-"""How well the force is followed: the RMS of measured less asked force, with and without the delay that explains most.
+"""How well the force is followed: the RMS of measured less asked force, with and without the best-fitting delay.
 
 Only ticks at which the force could be followed count: ENABLED, a setpoint that the device can give, and a handle that
 slides. The way to the first force does not count, nor does the decay after the last.
@@ -12,25 +12,21 @@ from typing import Final
 from tormagd_client.messages import MAX_DISPLACEMENT_MM, FollowingReport
 
 PERIOD_S: Final = 0.02
-"Time between two looks, unless another is stated."
 MAX_DELAY_S: Final = 0.4
-"Greatest delay that is taken out: the budget of the whole way."
+"Greatest delay that is taken out: the budget from sensor to force."
 NEAR_N: Final = 0.1
-"The way to the first force ends this near to it."
+"The first force counts as reached this close to it."
 MIN_S: Final = 1.0
-"No figure is told of fewer looks than fill this time."
+"Looks over a shorter time give no figure."
 SLIDES_MM_S: Final = 1.0
 SLID_MM: Final = MAX_DISPLACEMENT_MM
-"A slower handle sticks, and one that has turned feels all of the brake's force only so much further."
+"A handle feels all of the brake's force only this far after a turn or a stop."
 NOT_FOLLOWED: Final = frozenset({"RANGE", "STANDBY", "F_MIN", "F_MAX", "TAKEOVER"})
-"Limits under which another force is rendered than was asked."
+"Under these limits another force is rendered than was asked."
 
 
 class Following:
-    """Measures how well the force is followed: RMS error, and the delay that explains most of it."""
-
     def __init__(self, period_s: float = PERIOD_S, forgets_s: float = math.inf) -> None:
-        """Begin without figures."""
         self._period_s = period_s
         self._kept = math.exp(-period_s / forgets_s)
         count = round(MAX_DELAY_S / period_s) + 1
@@ -52,7 +48,7 @@ class Following:
         handle_mm: float | None,
         rate_mm_s: float | None,
     ) -> None:
-        """Look once, and add the error for each delay where it counts."""
+        """Look once, and add the error for each delay."""
         if self._kept < 1.0:
             self._weight *= self._kept
             self._squares = [self._kept * known for known in self._squares]
@@ -73,12 +69,12 @@ class Following:
             ]
 
     def begin(self) -> None:
-        """Forget what was asked, and that the force has arrived: what follows is on its way to a first force again."""
+        """Forget what was asked: the next force is a first force again."""
         self._asked_N.clear()
         self._has_arrived = False
 
     def _slides(self, rate_mm_s: float | None, place_mm: float | None) -> bool:
-        """Tell whether the handle has slid SLID_MM since it last turned or was slower than about SLIDES_MM_S."""
+        """Whether the handle has slid SLID_MM since it last turned or stuck."""
         if rate_mm_s is None or place_mm is None:
             return True
         if rate_mm_s * self._rate_mm_s < SLIDES_MM_S**2:
@@ -87,7 +83,7 @@ class Following:
         return abs(place_mm - self._turned_mm) >= SLID_MM
 
     def report(self) -> FollowingReport | None:
-        """Return the RMS error, N, the RMS error with the best delay taken out, N, and that delay, ms."""
+        """Return the RMS error, the RMS error with the best delay taken out, and that delay."""
         if self.counted_s < MIN_S:
             return None
         least = min(self._squares)

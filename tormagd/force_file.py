@@ -1,5 +1,4 @@
-"""Quantities over time in a CSV file: a force that is sent, asked for by a scene or designed for, or a hand's
-motion."""
+"""Quantities over time in a CSV file: a force that is sent, asked for or designed for, or a hand's motion."""
 
 import csv
 import io
@@ -12,33 +11,33 @@ from tormagd.bounded_file import read_bounded
 from tormagd_client.messages import MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S
 
 OPTIONAL_COLUMNS = ("displacement_mm", "rate_mm_s")
-TIME = (-1e10, 1e10, "s")  # seconds since 1970 are fine
+TIME = (-1e10, 1e10, "s")  # seconds since 1970 are allowed
 ALLOWED = {
     "t_s": TIME,
     "force_N": (0.0, MAX_FORCE_N, "N"),
     "displacement_mm": (0.0, MAX_DISPLACEMENT_MM, "mm"),
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
 }
-"Least, most and unit of each column; those of a setpoint's fields are the messages'."
+"Least, most and unit of each column."
 MIN_ROWS = 2
 MAX_FILE_BYTES = 16_000_000
-"Enough for over a quarter of an hour at 1 kHz."
+"Over a quarter of an hour at 1 kHz."
 
 
 Allowed = Mapping[str, tuple[float, float, str]]
 
 
 class ForceFileError(ValueError):
-    """CSV file that is not as allowed: the message names file, row, column, value and what is allowed."""
+    """A CSV file that is not as allowed: the message names file, row, column and value."""
 
 
 def read_forces(path: Path) -> dict[str, "array[float]"]:
-    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has, into arrays by name."""
+    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has, by name."""
     return read_table(path, ALLOWED, OPTIONAL_COLUMNS)
 
 
 def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"]:
-    """Read `t_s` and one `column` more, and return both as arrays (n each); pass over the rest."""
+    """Read `t_s` and one `column` more, and ignore the rest."""
     table = read_table(path, {"t_s": TIME, column: (-1e9, 1e9, "")}, has_others=True)
     return table["t_s"], table[column]
 
@@ -46,7 +45,7 @@ def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"
 def read_table(
     path: Path, allowed: Allowed, optional: tuple[str, ...] = (), *, has_others: bool = False
 ) -> dict[str, "array[float]"]:
-    """Read a CSV file's columns into arrays of equal length, by name; a million rows fit."""
+    """Read a CSV file's columns into arrays of equal length, by name."""
     try:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
         with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as file:
@@ -72,7 +71,6 @@ def read_table(
 
 
 def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> None:
-    """Check `columns`, the names in the first row of the file at `path`; any order is allowed."""
     required = [name for name in known if name not in optional]
     also = f" and optionally {','.join(optional)}" if optional else ""
     allowed = f"allowed is {','.join(required)}{also}"
@@ -89,8 +87,7 @@ def _check_header(path: Path, columns: list[str], known: list[str], optional: tu
 def _check_row(
     path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]", allowed: Allowed
 ) -> list[float]:
-    """Return the numbers of the row `cells` in the order of `columns`; columns that `allowed` does not name are left
-    out."""
+    """Return the numbers of the columns that `allowed` names."""
     if len(cells) != len(columns):
         raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
     known = [(name, text) for name, text in zip(columns, cells, strict=True) if name in allowed]
@@ -104,7 +101,6 @@ def _check_row(
 
 
 def _number(path: Path, line: int, name: str, text: str, least: float, most: float, unit: str) -> float:
-    """Return `text` as a finite number from `least` to `most`, both allowed."""
     try:
         value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else
     except ValueError:

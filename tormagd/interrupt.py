@@ -1,4 +1,4 @@
-"""Ending a long run by a signal, between two of its steps."""
+"""Ends a long run by a signal, between two of its steps."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -8,7 +8,7 @@ from types import FrameType
 
 @contextmanager
 def interrupted_by(*signals: signal.Signals) -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether one of `signals` has come since; put the earlier handlers back at the end."""
+    """Give a function that says whether one of `signals` has come since."""
     arrived: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:

@@ -1,23 +1,22 @@
-"""Messages between the daemon and the process that keeps its black box, both ways: msgpack, one a packet."""
+"""Messages between the daemon and the process that keeps its black box: msgpack, one a packet."""
 
 import msgspec
 
 KEEPER = "tormagd.recording.keeper"
-"Module that the keeper's process runs, with its socket's descriptor as the argument."
+"The keeper's main module, with its socket's descriptor as the argument."
 READ, WROTE = "read", "wrote"
-"Entries of what passed between daemon and device: `[READ, time_s, raw, ...]`, raw as `hardware/backend.py` has it."
+"Entries of what passed between daemon and device: `[READ, time_s, raw, ...]`."
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
-    """First message of the daemon: the folder for black boxes, and the header of each."""
+    """First message: the folder for black boxes, and the header of each."""
 
     folder: str
     header: dict[str, str]
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
-    """Some control periods, as entries that `assembly/journal.py` encoded. `time_s` and `t_ns` are those of the last
-    period."""
+    """Some control periods, as entries of `assembly/journal.py`. Both times are the last period's."""
 
     time_s: float
     t_ns: int
@@ -25,7 +24,7 @@ class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
 
 
 class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
-    """Request to write the kept entries, and what comes within `after_s` from now, to the file `name` in the folder."""
+    """Request to write the kept entries, and those of the next `after_s`, to the file `name`."""
 
     name: str
     reason: str
@@ -34,11 +33,11 @@ class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
 
 
 class End(msgspec.Struct, frozen=True, array_like=True, tag="end"):
-    """Last message of a daemon that ends as it should; a daemon that is gone without it leaves a black box."""
+    """Last message of a daemon that ends as it should; one that ends without it leaves a black box."""
 
 
 class Written(msgspec.Struct, frozen=True, array_like=True, tag="written"):
-    """Answer of the keeper: the black box `name` is on the disk, unless `refusal` says why not."""
+    """Answer of the keeper: the black box `name` is on the disk, or a `refusal`."""
 
     name: str
     refusal: str = ""

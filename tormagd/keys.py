@@ -9,7 +9,6 @@ from tormagd_client.endpoints import ROLES, ConfigError, Endpoints
 from tormagd_client.keys import PUBLIC, load_pair, load_public, regular
 
 MAX_KEYS = 256
-"Most public keys in the folder of one role."
 
 
 class Listed(NamedTuple):
@@ -20,12 +19,11 @@ class Listed(NamedTuple):
 
 
 Allowed = Mapping[str, Listed]
-"Accepted keys by the 40 characters of the public key."
+"Accepted keys by public key."
 
 
 class KeyRing:
-    """The daemon's own key pair `server`, and the accepted public keys of each role, as read when it was made, in
-    `allowed`."""
+    """The daemon's own key pair, and the accepted public keys of each role."""
 
     def __init__(self, endpoints: Endpoints) -> None:
         curve = endpoints.curve
@@ -37,7 +35,7 @@ class KeyRing:
         self.allowed: Allowed = self.load_allowed()
 
     def load_allowed(self) -> Allowed:
-        """Read the key folders of all roles again and return the accepted keys; `allowed` stays as it is."""
+        """Read the key folders of all roles again and return the accepted keys."""
         found: dict[str, Listed] = {}
         for role, folder in self._folders.items():
             for name, public in load_folder(folder):
@@ -47,7 +45,7 @@ class KeyRing:
 
 
 def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
-    """Yield name and public key of every `NAME.key` in `folder`, sorted by name; nothing for a folder without any."""
+    """Yield name and public key of every `NAME.key` in `folder`, sorted by name."""
     try:
         information = folder.stat()
         paths = sorted(path for path in folder.iterdir() if path.suffix == PUBLIC)

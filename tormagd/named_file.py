@@ -1,4 +1,4 @@
-"""Files that a user names: one that comes with the package, by its name, or one of his own, by its path."""
+"""Files that a user names: a shipped one by its name, or one of his own by its path."""
 
 from collections.abc import Iterable
 from importlib.resources.abc import Traversable
@@ -9,12 +9,12 @@ from tormagd_client.printable import in_short
 
 
 def shipped(folder: Traversable, ending: str) -> tuple[str, ...]:
-    """Return the names of a package folder's files that end with `ending`, sorted and without it; empty where none do."""
+    """Return the names of a package folder's files with `ending`, without it."""
     return tuple(sorted(each.name.removesuffix(ending) for each in folder.iterdir() if each.name.endswith(ending)))
 
 
 def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = Path()) -> Path:
-    """Return the path of a shipped file by its name, or else of what exists at the path `name`, relative to `beside`."""
+    """Return the path of a shipped file, or else of the existing file `name`, relative to `beside`."""
     names, reason = shipped(folder, ending), ""
     if name in names:
         return Path(str(folder / f"{name}{ending}"))
@@ -28,7 +28,7 @@ def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = 
 
 
 def did_you_mean(word: str, allowed: Iterable[str]) -> str:
-    """Return `; did you mean ...?` with the allowed word that is nearest to `word`; an empty text where none is near."""
+    """Return `; did you mean ...?` with the allowed word nearest to `word`, or ""."""
     import difflib  # takes a moment, and most configurations are right
 
     near = difflib.get_close_matches(word, list(allowed), n=1)

@@ -1,7 +1,7 @@
 """Lines on a standard stream that may be closed or full, or whose reader may have gone.
 
 A terminal obeys what is printed to it. So words of a file, a device or another process are made `printable` where they
-come in. Whatever else is not printable is escaped where it goes out, all but line ends and our own colours.
+come in, and whatever else is not printable is escaped on output, except line ends and our own colours.
 """
 
 import codecs
@@ -15,14 +15,13 @@ from typing import TextIO
 from tormagd_client.printable import printable
 
 _OURS = re.compile("(\n|\t|\x1b\\[(?:0|1|31|32|33)m)")
-"What a line may hold besides printable characters: its end, a tabulator, and the colours of `ctl.outcome.Colour`."
+"What a line may hold besides printable characters: its end, tabulators, and the colours of `ctl.outcome.Colour`."
 _ALIKE = {"±": "+-", "·": "-", "…": "~"} | dict(zip("▁▂▃▄▅▆▇█", ".,:;+=*#", strict=True))
-"What stands for our own characters on a terminal that has no others than ASCII's."
+"Substitutes on a terminal that has only ASCII."
 
 
 def _alike(error: UnicodeError) -> tuple[str, int]:
-    """Return what a stream writes for characters that its encoding lacks, and where it goes on: an error handler of
-    codecs."""
+    """Replace characters that an encoding lacks: an error handler of codecs."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
@@ -33,20 +32,19 @@ codecs.register_error("alike", _alike)
 
 
 def write_in_any_encoding() -> None:
-    """Make stdout and stderr take any text from here on, for the whole process."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="alike")
 
 
 def write_line(text: str, stream: TextIO | None) -> OSError | None:
-    """Write `text`, escaped, and a line end at once; return the error that kept this from being done, or None."""
+    """Write `text`, escaped, with a line end; return the error that prevented it."""
     if stream is None:
         return None
     try:
         print(escaped(text), file=stream, flush=True)
     except OSError as error:
-        # or the interpreter would try again at its end, complain, and change the exit code
+        # otherwise the interpreter tries again at its end, complains, and changes the exit code
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
@@ -55,7 +53,7 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
 
 
 def write_answer(text: str, program: str) -> bool:
-    """Write to stdout what `program` was asked for; False where that could not be, which stderr is told."""
+    """Write the answer of `program` to stdout; on failure tell stderr and return False."""
     lost = write_line(text, sys.stdout)
     # a reader that stopped reading meant to; a disk that is full did not
     if lost is None or isinstance(lost, BrokenPipeError):
@@ -65,7 +63,7 @@ def write_answer(text: str, program: str) -> bool:
 
 
 def escaped(text: str) -> str:
-    """Return `text` with each unprintable character escaped, but for line ends, tabulators and our own colours."""
+    """Escape all but printable characters, line ends, tabulators and our own colours."""
     parts = _OURS.split(text)
     parts[::2] = [printable(part) for part in parts[::2]]
     return "".join(parts)

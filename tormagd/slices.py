@@ -1,9 +1,8 @@
 """Short slices of the processor: what Linux gives an ordinary thread that wakes often and has little to do.
 
 A thread without real-time priority waits, when it wakes up, for whoever runs to use up a slice, 1.4 ms on two
-processors. From Linux 6.12 on, a thread that asked for shorter slices itself goes first (EEVDF). See sched_setattr(2)
-and the kernel's Documentation/scheduler/sched-eevdf.rst. In all it gets no more of the processor, and it needs no
-privilege.
+processors. From Linux 6.12 on, a thread that asked for shorter slices goes first (EEVDF). Its share of the processor is
+the same, and it needs no privilege. See sched_setattr(2) and the kernel's Documentation/scheduler/sched-eevdf.rst.
 """
 
 import ctypes
@@ -11,13 +10,13 @@ import os
 import sys
 
 SHORTEST_NS = 100_000
-"The shortest slice that the kernel gives."
+"The kernel's least."
 _SYSTEM_CALL = {"x86_64": 314, "aarch64": 274}
-"Number of sched_setattr(2) for 64-bit programs; the C library has a function for it only from glibc 2.41 on."
+"Numbers of sched_setattr(2); the C library has a function for it only from glibc 2.41 on."
 
 
 class _Attributes(ctypes.Structure):
-    """The kernel's `struct sched_attr`, as sched_setattr(2) takes it."""
+    """The kernel's `struct sched_attr`."""
 
     _fields_ = (
         ("size", ctypes.c_uint32),
@@ -32,7 +31,7 @@ class _Attributes(ctypes.Structure):
 
 
 def ask_for_slices(slice_ns: int = SHORTEST_NS) -> None:
-    """Ask the kernel for slices of `slice_ns`, 0 for its own length, for this thread and those that it begins."""
+    """Ask the kernel for slices of `slice_ns` for this thread and its children; 0: its own length."""
     number = _SYSTEM_CALL.get(os.uname().machine)
     if number is None or sys.maxsize < 2**32 or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return

@@ -1,6 +1,6 @@
-"""Reading TOML that anybody may have written.
+"""Reads TOML that anybody may have written.
 
-A text is refused by its shape before it is parsed, then by its numbers, then by what its tables may say. A refusal
+A text is refused by its shape before it is parsed, then by its numbers, then by what its tables may hold. A refusal
 names the key's path, the value, what is allowed and the line.
 """
 
@@ -21,17 +21,16 @@ from tormagd_client.printable import in_short
 MAX_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
 LONGEST_LINE = 8_192
-"Characters in a line: the parser's time grows as the square of a key's parts, to a minute."
+"Characters in a line: the parser's time grows as the square of a key's parts."
 MAX_GUESSES = 16
-"Lines with a key's name that are tried for the one that gives it: a file may be full of them."
+"Lines with a key's name that are tried: a hostile file may be full of them."
 MAX_LINES = 8
-"Lines of one value whose key's line is found."
 
 T = TypeVar("T")
 _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
-"The key, or the table, that a refusal of ours begins with."
+"The key or table at the head of our own refusals."
 _PLACE = re.compile(r"`\$([^`]*)`")
-"The place that a refusal of msgspec ends with."
+"The place at the end of msgspec's refusals."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
 GONE = {
     "limits.neutral_margin_N": "; delete it: `enable` goes to any setpoint along a ramp now",
@@ -39,15 +38,15 @@ GONE = {
 }
 "Keys of earlier versions, and what to do about them."
 _NOTHING = object()
-"Stands for no value: a value of a table may be None."
+"A table's value may be None."
 
 
 class TomlError(ValueError):
-    """A text that is refused: not TOML (with its line), nested too deeply, too long a line, or an impossible number."""
+    """A text that is refused as TOML."""
 
 
 def toml_text(path: Path) -> str:
-    """Read a text file of at most MAX_BYTES, in UTF-8, and return its text, without a byte order mark."""
+    """Read a UTF-8 text file of at most MAX_BYTES."""
     try:
         return read_bounded(path, MAX_BYTES).decode("utf-8-sig")  # editors on Windows put a byte order mark first
     except UnicodeDecodeError as error:
@@ -55,8 +54,8 @@ def toml_text(path: Path) -> str:
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """Parse `text` as TOML and return its tables."""
-    import tomllib  # not above: most commands of tormagctl read no file, and need not wait for it
+    """Parse `text` as TOML."""
+    import tomllib  # not above: most commands of tormagctl read no file
 
     for number, line in enumerate(text.splitlines(), start=1):
         if len(line) > LONGEST_LINE:
@@ -78,12 +77,11 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def convert(path: Path, kind: type[T]) -> T:
-    """Read a TOML file as a `kind`."""
     return convert_as(path, lambda _tables: kind)
 
 
 def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
-    """Read a TOML file as the kind that `kind_of` returns for its tables, which have been parsed, but not checked."""
+    """Read a TOML file as the kind that `kind_of` chooses by its tables."""
     try:
         text = toml_text(path)
         try:
@@ -98,13 +96,12 @@ def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
 
 
 def placed(path: Path | None, message: str) -> str:
-    """Return `message`, a refusal of what the file at `path` says, as `PATH: message (line N)`."""
+    """Return a refusal of the file at `path` as `PATH: message (line N)`."""
     where = "" if path is None else _line(toml_text(path), message)
     return f"{path}: {message}{where}" if where else message
 
 
 def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
-    """Convert tables to a `kind`, a msgspec struct, and return it."""
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
@@ -116,13 +113,12 @@ def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
 
 
 def table_in(kind: Any) -> type[msgspec.Struct] | None:
-    """Return the struct, optional or not, that a field of type `kind` holds; None where it holds a plain value."""
     structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
     return next(structs, None)
 
 
 def _known_key(kind: Any, message: str) -> str:
-    """Return `; did you mean ...?` for the unknown key in a message of msgspec, or what to do about a key in GONE."""
+    """Return `; did you mean ...?` for an unknown key, or what to do about a key in GONE."""
     key = _key_in(message)
     if (unknown := _UNKNOWN.search(message)) is None or ".".join(key) in GONE:
         return GONE[".".join(key)] if unknown else ""
@@ -134,14 +130,14 @@ def _known_key(kind: Any, message: str) -> str:
 
 
 def _line(text: str, message: str) -> str:
-    """Return ` (line N)` of the key in a refusal, or of the nearest table above it that `text` gives; else nothing."""
+    """Return ` (line N)` of the key in a refusal, or of the nearest table above it."""
     key = _key_in(message)
     lines = (line_of(text, key[:size]) for size in range(len(key), 0, -1))
     return next((f" (line {line})" for line in lines if line is not None), "")
 
 
 def _key_in(message: str) -> list[str]:
-    """Return the key that a refusal names, as its parts; empty where it names none."""
+    """Return the key that a refusal names, as its parts."""
     if ours := _OURS.match(message):
         return ours[1].split(".")
     place, unknown = _PLACE.search(message), _UNKNOWN.search(message)
@@ -150,7 +146,7 @@ def _key_in(message: str) -> list[str]:
 
 
 def _value_at(tables: dict[str, Any], message: str) -> str:
-    """Return ` (it is VALUE)` for the path `$.a.b` at the end of a message of msgspec, which leaves the value out."""
+    """Return ` (it is VALUE)` for the path in a refusal of msgspec, which leaves the value out."""
     if "`$." not in message:
         return ""
     value = _at(tables, message.rsplit("`$.", 1)[1].rstrip("`").split("[")[0].split("."))
@@ -158,22 +154,21 @@ def _value_at(tables: dict[str, Any], message: str) -> str:
 
 
 def _at(table: Any, key: Sequence[str]) -> Any:
-    """Return what the path `key` leads to in nested tables; _NOTHING where it leads nowhere."""
+    """Return what the path `key` leads to in nested tables, or _NOTHING."""
     for name in key:
         table = table.get(name, _NOTHING) if isinstance(table, dict) else _NOTHING
     return table
 
 
 def line_of(text: str, key: Sequence[str]) -> int | None:
-    """Return the number, from 1, of the line of `text`, which is TOML, that gives `key`, a path through its tables."""
+    """Return the number of the line, from 1, that gives `key`."""
     lines = text.splitlines()
     guesses = (number for number, line in enumerate(lines, start=1) if key and key[-1] in line)
     return next((number for number in islice(guesses, MAX_GUESSES) if _is_known(lines, number, key)), None)
 
 
 def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
-    """Tell whether `key` is known after line `number`, from 1, or after up to MAX_LINES more that its value may go on
-    in."""
+    """Whether `key` is known after line `number`, or at most MAX_LINES later."""
     import tomllib
 
     for end in range(number, min(number + MAX_LINES, len(lines)) + 1):  # a value may go on in the lines below
@@ -185,7 +180,7 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
 
 
 def _require_numbers(value: Any, key: str) -> None:
-    """Raise TomlError for a number in `value`, however deep, that is not finite or not of 64 bits, with its key."""
+    """Raise TomlError for a number that is not finite or not of 64 bits."""
     if isinstance(value, float) and not math.isfinite(value):
         raise TomlError(f"{key} = {value}: allowed is a finite number")
     if isinstance(value, int) and not -(2**63) <= value < 2**63:

@@ -1,7 +1,8 @@
-"""Rings the terminal's bell for who looks at the patient and at no screen. It rings once for a limit that comes, and
-every two seconds while the device is in FAULT or nothing is heard.
+"""Rings the terminal's bell for an operator who does not look at a screen.
 
-    python cue.py FOLDER [LIMIT ...]     where the daemon's sockets are, and which limits are to be heard
+It rings once for a new limit, and every two seconds while the device is in FAULT or silent.
+
+    python cue.py FOLDER [LIMIT ...]     the folder of the daemon's sockets, and the limits that are to be heard
 """
 
 import sys, time
@@ -17,10 +18,9 @@ class Cue:
         self.heard_s, self.rung_s, self.faults = now_s, now_s - AGAIN_S, ()
 
     def due(self, states, now_s):
-        """What is to be rung for now, after these snapshots, which may be none."""
         came = []
         for state in states:
-            for limit in self.held_s.keys() & set(state.limits):  # one that comes and goes is rung for once
+            for limit in self.held_s.keys() & set(state.limits):  # a limit that comes and goes is rung for once
                 came += [limit] if now_s - self.held_s[limit] >= AGAIN_S else []
                 self.held_s[limit] = now_s
             self.heard_s, self.faults = now_s, state.faults

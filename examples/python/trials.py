@@ -2,10 +2,10 @@
 
     python trials.py FOLDER OUT.csv [--pairs N] [--seed S]
 
-FOLDER is where the daemon's sockets are; somebody has enabled it, and its scene says withdrawing what it likes. The
-operator pushes the handle into the first wall, draws back, pushes into the second one, and answers 1 or 2. Who asks
-does not know either: the order is drawn, and stands in OUT.csv only after the answer. A pair that is interrupted is
-not written. At the end: how often each difference of stiffness was told, with a 95 % interval (Wilson).
+FOLDER is where the sockets of an enabled daemon are. The operator pushes the handle into two walls and answers 1 or 2.
+The order is drawn, and is written to OUT.csv only after the answer, so the experimenter does not know it either. An
+interrupted pair is not written. At the end the program prints how often each difference of stiffness was told, with a
+95 % interval (Wilson).
 """
 
 import argparse
@@ -24,13 +24,13 @@ REFERENCE_N_MM = 0.3
 RATIOS = (1.1, 1.22, 1.5, 2.0)
 "The other wall's stiffness over the reference's: around the just noticeable difference, 22 %."
 WALL_MM = 20.0
-"From where the handle is when a wall is offered."
 PERIOD_S = 0.01
 
 
 def offer(folder: str, stiffness_N_mm: float, ended: threading.Event) -> bool:
-    """Publishes one wall from a client of its own until `ended`. Returns whether the brake was enabled, and followed this
-    wall, at some time. Raises ClientError or ValueError where it could not be published."""
+    """Publish one wall until `ended`; return whether the enabled brake ever followed it. Raises ClientError or
+    ValueError.
+    """
     is_felt, start_mm = False, None
     with Client.local(folder, wait_s=2.0, source="trials") as client:
         while not ended.wait(PERIOD_S):
@@ -45,7 +45,7 @@ def offer(folder: str, stiffness_N_mm: float, ended: threading.Event) -> bool:
 
 
 def pairs(count: int, seed: int) -> list[tuple[float, bool]]:
-    """So many ratios, each as often as the others, and whether the stiffer wall comes first: in a drawn order."""
+    """Return the ratios in a drawn order, equally often, and whether the stiffer wall comes first."""
     drawn = random.Random(seed)
     all_pairs = list(itertools.islice(itertools.cycle(itertools.product(RATIOS, (True, False))), count))
     drawn.shuffle(all_pairs)
@@ -53,14 +53,13 @@ def pairs(count: int, seed: int) -> list[tuple[float, bool]]:
 
 
 def interval(right: int, count: int) -> tuple[float, float]:
-    """The 95 % interval of a share, Wilson's."""
     z, share = 1.96, right / count
     middle, half = share + z * z / (2 * count), z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
     return (middle - half) / (1 + z * z / count), (middle + half) / (1 + z * z / count)
 
 
 def offered(folder: str, stiffness_N_mm: float, number: int, say: Callable[[str], str]) -> bool:
-    """One wall, until the operator is done with it; whether there was one to feel. Raises as `offer`."""
+    """Offer one wall until the operator is done; return whether there was one to feel. Raises as `offer`."""
     ended = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         wall = pool.submit(offer, folder, stiffness_N_mm, ended)
@@ -74,7 +73,7 @@ def offered(folder: str, stiffness_N_mm: float, number: int, say: Callable[[str]
 def run(
     folder: str, write: Callable[[list[object]], object], trials: list[tuple[float, bool]], say: Callable[[str], str]
 ) -> dict[float, list[bool]]:
-    """All pairs; for each ratio, whether the stiffer wall was told. A pair of which a wall was missing is void."""
+    """Run all pairs; return for each ratio whether the stiffer wall was told. A pair without both walls is void."""
     told: dict[float, list[bool]] = {ratio: [] for ratio in RATIOS}
     for number, (ratio, is_first) in enumerate(trials, start=1):
         print(f"pair {number} of {len(trials)}")
@@ -91,7 +90,6 @@ def run(
 
 
 def main() -> None:
-    """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder")
     parser.add_argument("out")

@@ -2,7 +2,7 @@
 
     python crtk_bridge.py --ros-args -r __ns:=/brake -p folder:=/run/tormag
 
-It takes rclpy, crtk_msgs, geometry_msgs and sensor_msgs of a ROS 2 installation, and tormagd in the same Python.
+It needs rclpy, crtk_msgs, geometry_msgs and sensor_msgs of a ROS 2 installation, and tormagd in the same Python.
 """
 
 import rclpy
@@ -23,9 +23,7 @@ from translation import (
 from tormagd_client import Client, ClientError
 
 LOOK_S = 0.02
-"As often as the daemon tells what it does."
 HANDLE_S = 0.004
-"As often as the handle's motion is looked for."
 
 
 class CrtkBridge(Node):
@@ -70,7 +68,6 @@ class CrtkBridge(Node):
 
 
 def main() -> None:
-    """Until Ctrl-C."""
     rclpy.init()
     try:
         rclpy.spin(CrtkBridge())

@@ -1,7 +1,7 @@
-"""Build the C sources on this machine, for the simulated device and for tests.
+"""Builds the C sources on this machine, for the simulated device and for tests.
 
 `python -m firmware_protocol.c.build` builds the shared library, if that has not been done yet, and prints its path. The
-library is kept in the user's cache, under a name that follows from the sources, the compiler and its flags.
+library is kept in the user's cache, under a name made from the sources, the compiler and its flags.
 """
 
 import ctypes
@@ -19,7 +19,7 @@ from typing import Final
 ROOM: Final = Path(__file__).parent
 FIRMWARE: Final = ("codec", "crc", "device", "framing", "messages", "motion", "reports", "tormag")
 STRICT: Final = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
-# A fused multiplication rounds once where Python rounds twice; without it the doubles are the same to the last bit.
+# a fused multiplication rounds once where Python rounds twice; without it the doubles are equal to the last bit
 SAME_DOUBLES: Final = ("-ffp-contract=off",)
 SANITIZED: Final = ("-O1", "-g", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
 TIME_LIMIT_S: Final = 120
@@ -30,15 +30,14 @@ DEBIAN: Final = {
     "arm-none-eabi-size": _EMULATION,
     "clang": "clang and libclang-rt-14-dev",
 }
-"Debian's packages that bring a program."
 
 
 class BuildError(RuntimeError):
-    """The C sources could not be built here. The text says why and what helps."""
+    """The C sources could not be built here; the text says why and what helps."""
 
 
 class Target(Enum):
-    """A program or library to build: its sources beside the firmware's, its flags, and a compiler that it needs."""
+    """A program or library to build: its sources besides the firmware's, its flags, and a compiler that it needs."""
 
     LIBRARY = ("host/bridge",), ("-O2", "-fPIC", "-shared")
     SANITIZED_EXCHANGE = ("host/bridge", "host/exchange"), (*SANITIZED, "-fsanitize=address,undefined")
@@ -63,7 +62,6 @@ class Target(Enum):
 
 
 def compiler() -> str:
-    """Return the path of the C compiler: `CC` from the environment, else `cc`."""
     wanted = os.environ.get("CC", "cc")
     found = shutil.which(wanted)
     if found is None:
@@ -72,7 +70,6 @@ def compiler() -> str:
 
 
 def debian_tool(name: str) -> str:
-    """Return the path of a program of DEBIAN."""
     found = shutil.which(name)
     if found is None:
         raise BuildError(f"{name} is not on the path; install the Debian packages {DEBIAN[name]}")
@@ -80,7 +77,7 @@ def debian_tool(name: str) -> str:
 
 
 def build(target: Target) -> Path:
-    """Build a target, unless the cache has it from the present sources, and return the path of its file."""
+    """Build a target, unless the cache has it from the present sources, and return its path."""
     command = [debian_tool(target.needs) if target.needs else compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     path = user_cache / "tormagd" / f"{target.name.lower()}-{_fingerprint(command)}"
@@ -88,7 +85,7 @@ def build(target: Target) -> Path:
         return path
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Built beside its place and moved there whole, because another process may be building it too.
+        # built beside its place and moved there whole, because another process may be building it too
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             built = Path(folder) / path.name
             _compile([*command, *map(str, target.sources), "-lm", "-o", str(built)])
@@ -100,7 +97,6 @@ def build(target: Target) -> Path:
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """Load the shared library, built first where need be; later calls return the same."""
     path = build(Target.LIBRARY)
     try:
         return ctypes.CDLL(str(path))
@@ -109,8 +105,7 @@ def load_library() -> ctypes.CDLL:
 
 
 def _fingerprint(command: list[str]) -> str:
-    """Return 16 hexadecimal digits that change with the compiler's command and with any C source, header or linker
-    script."""
+    """Return 16 hexadecimal digits that change with the command and with any C source, header or linker script."""
     digest = hashlib.sha256("\0".join(command).encode())
     for path in sorted([*ROOM.rglob("*.[ch]"), *ROOM.rglob("*.ld")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -118,7 +113,6 @@ def _fingerprint(command: list[str]) -> str:
 
 
 def _compile(command: list[str]) -> None:
-    """Run the compiler."""
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False)
     except subprocess.TimeoutExpired as error:
@@ -128,7 +122,6 @@ def _compile(command: list[str]) -> None:
 
 
 def main() -> int:
-    """Build the library and print its path."""
     try:
         print(build(Target.LIBRARY))
     except BuildError as error:

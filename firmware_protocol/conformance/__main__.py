@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def report(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the results as the JSON document that `--json` prints; what was not tested is a list of its own."""
+    """Return the results as the JSON document of `--json`; what was not tested is a list of its own."""
     return {
         "checks": [{**_row(result), "passed": result.passed} for result in results if result.passed is not None],
         "untested": [_row(result) for result in results if result.passed is None],
@@ -76,7 +76,7 @@ def _row(result: Result) -> dict[str, Any]:
 
 
 def told(result: Result) -> str:
-    """Return a result for a person: one line where the check passed, else what was sent, seen and expected."""
+    """Return a result as text: one line if the check passed, else what was sent, seen and expected."""
     one = result.check
     if result.passed:
         return f"ok    {one.name}: {result.seen}"
@@ -89,7 +89,6 @@ def told(result: Result) -> str:
 
 
 def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
-    """Perform the chosen checks, print each result, and return all; none where they were ended or the line is gone."""
     checks = _chosen(checks_on(line), options.only)
     out = sys.stderr if options.json else sys.stdout
     host = Host(
@@ -108,7 +107,7 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
     with contextlib.ExitStack() as kept:
         for number in (signal.SIGINT, signal.SIGTERM):
             kept.callback(signal.signal, number, signal.getsignal(number))
-        # a request to end ends the checks, not the promise to leave the gap open
+        # a request to end ends the checks, but the gap is still opened
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             try:
@@ -131,7 +130,7 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
 
 
 def _resetter(options: argparse.Namespace) -> Callable[[str], None] | None:
-    """Return what resets the device: the command of `--reset`, or a person at the terminal; None without either."""
+    """Return what resets the device: the command of `--reset`, or a person at the terminal."""
     if options.reset:
         return lambda how: _call([*shlex.split(options.reset), how])
     if options.yes or not sys.stdin.isatty():
@@ -140,7 +139,6 @@ def _resetter(options: argparse.Namespace) -> Callable[[str], None] | None:
 
 
 def _call(command: Sequence[str]) -> None:
-    """Run a command."""
     try:
         done = subprocess.run(command, check=False, timeout=RESET_S, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired as error:
@@ -150,7 +148,6 @@ def _call(command: Sequence[str]) -> None:
 
 
 def _ask_for_reset(how: str) -> None:
-    """Ask a person for a reset, and wait until it is done."""
     ways = {"warm": "by its reset pin", "cold": "by its supply, off and on"}
     print(f"Reset the device {ways[how]}, then press Enter: ", end="", file=sys.stderr, flush=True)
     sys.stdin.readline()
@@ -162,7 +159,7 @@ def _say(text: str, out: TextIO) -> None:
 
 
 def _name(host: Host) -> str:
-    """Return the device's serial number and firmware in words; "nobody" before an Identity."""
+    """Return the device's serial number and firmware in words."""
     heard = host.newest.get(Identity)
     if heard is None or not isinstance(heard.message, Identity):
         return "nobody"
@@ -171,7 +168,7 @@ def _name(host: Host) -> str:
 
 
 def _chosen(checks: Sequence[Check], only: Sequence[str]) -> Sequence[Check]:
-    """Return the checks that `only` names, all where it is empty, and always the one that leaves the gap open."""
+    """Return the checks that `only` names (empty: all), and always the one that leaves the gap open."""
     names = {one.name for one in checks}
     if unknown := [name for name in only if name not in names]:
         raise ValueError(f"--only {unknown[0]}: checks on this line are {', '.join(sorted(names))}")
@@ -179,7 +176,6 @@ def _chosen(checks: Sequence[Check], only: Sequence[str]) -> Sequence[Check]:
 
 
 def _is_agreed(line: str) -> bool:
-    """Print the warning and tell whether the user types yes; False without a terminal to ask on."""
     print(WARNING.format(line=line), file=sys.stderr, flush=True)
     if not sys.stdin.isatty():
         return False
@@ -188,7 +184,6 @@ def _is_agreed(line: str) -> bool:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the kit's argument parser; docs/reference/commands.md is written from it, too."""
     made = argparse.ArgumentParser(
         prog="python -m firmware_protocol.conformance",
         description="Plays the host against a device and says what of firmware_protocol/README.md it does not keep. "
@@ -224,7 +219,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _positive(text: str) -> float:
-    """Return a word of the command line as a number over 0."""
     try:
         value = float(text)
     except ValueError:

@@ -26,7 +26,7 @@ TO_TURN_S: Final = 0.5
 
 
 def _is_new(host: Host, how: str) -> str:
-    """Reset a device in RUN, FAR_INSIDE_MM in, and hold it against a new one."""
+    """Reset a device in RUN, FAR_INSIDE_MM in, and compare it with a new one."""
     if host.reset is None:
         raise Untested(f"nobody can reset the device: --reset COMMAND, which is called with {how}")
     host.running(FAR_INSIDE_MM)
@@ -59,13 +59,12 @@ LIKE_NEW: Final = (
 
 @check(Hazard.CLOSES, PAGE, f"in RUN, {FAR_INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
 def warm_reset(host: Host) -> str:
-    """Check that a reset by watchdog or pin leaves nothing of before: a zero that was kept may be off."""
+    """A zero that was kept over a reset by watchdog or pin may be off."""
     return _is_new(host, "warm")
 
 
 @check(Hazard.CLOSES, PAGE, f"in RUN, {FAR_INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
 def cold_reset(host: Host) -> str:
-    """Check that a device without a memory of before waits for Home and Hello."""
     return _is_new(host, "cold")
 
 
@@ -86,5 +85,4 @@ BY_HAND: Final = (
     _by_hand("temperature", Hazard.WORN, "the sensor warmed to over 60 degC", "TEMPERATURE; as SUPPLY"),
     _by_hand("watchdog", Hazard.CLOSES, "a firmware that hangs in RUN", "a reset within 50 ms, drives off"),
 )
-"""What only a bench can show."""
 CHECKS: Final = (warm_reset, cold_reset, *BY_HAND)

@@ -1,4 +1,4 @@
-"""A check, which says what is sent, what the protocol page expects, and which hazard it bears on; and their running."""
+"""A check: what is sent, what the protocol page expects, and which hazard it bears on; and the running of checks."""
 
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
@@ -7,13 +7,11 @@ from typing import Final, NamedTuple
 from firmware_protocol.conformance.host import STALLED_S, Host, Unmet, Untested
 
 ATTEMPTS: Final = 3
-"A check that fails while this process is late is tried this often."
+"Tries of a check that fails while this process is late."
 Perform = Callable[[Host], str]
 
 
 class Hazard(Enum):
-    """What may happen where a rule is broken."""
-
     SHUT = "the gap stays shut: the brake holds the hand"
     CLOSES = "the gap closes unasked: the force rises"
     OPENS = "the gap opens unasked: the force is lost"
@@ -33,11 +31,11 @@ class Check(NamedTuple):
     perform: Perform
     moves: bool
     is_gate: bool
-    "If this check fails, checks that move the device are not tried any more."
+    "If this check fails, checks that move the device are no longer tried."
 
 
 class Result(NamedTuple):
-    """The result of one check: whether it passed, None where it was not tested, and what was seen."""
+    """The result of one check: whether it passed (None: not tested), and what was seen."""
 
     check: Check
     passed: bool | None
@@ -47,12 +45,11 @@ class Result(NamedTuple):
 def check(
     hazard: Hazard, page: str, sent: str, expected: str, *, moves: bool = False, is_gate: bool = False
 ) -> Callable[[Perform], Check]:
-    """Return a decorator that makes a Check of a function, with the function's name."""
     return lambda perform: Check(perform.__name__, hazard, page, sent, expected, perform, moves, is_gate)
 
 
 def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = lambda result: None) -> Sequence[Result]:
-    """Perform checks one after the other, hand each result to `tell`, and return all results."""
+    """Perform checks in order, hand each result to `tell`, and return all."""
     results: list[Result] = []
     closed_by = ""
     for one in checks:
@@ -68,7 +65,7 @@ def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = la
 
 
 def _performed(host: Host, one: Check) -> Result:
-    """Perform one check; repeat a failure, ATTEMPTS times in all, while this process was late during it."""
+    """Perform one check; repeat a failure while this process was late during it."""
     for attempt in range(1, ATTEMPTS + 1):
         host.begin()
         try:

@@ -47,7 +47,7 @@ def _command(kind: type[Message], nonce: int) -> bytes:
 
 
 def _ignores(host: Host, put: Iterable[Send]) -> str:
-    """Send bad Drives, each by a function of `put` that takes the counter, and a good Drive after each."""
+    """Send bad Drives, and a good one after each."""
     tried = 0
     for send in put:
         host.pass_time(3 * PERIOD_S, Beat.OFF)
@@ -71,7 +71,7 @@ def _ignores(host: Host, put: Iterable[Send]) -> str:
 
 
 def _refuses(host: Host, put: Iterable[tuple[str, Send]]) -> str:
-    """Send bad commands to an idle device, each by a function that takes the nonce, and a good Clear after each."""
+    """Send bad commands to an idle device, and a good Clear after each."""
     tried = 0
     host.idle()
     for what, send in put:
@@ -90,7 +90,6 @@ def _refuses(host: Host, put: Iterable[tuple[str, Send]]) -> str:
 
 @check(Hazard.CLOSES, "Carriers", "a Drive with a wrong CRC-8 in a whole frame", SILENT)
 def drive_crc_8(host: Host) -> str:
-    """Check that a Drive with a wrong bit, in the CRC-8 or in a duty, is ignored."""
     return _ignores(
         host,
         [
@@ -107,7 +106,6 @@ def drive_crc_8(host: Host) -> str:
     SILENT,
 )
 def drive_range(host: Host) -> str:
-    """Check that a Drive with a duty out of range is ignored."""
     return _ignores(
         host,
         [
@@ -121,7 +119,6 @@ def drive_range(host: Host) -> str:
 
 @check(Hazard.SHUT, "Who says what when, 2", "a Drive of mode 2 or 255, its CRC-8 right", SILENT)
 def drive_mode(host: Host) -> str:
-    """Check that a Drive with an undefined mode is ignored."""
     return _ignores(
         host,
         [
@@ -133,7 +130,7 @@ def drive_mode(host: Host) -> str:
 
 @check(Hazard.CLOSES, "Carriers", "a Drive of 6 and of 8 bytes, and of none", SILENT)
 def drive_length(host: Host) -> str:
-    """Check that a Drive of a wrong length is ignored, though its frame is whole."""
+    """The carrier's frame is whole; only the message is too short or too long."""
     return _ignores(
         host,
         [
@@ -146,7 +143,6 @@ def drive_length(host: Host) -> str:
 
 @check(Hazard.MISLED, "Carriers", "functions 10 and 127, and a device's own State and Identity", SILENT)
 def other_functions(host: Host) -> str:
-    """Check that messages of unknown functions and a device's own are ignored."""
 
     def send(function: int) -> Send:
         return lambda counter: host.line.send(function, _drive(counter) + b"\x00")
@@ -156,7 +152,7 @@ def other_functions(host: Host) -> str:
 
 @check(Hazard.OPENS, "Carriers", "each command with a byte more, a byte less, and without any", UNDONE)
 def command_length(host: Host) -> str:
-    """Check that commands of a wrong length are ignored: without a CRC-8, the length is all there is to check."""
+    """A command has no CRC-8: the length is all there is to check."""
 
     def send(kind: type[Message], cut: Callable[[bytes], bytes]) -> tuple[str, Send]:
         return kind.__name__, lambda nonce: host.line.send(FUNCTION[kind], cut(_command(kind, nonce)))
@@ -176,7 +172,7 @@ SENT: Final = {
 
 
 def _of_carrier(name: str) -> Check:
-    """Return the check that messages with one kind of damage of the carrier are ignored; `name` is a key of SENT."""
+    """Return the check that messages with the carrier's damage `name`, a key of SENT, are ignored."""
 
     def perform(host: Host) -> str:
         def forms(kind: type[Message], body: Callable[[int], bytes]) -> list[Send]:
@@ -206,4 +202,3 @@ CHECKS: Final = (
     command_length,
 )
 ON_A_CARRIER: Final = tuple(_of_carrier(name) for name in SENT)
-"""The checks of damages by the carrier. A line has those that its `damages` names."""

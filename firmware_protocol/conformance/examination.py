@@ -20,7 +20,7 @@ from firmware_protocol.conformance.line import Line
 
 
 def checks_on(line: Line) -> Sequence[Check]:
-    """Return the checks that can be made on a line: all, but for damages that its carrier cannot do."""
+    """Return all checks but those of damages that the line's carrier cannot do."""
     damages = line.damages(FUNCTION[Drive], b"")
     return [one for one in CHECKS if one not in damage.ON_A_CARRIER or one.name in damages]
 
@@ -39,4 +39,3 @@ CHECKS = (
     *bench.CHECKS,
     overall.left_open,
 )
-"""The checks of every line."""

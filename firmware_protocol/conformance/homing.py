@@ -25,11 +25,11 @@ TAKES: Final = "What each mode takes"
 ZERO_MM = 1.0
 """A carriage rests this near its zero: behind its switch, where it was braked from a creep."""
 JUMP_MM = 0.2
-"""Carriages are braked when HOMED shows: a State further than this from later ones is of the old origin."""
+"""Carriages are braked when HOMED shows: a State further off than this has the old origin."""
 
 
 def _homings(host: Host) -> list[Homing]:
-    """Return the homings so far; without any, home a device without a zero."""
+    """Return the homings so far; without any, home the device."""
     if not host.homings:
         host.without_zero()
         host.home()
@@ -45,7 +45,6 @@ def _homings(host: Host) -> list[Homing]:
     is_gate=True,
 )
 def home_homes(host: Host) -> str:
-    """Check that the device finds its open end by itself."""
     homing = _homings(host)[0]
     modes = " ".join(mode.name for mode in homing.modes)
     status = homing.status
@@ -63,7 +62,6 @@ def home_homes(host: Host) -> str:
     moves=True,
 )
 def home_zeroes(host: Host) -> str:
-    """Check that positions are near 0 after each homing: the origin is the open switch, found at a creep."""
     seen = ""
     for homing in _homings(host):
         state = homing.last
@@ -81,7 +79,7 @@ def home_zeroes(host: Host) -> str:
     moves=True,
 )
 def homed_is_in_new_origin(host: Host) -> str:
-    """Check that the first State after HOMED has the new origin: from it on the host takes the device for homed."""
+    """The host takes the device for homed from this State on."""
     seen = ""
     for homing in _homings(host):
         first, last = homing.first, homing.last
@@ -97,7 +95,6 @@ def homed_is_in_new_origin(host: Host) -> str:
     Hazard.OPENS, "Who says what when, 5", "Home, and when it is done the same Home again", "not done again", moves=True
 )
 def repeated_command(host: Host) -> str:
-    """Check that the device acts on a nonce once: a repeated Home is not done again."""
     host.homed()
     host.obeyed(Home)
     nonce = host.status.command_nonce
@@ -118,7 +115,6 @@ def repeated_command(host: Host) -> str:
     moves=True,
 )
 def retract_when_idle(host: Host) -> str:
-    """Check that an idle device takes a Retract."""
     host.homed()
     was_acknowledged = host.command(Retract)
     host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
@@ -134,7 +130,6 @@ def retract_when_idle(host: Host) -> str:
     moves=True,
 )
 def homing_takes_only_retract(host: Host) -> str:
-    """Check that of all commands only a Retract ends a homing."""
     host.homed()
     host.obeyed(Home)
     for kind in (Clear, Home):

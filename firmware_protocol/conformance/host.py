@@ -38,12 +38,12 @@ from firmware_protocol.conformance.line import Line
 
 PERIOD_S: Final = 1e-3
 REPEAT_S: Final = 0.05
-"A command or Hello without its acknowledgement is sent again after this time."
+"A command or Hello that is not acknowledged is sent again after this time."
 ANSWER_S: Final = 0.02
-"Within this time an answer that is sent at once has arrived, on any carrier that the position loop bears."
+"An immediate answer has arrived by then, on any carrier that the position loop can use."
 STATUS_S: Final = 0.02
 SEEN_S: Final = 0.065
-"Three Status come in this time: the present state shows in one of them, even where one is lost."
+"Three Status come in this time: one of them shows the present state, even where one is lost."
 ACKNOWLEDGED_S: Final = 0.5
 OPENED_S: Final = 10.0
 HOMED_S: Final = 12.0
@@ -51,43 +51,40 @@ HOMED_S: Final = 12.0
 HELLO_NONCE: Final = 255
 MAX_NONCE: Final = 254
 INSIDE_MM: Final = 2.0
-"How far a carriage is brought from its open switch where a check needs room."
 DUTY_PER_MM: Final = 3.0
 TRAVEL_MM_S: Final = 8.0
 ARRIVED_MM: Final = 0.3
 MOVED_S: Final = 2.0
-"How much longer than at TRAVEL_MM_S a way may take."
+"Time that a motion may take in addition to that at TRAVEL_MM_S."
 OPENING_MM_S: Final = 15.0
 STROKE_MM: Final = 25.25
-"From the open to the closed switch of a carriage."
 SWITCH_MM: Final = 0.5
-"A switch may close this far from where it should, while a carriage passes it at any speed."
+"A switch may close this far from its place, while a carriage passes it at any speed."
 FRESH_S: Final = 5e-3
 TIME_SPAN_S: Final = period(State, "device_time_s")
 OPEN: Final = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
 NO_FAULT: Final = DeviceFault(0)
 STALLED_S: Final = 0.005
-"Lateness of this process from which on it, and not the device, may be to blame for a failed check."
+"From this lateness on this process may be to blame for a failed check."
 
 M = TypeVar("M", bound=Message)
 Command = type[Retract] | type[Clear] | type[Home]
 
 
 class Unmet(Exception):  # noqa: N818  (what a device leaves unmet; nothing has gone wrong here)
-    """The device does not do what the protocol page says. The text is what was seen."""
+    """The device does not do what the protocol page says; the text is what was seen."""
 
 
 class Untested(Exception):  # noqa: N818  (nothing has gone wrong here either)
-    """A rule cannot be tested here. The text says why, and what would help."""
+    """A rule cannot be tested here; the text says why, and what would help."""
 
 
 def told(was_acknowledged: bool) -> str:
-    """Return whether a command was acknowledged, in words."""
     return "acknowledged" if was_acknowledged else "not acknowledged"
 
 
 def unless(is_wrong: object, seen: str) -> str:
-    """Return `seen`; raise Unmet with it if `is_wrong` is true or not empty."""
+    """Return `seen`, or raise Unmet with it if `is_wrong`."""
     if is_wrong:
         raise Unmet(seen)
     return seen
@@ -102,30 +99,21 @@ class Beat(Enum):
 
 
 class Heard(NamedTuple):
-    """A message of the device, and the time at which it came, s."""
-
     time_s: float
     message: Message
 
 
 class Homing(NamedTuple):
-    """How one homing went."""
-
     was_acknowledged: bool
     seconds: float
     status: Status
-    """The last Status."""
     modes: tuple[DeviceMode, ...]
-    """The modes in the order in which Status showed them, repetitions left out."""
+    """In the order in which Status showed them, without repetitions."""
     first: State | None
-    """The first State after the first Status with HOMED; None where none came."""
     last: State | None
-    """The last State, when the carriages are at rest; None where none came."""
 
 
 class Host:
-    """One conversation with a device."""
-
     def __init__(
         self,
         line: Line,
@@ -135,7 +123,6 @@ class Host:
         uptime_s: float | None = None,
         reset: Callable[[str], None] | None = None,
     ) -> None:
-        """Begin a conversation with a device that opens at `opening_mm_s` and has ways of `stroke_mm`."""
         self.line = line
         self.opening_mm_s = opening_mm_s
         self.stroke_mm = stroke_mm
@@ -145,18 +132,16 @@ class Host:
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
         self.refused = Counter[str]()
-        """Whole frames that held no message of a device: what was wrong with them, and how often."""
+        """What was wrong with whole frames that held no message of a device, and how often."""
         self.resets = 0
-        """How often a Status with nonce 0 followed one with another nonce."""
+        """How often nonce 0 followed another nonce in Status."""
         self.contradictions = Counter[str]()
-        """Contradictions within a Status, and how often each came."""
         self.misplaced = Counter[str]()
         """End switches that did not fit the positions, and how often."""
         self.homings: list[Homing] = []
         self.stalled_s = 0.0
         """The greatest lateness of this process since `begin`."""
         self.drive_s = line.port.now_s()
-        """When the last good Drive was sent."""
         self.counter = 0
         self._nonce = 0
         self._next_s = line.port.now_s()
@@ -172,11 +157,9 @@ class Host:
     # -- what is sent ------------------------------------------------------------------------------------------------
 
     def send(self, message: Message) -> None:
-        """Send one message in a whole frame."""
         self.line.send(FUNCTION[type(message)], encode(message))
 
     def drive(self, mode: DriveMode, left: float = 0.0, right: float = 0.0) -> None:
-        """Send the next Drive, its counter one higher."""
         self.counter = (self.counter + 1) % 256
         self.drive_s = self.now_s
         self.send(Drive(left, right, mode, self.counter))
@@ -188,19 +171,18 @@ class Host:
         nonce: int = HELLO_NONCE,
         beat: Beat = Beat.NOTHING,
     ) -> None:
-        """Send one Hello, and wait for the time of its answer with `beat` going on."""
+        """Send one Hello, and wait for its answer."""
         self.send(Hello(schema_hash, version, nonce))
         self.pass_time(ANSWER_S, beat)
 
     def new_nonce(self) -> int:
-        """Return a nonce that the device has not accepted last: 1 to 254, counting on."""
         self._nonce = self._nonce % MAX_NONCE + 1
         if self._nonce == self._shown_nonce():
             self._nonce = self._nonce % MAX_NONCE + 1
         return self._nonce
 
     def command(self, kind: Command, beat: Beat = Beat.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
-        """Send a command again and again until a Status acknowledges it; return whether one did within `limit_s`."""
+        """Repeat a command until a Status acknowledges it; return whether one did within `limit_s`."""
         nonce = self.new_nonce()
         start_s = due_s = self._next_s
         while self.status.command_nonce != nonce:
@@ -213,7 +195,6 @@ class Host:
         return True
 
     def obeyed(self, kind: Command, beat: Beat = Beat.OFF) -> None:
-        """Send a command as `command` does."""
         if not self.command(kind, beat):
             raise Unmet(f"{kind.__name__} not acknowledged: {shown(self.status)}")
 
@@ -222,13 +203,12 @@ class Host:
         return not self.command(kind, beat, SEEN_S)
 
     def refuses(self, kind: Command, mode: DeviceMode, beat: Beat = Beat.OFF, *, homed: bool | None = None) -> str:
-        """Send a command that the device must refuse, and return what the next Status shows, as `shows`."""
+        """Send a command that the device must refuse, and return what the next Status shows."""
         is_refused = self.is_refused(kind, beat)
         besides = f"{kind.__name__} {told(not is_refused)}"
         return self.shows(mode, beat, homed=homed, besides=besides, wrong=not is_refused)
 
     def beat(self, beat: Beat, left: float = 0.0, right: float = 0.0, period_s: float = PERIOD_S) -> None:
-        """Send a Drive, unless `beat` is NOTHING, and listen for a millisecond or `period_s`."""
         if beat is not Beat.NOTHING:
             self.drive(DriveMode.RUN if beat is Beat.RUN else DriveMode.OFF, left, right)
         self._listen(period_s)
@@ -236,12 +216,12 @@ class Host:
     def pass_time(
         self, seconds: float, beat: Beat = Beat.NOTHING, period_s: float = PERIOD_S, duty: float = 0.0
     ) -> None:
-        """Repeat `beat` every millisecond or `period_s` for a time, with `duty` for both motors."""
+        """Repeat `beat` for a time, with `duty` for both motors."""
         for _ in range(round(seconds / period_s)):
             self.beat(beat, duty, duty, period_s)
 
     def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = Beat.OFF) -> bool:
-        """Repeat `beat` every millisecond until `reached()` or for `limit_s`; return whether it was reached."""
+        """Repeat `beat` until `reached()` or for `limit_s`; return whether it was reached."""
         end_s = self._next_s + limit_s
         while not reached():
             if self._next_s >= end_s:
@@ -252,21 +232,19 @@ class Host:
     # -- what came ---------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Begin a check: forget the messages heard and the lateness, and restart the rhythm from now."""
+        """Forget the messages heard and the lateness, and restart the rhythm from now."""
         self.forget()
         self.stalled_s = 0.0
         self._next_s = self.now_s
 
     def forget(self) -> None:
-        """Forget the messages heard; `newest` is kept."""
+        """Forget the messages heard, except `newest`."""
         self.heard.clear()
 
     def all_of(self, kind: type[M]) -> list[tuple[float, M]]:
-        """Return the messages of a type since `forget`, with their times."""
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
 
     def last(self, kind: type[M]) -> M:
-        """Return the newest message of a type."""
         message = self.newest[kind].message if kind in self.newest else None
         if not isinstance(message, kind):
             raise Unmet(f"no {kind.__name__} ever came")
@@ -274,13 +252,12 @@ class Host:
 
     @property
     def status(self) -> Status:
-        """The newest Status; waits for the first one."""
         if Status not in self.newest:
             self.until(lambda: Status in self.newest, 10 * STATUS_S, Beat.NOTHING)
         return self.last(Status)
 
     def next_status(self, beat: Beat) -> Status:
-        """Wait for a Status that comes from now on, and return it."""
+        """Wait for a Status that comes from now on."""
         before = self.newest.get(Status)
         if not self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat):
             raise Unmet(f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
@@ -297,7 +274,7 @@ class Host:
         besides: str = "",
         wrong: object = False,
     ) -> str:
-        """Return what the next Status shows, in words, behind what was seen `besides`."""
+        """Return in words what the next Status shows, after `besides`."""
         status = self.next_status(beat)
         is_right = (
             status.mode is mode
@@ -339,7 +316,7 @@ class Host:
         self.newest[type(message)] = heard
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
-        """Return the end switches in a Status that do not fit a State just before it."""
+        """Return the end switches in a Status that do not fit the State just before it."""
         state = self.newest.get(State)
         is_usable = Status in self.newest and is_homed(self.last(Status)) and is_homed(status)
         if state is None or not is_usable or time_s - state.time_s > FRESH_S:
@@ -355,7 +332,6 @@ class Host:
     # -- where a check begins ----------------------------------------------------------------------------------------
 
     def idle(self) -> None:
-        """Bring the device to IDLE without a fault, by a Hello, Drive OFF and, in LATCHED, a Clear."""
         self.hello()
         self.pass_time(SEEN_S, Beat.OFF)
         if not self.until(self.is_resting, HOMED_S):
@@ -367,12 +343,11 @@ class Host:
             raise Unmet(f"not IDLE without a fault after Hello, Drive OFF and Clear: {shown(status)}")
 
     def without_zero(self) -> None:
-        """Take the device's zero away by a mismatched Hello, and bring it to IDLE; nothing moves."""
+        """Take the device's zero away by a mismatched Hello, and bring it to IDLE."""
         self.hello(SCHEMA_HASH ^ 1)
         self.idle()
 
     def homed(self) -> None:
-        """Bring the device to IDLE, homed, at both open switches."""
         self.idle()
         if not is_homed(self.status):
             self.home()
@@ -382,7 +357,7 @@ class Host:
             raise Unmet(f"Retract does not open: {shown(self.status)}")
 
     def home(self, beat: Beat = Beat.OFF) -> Homing:
-        """Home an idle device; return how it went, well or not, and add this to `homings`."""
+        """Home an idle device and record how it went."""
         start_s = self._next_s
         first_heard = len(self.heard)
         was_acknowledged = self.command(Home, beat)
@@ -400,7 +375,6 @@ class Host:
         return homing
 
     def running(self, inside_mm: float = 0.0) -> None:
-        """Bring the device to RUN, duties 0, the carriages `inside_mm` from their open switches."""
         self.homed()
         self.pass_time(2 * PERIOD_S, Beat.OFF)
         if not self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, Beat.RUN):
@@ -412,7 +386,6 @@ class Host:
     def bring(
         self, left_mm: float, right_mm: float, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
     ) -> None:
-        """Bring the carriages in RUN to places from home, at this speed, unless `ends()` becomes true before."""
         goals = left_mm, right_mm
         targets = places(self.last(State))
         way_mm = max(abs(goal - at) for goal, at in zip(goals, targets, strict=True))
@@ -431,7 +404,7 @@ class Host:
                 raise Unmet(f"on the way to left {left_mm:+.1f} mm, right {right_mm:+.1f} mm: {seen}")
 
     def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] | None = None) -> float:
-        """Send no Drive in RUN for a time, then a Drive RUN; return how long the device's clock says that this was, s."""
+        """Send no Drive in RUN for a time, then one; return the silence by the device's clock, s."""
         self.next_status(Beat.RUN)
         self.pass_time(self.random.randrange(20) * PERIOD_S, Beat.RUN)
         self._answered(Beat.RUN)
@@ -443,7 +416,6 @@ class Host:
         return (self._answered(Beat.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
 
     def _answered(self, beat: Beat) -> State:
-        """Send a Drive and return the State that answers it."""
         before = self.newest.get(State)
         self.beat(beat)
         if not self.until(lambda: self.newest.get(State) is not before, ANSWER_S, Beat.NOTHING):
@@ -451,7 +423,7 @@ class Host:
         return self.last(State)
 
     def latched(self) -> None:
-        """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN; at once where it is."""
+        """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN."""
         status = self.next_status(Beat.NOTHING)
         if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults:
             self.running(INSIDE_MM)
@@ -461,7 +433,7 @@ class Host:
                 raise Unmet(f"silence in RUN does not lead to LATCHED: {shown(self.status)}")
 
     def leave_open(self) -> str:
-        """Open the gap, whatever the device was doing; return what hinders it, in words, or "" for an open gap."""
+        """Open the gap from any state; return what hinders it in words, or ""."""
         self.hello()
         for _ in range(2):
             if Status not in self.newest and not self.until(lambda: Status in self.newest, 0.2):
@@ -477,44 +449,38 @@ class Host:
         return "" if is_open(status) and self.is_resting() else shown(status)
 
     def is_resting(self) -> bool:
-        """Tell whether the newest Status shows the drives off."""
+        """Whether the newest Status shows the drives off."""
         return self.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED)
 
 
 def is_homed(status: Status) -> bool:
-    """Tell whether a Status says HOMED."""
     return Switches.HOMED in status.switches
 
 
 def is_open(status: Status) -> bool:
-    """Tell whether both carriages are at their open switches."""
     return OPEN in status.switches
 
 
 def shown(status: Status) -> str:
-    """Return a Status in a few words."""
     faults = "|".join(fault.name or "" for fault in DeviceFault if fault in status.faults) or "no fault"
     switches = "|".join(switch.name or "" for switch in Switches if switch in status.switches) or "no switch"
     return f"{status.mode.name}, {faults}, {switches}, nonce {status.command_nonce}"
 
 
 def places(state: State) -> tuple[float, float]:
-    """Return where the left and the right carriage are, mm from home."""
     return state.left_position_mm, state.right_position_mm
 
 
 def clamped(value: float, most: float) -> float:
-    """Return the value, in -most..most."""
     return min(max(value, -most), most)
 
 
 def positions(state: State) -> str:
-    """Return where the carriages are, in a few words."""
     return f"left {state.left_position_mm:+.2f} mm, right {state.right_position_mm:+.2f} mm"
 
 
 def contradictions(status: Status) -> list[str]:
-    """Return what in one Status cannot be true together, in words; empty where nothing is wrong."""
+    """Return in words what in one Status cannot be true together."""
     mode, switches = status.mode, status.switches
     found = {
         "LEFT_OPEN with LEFT_CLOSED": (Switches.LEFT_OPEN | Switches.LEFT_CLOSED) in switches,
@@ -527,5 +493,5 @@ def contradictions(status: Status) -> list[str]:
 
 
 def usual(values: list[float]) -> float:
-    """Return the median of some values; NaN of none."""
+    """Return the median; NaN of no values."""
     return sorted(values)[len(values) // 2] if values else math.nan

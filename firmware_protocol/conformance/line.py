@@ -1,4 +1,4 @@
-"""Lines: they carry frames between the kit and a device, have a clock, and can send damaged frames."""
+"""Lines carry frames between the kit and a device, have a clock, and can send damaged frames."""
 
 from collections.abc import Mapping
 from typing import Final, NamedTuple, Protocol, TypeAlias
@@ -8,12 +8,10 @@ from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, cobs
 
 NODES: Final = 16
 NOISE: Final = bytes((0x55, 0xAA, 0xFF, 0x01, 0x7E, 0x80, 0x0D, 0x0A, 0x11, 0x13)) * 3
-"No frame; among its bytes are those that a terminal acts on, XON and XOFF, CR and LF."
+"Not a frame; it includes bytes that a terminal acts on: XON and XOFF, CR and LF."
 
 
 class Arrival(NamedTuple):
-    """The payload of one whole frame, its function, and the time at which it came, s."""
-
     time_s: float
     function: int
     payload: bytes
@@ -23,7 +21,7 @@ class BytePort(Protocol):
     """A serial port and a clock, real or virtual."""
 
     def now_s(self) -> float:
-        """Return the time, from any start; it never falls."""
+        """Return a time that never falls."""
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises OSError when the port is gone."""
@@ -36,23 +34,25 @@ class BytePort(Protocol):
 
 
 class FramePort(Protocol):
-    """A CAN bus and a clock, real or virtual. Frames are classical, with 11-bit identifiers."""
+    """A CAN bus and a clock, real or virtual, for classical frames with 11-bit identifiers."""
 
     def now_s(self) -> float:
-        """Return the time, from any start; it never falls."""
+        """Return a time that never falls."""
 
     def write(self, identifier: int, data: bytes) -> None:
         """Send a frame. Raises OSError when the bus is gone."""
 
     def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
-        """Wait until `until_s`; return the time, identifier and data of each frame. Raises OSError for a lost bus."""
+        """Wait until `until_s`; return the time, identifier and data of each frame. Raises OSError when the bus is
+        gone.
+        """
 
     def close(self) -> None:
         """Close the bus."""
 
 
 class SerialLine:
-    """One conversation with one device, in frames of COBS and CRC-16 on a serial port."""
+    """One conversation with a device, in frames of COBS and CRC-16 on a serial port."""
 
     def __init__(self, port: BytePort) -> None:
         self.port = port
@@ -62,11 +62,10 @@ class SerialLine:
         port.write(DELIMITER)  # ends whatever was there before
 
     def send(self, function: int, payload: bytes) -> None:
-        """Send one frame, with the next sequence number."""
         self.port.write(self._frame(function, payload))
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """Return damaged forms of a frame, by the kind of damage, for `send_damaged`; a device has to ignore each."""
+        """Return damaged forms of a frame, by the kind of damage, which a device has to ignore."""
         frame = self._frame(function, payload)
         body = frame[:-1]
         middle = len(body) // 2
@@ -84,7 +83,6 @@ class SerialLine:
         }
 
     def send_damaged(self, unit: bytes) -> None:
-        """Send bytes as they are."""
         self.port.write(unit)
 
     def receive(self, until_s: float) -> list[Arrival]:
@@ -100,14 +98,13 @@ class SerialLine:
         return arrivals
 
     def _frame(self, function: int, payload: bytes) -> bytes:
-        """Return a whole frame, and count the sequence on."""
         frame = encode_frame(function, self._sequence, payload)
         self._sequence = (self._sequence + 1) % 256
         return frame
 
     @property
     def frame_errors(self) -> dict[str, int]:
-        """What was wrong with the device's frames, and how often; empty where nothing was."""
+        """What was wrong with the device's frames, and how often."""
         statistics = self._decoder.statistics
         now = statistics.corrupt, statistics.lost, statistics.repeated
         corrupt, lost, repeated = (count - before for count, before in zip(now, self._before or (1, 0, 0), strict=True))
@@ -120,10 +117,9 @@ class SerialLine:
 
 
 class CanLine:
-    """One conversation with one device, a node on a CAN bus: payloads are the data of CAN frames."""
+    """One conversation with a node on a CAN bus."""
 
     def __init__(self, port: FramePort, node: int) -> None:
-        """Begin a conversation with `node`."""
         can_identifier(1, node)
         self.port, self._node = port, node
         self._others: set[int] = set()
@@ -133,11 +129,10 @@ class CanLine:
         return {}
 
     def send(self, function: int, payload: bytes) -> None:
-        """Send one frame to the node."""
         self.port.write(can_identifier(function, self._node), payload)
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """Return whole frames to other nodes, for `send_damaged`; the device has to ignore them."""
+        """Return whole frames to other nodes, which the device has to ignore."""
         free = [node for node in range(NODES) if node != self._node and node not in self._others]
         frames = tuple(can_identifier(function, node).to_bytes(2, "big") + payload for node in free[:2])
         return {"other_node": frames} if frames else {}
@@ -147,7 +142,7 @@ class CanLine:
         self.port.write(int.from_bytes(unit[:2], "big"), unit[2:])
 
     def receive(self, until_s: float) -> list[Arrival]:
-        """Wait until `until_s`, and return the frames of the node; note which other nodes are on the bus."""
+        """Wait until `until_s`, and return the node's frames; note which other nodes are on the bus."""
         arrivals = []
         for time_s, identifier, data in self.port.read(until_s):
             if identifier & 0xF == self._node:

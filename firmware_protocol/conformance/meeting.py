@@ -10,12 +10,11 @@ PAGE = "Who says what when, 1"
 CLEARING = "What each mode takes"
 HELLOS = 3
 NONCES: Final = (1, 129, 1, 65, 1, 33, 1, 17, 1, 9, 1, 5, 1, 3, 2, 254, 253, 128, 127, 126, 6)
-"""Each bit changes alone, and they rise and fall by any way."""
+"""Each bit changes alone, up and down by any distance."""
 
 
 @check(Hazard.MISLED, PAGE, f"{HELLOS} Hellos", "one Identity each, at once", is_gate=True)
 def identity_answers_hello(host: Host) -> str:
-    """Check that the device answers each Hello with one Identity."""
     for _ in range(HELLOS):
         host.hello()
     count = len(host.all_of(Identity))
@@ -31,7 +30,7 @@ def identity_answers_hello(host: Host) -> str:
     is_gate=True,
 )
 def schema_hash(host: Host) -> str:
-    """Check that firmware and kit were built from the same tormag.dbc; tells apart a reversed byte order."""
+    """Tells a reversed byte order apart from another tormag.dbc."""
     host.hello()
     theirs = host.last(Identity).schema_hash
     seen = f"schema {theirs:08X}, bytes {theirs.to_bytes(4, 'little').hex(' ')}"
@@ -43,7 +42,6 @@ def schema_hash(host: Host) -> str:
 
 @check(Hazard.MISLED, "Who says what when, 5", "Hello with nonce 255, 77, 77, 255", "the next Status shows each")
 def hello_nonce(host: Host) -> str:
-    """Check that the nonce of a Hello counts as accepted: the next Status shows it."""
     seen = []
     for nonce in (255, 77, 77, 255):
         host.hello(nonce=nonce)
@@ -53,7 +51,6 @@ def hello_nonce(host: Host) -> str:
 
 
 def _mismatch(host: Host, schema: int, version: int) -> str:
-    """Send an idle device a Hello of this schema and version."""
     host.idle()
     host.forget()
     host.hello(schema, version)
@@ -71,7 +68,6 @@ def _mismatch(host: Host, schema: int, version: int) -> str:
     Hazard.CLOSES, PAGE, "Hello with another schema hash", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED"
 )
 def schema_mismatch(host: Host) -> str:
-    """Check that a device latches for a host of another schema."""
     return _mismatch(host, SCHEMA_HASH ^ 1, PROTOCOL_VERSION)
 
 
@@ -82,13 +78,12 @@ def schema_mismatch(host: Host) -> str:
     "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED",
 )
 def version_mismatch(host: Host) -> str:
-    """Check that a device latches for a host of another protocol version."""
     return _mismatch(host, SCHEMA_HASH, (PROTOCOL_VERSION + 1) % 256)
 
 
 @check(Hazard.CLOSES, CLEARING, "Hello with another schema hash, then Clear", "Clear not acknowledged, still LATCHED")
 def mismatch_holds(host: Host) -> str:
-    """Check that Clear does not take away a mismatch while its cause is there."""
+    """A mismatch holds as long as its cause."""
     schema_mismatch.perform(host)
     host.refuses(Clear, DeviceMode.LATCHED)
     return host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH)
@@ -101,7 +96,7 @@ def mismatch_holds(host: Host) -> str:
     "Clear acknowledged; IDLE, no fault, not HOMED",
 )
 def clear_clears(host: Host) -> str:
-    """Check that Clear takes away a fault whose cause is gone, and brings back no zero."""
+    """Clear ends a fault whose cause is gone, and brings back no zero."""
     schema_mismatch.perform(host)
     host.hello()
     host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH, besides="after the right Hello, before Clear")
@@ -111,7 +106,6 @@ def clear_clears(host: Host) -> str:
 
 @check(Hazard.CLOSES, "Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
 def run_needs_homing(host: Host) -> str:
-    """Check that a device without a zero does not run."""
     host.without_zero()
     unless(is_homed(host.status), f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     host.pass_time(SEEN_S, Beat.RUN)
@@ -125,7 +119,7 @@ def run_needs_homing(host: Host) -> str:
     "each acknowledged, the last one of the row",
 )
 def every_nonce(host: Host) -> str:
-    """Check that a command is new whenever its nonce differs, in any bit, up or down; a Retract would be lost."""
+    """A command is new whenever its nonce differs; otherwise a Retract could be lost."""
     host.idle()
     for nonce in NONCES:
         host.send(Clear(nonce))

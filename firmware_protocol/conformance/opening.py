@@ -1,4 +1,4 @@
-"""Checks of opening from the whole stroke: how fast, how far, and what it ends in, whatever it was for."""
+"""Checks of opening from the whole stroke: how fast, how far, and how it ends."""
 
 from collections import deque
 from collections.abc import Callable
@@ -21,20 +21,19 @@ from firmware_protocol.conformance.host import (
 
 PAGE: Final = "Opening"
 NEARLY_MM: Final = 1.25
-"Before the closed switch: here an opening from the whole stroke begins."
+"An opening from the whole stroke begins this far before the closed switch."
 MIN_SHARE: Final = 0.6
 MAX_SHARE: Final = 1.15
-"""Of the device's speed of opening: what a carriage has as a mean but for both ends, and at most."""
+"""Bounds of a carriage's speed as shares of the device's opening speed: its mean without the ends, and its most."""
 ENDS_MM: Final = 3.0
 CLOSING_DUTY: Final = -0.5
 WINDOW: Final = 50
-"""States over which a speed is taken."""
 FULLY: Final = f"all the way at {MIN_SHARE:g} to {MAX_SHARE:g} of the device's speed; "
 NEARLY: Final = f"in RUN, {NEARLY_MM:g} mm from the closed switches, "
 
 
 def opens_fully(host: Host, fault: DeviceFault, beat: Beat = Beat.OFF) -> str:
-    """Watch a device open that has begun, and judge each carriage's speed on the device's clock."""
+    """Watch a device open, and judge each carriage's speed on the device's clock."""
     host.forget()
     starts_mm = places(host.last(State))
     host.until(host.is_resting, OPENED_S, beat)
@@ -53,7 +52,7 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = Beat.OFF) -> str:
 
 
 def _speeds(rows: list[tuple[float, tuple[float, float]]], side: int, start_mm: float) -> tuple[float, float]:
-    """Return one carriage's mean speed but for ENDS_MM at both ends, and the most over a window, mm/s; 0 for no way."""
+    """Return one carriage's mean speed without ENDS_MM at both ends, and the most over a window."""
     window: deque[tuple[float, float]] = deque(maxlen=WINDOW)
     way: list[tuple[float, float]] = []
     most_mm_s = 0.0
@@ -69,7 +68,6 @@ def _speeds(rows: list[tuple[float, tuple[float, float]]], side: int, start_mm: 
 
 
 def _from_inside(host: Host, ends_run: Callable[[], object], fault: DeviceFault, beat: Beat) -> str:
-    """Bring the carriages in, end RUN, and watch the device open as `opens_fully`."""
     host.running(host.stroke_mm - NEARLY_MM)
     ends_run()
     if (status := host.next_status(beat)).mode is not DeviceMode.RETRACTING:
@@ -90,13 +88,11 @@ def _lets_go(host: Host) -> None:
     moves=True,
 )
 def off_opens_fully(host: Host) -> str:
-    """Check speed and way of the opening that ends every run."""
     return _from_inside(host, lambda: _lets_go(host), NO_FAULT, Beat.OFF)
 
 
 @check(Hazard.SHUT, PAGE, f"{NEARLY}Retract, Drive RUN going on", f"{FULLY}IDLE, open, HOMED, no fault", moves=True)
 def retract_opens_fully(host: Host) -> str:
-    """Check speed and way of the opening that a Retract begins."""
     return _from_inside(host, lambda: host.obeyed(Retract, Beat.RUN), NO_FAULT, Beat.RUN)
 
 
@@ -108,7 +104,6 @@ def retract_opens_fully(host: Host) -> str:
     moves=True,
 )
 def silence_opens_fully(host: Host) -> str:
-    """Check speed and way of the opening that the device begins by itself."""
     return _from_inside(host, lambda: host.pass_time(0.1), DeviceFault.COMMAND_TIMEOUT, Beat.OFF)
 
 

@@ -26,26 +26,23 @@ class SerialPort:
     """An open, exclusively held serial port: a `BytePort`."""
 
     def __init__(self, path: str, baud: int) -> None:
-        """Open the port at `path`, with its latency timer at 1 ms where it has one."""
+        """Open the port at `path`, with its latency timer at 1 ms if it has one."""
         try:
             self._port = serial.Serial(path, baud, timeout=0, write_timeout=PATIENCE_S, exclusive=True)
             self._port.reset_input_buffer()
-        except termios.error as error:  # no OSError; unplugged while it was set up
+        except termios.error as error:  # not an OSError; unplugged while it was set up
             raise OSError(f"{path}: {error.args[-1]}") from error
-        # USB serial chips keep bytes back for 16 ms unless they are told otherwise; a pty has no such mode
+        # USB serial chips hold bytes back for 16 ms by default; a pty has no such mode
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             self._port.set_low_latency_mode(True)
 
     def now_s(self) -> float:
-        """Return the time of the monotonic clock."""
         return time.monotonic()
 
     def write(self, data: bytes) -> None:
-        """Send bytes."""
         self._port.write(data)
 
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Wait until `until_s`; return what came, with its times."""
         came: list[tuple[float, bytes]] = []
         while (left_s := until_s - time.monotonic()) > 0.0 or not came:
             if select.select([self._port.fileno()], [], [], max(left_s, 0.0))[0]:
@@ -84,18 +81,15 @@ class CanPort:
             raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
 
     def now_s(self) -> float:
-        """Return the time of the monotonic clock."""
         return time.monotonic()
 
     def write(self, identifier: int, data: bytes) -> None:
-        """Send a frame."""
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=PATIENCE_S)
         except can.CanError as error:
             raise OSError(str(error)) from error
 
     def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
-        """Wait until `until_s`; return the time, identifier and data of each frame."""
         came: list[tuple[float, int, bytes]] = []
         while True:
             left_s = until_s - time.monotonic()
@@ -107,20 +101,19 @@ class CanPort:
                 return came
 
     def close(self) -> None:
-        """Close the bus."""
         with contextlib.suppress(can.CanError, OSError):  # it may be gone
             self._bus.shutdown()
 
     def _received(self) -> can.Message | None:
-        """Return a classical data frame with an 11-bit identifier; None for any other, and where none is there."""
+        """Return a classical data frame with an 11-bit identifier, if one is there."""
         try:
             frame = self._bus.recv(0)
         except (can.CanError, OSError) as error:
             if isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError):
-                self._bus.flush()  # python-can would keep a line that is no text for ever
+                self._bus.flush()  # python-can would keep a line that is not text for ever
                 return None
             raise OSError(str(error)) from error
-        except (ValueError, IndexError):  # how slcan says that a line of the adapter's is damaged
+        except (ValueError, IndexError):  # slcan's answer to a damaged line from the adapter
             return None
         if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
             return None

@@ -1,4 +1,4 @@
-"""Checks of RUN: how it is entered, what the duties do, what ends it; and of each mode that refuses it."""
+"""Checks of RUN: how it is entered, what the duties do, what ends it, and which modes refuse it."""
 
 from typing import Final
 
@@ -42,7 +42,7 @@ REFUSED_DUTY: Final = -0.4
 REFUSED_MM: Final = 0.1
 HOMING_S: Final = 0.5
 HOMING_MM: Final = 3.0
-"A homing that goes in further than it backs off has another in command."
+"A homing that goes in further than it backs off obeys another command."
 MOVED_MM: Final = 0.3
 AT_STOP_DUTY: Final = 0.3
 AT_STOP_MM: Final = 0.1
@@ -53,7 +53,7 @@ BEGUN_S: Final = 0.2
 OPEN_S: Final = 0.8
 """A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."""
 GIVEN_UP_S: Final = 7.0
-"""A device that cannot open, from anywhere, has said so after this time."""
+"""By then a device that cannot open has said so."""
 IN_TIME: Final = (
     f"RETRACTING, both out by {BEGUN_MM:g} mm in {BEGUN_S:g} s; in {OPEN_S:g} s IDLE, open, HOMED, no fault"
 )
@@ -62,7 +62,6 @@ RUNNING: Final = f"in RUN, {INSIDE_MM:g} mm in, "
 
 @check(Hazard.OPENS, PAGE, "homed, Drive OFF, then Drive RUN with a duty of 0", "RUN", moves=True)
 def run_is_entered(host: Host) -> str:
-    """Check that a Drive RUN is enough to enter RUN for a device that is homed, without a fault, after a Hello."""
     host.running()
     return shown(host.status)
 
@@ -76,7 +75,7 @@ def run_is_entered(host: Host) -> str:
     is_gate=True,
 )
 def left_duty(host: Host) -> str:
-    """Check side and sign of the left duty: with either wrong, every safe state closes the gap."""
+    """With a wrong side or sign every safe state closes the gap."""
     return _duty_moves(host, is_left=True)
 
 
@@ -89,12 +88,10 @@ def left_duty(host: Host) -> str:
     is_gate=True,
 )
 def right_duty(host: Host) -> str:
-    """Check side and sign of the right duty."""
     return _duty_moves(host, is_left=False)
 
 
 def _duty_moves(host: Host, *, is_left: bool) -> str:
-    """Lower one duty slowly."""
     host.running()
     start = host.last(State)
     for step in range(round(MAX_DUTY / RAMP_PER_S / PERIOD_S)):
@@ -122,7 +119,6 @@ def _duty_moves(host: Host, *, is_left: bool) -> str:
     moves=True,
 )
 def open_switch_stops(host: Host) -> str:
-    """Check that a carriage at its open switch is not driven out into the stop."""
     host.running()
     if not is_open(host.status):
         raise Unmet(f"not at the open switches: {shown(host.status)}")
@@ -153,7 +149,6 @@ def _moved_mm(host: Host, start: State) -> tuple[float, float]:
     moves=True,
 )
 def off_opens(host: Host) -> str:
-    """Check that Drive OFF ends RUN: the gap opens, and nothing is latched."""
     host.running(INSIDE_MM)
     return _opens(host, Beat.OFF)
 
@@ -166,14 +161,12 @@ def off_opens(host: Host) -> str:
     moves=True,
 )
 def retract_opens(host: Host) -> str:
-    """Check that a Retract opens the gap though Drive RUN goes on."""
     host.running(INSIDE_MM)
     host.obeyed(Retract, Beat.RUN)
     return _opens(host, Beat.RUN)
 
 
 def _opens(host: Host, beat: Beat) -> str:
-    """Watch the gap open, with `beat` going on."""
     start = host.last(State)
     host.shows(DeviceMode.RETRACTING, beat, besides=f"from {positions(start)}")
     seen = f"from {positions(start)} to "
@@ -202,7 +195,6 @@ def _given_up(host: Host, beat: Beat) -> str:
     moves=True,
 )
 def let_go_after_retract(host: Host) -> str:
-    """Check that RUN, ended by a Retract, comes back only after a Drive OFF."""
     host.running()
     host.obeyed(Retract, Beat.RUN)
     host.until(lambda: host.status.mode is not DeviceMode.RETRACTING, OPENED_S, Beat.RUN)
@@ -211,7 +203,7 @@ def let_go_after_retract(host: Host) -> str:
 
 def has_to_let_go(host: Host) -> str:
     """Send Drive RUN to an idle device, one Drive OFF, then Drive RUN again."""
-    host.hello(beat=Beat.RUN)  # a host says one every second
+    host.hello(beat=Beat.RUN)  # as a host does every second
     start = host.last(State)
     host.pass_time(SEEN_S, Beat.RUN, duty=REFUSED_DUTY)
     moved_mm = min(_moved_mm(host, start))
@@ -224,7 +216,7 @@ def has_to_let_go(host: Host) -> str:
 
 @check(Hazard.OPENS, TAKES, "in RUN a Home, then a Clear", "neither acknowledged, stays RUN and HOMED", moves=True)
 def run_refuses_home_and_clear(host: Host) -> str:
-    """Check that Home and Clear are refused in RUN: they would take the brake out of the host's hands."""
+    """Home and Clear would take the brake out of the host's hands."""
     host.running()
     seen = [host.refuses(kind, DeviceMode.RUN, Beat.RUN, homed=True) for kind in (Home, Clear)]
     return "; ".join(seen)
@@ -232,7 +224,7 @@ def run_refuses_home_and_clear(host: Host) -> str:
 
 @check(Hazard.OPENS, "Who says what when, 1", "the right Hello in RUN", "Identity; stays RUN and HOMED", moves=True)
 def hello_in_run(host: Host) -> str:
-    """Check that a right Hello is answered in RUN and changes nothing; the host sends one every second."""
+    """The host sends a Hello every second."""
     host.running()
     host.forget()
     for nonce in (host.status.command_nonce, 77):
@@ -244,7 +236,6 @@ def hello_in_run(host: Host) -> str:
 
 @check(Hazard.CLOSES, TAKES, f"Home; while HOMING, Drive RUN with {REFUSED_DUTY:g}", "homes as without", moves=True)
 def homing_refuses_run(host: Host) -> str:
-    """Check that a Drive RUN neither ends a homing nor drives a motor in it."""
     host.homed()
     host.obeyed(Home)
     start = host.last(State)
@@ -271,7 +262,6 @@ def refuses_run(host: Host, mode: DeviceMode) -> str:
 
 
 def _mismatched(host: Host, beat: Beat, faults: DeviceFault = DeviceFault.SCHEMA_MISMATCH) -> str:
-    """Send a Hello of another schema."""
     host.hello(SCHEMA_HASH ^ 1, beat=beat)
     if (status := host.next_status(beat)).mode not in (DeviceMode.RETRACTING, DeviceMode.LATCHED):
         raise Unmet(shown(status))
@@ -287,7 +277,7 @@ def _mismatched(host: Host, beat: Beat, faults: DeviceFault = DeviceFault.SCHEMA
     moves=True,
 )
 def mismatch_in_every_mode(host: Host) -> str:
-    """Check that a Hello of another schema is acted on in every mode: a host has come that does not know the rules."""
+    """A host of another schema does not know the rules."""
     host.running(INSIDE_MM)
     seen = [f"in RUN: {_mismatched(host, Beat.RUN)}"]
     host.homed()
@@ -310,7 +300,6 @@ def mismatch_in_every_mode(host: Host) -> str:
     moves=True,
 )
 def retracting_takes_only_retract(host: Host) -> str:
-    """Check that a device that opens refuses Home and Clear, and takes Retract."""
     host.running(2.0 * INSIDE_MM)
     host.shows(DeviceMode.RETRACTING, besides="after Drive OFF")
     taken = [kind.__name__ for kind in (Home, Clear) if not host.is_refused(kind)]

@@ -1,4 +1,4 @@
-"""Checks of silence in RUN: when the device notices, what it does then, and what it takes until it runs again."""
+"""Checks of silence in RUN: when the device notices, what it does, and what it takes until it runs again."""
 
 from typing import Final
 
@@ -41,15 +41,15 @@ SHORT_S: Final = 0.047
 LONG_S: Final = 0.053
 BORNE_S: Final = 0.0495
 NOTICED_S: Final = 0.0515
-"""By the device's clock between two answers: a silence up to here is borne, from here on noticed; a tick is between."""
+"""By the device's clock: shorter silences are borne, longer ones noticed, with a tick for tolerance."""
 SHORTS, LONGS = 12, 5
 LATCHED_S: Final = 10.0
 RESTING_A: Final = 0.05
 HELD_S: Final = 37.0
 HOLDS: Final = 3
-"""Modulo 2^16 ms every time is one in RUN, though it takes 5 s to get back there, and no 2^15 ms lack a silence."""
+"""The holds together meet every time modulo 2^16 ms in RUN, and a silence in every 2^15 ms."""
 SPARSE_S: Final = 0.02
-"""Drives that come this seldom still hold RUN."""
+"""Drives this seldom still hold RUN."""
 OVER_S: Final = 16.0
 UPTIMES: Final = {31: 2.0**31 * 1e-6, 32: 2.0**32 * 1e-6}
 SILENT: Final = f"in RUN, {INSIDE_MM:g} mm in, no Drive any more"
@@ -58,7 +58,6 @@ TIMED_OUT: Final = DeviceFault.COMMAND_TIMEOUT
 
 
 def _ends(host: Host, silent_s: float) -> bool:
-    """Return whether a silence of a device in RUN ended RUN."""
     silence_s = host.fall_silent(silent_s)
     status = host.next_status(Beat.RUN)
     has_ended = status.mode is not DeviceMode.RUN
@@ -76,7 +75,6 @@ def _ends(host: Host, silent_s: float) -> bool:
     moves=True,
 )
 def short_silence_is_borne(host: Host) -> str:
-    """Check that short silences change nothing: up to 50 ms are allowed."""
     host.running()
     for _ in range(SHORTS):
         _ends(host, SHORT_S)
@@ -92,7 +90,6 @@ def short_silence_is_borne(host: Host) -> str:
     moves=True,
 )
 def silence_is_noticed(host: Host) -> str:
-    """Check that the device notices silence after 50 ms on its clock and a tick, whenever it begins."""
     noticed = 0
     for at in range(LONGS):
         host.running(INSIDE_MM if at else 0.0)
@@ -110,7 +107,6 @@ def silence_is_noticed(host: Host) -> str:
     moves=True,
 )
 def only_good_drives_extend(host: Host) -> str:
-    """Check that only a good Drive extends the 50 ms: not a repeated or damaged one, a Clear or a Hello."""
     host.running(2.0 * INSIDE_MM)
     bad_counter = 0
 
@@ -139,7 +135,6 @@ def only_good_drives_extend(host: Host) -> str:
     moves=True,
 )
 def silence_latches(host: Host) -> str:
-    """Check that the fault of silence stays until it is cleared, and the drives off."""
     host.latched()
     host.pass_time(LATCHED_S / 2.0, Beat.NOTHING, SPARSE_S)
     host.pass_time(LATCHED_S / 4.0, Beat.OFF, SPARSE_S)
@@ -155,7 +150,7 @@ def silence_latches(host: Host) -> str:
 
 @check(Hazard.OPENS, LATCHES, f"{LATCHED}Home, then Retract", "neither acknowledged, stays LATCHED", moves=True)
 def latched_refuses_home_and_retract(host: Host) -> str:
-    """Check that a latched device takes nothing but a Clear: it is open, or cannot open."""
+    """A latched device is open, or cannot open."""
     host.latched()
     return "; ".join(host.refuses(kind, DeviceMode.LATCHED, homed=False) for kind in (Home, Retract))
 
@@ -168,7 +163,7 @@ def latched_refuses_home_and_retract(host: Host) -> str:
     moves=True,
 )
 def cleared_is_not_homed(host: Host) -> str:
-    """Check that a Clear is taken in LATCHED and brings back no zero: after a fault the device has to home again."""
+    """After a fault the device has to home again."""
     host.latched()
     host.obeyed(Clear, Beat.NOTHING)
     host.shows(DeviceMode.IDLE, Beat.NOTHING, homed=False, fault=NO_FAULT)
@@ -183,7 +178,7 @@ def cleared_is_not_homed(host: Host) -> str:
     moves=True,
 )
 def let_go_after_fault(host: Host) -> str:
-    """Check that RUN comes back after a fault only by a Drive OFF, for a host that did not see the fault."""
+    """For a host that did not see the fault."""
     host.running(INSIDE_MM)
     host.pass_time(0.1)
     host.until(host.is_resting, OPENED_S, Beat.RUN)
@@ -195,7 +190,7 @@ def let_go_after_fault(host: Host) -> str:
 
 
 def _holds(host: Host, end_s: float) -> str:
-    """Hold RUN until then with Drives that come seldom, then fall silent."""
+    """Hold RUN with sparse Drives until then, and fall silent."""
     host.running()
     while host.now_s < end_s:
         host.beat(Beat.RUN, period_s=SPARSE_S)
@@ -215,14 +210,14 @@ def _holds(host: Host, end_s: float) -> str:
     moves=True,
 )
 def any_uptime(host: Host) -> str:
-    """Check that a counter of the timeout that runs over at 2^16 ms, or changes its sign, is not seen."""
+    """Finds a timeout's counter that overflows at 2^16 ms or changes its sign."""
     began_s = host.now_s
     seen = [_holds(host, began_s + at * HELD_S) for at in range(1, HOLDS + 1)]
     return f"{len(seen)} times: {seen[-1]}"
 
 
 def _clock_runs_over(bits: int) -> Check:
-    """Return the check that nothing happens where a counter of microseconds runs over at 2 to this power."""
+    """Return the check that a counter of microseconds may overflow at 2 to this power."""
     over_s = UPTIMES[bits]
 
     def perform(host: Host) -> str:

@@ -27,7 +27,7 @@ PAIRS = 20
 TIMES = 100
 FINE_S = 1.13e-3
 WINDOW = 300
-"""States of one comparison of the clocks; the median of all comparisons counts, because a step is no rate."""
+"""States of one comparison of the clocks; the median of all counts, because a step is no rate."""
 ENDS = 50
 """States at either end of a window; the least delayed of them counts."""
 STATUS_TOLERANCE = 0.03
@@ -35,7 +35,7 @@ MAX_DRIFT = 0.01
 MAX_ANSWER_S = 3e-3
 """The device's own millisecond, and the way there and back by any adapter."""
 HANDLE_MM = 1.0
-"""A handle at 0.3 m/s goes a third of this in a millisecond; one of swapped bytes leaps by 2 mm a step."""
+"""A handle at 0.3 m/s moves a third of this in 1 ms; one of swapped bytes leaps by 2 mm a step."""
 HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
 
 
@@ -46,18 +46,15 @@ HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
     "50 Status a second, 3 % more or less, on the device's own clock",
 )
 def status_without_host(host: Host) -> str:
-    """Check that Status comes at its rate without a host."""
     return _status_rate(host, Beat.NOTHING)
 
 
 @check(Hazard.MISLED, STATUS, f"Drive OFF every 1 ms for {LISTENED_S:g} s", "50 Status a second, 3 % more or less")
 def status_with_host(host: Host) -> str:
-    """Check that Status comes at its rate while Drives come."""
     return _status_rate(host, Beat.OFF)
 
 
 def _status_rate(host: Host, beat: Beat) -> str:
-    """Listen for LISTENED_S."""
     start_s = host.now_s
     host.pass_time(LISTENED_S, beat)
     times = [time_s for time_s, _ in host.all_of(Status)]
@@ -65,13 +62,13 @@ def _status_rate(host: Host, beat: Beat) -> str:
     period_s = (times[-1] - times[0]) / (len(times) - 1)
     widest_s = max(after - before for before, after in pairwise([start_s, *times, host.now_s]))
     seen = f"one every {period_s * 1e3:.1f} ms, {widest_s * 1e3:.0f} ms apart at most"
-    # a lost Status, or a late turn of this process, makes one gap of two; a sender that lags makes more
+    # a lost Status or a late turn of this process makes one gap of two; a sender that lags makes more
     return unless(abs(period_s / STATUS_S - 1.0) > STATUS_TOLERANCE or widest_s > 2.5 * STATUS_S, seen)
 
 
 @check(Hazard.MISLED, ANSWERS, f"{DRIVES} Drive OFF, one every 1 ms", "for each one State, then one Sense")
 def every_drive_answered(host: Host) -> str:
-    """Check that each Drive is answered by State, then Sense: the control loop needs positions at its own rate."""
+    """The control loop needs positions at its own rate."""
     host.pass_time(DRIVES * PERIOD_S, Beat.OFF)
     host.pass_time(ANSWER_S)
     kinds = [type(one.message) for one in host.heard if isinstance(one.message, State | Sense)]
@@ -88,7 +85,7 @@ def every_drive_answered(host: Host) -> str:
 
 @check(Hazard.MISLED, ANSWERS, f"{PAIRS} times two Drive OFF at once", "two State for each pair")
 def drives_at_once(host: Host) -> str:
-    """Check that each of two Drives that come together is answered: a host that was late sends so."""
+    """A late host sends two Drives at once."""
     host.pass_time(ANSWER_S)
     host.forget()
     for _ in range(PAIRS):
@@ -102,7 +99,6 @@ def drives_at_once(host: Host) -> str:
 
 @check(Hazard.MISLED, DRIVE, "Drive OFF, its counter changed by 128, 64, .. 1, 255, 254", "a State for each")
 def every_counter(host: Host) -> str:
-    """Check that a Drive is accepted whenever its counter differs, in any bit, up or down."""
     host.beat(Beat.OFF)
     host.pass_time(ANSWER_S)
     for change in (128, 64, 32, 16, 8, 4, 2, 1, 255, 254):
@@ -117,7 +113,6 @@ def every_counter(host: Host) -> str:
 
 @check(Hazard.MISLED, ANSWERS, "no Drive for 0.2 s", "no State and no Sense")
 def no_answer_without_drive(host: Host) -> str:
-    """Check that State and Sense come only as answers to a Drive."""
     host.pass_time(ANSWER_S)
     host.forget()
     host.pass_time(0.2)
@@ -132,7 +127,7 @@ def no_answer_without_drive(host: Host) -> str:
     f"State within {MAX_ANSWER_S * 1e3:g} ms as a rule, at once on the device",
 )
 def answer_time(host: Host) -> str:
-    """Check that State comes as soon as the position loop needs it, the adapter's delay included."""
+    """The position loop needs State in time, including the adapter's delay."""
     delays_s = []
     for _ in range(200):
         host.beat(Beat.OFF)
@@ -148,7 +143,7 @@ def answer_time(host: Host) -> str:
 
 @check(Hazard.MISLED, "State", "Drive OFF every 1 ms for 0.6 s", "State's counter is one more each time, modulo 256")
 def state_counter(host: Host) -> str:
-    """Check that State's counter rises by one: by it the host counts lost States, and knows repeated ones."""
+    """By the counter the host finds lost and repeated States."""
     host.pass_time(0.6, Beat.OFF)
     counters = [state.counter for _, state in host.all_of(State)]
     unless(len(counters) < 2, f"{len(counters)} State")
@@ -165,7 +160,7 @@ def state_counter(host: Host) -> str:
     "device_time_s runs by 1 s in a second, 1 % more or less",
 )
 def device_clock(host: Host) -> str:
-    """Check that the device's clock runs true: speeds are computed from it."""
+    """Speeds are computed from this clock."""
     host.pass_time(CLOCKED_S, Beat.OFF)
     states = host.all_of(State)
     device_s, clocks = 0.0, []
@@ -184,7 +179,7 @@ def device_clock(host: Host) -> str:
 
 @check(Hazard.MISLED, "State", f"{TIMES} Drive OFF, one every 1.13 ms", "device_time_s in steps of 10 us")
 def device_time_is_fine(host: Host) -> str:
-    """Check that times are not rounded to the tick: a speed would be wrong by up to a half."""
+    """With times rounded to the tick a speed would be wrong by up to a half."""
     host.pass_time(TIMES * FINE_S, Beat.OFF, FINE_S)
     host.pass_time(ANSWER_S)
     steps = {round(state.device_time_s * 1e5) % 100 for _, state in host.all_of(State)}
@@ -198,7 +193,7 @@ def device_time_is_fine(host: Host) -> str:
     "no leap over 1 mm, a force against the motion",
 )
 def handle_runs_on(host: Host) -> str:
-    """Check that the handle's position has no leaps, as of swapped bytes, and that the force is against its motion."""
+    """Finds leaps, as of swapped bytes, and a force that is not against the motion."""
     host.pass_time(LISTENED_S, Beat.OFF)
     places = [sense.handle_position_mm for _, sense in host.all_of(Sense)]
     half = HANDLE_SPAN_MM / 2.0
@@ -216,7 +211,7 @@ def handle_runs_on(host: Host) -> str:
     Hazard.MISLED, STATUS, "Drive OFF, its counter going up, then none", "Status shows the counter of the last Drive"
 )
 def drive_counter_shown(host: Host) -> str:
-    """Check that Status shows the counter of the last Drive: by it the host sees what arrived."""
+    """By this counter the host sees what arrived."""
     seen = ""
     for _ in range(3):
         host.pass_time(7 * PERIOD_S, Beat.OFF)
@@ -228,7 +223,6 @@ def drive_counter_shown(host: Host) -> str:
 
 @check(Hazard.SHUT, DRIVE, "a Drive OFF, then five more with the same counter, of other duties too", "one State")
 def repeated_drive(host: Host) -> str:
-    """Check that a repeated Drive is not answered: it is not accepted."""
     host.pass_time(2 * PERIOD_S, Beat.OFF)
     host.pass_time(ANSWER_S)
     host.forget()
@@ -249,7 +243,7 @@ def repeated_drive(host: Host) -> str:
     "a supply of 9 to 15 V, an element of -20 to 60 degC, no SUPPLY or TEMPERATURE",
 )
 def status_plausible(host: Host) -> str:
-    """Check that supply and temperature are plausible: a wrong unit or a loose wire shows here."""
+    """Finds a wrong unit or a loose wire."""
     status = host.next_status(Beat.OFF)
     seen = f"{status.supply_V:.1f} V, {status.temperature_C:.0f} degC, {shown(status)}"
     causes = [fault.name for fault in status.faults if fault.name in ("SUPPLY", "TEMPERATURE")]
@@ -258,7 +252,6 @@ def status_plausible(host: Host) -> str:
 
 @check(Hazard.MISLED, "Sense", "Drive OFF, nothing moving", "currents under 0.2 A, a force under 5 N")
 def sense_plausible(host: Host) -> str:
-    """Check that currents and force are near 0 at rest."""
     host.idle()
     host.pass_time(0.1, Beat.OFF)
     sense = host.last(Sense)

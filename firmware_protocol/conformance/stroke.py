@@ -29,9 +29,9 @@ BOUND_MM: Final = 0.3
 "Two Status at SLOW_MM_S, and the sway of a carriage."
 AHEAD_MM: Final = 0.7
 NEAR: Final = 0.85
-"""Of the stroke: up to here at a brisk speed."""
+"""Share of the stroke that is travelled at a brisk speed."""
 PAST: Final = 1.15
-"""Of the stroke: no scale of ours is off by this much; a device that gets here does not watch."""
+"""Share of the stroke: no scale is off by this much, so a device that gets here does not watch."""
 DUTIES: Final = (0.4, 0.6, 0.8, 1.0)
 MIDDLE_MM: Final = 10.0
 PULSE_S: Final = 0.3
@@ -40,7 +40,7 @@ MIN_GAIN: Final = 0.6
 STARTED_S: Final = 0.02
 STARTED_MM: Final = 0.05
 STARTING_A: Final = (0.5, 10.0)
-"""What a motor draws that starts at the whole duty: under this the unit is wrong, over it too."""
+"""What a motor draws that starts at the whole duty; outside, the unit is wrong."""
 
 
 @check(
@@ -51,7 +51,7 @@ STARTING_A: Final = (0.5, 10.0)
     moves=True,
 )
 def zero_is_at_switch(host: Host) -> str:
-    """Check that the zero of each encoder is where its own open switch closes."""
+    """Each encoder's zero is where its own open switch closes."""
     host.running()
     seen = []
     for side, name in enumerate(("LEFT", "RIGHT")):
@@ -78,7 +78,7 @@ def _has_closed(host: Host, switch: Switches) -> bool:
 
 
 def _edges_mm(host: Host, side: int, switch: Switches) -> list[float]:
-    """Return where the carriage was when its switch changed, mm, by the States and Status heard."""
+    """Return where the carriage was each time its switch changed, mm."""
     edges_mm, at_mm, was = [], 0.0, True
     for one in host.heard:
         if isinstance(one.message, State):
@@ -97,7 +97,7 @@ def _edges_mm(host: Host, side: int, switch: Switches) -> list[float]:
     moves=True,
 )
 def duty_makes_speed(host: Host) -> str:
-    """Check that speed rises with the duty up to the whole, both ways, and nothing gives way."""
+    """Speed rises with the duty up to the whole, both ways, and nothing gives way."""
     host.running(MIDDLE_MM)
     seen = []
     for sign in (-1.0, 1.0):
@@ -121,7 +121,6 @@ def duty_makes_speed(host: Host) -> str:
     moves=True,
 )
 def answers_are_of_now(host: Host) -> str:
-    """Check that currents and positions are of the Drive that they answer, currents with their unit and sign."""
     host.running(MIDDLE_MM)
     start_mm = places(host.last(State))
     # the second Drive measures what the first began; an answer that lags shows a motor at rest
@@ -135,7 +134,7 @@ def answers_are_of_now(host: Host) -> str:
 
 
 def _speed_mm_s(host: Host, duty: float) -> float:
-    """Give both motors a duty for PULSE_S and return the slower carriage's speed in its direction, once settled."""
+    """Give both motors a duty for PULSE_S and return the slower carriage's settled speed."""
     host.pass_time(SETTLED_S, Beat.RUN, duty=duty)
     start = places(host.last(State))
     host.pass_time(PULSE_S - SETTLED_S, Beat.RUN, duty=duty)
@@ -153,7 +152,6 @@ def _speed_mm_s(host: Host, duty: float) -> float:
     moves=True,
 )
 def skew_opens(host: Host) -> str:
-    """Check that carriages that come apart end RUN, whichever is ahead."""
     seen = []
     for side in (0, 1):
         host.running(MIDDLE_MM)
@@ -183,7 +181,7 @@ def _has_left(host: Host) -> bool:
     moves=True,
 )
 def end_stop_opens(host: Host) -> str:
-    """Check that each closed switch ends RUN, and that it is as far from the open one as the plant says."""
+    """Each closed switch ends RUN, at the stated distance from the open one."""
     seen = []
     for ahead in ((AHEAD_MM, 0.0), (0.0, AHEAD_MM)):
         host.running(NEAR * host.stroke_mm)

@@ -13,20 +13,17 @@ SPEED_MM_S = 8.0
 
 
 class Tip:
-    """A tip with sensors, and what its estimator has seen."""
-
     def __init__(self, wall_mm: float, stiffness_N_mm: float, friction_N: float = 0.1, seed: int = 0) -> None:
         self.wall_mm, self.stiffness_N_mm, self.friction_N = wall_mm, stiffness_N_mm, friction_N
         self.found, self.place_mm = ContactEstimator(), 0.0
         self._draw = random.Random(seed)
 
     def go(self, *places_mm: float) -> None:
-        """From place to place."""
         for to_mm in places_mm:
             self._go(to_mm)
 
     def _go(self, to_mm: float) -> None:
-        """At its speed; or, where it is there, a second of rest."""
+        """Move at the tip's speed, or rest for a second if it is there."""
         step_mm = SPEED_MM_S / HZ
         steps = round(abs(to_mm - self.place_mm) / step_mm)
         onward_mm = (to_mm - self.place_mm) / steps if steps else 0.0
@@ -38,7 +35,6 @@ class Tip:
             self.found.update(self.place_mm + self._draw.gauss(0.0, NOISE_MM), force_N, way)
 
     def expect(self, within_mm: float = 0.2, share: float = 0.1) -> None:
-        """The wall is known."""
         contact = self.found.contact
         assert contact is not None
         assert contact.handle_mm == pytest.approx(self.wall_mm, abs=within_mm)

@@ -22,14 +22,11 @@ Maker = Callable[..., ClosedLoop]
 
 @pytest.fixture(scope="session")
 def core() -> Core:
-    """Of the shipped coronary scene."""
     return build_core(Config())
 
 
 @pytest.fixture(scope="session")
 def make(core: Core) -> Maker:
-    """A loop on a simulated device that has just been switched on."""
-
     def build(
         plant: str | PlantParameters = "sample_1",
         hand: Hand | None = None,
@@ -49,8 +46,6 @@ def make(core: Core) -> Maker:
 
 @pytest.fixture(scope="session")
 def arm(make: Maker) -> Maker:
-    """A loop that is armed, at the open gap."""
-
     def armed(
         plant: str | PlantParameters = "sample_1", *hand: Hand, planned: bool = True, **options: object
     ) -> ClosedLoop:
@@ -65,13 +60,12 @@ def arm(make: Maker) -> Maker:
 
 @pytest.fixture
 def armed(arm: Maker) -> ClosedLoop:
-    """A loop that is armed: homing is the same every time."""
     return arm()
 
 
 @pytest.fixture(scope="session")
 def gap_ticks() -> Callable[[ClosedLoop, float, float], Iterator[Sample]]:
-    """The ticks while a gap is asked for, for so many seconds, one by one: between them the stages can be looked at."""
+    """The ticks, one by one, while a gap is asked for."""
 
     def ticks(loop: ClosedLoop, gap_mm: float, seconds: float) -> Iterator[Sample]:
         for _ in range(round(1e3 * seconds)):
@@ -82,14 +76,11 @@ def gap_ticks() -> Callable[[ClosedLoop, float, float], Iterator[Sample]]:
 
 @pytest.fixture(scope="session")
 def hold_gap(gap_ticks: Callable[..., Iterator[Sample]]) -> Callable[[ClosedLoop, float, float], list[Sample]]:
-    """All of them."""
     return lambda *asked: list(gap_ticks(*asked))
 
 
 @pytest.fixture(scope="session")
 def render() -> Callable[[ClosedLoop, float, float], list[Sample]]:
-    """The ticks while a publisher asks for a force, for so many seconds."""
-
     def rendered(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
         return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))
 

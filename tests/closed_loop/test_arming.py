@@ -20,7 +20,6 @@ STOPPED = latch(SafetyState(), (Fault.STOPPED,))
 
 
 def live(now_s: float, force_N: float = ASKED_N) -> TimedSetpoint:
-    """A publisher's newest, 500 a second."""
     return TimedSetpoint(force_N, now_s - now_s % 0.002, 0.1)
 
 
@@ -29,7 +28,6 @@ def ticks(loop: ClosedLoop, duration_s: float, force_N: float | None = ASKED_N) 
 
 
 def arm_beside(loop: ClosedLoop) -> tuple[Arming, list[Sample]]:
-    """What came of one `arm` beside the publisher, and of the two seconds after it."""
     arming, samples = Arming(loop.now_s, loop.stepper.safety.faults), []
     while not arming.is_over:
         arming.advance(loop.now_s, loop.stepper.safety, loop.conditions(), loop.command)
@@ -38,7 +36,6 @@ def arm_beside(loop: ClosedLoop) -> tuple[Arming, list[Sample]]:
 
 
 def steepest_step_N_s(samples: list[Sample]) -> float:
-    """Of the governed force, from each plan to the next one."""
     plans = [each.plan for each in samples]
     return max(
         abs(after.governed_N - before.governed_N) / (after.time_s - before.time_s)
@@ -48,7 +45,6 @@ def steepest_step_N_s(samples: list[Sample]) -> float:
 
 
 def fastest_N_s(samples: list[Sample]) -> float:
-    """Of the plant's force, over OVER_S."""
     forces_N, over = [each.truth.force_N for each in samples], round(OVER_S * 1e3)
     return max(abs(after - before) / OVER_S for before, after in zip(forces_N, forces_N[over:], strict=False))
 

@@ -1,6 +1,7 @@
 """The daemon's core against the simulated device, in virtual time and through protocol bytes.
 
-All data here are synthetic: the device is the simulator's, the pulse is a formula."""
+All data here are synthetic: the device is the simulator's, the pulse is a formula.
+"""
 
 import math
 import statistics
@@ -27,7 +28,7 @@ LEAD_IN_S = 0.7
 
 
 def pulse_N(time_s: float) -> float:
-    """A synthetic pulse of 1.2 Hz between 1.4 and 1.7 N, steep to rise and slow to fall, behind a ramp and a hold."""
+    """A synthetic pulse of 1.2 Hz, steep to rise and slow to fall, behind a ramp and a hold."""
     if time_s < LEAD_IN_S:
         return min(0.6 + 2.0 * time_s, 1.4)
     phase = 2.0 * math.pi * 1.2 * (time_s - LEAD_IN_S)
@@ -35,13 +36,12 @@ def pulse_N(time_s: float) -> float:
 
 
 def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
-    """The ticks while a publisher sends this force."""
     times = np.arange(round(duration_s * rate_hz)) / rate_hz
     return list(loop.run(duration_s, stream(times + loop.now_s, np.array([force_N(time) for time in times]))))
 
 
 def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: float) -> float:
-    """Error of the true force against the force asked, from `from_s` after the first tick; nothing is removed."""
+    """Return the error of the true force against the force asked, from `from_s` after the first tick."""
     start_s = samples[0].time_s
     errors = [
         sample.truth.force_N - force_N(sample.time_s - start_s)
@@ -55,9 +55,6 @@ def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
     return samples[-1].safety.faults
 
 
-# -- rendering -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("plant", "from_s", "within_N", "trim"),
     [("sample_1", 0.0, 0.03, 1.0), ("sample_2", 1.5, 0.05, 0.8), ("sample_3", 1.5, 0.05, 0.85)],
@@ -67,7 +64,7 @@ def test_a_pulse_is_rendered(arm, plant: str, from_s: float, within_N: float, tr
     assert faults_of(samples) == ()
     assert rms_N(samples, pulse_N, LEAD_IN_S + from_s) <= within_N
     assert samples[-1].plan.trim == pytest.approx(trim, abs=0.15)
-    # what is said of it: once it has arrived, nothing holds it back
+    # once it has arrived, nothing holds the force back
     assert not any(sample.plan.limits for sample in samples[-1_000:])
 
 
@@ -106,19 +103,15 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     samples = list(armed.run(1.2, stream(np.array([at_s]), np.array([1.4]))))
     stale = [sample for sample in samples if Limit.STALE in sample.plan.limits]
     assert stale[0].time_s - at_s == pytest.approx(0.1, abs=0.01)
-    # nobody asks for less than the least force: no advice about that
+    # nobody asks for less than the least force
     assert not any(Limit.F_MIN in sample.plan.limits for sample in stale)
-    # 2 N/s down to the least force, and no faster
     governed = [sample.plan.governed_N for sample in stale]
     assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061
-    # down to what this device, as far as it has shown itself, gives at its open gap
+    # this device's least force, as far as it has shown itself
     least_N = armed.planner.believe.min_N
     assert governed[-1] == pytest.approx(least_N, abs=0.01)
     assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
     assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.02)
-
-
-# -- position ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0], ids=["closing", "opening"])
@@ -153,9 +146,6 @@ def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, fro
     assert went_mm.max() - went_mm[0] < 0.6
 
 
-# -- commands ------------------------------------------------------------------------------------------------------
-
-
 def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
     publish(armed, lambda time_s: 1.2, 1.2)
     armed.command("pause")
@@ -174,7 +164,7 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
     assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
-# -- faults: those that are put into a running pulse are rows of the fault matrix --------------------------------------
+# -- faults; others are rows of the fault matrix
 
 
 def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
@@ -192,7 +182,7 @@ def test_a_loop_without_a_planner_wants_plans(make) -> None:
         make(planned=False).tick()
 
 
-# -- the second plant, whose laws are of another form than everything that the core was made with ----------------------
+# -- the second plant, whose laws differ
 
 
 def test_a_force_is_found_on_a_plant_of_other_structure(
@@ -206,9 +196,6 @@ def test_a_force_is_found_on_a_plant_of_other_structure(
         assert statistics.fmean(felt_N) == pytest.approx(asked_N, abs=0.05)
         assert max(felt_N) < asked_N + 0.1
         assert Limit.MODEL_RANGE not in samples[-1].plan.limits
-
-
-# -- the tactile element: a finger in a pad ----------------------------------------------------------------------------
 
 
 SCENE = load_scene("radial_pulse")
@@ -249,7 +236,7 @@ def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
 
 def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
     whole, coarse = (hold(Case("pad_1", False, False, 10.0, is_coarse)) for is_coarse in (False, True))
-    # where the gap comes to rest differs by what friction lets it; how the force falls from there does not
+    # friction lets the gap rest in different places; how the force falls from there is the same
     fell, fell_coarse = (run["last_force_error"] - run["shares"][0] for run in (whole, coarse))
     assert fell == pytest.approx(fell_coarse, abs=1e-4)
     assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=2e-3)

@@ -34,7 +34,7 @@ def on_the_way(loop: ClosedLoop, gap_mm: float, ticks: int) -> list[Sample]:
 
 
 def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
-    """One tick towards a gap: finite everywhere, nothing wound up beyond the duty limit."""
+    """Tick towards a gap, and check that all is finite and nothing winds up beyond the duty limit."""
     sample, move = loop.tick(plan=gap_plan(gap_mm, loop.now_s, speed_mm_s)), loop.stepper.move
     limit = CONFIG.position.duty_limit
     assert isinstance(move, Carriages)
@@ -47,9 +47,6 @@ def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
     return sample
 
 
-# -- synchronisation -----------------------------------------------------------------------------------------------
-
-
 def uneven() -> PlantParameters:
     """Sample 1 with three times the drag on the left."""
     plant = load_plant("sample_1")
@@ -59,7 +56,7 @@ def uneven() -> PlantParameters:
 
 
 def skews_um(synchronisation: float) -> Array:
-    """Skew by the encoders on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
+    """Skew on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
     config = msgspec.structs.replace(
         CONFIG, position=msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
     )
@@ -95,11 +92,7 @@ def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
     )
 
 
-# -- the clock -----------------------------------------------------------------------------------------------------
-
-
 def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sample]:
-    """The ticks on the way to a gap, each this long after the one before it."""
     samples = []
     for period_s in periods_s:
         now_s = loop.now_s
@@ -126,9 +119,6 @@ def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(arm, period
     assert min(sample.truth.gap_mm for sample in samples) > 90.0 - 2.0
 
 
-# -- the target ----------------------------------------------------------------------------------------------------
-
-
 def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm) -> None:
     loop = arm(planned=False)
     on_the_way(loop, 85.0, 500)
@@ -141,15 +131,11 @@ def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm)
     )
 
 
-# -- strokes of the gap: magnets that pull and screws that stick -------------------------------------------------------
-
-
 AT_REST = RecordedHand((0.0,), (0.0,))
 "A handle that moves would bring a force over the scene's, and a fault."
 
 
 def lag_mm(loop: ClosedLoop) -> float:
-    """How far the encoders are off what is expected of them."""
     stepper = loop.stepper
     assert isinstance(stepper.move, Carriages)
     return abs(stepper.move.expected.gap_mm - stepper.measured.gap_mm)  # type: ignore[union-attr]

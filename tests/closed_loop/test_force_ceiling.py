@@ -31,13 +31,10 @@ def worst_N(samples: list[Sample]) -> float:
 
 
 def named_s(samples: list[Sample]) -> float:
-    """When the readings were named first, s from the first of these samples."""
     doubted = [sample.time_s for sample in samples if NAMED & set(sample.plan.limits)]
     assert doubted, "the readings were never named"
     return doubted[0] - samples[0].time_s
 
-
-# -- the sensor ----------------------------------------------------------------------------------------------------
 
 LIES: dict[str, Lie] = {
     "+0.3 N": lambda _, reading_N: reading_N + 0.3,
@@ -62,8 +59,6 @@ def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(render, lie: st
 
 @pytest.fixture
 def lying(make):
-    """An armed loop whose sensor has lied so from the beginning."""
-
     def build(lie: str, **options: object):
         loop = make(**options)
         LyingSensor(loop.simulated.plant, LIES[lie])
@@ -127,7 +122,7 @@ def slides(sample: Sample) -> bool:
 def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(render, armed: ClosedLoop) -> None:
     render(armed, ASKED_N, 2.0)
     before = armed.planner.believe.strength.fit
-    # as after ten minutes of turning the one way
+    # as after ten minutes of turning one way
     armed.planner.believe.zero.variance_N2 = 1.01 * UNKNOWN_SD_N**2
     LyingSensor(armed.simulated.plant, lambda _, reading_N: reading_N + 0.1)
     samples = render(armed, ASKED_N, 3.0)
@@ -151,12 +146,9 @@ def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
         assert not any(NAMED & set(sample.plan.limits) for sample in render(loop, asked_N, 3.0))
 
 
-# -- layer a: the governed force -----------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="session")
 def open_core(core: Core) -> Core:
-    """Of a scene in which a hundred times the force is none too great: no ceiling acts."""
+    """The scene allows a hundred times the force, so that no ceiling acts."""
     force = msgspec.structs.replace(core.scene.force, most_N=100.0 * MAX_N)
     return core._replace(scene=msgspec.structs.replace(core.scene, force=force))
 
@@ -170,11 +162,8 @@ def test_the_governed_force_holds_alone(make, render, core: Core, open_core: Cor
     assert Limit.RANGE in samples[-1].plan.limits
 
 
-# -- layer b: the gap ----------------------------------------------------------------------------------------------
-
-
 def ask_for_six_newtons(core: Core) -> Governor:
-    """A governor that has gone mad: it takes the device for a giant, and the scene for one that wants nothing else."""
+    """A governor that has gone mad, and asks for 6 N whatever the scene wants."""
     giant = Portrait([95.0, 45.0], [0.0, 100.0], [2.0, 2.0])
     force = msgspec.structs.replace(core.scene.force, least_N=6.0, most_N=6.0)
     return Governor(0.0, giant, force, CONFIG.position.gap_speed_mm_s)
@@ -192,9 +181,6 @@ def test_the_gap_holds_alone(make, render, core: Core, open_core: Core, sample: 
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
 
 
-# -- layer c: the measured force -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("sample", WEAKEST_AND_STRONGEST)
 def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) -> None:
     shut = hold_gap(arm(sample), 47.0, 4.0)
@@ -203,7 +189,7 @@ def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) 
     forces_N = np.array([sample.truth.force_N for sample in shut])
     assert 1e-3 * np.count_nonzero(forces_N > CEILING_N) < 0.3, "seconds over it"
     assert forces_N.max() < CEILING_N + 0.5
-    # the force does not vanish at once, which would be a hazard of its own
+    # a force that vanishes at once would be a hazard of its own
     assert 1.0 < (forces_N[:-20] - forces_N[20:]).max() / 0.02 < core.scene.force.most_release_N_s
     assert shut[-1].truth.gap_mm > 90.0
 
@@ -215,7 +201,7 @@ def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     assert worst_N(samples) < CEILING_N
 
 
-# -- a profile is a prior for tracking, never for the ceiling: it presses no harder than any device may ----------------
+# -- a profile is a prior for tracking only
 
 
 RESTS_S, GOES_MM_S = 3.0, (0.0, 1.0, 42.0)

@@ -18,7 +18,7 @@ from tormagd.simulation.hand import ReversingHand
 
 VALID_S = 0.2
 SAMPLES = ("sample_2", "sample_3")
-"Neither chose a constant of the learning."
+"No constant of the learning was chosen on them."
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
@@ -55,7 +55,6 @@ PULSE = Config(scene="pulse")
 
 @pytest.fixture(scope="module")
 def frozen() -> Core:
-    """One that learns nothing."""
     return build_core(PULSE, msgspec.structs.replace(load_scene("pulse"), terms=Terms(learning=False)))
 
 
@@ -77,9 +76,6 @@ def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces
     loop = arm("sample_3", ReversingHand(1.0), core=frozen, config=PULSE)
     list(loop.run(2.5, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)))
     assert (loop.planner.believe.learned(), loop.stepper.move.acceleration_scale) == (NOTHING_LEARNED, 1.0)
-
-
-# -- what is believed is told, with its unit and whether it acts -------------------------------------------------------
 
 
 def test_a_weak_device_that_was_slid_at_speed_is_known_as_such(arm, render) -> None:
@@ -109,20 +105,14 @@ def test_a_term_that_is_left_out_does_not_act_though_a_preview_tells_what_comes(
     assert (told["scale"].value, told["field_lag"].value) == (1.0, 0.0)
 
 
-# -- a great step, held: what the elastomer relaxes before the trim gives it back --------------------------------------
-
-
 Maker = Callable[..., ClosedLoop]
 LOW_N, HIGH_N = 0.7, 2.0
 REST_S, HOLD_S = 12.0, 12.0
-"The trim knows the device before the step; the elastomer's shortest time constant is 8 s."
 TRIMMED_S = 3.0
-"Arrival takes 0.8 s; then three time constants of the trim, which learned the device at the lower force."
 PERIOD_S = 0.01
 
 
 def errors_after_step(arm: Maker) -> tuple[np.ndarray, np.ndarray]:
-    """Times after the step and the true force less the asked one."""
     loop = arm("sample_2")
     times_s = loop.now_s + PERIOD_S * np.arange(round((REST_S + HOLD_S) / PERIOD_S))
     step_s = loop.now_s + REST_S
@@ -138,7 +128,6 @@ def errors_after_step(arm: Maker) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def allowed_N(core: Core) -> float:
-    """A fifth of what the scene tolerates."""
     return 0.2 * core.scene.force.tolerance_rms_N
 
 

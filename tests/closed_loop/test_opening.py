@@ -25,17 +25,15 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 CLOSED_MM, HALF_MM, OPEN_MM = 48.0, 70.0, 95.0
 NAMED_S = 0.5
 SHOULD_S = (OPEN_MM - HALF_MM) / 2.0 / Config().device.retract_mm_s + 0.3
-"When it should be open: the way at the device's speed, and what it takes to turn round and to taper."
+"When it should be open: the way at the device's speed, turning round and tapering."
 MM_S = 20.0
-"What the weakest device closes the gap by, and more."
+"More than the weakest device closes the gap by."
 Spoils = Callable[[MessageDevice, float], None]
 Opens = Callable[..., ClosedLoop]
 
 
 @pytest.fixture(scope="module")
 def closed(core: Core) -> Opens:
-    """A loop that has driven the gap to a place, on either bus."""
-
     def build(bus: str, plant: str | PlantParameters = "sample_1", gap_mm: float = HALF_MM, faults=()) -> ClosedLoop:
         parameters = load_plant(plant) if isinstance(plant, str) else plant
         struck = [parse_fault(fault) for fault in faults]
@@ -51,7 +49,7 @@ def closed(core: Core) -> Opens:
 
 
 def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0) -> float:
-    """How long after now NOT_OPENING is latched, infinity where it is not; `spoils` is done before each tick."""
+    """Return after how long NOT_OPENING is latched; `spoils` runs before each tick."""
     begins_s = loop.now_s
     while loop.now_s < begins_s + seconds:
         if spoils is not None:
@@ -62,7 +60,6 @@ def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0
 
 
 def never_begins(device: MessageDevice, time_s: float) -> None:
-    """The firmware forgets to open, and says nothing."""
     assert isinstance(device.firmware, Firmware)
     if device.firmware.mode is DeviceMode.RETRACTING:
         device.firmware._rest(time_s, DeviceMode.IDLE)
@@ -120,7 +117,7 @@ def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_an
     assert isinstance(firmware, Firmware)
     firmware.homed, firmware._left_zero_mm, firmware._right_zero_mm = True, 7.5, 8.5
     loop = ClosedLoop(Config(), core.stepper(), None, device)
-    assert named_s(loop) <= NAMED_S + 0.1  # until the first State
+    assert named_s(loop) <= NAMED_S + 0.1
     held(loop, CLOSED_MM, 2.0)
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
 

@@ -12,11 +12,11 @@ from tormagd.safety.operating_state import Conditions
 from tormagd_client.messages import Setpoint, encode
 
 LASTS_S, BEFORE_S = 1.5, 0.7
-"A run that is repeated, and how long before the rollover it begins."
+"How long a repeated run takes, and how long before the rollover it begins."
 SENT_HZ = 137.3
-"Setpoints a second: not in step with the forecast's grid, where the last digit of a stamp would decide."
+"Out of step with the forecast's grid, where the last digit of a stamp would decide."
 SAME_DUTY = 1e-4
-"A step of the wire: what a clock of coarser floats may change."
+"One step on the wire: a clock of coarser floats may change as much."
 READY = Conditions(True, True, True, False, False)
 
 
@@ -31,7 +31,6 @@ def recorded(arm) -> list[Sample]:
 
 
 def duties(core: Core, recorded: list[Sample], device_s: float, host_s: float) -> list[Duty]:
-    """The duties of a core that is given the same at another time of either clock."""
     begins_s = host_s + recorded[0].time_s
     stepper, planner = core.stepper(begins_s), core.planner(begins_s)
     found: list[Duty] = []
@@ -70,7 +69,6 @@ def test_a_rollover_changes_no_duty(core: Core, recorded: list[Sample], device_s
 
 
 def stamped_s(base_ns: int) -> float:
-    """The time that the newest of four setpoints about then is taken for; their numbers are as large."""
     inbox = SetpointInbox()
     for ago_ns in (4 * 10**6, 3 * 10**6, 2 * 10**6, 10**6):
         at_ns = base_ns - ago_ns

@@ -26,7 +26,7 @@ WAY_S = 0.001
 
 
 class Publisher(NamedTuple):
-    """One process that sends a force, from a time on, by its own clock."""
+    """One process that sends a force by its own clock."""
 
     force_N: Callable[[float], float]
     source: str = "a"
@@ -39,7 +39,6 @@ class Publisher(NamedTuple):
     is_lost: Callable[[int], bool] = lambda number: False
 
     def messages(self, start_s: float, lasts_s: float) -> Iterable[tuple[float, bytes]]:
-        """When each of its messages arrives, in that order; times count from `start_s`."""
         arrived_s = -math.inf
         for number in range(round(self.from_s / PERIOD_S), round(min(self.to_s, lasts_s) / PERIOD_S)):
             sent_s = number * PERIOD_S
@@ -59,8 +58,6 @@ class Publisher(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What came of it."""
-
     samples: list[Sample]
     inbox: SetpointInbox
     way: Way
@@ -70,11 +67,9 @@ class Run(NamedTuple):
         return self.inbox.report(self.samples[-1].time_s).by_source[source]
 
     def held_by(self, limit: Limit) -> list[float]:
-        """When this limit held the force, counted from the start."""
         return [each.time_s - self.start_s for each in self.samples if limit in each.plan.limits]
 
     def error_N(self, force_N: Callable[[float], float], from_s: float, to_s: float = math.inf) -> float:
-        """The greatest difference between the plant's force and this one."""
         return max(
             abs(each.truth.force_N - force_N(each.time_s - self.start_s))
             for each in self.samples
@@ -93,7 +88,7 @@ def run(
     sources: Sources = EQUAL_SOURCES,
     at: Callable[[SetpointInbox, float], None] = lambda inbox, now_s: None,
 ) -> Run:
-    """The loop with these publishers; `at` is called in every tick, as an operator may."""
+    """Run the loop with these publishers; `at` is called in every tick."""
     inbox, way, samples, start_s = SetpointInbox(sources), Way(), [], loop.now_s
     coming = heapq.merge(*(each.messages(start_s, lasts_s) for each in publishers))
     following = next(coming, None)
@@ -124,7 +119,6 @@ def swell_N(time_s: float) -> float:
 def test_when_the_first_is_gone_the_second_takes_over_along_the_ramp(armed: ClosedLoop, core: Core) -> None:
     done = run(armed, Publisher(constant(1.6), to_s=1.5), Publisher(constant(0.8), "b", from_s=1.0))
     assert done.error_N(constant(1.6), 1.0, 1.5) < 0.05
-    # the last setpoint is valid for 0.1 s; 0.8 N take 0.4 s
     assert done.error_N(constant(0.8), 2.2) < 0.05
     passed_s = [time_s for time_s in done.held_by(Limit.TAKEOVER) if time_s > 1.0]
     assert passed_s[0] == pytest.approx(1.6, abs=0.01)
@@ -217,7 +211,7 @@ def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
     done = run(armed, Publisher(swell_N, way_s=lambda t: noise.uniform(0.08, 0.0815)), lasts_s=6.0)
     found = done.way.report(400.0, armed.planner.believe.carriages.lag_s, Budget())
     delay_us = done.of("a").delay_us
-    # in ticks of 1 ms: what arrives is read in the next, planned in it, and driven in the one after; bins are 3% wide
+    # what arrives is read in the next tick of 1 ms, and driven in the one after
     assert 0.0 < found.to_duty_us.p50 - delay_us.p50 <= 1_000.0 + 0.04 * delay_us.p50
     assert delay_us.p50 == pytest.approx(81e3, rel=0.04)
     assert found.carriages_ms is not None
@@ -227,7 +221,7 @@ def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
 
 
 def aligned_rms_N(done: Run, from_s: float = 1.5) -> float:
-    """How well the plant's force follows the swell, with the delay that explains most taken out."""
+    """Return how well the plant's force follows the swell, with the best delay taken out."""
     known = [(each.time_s - done.start_s, each.truth.force_N) for each in done.samples]
     counted = [(time_s, force_N) for time_s, force_N in known if time_s >= from_s]
     return min(
@@ -246,7 +240,6 @@ def test_a_playout_of_the_delays_p99_makes_jitter_as_good_as_a_steady_way(arm: C
     steady = run(arm(), Publisher(swell_N, way_s=lambda t: playout_ms * 1e-3))
     played = run(arm(), jittery(), sources=Sources(playout_ms=playout_ms))
     assert aligned_rms_N(played) <= 1.2 * aligned_rms_N(steady) < aligned_rms_N(before)
-    # and it is told what that costs: the rest of the playout, besides the delay
     found = played.inbox.report(played.samples[-1].time_s).playout
     assert found is not None
     assert 0 < found.late <= 0.03 * found.setpoints

@@ -42,24 +42,19 @@ from tormagd.simulation.plant import Truth
 
 UP, DOWN = "to the daemon", "to the device"
 SLOWEST = 0.7
-"The slowest clock of a device here, over the host's."
 TIMEOUT_MS = 51
-"By when a device that hears no Drive has left RUN."
+"A device that hears no Drive has left RUN by then."
 SILENT_MS = {FUNCTION[State]: 52, FUNCTION[Status]: 102, FUNCTION[Sense]: 102}
-"By when the daemon drives no more without this stream, as docs/states.md has it."
+"The daemon stops driving by then without this stream (docs/states.md)."
 ASKED_MS = 5
-"How long a command may be on its way."
 RECONNECTED_MS = 6_000
-"By when a device that was reset has been found again and asked to open, and is open, though messages are lost."
+"A device that was reset has been found, asked to open, and is open by then."
 MODE_AT = 6
-"Of a Drive's mode, behind function, sequence and two duties."
 OPEN_MM, OPENED_MM, UNHOMED_MM_S, TURNED_MS = 95.0, 93.5, 8.0, 300.0
-"How slowly a device opens, one without a zero, and what it takes to turn round and to taper."
+"How slowly a device without a zero opens, and what turning round takes."
 FROZEN_MS = 103
-"Until its watchdog resets a firmware that hangs."
 PATIENCE_S, SETTLED_MS = 15.0, 110
 CLOSING_MS = 300
-"In which an armed gap closes by some millimetres."
 HINDERING = (
     "blocked_left",
     "motor_dead_left",
@@ -68,13 +63,10 @@ HINDERING = (
     "motor_reversed_left",
     "switch_stuck_left",
 )
-"With these nothing can open the gap; named they are nevertheless."
+"With these nothing can open the gap; they are named all the same."
 HELD = DeviceFault.SUPPLY | DeviceFault.HOMING_FAILED | DeviceFault.RETRACT_FAILED
-"Latched with these the device rests where it is, until somebody has cleared and homed it."
 DEAF, RESTS = ("commands_vanish", "other_schema"), (DeviceMode.IDLE, DeviceMode.LATCHED)
-"A device that was reset and hears nobody rests where it is."
 ASKED = {DeviceMode.HOMING: DeviceRequest.HOME, (DeviceMode.LATCHED, DeviceMode.IDLE): DeviceRequest.CLEAR}
-"Modes and ways that a device takes only where it is asked to."
 FAULTS = (
     *("reset", "frozen", "overheated", "end_stop_left", "commands_vanish", "no_state", "no_sense", "no_status"),
     *("encoder_stuck_left", "encoder_jump", "encoder_reversed_left", "duties_reversed", "answers_half", "state_crc"),
@@ -93,7 +85,7 @@ Pair = tuple[OperatingState, DeviceMode]
 
 
 class BadLine:
-    """A device behind a line that loses or damages the next frames of a direction, all or those of one function."""
+    """A device behind a line that loses or damages the next frames."""
 
     def __init__(self, device: SerialDevice) -> None:
         self._device, self.messages = device, device.messages
@@ -120,7 +112,7 @@ class BadLine:
         return b"".join([self._carried(UP, frame + DELIMITER) for frame in frames])
 
     def _carried(self, direction: str, frame: bytes) -> bytes:
-        function = frame[1]  # the code that COBS puts before it is never the function's own: that is no zero
+        function = frame[1]  # COBS puts a code before it that never equals the function
         for kind in (function, 0) if self.spells else ():
             left, bit = self.spells.pop((direction, kind), (0, 0))
             if left > 1:
@@ -135,7 +127,6 @@ class BadLine:
 
 @cache
 def plant() -> PlantParameters:
-    """Sample 1, switched on near its open end: it has homed within a second."""
     parameters = load_plant("sample_1")
     near = msgspec.structs.replace(parameters.assumed, start_left_mm=47.2, start_right_mm=47.0)
     return msgspec.structs.replace(parameters, assumed=near)
@@ -143,14 +134,12 @@ def plant() -> PlantParameters:
 
 @cache
 def rare_plans() -> Core:
-    """A core that plans as seldom as is allowed: time here is ticks."""
+    """A core that plans as seldom as is allowed, because time here is ticks."""
     config = Config()
     return build_core(msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, inference_hz=100)))
 
 
 class Together(RuleBasedStateMachine):
-    """What may happen to a daemon and its device."""
-
     visited: ClassVar[set[Pair]] = set()
     faults: ClassVar[set[Fault]] = set()
     examples = periods = 0
@@ -166,12 +155,10 @@ class Together(RuleBasedStateMachine):
         self.force_N = 1.1
         self.is_armed = False
         self.firmware, self.mode = device.messages.firmware, DeviceMode.IDLE
-        # periods: in which the daemon last drove, asked for each request, and the device was reset; by when what is
+        # in periods: when the daemon last drove, asked for each request, and reset the device
         self.undriven = self.reset = self.hangs_until = 0
         self.asked = dict.fromkeys(DeviceRequest, 0)
         self.open_by, self.was_held = 0.0, False
-
-    # -- what happens ----------------------------------------------------------------------------------------------
 
     @initialize(is_armed=st.sampled_from([True, True, True, False]), force_N=st.sampled_from([0.95, 1.1, 1.3]))
     def begin(self, is_armed: bool, force_N: float) -> None:
@@ -233,7 +220,6 @@ class Together(RuleBasedStateMachine):
     @precondition(lambda self: not self.is_armed)
     @rule()
     def arm(self) -> None:
-        """As far as one gets in two seconds."""
         self.follow(Arming(self.loop.now_s, self.loop.stepper.safety.faults), self.loop.now_s + 2.0)
         self.run(CLOSING_MS)
 
@@ -243,15 +229,13 @@ class Together(RuleBasedStateMachine):
         type(self).examples += 1
         type(self).periods += self.line.period
 
-    # -- how time passes -------------------------------------------------------------------------------------------
-
     def put_right(self) -> None:
         self.loop.simulated.mend()
         self.struck.clear()
         self.line.spells.clear()
 
     def lead_out(self) -> None:
-        """Once the cause is gone the documented commands lead to ENABLED."""
+        """Check that the documented commands lead to ENABLED once the cause is gone."""
         self.put_right()
         faults, until_s, said = self.loop.stepper.safety.faults, self.loop.now_s + PATIENCE_S, list[str]()
         while not self.is_armed or not self.stays_armed():
@@ -261,7 +245,6 @@ class Together(RuleBasedStateMachine):
             assert self.loop.now_s < until_s, f"no way out of {faults}: {said[-3:]}"
 
     def stays_armed(self) -> bool:
-        """Whether it is ENABLED, once whatever is on its way has come."""
         if self.loop.stepper.safety.operating_state is OperatingState.PAUSED:
             return False
         self.run(SETTLED_MS)
@@ -291,8 +274,6 @@ class Together(RuleBasedStateMachine):
                 self.loop.tick(TimedSetpoint(self.force_N, now_s - now_s % 0.01, 0.1))
             self.judge(is_away)
 
-    # -- what holds ------------------------------------------------------------------------------------------------
-
     def judge(self, is_away: bool) -> None:
         safety, firmware, line = self.loop.stepper.safety, self.loop.simulated.firmware, self.line
         before, self.mode = self.mode, firmware.mode
@@ -316,7 +297,7 @@ class Together(RuleBasedStateMachine):
                 assert silent_ms <= longest_ms, f"driven {silent_ms} ms after the last of function {function}"
 
     def judge_device(self, before: DeviceMode) -> None:
-        """It runs for a daemon that drives it, and homes or forgets a fault for one that has asked for that."""
+        """It runs, homes or clears a fault only for a daemon that asks for it."""
         now, mode = self.line.period, self.mode
         if mode is DeviceMode.RUN:
             most_ms = TIMEOUT_MS / (SLOWEST if "clock=-30%" in self.struck else 1.0)
@@ -328,7 +309,6 @@ class Together(RuleBasedStateMachine):
             assert since_ms <= ASKED_MS, f"{before.name} to {mode.name} {since_ms} ms after {request} was asked"
 
     def judge_gap(self) -> None:
-        """Whatever is lost, the gap is open in the time that opening takes."""
         gap_mm, now = self.loop.simulated.truth.gap_mm, self.line.period
         is_deaf = self.mode in RESTS and not self.struck.isdisjoint(DEAF)
         is_over = self.mode is DeviceMode.RUN or gap_mm > OPENED_MM

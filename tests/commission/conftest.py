@@ -1,4 +1,4 @@
-"""A simulated device in virtual time that courses run on; what its wire says may be altered."""
+"""A simulated device in virtual time for courses; what its wire says may be altered."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -28,7 +28,6 @@ CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
 PLACES = [TickRecord.__struct_fields__.index(name) for name in COLUMNS]
 MONOTONIC = COLUMNS.index("monotonic_s")
 Altered = Callable[[float, Message], Message]
-"From the time, s, and a message of the device to what arrives of it."
 
 
 class AlteringLine:
@@ -49,8 +48,6 @@ class AlteringLine:
 
 
 class Bench:
-    """A core and its simulated device."""
-
     def __init__(
         self,
         plant: PlantParameters,
@@ -69,7 +66,6 @@ class Bench:
             self.loop.tick()
 
     def command(self, name: str) -> None:
-        """As `tormagctl` gives it: a `disable` that is refused is over."""
         try:
             self.loop.command(name)
         except RefusedError:
@@ -77,7 +73,7 @@ class Bench:
                 raise
 
     def exchange(self, asked: Asked) -> Heard:
-        """Five ticks with one setpoint."""
+        """Run five ticks with one setpoint."""
         if self.loop.now_s >= self.ends_s:
             raise KeyboardInterrupt
         setpoint = None
@@ -98,13 +94,11 @@ class Bench:
         return Heard(self.loop.now_s, rows)
 
     def follow(self, course: Course[Found]) -> Found:
-        """What a course finds."""
         return drive(course, self)
 
     def commission(
         self, steps: Sequence[Step] = STEPS, weight_N: float | None = None
     ) -> tuple[dict[str, list[Finding]], Stopped | None]:
-        """The findings by step, and why it stopped."""
         found: dict[str, list[Finding]] = {}
         known = Known(CONFIG, 1e-3, self.least_N, 2.0, weight_N)
         course = sequence(
@@ -115,5 +109,4 @@ class Bench:
 
 @pytest.fixture(scope="session")
 def bench() -> type[Bench]:
-    """Makes a simulated device to commission."""
     return Bench

@@ -25,7 +25,6 @@ NEW = begun(None, 7, 0, None, CONFIG.motor)
 
 
 def with_part(name, **changes):
-    """Sample 1 with changes in one of its parts."""
     return msgspec.structs.replace(SAMPLE, **{name: msgspec.structs.replace(getattr(SAMPLE, name), **changes)})
 
 
@@ -52,11 +51,11 @@ def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench, tmp_path)
     assert page.count("<td>pass</td>") == sum(map(len, found.values())) > 30
     after = begun(msgspec.structs.replace(reread(report), began_ns=5), 7, 6, None, CONFIG.motor)
     assert "<td>+0</td>" in page_of(msgspec.structs.replace(after, findings=found))
-    # one that found nothing is no last one
+    # one that found nothing does not count as the last
     assert begun(after, 7, 8, None, CONFIG.motor).last_ns == after.last_ns == 5
-    # what a pulse would teach of the lag; fast sines teach three times as much
+    # fast sines teach three times as much of the lag as a pulse
     assert run.loop.planner.believe.carriages.lag_s < 0.008
-    # the daemon begins from it, and a core can be built: gains for the motor as it is
+    # a core can be built with it: gains for the motor as it is
     file = tmp_path / "00000007.toml"
     file.write_text(calibration(report, CONFIG))
     config = build_core(load_calibration(file, CONFIG, 7)).config
@@ -70,7 +69,6 @@ def test_a_healthy_device_passes_every_row_and_its_page_says_so(bench, tmp_path)
 
 
 def slipping():
-    """The left coupling loses 1% of what it goes towards closed."""
     lost_mm, last_mm = 0.0, None
 
     def alters(now_s, message):
@@ -86,7 +84,6 @@ def slipping():
 
 
 def sensing(changed):
-    """A sensor that reads what `changed` makes of the force."""
     return lambda now_s, message: (
         message.replaced(force_N=changed(message.force_N)) if isinstance(message, Sense) else message
     )

@@ -1,4 +1,4 @@
-"""The configuration: defaults that hold together, and refusals that say which key, which value, and what is allowed."""
+"""The configuration: defaults that hold together, and refusals with key, value, and what is allowed."""
 
 import json
 from collections.abc import Callable
@@ -21,7 +21,6 @@ Write = Callable[[str], Path]
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
-    """Writes a configuration file."""
 
     def write_toml(text: str) -> Path:
         path = tmp_path / "tormagd.toml"
@@ -32,7 +31,6 @@ def write(tmp_path: Path) -> Write:
 
 
 def refusal(path: Path, *said: str) -> str:
-    """What the refused file is told, with these words in it."""
     with pytest.raises(ConfigError) as caught:
         load_config(path)
     text = str(caught.value)
@@ -42,7 +40,6 @@ def refusal(path: Path, *said: str) -> str:
 
 
 AT_SCENES = Rates(of_scene=True)
-"Where a file states no rate."
 
 
 def test_no_file_and_an_empty_file_are_the_defaults(write) -> None:
@@ -111,6 +108,9 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
         ("[sources]\npriority = ['']", "$.sources.priority", "['']", ">= 1"),
         ("[sources]\npriority = ['a', 'a']", "sources.priority", "('a', 'a')", "different printable names"),
         ('[sources]\npriority = ["\\u001b[2J"]', "sources.priority", "x1b", "different printable names"),
+        ("[sources.keys]\nrobot = ['0123']", "sources.keys.robot", "('0123',)", "tormagctl keys show"),
+        ("[sources.keys]\nrobot = []", "sources.keys.robot", "()", "one or more"),
+        ("[sources.keys]\na = ['0123:4567:89ab:cdef']", "sources.keys", "['a']", "none where endpoints.setpoint asks"),
         # orders that cannot be
         ("[rates]\ncontrol_hz = 200\ninference_hz = 250", "rates.inference_hz = 250", "250", "rates.control_hz = 200"),
         ("[rates]\ntelemetry_hz = 60", "rates.telemetry_hz = 60", "60", "rates.control_hz = 1000"),
@@ -275,12 +275,12 @@ def test_check_prints_the_resolved_configuration_and_names_a_broken_plugin(write
         ("[position]\nproportional_per_mm = 500.0", "margin"),
         ("[rates]\ncontrol_hz = 250", "rates.control_hz"),
         ("not toml", "line 1"),
-        # a refusal that takes more than the file names line and key, too
+        # refusals that need more than the file name line and key, too
         ('\nscene = "pulsee"\n', "did you mean `pulse`? (line 2)\n"),
         ('[device]\nbackend = "cann"\n', "did you mean `can`? (line 2)\n"),
         ("[device.options]\nbuad = 9600\n", "did you mean `baud`? (line 2)\n"),
         ('[device]\nbackend = "can"\noptions.interface = "sockcan"\n', "did you mean `socketcan`? (line 3)\n"),
-        # what is missing, or does not fit together, with the line of its table
+        # missing or conflicting values, with the line of their table
         ('[device]\nport = "can0"\nbackend = "can"\n', " (line 1)\n"),
         ('[device]\nbackend = "can"\n[device.options]\nnode = 2\n', " (line 3)\n"),
         ("[rates]\ncontrol_hz = 1000\n[position]\nproportional_per_mm = 500.0\n", " (line 3)\n"),
@@ -332,9 +332,6 @@ def test_the_sample_files_are_accepted(example: Path) -> None:
     config = load_config(example)
     assert config.scene == "coronary"
     choose(config.device, config.rates)
-
-
-# -- what a device's calibration states goes before it -----------------------------------------------------------------
 
 
 def test_a_calibration_goes_before_the_configurations_own_keys(write) -> None:

@@ -26,7 +26,6 @@ def ring(folder: Path) -> KeyRing:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """What `tormagctl keys generate` makes."""
     generate("server", tmp_path, tmp_path)
     for role in ("publish", "operate", "observe"):
         generate(f"{role}r", tmp_path, tmp_path / role)
@@ -160,9 +159,6 @@ def test_a_fingerprint_is_the_keys_own() -> None:
 
 def test_an_empty_folder_lets_nobody_in(tmp_path: Path) -> None:
     assert list(load_folder(tmp_path)) == []
-
-
-# -- the configuration ---------------------------------------------------------------------------------------------
 
 
 def test_other_machines_are_taken_with_keys_only() -> None:

@@ -35,20 +35,18 @@ LOADED = "tormagd.assembly.build.load_model"
 
 
 def load_forgetful(path: Path, **meant: str) -> ForceModel:
-    """A model that remembers nothing: with it a gap and a force say the same at any time."""
+    """A model that remembers nothing, so that a gap and a force say the same at any time."""
     model = load_model(path, **meant)
     return replace(model, metadata=msgspec.structs.replace(model.metadata, memory=NO_MEMORY))
 
 
 @pytest.fixture
 def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cores are built with such a model."""
     monkeypatch.setattr(LOADED, load_forgetful)
 
 
 @pytest.fixture(scope="session")
 def core(config: Config) -> Core:
-    """Of the shipped coronary scene, with such a model."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(LOADED, load_forgetful)
         return build_core(config)
@@ -56,13 +54,12 @@ def core(config: Config) -> Core:
 
 @pytest.fixture
 def planner(core: Core) -> Planner:
-    """Of a device that nothing is known of."""
     return core.planner()
 
 
 @pytest.fixture(scope="session")
 def measure() -> MeasurementMaker:
-    """A healthy homed device's measurement `number`, a millisecond apart, at a gap of 80 mm."""
+    """Measurements of a healthy homed device, a millisecond apart, at a gap of 80 mm."""
 
     def make(number: int, **changes: object) -> Measurement:
         healthy = Measurement(
@@ -115,7 +112,6 @@ class Bench:
 
     @property
     def opened_for(self) -> tuple[Fault, ...] | None:
-        """The faults for which the drives are off, and the device has been asked to open; None where it is not so."""
         is_faulty = self.stepper.safety.operating_state is OperatingState.FAULT
         is_opened = is_faulty and self.is_off and self.output.request is DeviceRequest.RETRACT
         return self.faults if is_opened else None
@@ -126,29 +122,26 @@ class Bench:
 
     @staticmethod
     def gap(gap_mm: float) -> dict[str, float]:
-        """Of a measurement: carriages this far apart."""
         return dict.fromkeys(("left_mm", "right_mm"), gap_mm / 2.0 - 47.5)
 
     def plan(self, gap_mm: float, **fields: object) -> Plan:
-        """A plan of now for a gap."""
         at_rest = Plan(1, self.now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
         return at_rest.replaced(**fields)  # type: ignore[arg-type]
 
     def at(self, now_s: float, measurement: Measurement | None, aim: Plan | float = 80.0) -> Duty:
-        """One step, whenever that is."""
         self.now_s = now_s
         self.output = self.stepper.step(now_s, measurement, aim if isinstance(aim, Plan) else self.plan(aim))
         return self.output
 
     def step(self, aim: Plan | float = 80.0, count: int = 1, **changes: object) -> Duty:
-        """Some control periods with the same kind of measurement."""
+        """Run some control periods with the same kind of measurement."""
         for _ in range(count):
             self.ticks += 1
             self.at(self.ticks * PERIOD_S, self.measure(self.ticks, **changes), aim)
         return self.output
 
     def silent(self, measurement: Measurement | None, count: int = 1) -> Duty:
-        """Some control periods in which this same measurement is the newest."""
+        """Run some control periods in which this measurement stays the newest."""
         for _ in range(count):
             self.ticks += 1
             self.at(self.ticks * PERIOD_S, measurement)
@@ -158,19 +151,17 @@ class Bench:
         self.stepper.command(name, self.now_s, READY.replaced(**conditions))  # type: ignore[arg-type]
 
     def refused(self, name: str, **conditions: object) -> RefusedError:
-        """A command that is refused."""
         with pytest.raises(RefusedError) as caught:
             self.command(name, **conditions)
         return caught.value
 
     def enabled(self, **changes: object) -> "Bench":
-        """Enabled after three periods of this kind."""
         self.step(count=3, **changes)
         self.command("enable")
         return self
 
     def run_into(self, fault: Fault, aim: Plan | float = 80.0, **changes: object) -> int:
-        """Periods until exactly this fault is latched, and so the drives off and the device asked to open."""
+        """Return how many periods it takes until exactly this fault is latched."""
         start = self.ticks
         while not self.faults:
             self.step(aim, **changes)
@@ -181,8 +172,6 @@ class Bench:
 
 @pytest.fixture(scope="session")
 def make_bench(core: Core, measure: MeasurementMaker) -> Callable[..., Bench]:
-    """Makes benches, of a configuration with other values in the sections that are named."""
-
     def make(scene: Scene = core.scene, **sections: dict[str, object]) -> Bench:
         changed = {
             name: msgspec.structs.replace(getattr(core.config, name), **values) for name, values in sections.items()
@@ -199,7 +188,6 @@ def bench(make_bench: Callable[..., Bench]) -> Bench:
 
 @pytest.fixture
 def running(bench: Bench) -> Bench:
-    """Enabled at a gap of 80 mm, and at rest there."""
     bench.enabled().step(count=3)
     assert bench.stepper.safety.operating_state is OperatingState.ENABLED
     return bench
@@ -219,8 +207,6 @@ def moving() -> Callable[..., Measured]:
 
 @pytest.fixture(scope="session")
 def planned() -> Callable[..., Plan]:
-    """The planner's next plan, a period later, for a setpoint of that moment."""
-
     def plan(planner: Planner, force_N: float, measured: Measured | None = None, **setpoint: object) -> Plan:
         now_s = planner.planned.time_s + PLAN_PERIOD_S
         if measured is not None:

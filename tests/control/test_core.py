@@ -37,9 +37,6 @@ def test_enabling_wants_a_measurement(bench) -> None:
     assert (refused, bench.stepper.safety.operating_state) == ("not_fresh", OperatingState.DISABLED)
 
 
-# -- counts that jump ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
 def test_counts_that_jump_and_come_back_do_no_harm(running, jump_mm: float) -> None:
     pushed = running.step(left_mm=-7.5 + jump_mm)
@@ -107,12 +104,9 @@ def test_homing_forgets_the_motion_before_it(bench) -> None:
     for tick in range(5):
         bench.step(mode=DeviceMode.HOMING, left_mm=float(tick), right_mm=float(tick), switches=Switches(0))
     bench.step(left_mm=0.0, right_mm=0.0)
-    # the origin jumped by 4 mm with the last homing state: one period's filtered jump is not carried further
+    # the origin jumped with the last homing state: one period's filtered jump is not carried further
     bench.step(left_mm=0.0, right_mm=0.0, mode=DeviceMode.RETRACTING)
     assert bench.stepper.measured.left_mm_s == 0.0
-
-
-# -- a link that goes, and numbers that are none -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("names", [[], ["pause"]])
@@ -171,9 +165,6 @@ def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> Non
     assert (running.stepper.time_s, planner.planned.number) == (before_s, 0)
 
 
-# -- commands ------------------------------------------------------------------------------------------------------
-
-
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:
     broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED, "left_mm": 0.0, "right_mm": 0.0}
     bench.step(**broken)
@@ -189,8 +180,6 @@ def test_a_latched_fault_asks_once_and_stays(running) -> None:
     running.step(count=100)
     assert running.opened_for == (Fault.DEVICE_SKEW,)
 
-
-# -- any input -----------------------------------------------------------------------------------------------------
 
 measurements = st.none() | st.builds(
     Measurement,
@@ -244,13 +233,8 @@ def test_any_history_keeps_duties_in_bounds_and_repeats_itself(make_bench, histo
     assert runs[0] == runs[1]
 
 
-# -- clocks and stalls ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def make_moving(make_bench):
-    """Makes benches on the way from 80 to 60 mm, whose carriages are where they are wanted."""
-
     def make():
         moving = make_bench().enabled()
         for _ in range(10):
@@ -295,7 +279,7 @@ def test_after_a_stall_one_drive_asks_and_moves_nothing(make_moving, elapsed_s: 
 @pytest.mark.parametrize("came_mm", [0.0, -1.7, 1.0])
 def test_the_answer_to_it_is_gone_on_from_without_a_kick(make_moving, came_mm: float) -> None:
     moving = make_moving()
-    # carriages that are where they are wanted at once pass for lively, and those are braked harder
+    # carriages that are at once where they are wanted pass for lively, and those are braked harder
     moving.move.acceleration_scale = 1.0
     integral, came_mm = moving.move.left.integral, moving.move.reference.gap_mm + came_mm
     for number, at_s in enumerate((moving.now_s + 0.045, moving.now_s + 0.046), moving.ticks):

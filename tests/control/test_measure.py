@@ -16,8 +16,6 @@ HANDLE_COUNT_MM = 2.0 * math.pi * 20.0 / 16384.0
 
 
 class Look:
-    """The stage, which is shown one measurement after another."""
-
     def __init__(self) -> None:
         self._stage = Measure(47.5, 0.003, turns=True, full_speed_mm_s=20.0, period_s=1e-3)
 
@@ -35,8 +33,6 @@ def look() -> Look:
 
 @pytest.fixture(scope="session")
 def follow_handle(measure):
-    """What is measured after the handle has been at each of these places, a millisecond apart."""
-
     def follow(positions: list[float], force_N: float = 0.6) -> Measured:
         return Look()(*[measure(number, handle_mm=mm, force_N=force_N) for number, mm in enumerate(positions)])
 

@@ -29,13 +29,11 @@ def pad_core() -> Core:
 
 
 def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, **changes: object) -> Measured:
-    """A homed device with a finger that deep in its pad."""
     handle, half_mm = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, 0.0)), gap_mm / 2.0
     return Measured(1, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0).replaced(**changes)
 
 
 def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = DEPTH_MM) -> Planner:
-    """After that force was asked for so long, the gap at once where it should be, and nothing learned."""
     planner = core.planner()
     for tick in range(1, round(seconds / PERIOD_S) + 1):
         now_s = tick * PERIOD_S

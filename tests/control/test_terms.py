@@ -1,4 +1,4 @@
-"""Every term can be left out, which is decided at construction, and then it is not there: not learned, not used."""
+"""Every term can be left out at construction; then it is neither learned nor used."""
 
 import math
 
@@ -33,8 +33,6 @@ def core_without(*names: str, learning: bool = True) -> Core:
 
 @pytest.fixture(scope="session")
 def told(moving, planned):
-    """One plan more, for which the device says something new: 1.2 N at 78 mm, less than the model expects."""
-
     def tell(planner: Planner, asked_N: float, rate_mm_s: float = 42.0, **setpoint: object) -> Plan:
         at_mm = 100.0 + rate_mm_s * (planner.planned.time_s + PERIOD_S)
         handle = Handle(MOBILISED_MM, rate_mm_s, Turn(1.0, 0.0, at_mm), rate_mm_s)
@@ -48,8 +46,6 @@ def told(moving, planned):
 
 @pytest.fixture(scope="session")
 def after(told):
-    """A planner after so many plans."""
-
     def run(core: Core, plans: int, rate_mm_s: float = 42.0, force_N: float = 1.0) -> Planner:
         planner = core.planner()
         for _ in range(plans):
@@ -153,7 +149,7 @@ def test_without_the_motor_what_is_known_of_it_is_not_looked_at(told) -> None:
 
 @pytest.fixture
 def duties(make_bench):
-    """The first duties of an armed device on its way from 80 mm; it has not moved yet, so nearly all is fed forward."""
+    """The first duties of an armed device on its way from 80 mm, nearly all of which is fed forward."""
 
     def first(target_mm: float, *left_out: str, **motor: float) -> list[float]:
         bench = make_bench(scene_without(*left_out), motor=motor).enabled()

@@ -2,8 +2,8 @@
 
     python tests/core/histories.py     a line of JSON: which build ran, and SHA-256 by kind of history
 
-Every float goes into its digest as it is: one bit in one number of one tick is another digest. A whole run, in both
-builds, is a black box that tests/replay has the other build run again.
+Every float goes into its digest as it is, to the last bit. A whole run, in both builds, is a black box that
+tests/replay has the other build run again.
 """
 
 import hashlib
@@ -48,20 +48,16 @@ STRANGE = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, -1e300, 1e9, -1.0]
 EPISODES, TICKS = 40, 150
 COMMANDS = ["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"]
 NEXT = {OperatingState.DISABLED: "enable", OperatingState.FAULT: "clear-fault"}
-"What leads back to where something is driven."
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
 WAYS = {(row.event, row.source): row.target for row in ROWS if isinstance(row, Transition)}
 
 
 class Digest:
-    """SHA-256 over whatever it is shown."""
-
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
         self.shown_bytes = 0
 
     def see(self, thing: object) -> None:
-        """Takes a value, a stage of the core or an error, with everything in it."""
         shown = packed(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing))
         self.shown_bytes += len(shown)
         self._hash.update(shown)
@@ -71,11 +67,8 @@ class Digest:
         return self._hash.hexdigest()
 
 
-# -- step and plan, whatever is measured ---------------------------------------------------------------------------
-
-
 def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
-    """Measurements, setpoints and commands at random; a tenth of all numbers is none that a device gives."""
+    """Random measurements, setpoints and commands; a tenth of all numbers is none that a device gives."""
     rng = random.Random(12)
     for _ in range(episodes):
         strangeness = rng.choice([0.0, 0.0, 0.01, 0.1])
@@ -106,7 +99,7 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
                     planner.plan(now_s, setpoint, stepper.measured, rng.random() < 0.8)
                     seen.see(planner)
                     planner.foresee()
-                except (ValueError, OverflowError) as error:  # of what is not finite, and no wire brings
+                except (ValueError, OverflowError) as error:
                     seen.see(error)
                     seen.see(planner)
                     planner = core.planner(now_s)
@@ -125,7 +118,6 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
 
 
 def check_step(output: Duty, before: SafetyState, after: SafetyState) -> None:
-    """Duties are within the limit, and finite; nothing is driven while it may not be."""
     duties, limit = (output.left_duty, output.right_duty), CONFIG.position.duty_limit
     assert all(abs(duty) <= limit for duty in duties), f"duties = {duties} in {after}"
     is_off = output.mode is DriveMode.OFF and duties == (0.0, 0.0)
@@ -134,7 +126,7 @@ def check_step(output: Duty, before: SafetyState, after: SafetyState) -> None:
 
 
 def check_way(event: Event, before: SafetyState, after: SafetyState) -> None:
-    """The operating state changes only along a row of the table, and has faults in FAULT and there only."""
+    """Check that the operating state changes along a row of the table, and that faults are latched in FAULT alone."""
     source, target = before.operating_state, after.operating_state
     assert (after.faults != ()) == (target is OperatingState.FAULT), str(after)
     if event is Event.FAULT and set(after.faults) <= set(before.faults):
@@ -145,8 +137,6 @@ def check_way(event: Event, before: SafetyState, after: SafetyState) -> None:
 
 
 def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, strangeness: float) -> Measurement:
-    """A homed device's that runs, mostly; its carriages are at about the same place."""
-
     def some(low: float, high: float) -> float:
         return rng.choice(STRANGE) if rng.random() < strangeness else rng.uniform(low, high)
 
@@ -175,7 +165,7 @@ def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, str
 
 
 def setpoint_at(rng: random.Random, now_s: float) -> TimedSetpoint:
-    """As it may come through the endpoint: finite, but far from what the scene asks."""
+    """A setpoint as it may come through the endpoint: finite, but far from what the scene asks."""
     preview_N = tuple(rng.uniform(0.0, 3.0) for _ in range(rng.choice([0, 0, 1, 7])))
     return TimedSetpoint(
         rng.choice([rng.uniform(0.0, 2.5), 0.0, 1e6]),
@@ -189,7 +179,6 @@ def setpoint_at(rng: random.Random, now_s: float) -> TimedSetpoint:
 
 
 def conditions(rng: random.Random) -> Conditions:
-    """Mostly those under which a device can be enabled."""
     good = [rng.random() < 0.95 for _ in range(3)]
     return Conditions(
         connected=good[0],
@@ -200,11 +189,7 @@ def conditions(rng: random.Random) -> Conditions:
     )
 
 
-# -- bytes ---------------------------------------------------------------------------------------------------------
-
-
 def vectors(core: Core, seen: Digest) -> None:
-    """The golden vectors, right and wrong ones."""
     messages = json.loads((VECTORS / "messages.json").read_text(encoding="utf-8"))
     types: dict[str, Callable[..., Any]] = {layout.message.__name__: layout.message for layout in LAYOUTS}
     for vector in messages["valid"]:
@@ -219,7 +204,6 @@ def vectors(core: Core, seen: Digest) -> None:
 
 
 def streams(core: Core, seen: Digest) -> None:
-    """Frames of random messages, spoiled in many ways, in pieces; and what codec and link make of them."""
     rng = random.Random(8)
     for flips in (0.0, 0.001, 0.01, 0.1):
         stream = bytearray()
@@ -258,7 +242,6 @@ def _signal(rng: random.Random, low: float, high: float, kind: Callable[[Any], A
 
 
 def _attempted(seen: Digest, attempt: Callable[..., object], *arguments: object) -> None:
-    """What comes of it, a value or an error."""
     try:
         seen.see(attempt(*arguments))
     except (DecodeError, RefusedError) as error:
@@ -266,7 +249,6 @@ def _attempted(seen: Digest, attempt: Callable[..., object], *arguments: object)
 
 
 def main() -> None:
-    """Runs all of them."""
     core = build_core(CONFIG)
     histories: dict[str, Callable[[Core, Digest], None]] = {
         "vectors": vectors,

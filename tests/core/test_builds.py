@@ -16,11 +16,10 @@ from firmware_protocol.build import SWITCH, judged
 ROOT = Path(__file__).parents[2]
 HISTORIES = Path(__file__).parent / "histories.py"
 MIN_BYTES = 6_000
-"Each kind of history shows more; one that stopped early would show that two builds fail alike."
+"Each kind of history shows more; a history that stopped early would make two builds look alike."
 
 
 def started(switch: str) -> subprocess.Popen[str]:
-    """All histories, in a process of their own with that build."""
     environment = {**os.environ, SWITCH: switch, "PYTHONPATH": str(ROOT)}
     return subprocess.Popen([sys.executable, "-P", str(HISTORIES)], env=environment, stdout=subprocess.PIPE, text=True)
 

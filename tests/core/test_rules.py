@@ -1,4 +1,4 @@
-"""What holds in every step of the core, whatever comes in: many more of the hostile histories that both builds run."""
+"""What holds in every step of the core: many more of the hostile histories that both builds run."""
 
 import importlib.util
 from pathlib import Path
@@ -13,10 +13,8 @@ from tormagd.safety.operating_state import Event, OperatingState
 
 
 class Unseen:
-    """Takes no digest."""
-
     def see(self, thing: object) -> None:
-        """Nothing."""
+        """Drop it."""
 
 
 @pytest.fixture

@@ -148,7 +148,6 @@ def status(**changes: Any) -> dict[str, Any]:
                 "accepted": 3,
                 "refused": 1,
                 "dropped": 0,
-                "oversize": 0,
                 "last_refusal": "too much",
                 "newest_source": "a",
                 "sources": {"a": 4},

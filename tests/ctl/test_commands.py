@@ -296,7 +296,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
             "force     asked -, governed -, measured -",
             "gap       -, wanted -, skew -",
             "link      BACK_OFF, 1 losses",
-            "setpoint  - old, 3 accepted, 1 refused, 0 dropped, 0 oversize",
+            "setpoint  - old, 3 accepted, 1 refused, 0 dropped",
         ),
         ("late by",),
     ),

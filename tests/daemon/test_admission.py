@@ -4,7 +4,6 @@ import contextlib
 import os
 import socket
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.config import Config
+from tormagd.config import Config, Sources
 from tormagd.daemon import admission
 from tormagd.daemon.admission import CONNECTIONS_PER_PEER, PLAIN
 from tormagd.daemon.endpoint import Endpoint
@@ -74,9 +73,9 @@ class Rig:
         self.peers.append(made)
         return made
 
-    def dial(self) -> socket.socket:
-        """A stranger at the setpoints' TCP port, who has said nothing yet."""
-        port = int(self.addresses["setpoint"].rsplit(":", 1)[1])
+    def dial(self, name: str = "setpoint") -> socket.socket:
+        """A stranger at a TCP port, who has said nothing yet."""
+        port = int(self.addresses[name].rsplit(":", 1)[1])
         return socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
 
     def until(self, reached: Callable[[], Any], what: str = "reached") -> None:
@@ -90,6 +89,7 @@ class Rig:
             self.endpoint.serve(self.answer, 4)
             self.endpoint.admission.update()
             self.endpoint.tell(time.monotonic())
+            self.endpoint.hear()
             self.endpoint.publish_ticks([(1,)], ("a",))
             time.sleep(0.002)
 
@@ -97,12 +97,10 @@ class Rig:
         self.answered.append(request.command)
         return {}
 
-    def reasons(self) -> dict[tuple[str, str, str], int]:
-        """How many were refused by endpoint, reason and key."""
-        found: Counter[tuple[str, str, str]] = Counter()
-        for each in self.endpoint.report().refusals:
-            found[each.endpoint, each.reason, each.key] += each.count
-        return found
+    def newest(self) -> tuple[str, str, str]:
+        """Where, why and with which key a peer was refused last."""
+        (it,) = self.endpoint.report().refusals
+        return it.endpoint, it.reason, it.key
 
     def close(self) -> None:
         self.endpoint.close()
@@ -213,7 +211,7 @@ def test_a_key_opens_only_what_it_is_listed_for(rig: Rig, name: str, who: str) -
     for _ in range(3):
         rig.peer(KINDS[name], name, rig.pair(who))
     rig.until(lambda: rig.endpoint.report().refused == 3, "refused")
-    assert rig.reasons() == {(name, f"role not allowed: {role}", f"{fingerprint(rig.pair(who).public)} ({who})"): 3}
+    assert rig.newest() == (name, f"role not allowed: {role}", f"{fingerprint(rig.pair(who).public)} ({who})")
     # nor does it, whatever it calls itself; one that takes offence at our kind of socket itself may count twice
     peers = [rig.peer(kind, name, rig.pair(who)) for kind in (zmq.DEALER, zmq.XPUB, zmq.SUB)]
     peers[-1].subscribe(b"")
@@ -244,10 +242,10 @@ def test_nobody_else_is_let_in_and_everybody_is_counted(
             with contextlib.suppress(zmq.Again):  # one that was refused already has nobody to send it to
                 peer.send(request("stop") if name == "control" else setpoint(1), zmq.NOBLOCK)
     rig.until(lambda: rig.endpoint.report().refused == 5, "refused")
-    assert rig.reasons() == {(name, reason, key): 5}
+    assert rig.newest() == (name, reason, key)
     assert not any(peer.poll(5) for peer in peers)
     assert rig.answered == []
-    assert (rig.endpoint.inbox.accepted, rig.endpoint.inbox.refused, rig.endpoint.admission.oversize) == (0, 0, 0)
+    assert (rig.endpoint.inbox.accepted, rig.endpoint.inbox.refused) == (0, 0)
     here = "127.0.0.1" if rig.addresses[name].startswith("tcp") else f"process {os.getpid()} of user {os.getuid()}"
     # whoever left at once has taken his address with him
     assert {report.address for report in rig.endpoint.report().refusals} <= {here, "gone before it was seen"}
@@ -281,7 +279,24 @@ def test_a_stranger_gets_nothing_but_the_greeting_and_its_mechanism(rig: Rig, se
         if len(got) == 64:
             assert got[12:32] == b"CURVE".ljust(20, b"\0")
     rig.until(lambda: rig.endpoint.report().refused == 1, "refused")
-    assert [place[:2] for place in rig.reasons()] == [("setpoint", reason)]
+    assert rig.newest() == ("setpoint", reason, "")
+
+
+def test_who_may_publish_sends_under_no_name_that_another_key_has(rig: Rig) -> None:
+    listed = {"a": (fingerprint(rig.pair("robot").public), fingerprint(STRANGER.public))}
+    rig.endpoint.inbox.sources = Sources(keys=listed)
+    generate("other", rig.keys, rig.keys / "publish")
+    rig.endpoint.admission.let_in(rig.ring.load_allowed())
+    inbox = rig.endpoint.inbox
+    for name, count in (("other", (0, 1)), ("robot", (1, 1))):
+        publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair(name))
+        rig.until(partial(publisher.poll, 0))
+        publisher.send(setpoint(1))
+        rig.until(lambda count=count: (inbox.accepted, inbox.refused) == count)  # type: ignore[misc]
+    assert inbox.last_refusal == (
+        f"source 'a' from the key {fingerprint(rig.pair('other').public)}: allowed by sources.keys is "
+        f"{', '.join(listed['a'])}"
+    )
 
 
 # -- lists that change ---------------------------------------------------------------------------------------------
@@ -307,30 +322,6 @@ def test_a_list_that_is_read_again_lets_in_and_shuts_out(rig: Rig, caplog: pytes
     rig.until(lambda: rig.endpoint.report().connections["recording"] == 0, "the viewer cut off")
 
 
-@over_tcp
-def test_a_stranger_that_leaves_before_it_was_asked_about_is_counted_once(rig: Rig) -> None:
-    for _ in range(5):
-        stranger = rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
-        time.sleep(0.03)
-        stranger.close(linger=0)
-    rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 0, "closed")
-    rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
-    rig.until(lambda: rig.endpoint.report().refused >= 6, "refused")
-    assert rig.endpoint.report().refused == 6
-
-
-@over_tcp
-def test_one_that_leaves_in_the_handshake_is_not_taken_for_one_that_was_asked_about(rig: Rig) -> None:
-    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
-    rig.until(lambda: publisher.poll(0))
-    rig.peer(zmq.XPUB, "setpoint", STRANGER)
-    rig.dial().close()
-    time.sleep(0.05)
-    rig.until(lambda: rig.endpoint.report().refused >= 2, "counted")
-    rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 1, "closed")
-    assert (rig.endpoint.report().refused, len(rig.endpoint.admission.left)) == (2, 0)
-
-
 # -- how many ------------------------------------------------------------------------------------------------------
 
 
@@ -339,7 +330,7 @@ def test_an_address_has_so_many_connections_and_no_more(rig: Rig, monkeypatch: p
     monkeypatch.setattr(admission, "CONNECTIONS_PER_PEER", 5)
     strangers = [rig.dial() for _ in range(12)]
     rig.until(lambda: rig.endpoint.report().refused >= 7, "refused")
-    assert ("setpoint", "too many connections", "") in rig.reasons()
+    assert rig.newest() == ("setpoint", "too many connections", "")
     rig.until(lambda: rig.endpoint.report().connections["setpoint"] <= 5, "cut off")
     for stranger in strangers:
         stranger.close()
@@ -350,15 +341,22 @@ def test_an_address_has_so_many_connections_and_no_more(rig: Rig, monkeypatch: p
 
 
 @over_tcp
-def test_refused_peers_beyond_those_that_are_told_apart_are_counted_together(
-    rig: Rig,
+def test_those_that_say_nothing_keep_nobody_out_and_cut_nobody_off(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    rig.endpoint.admission.refusals.most = 4
-    for _ in range(10):
-        rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
-    rig.until(lambda: rig.endpoint.report().refused == 10, "refused")
-    counts = sorted((each.address == "others", each.count) for each in rig.endpoint.report().refusals)
-    assert counts == [*[(False, 1)] * 4, (True, 6)]
+    monkeypatch.setattr(admission, "CONNECTIONS_PER_PEER", 5)
+    consoles: list[zmq.Socket[bytes]] = []
+    with contextlib.ExitStack() as strangers:
+        for refused in (0, 7, 18):
+            rig.until(lambda refused=refused: rig.endpoint.report().refused >= refused, "cut off")  # type: ignore[misc]
+            consoles.append(rig.peer(zmq.DEALER, "control", rig.pair("console")))
+            for console in consoles:
+                console.send(request("status"))
+                rig.until(partial(console.poll, 0), "answered")
+                console.recv_multipart()
+            for _ in range(12):
+                strangers.enter_context(rig.dial("control"))
+    assert caplog.text.count("127.0.0.1 makes more connections to control than 5") == 1
 
 
 @over_tcp

@@ -63,10 +63,9 @@ def test_what_is_held_back_is_for_the_planner_as_if_it_had_been_meant_that_much_
     assert not held.take(5.0, 1, 4.99)
     assert at_once.take(5.0, 1, 4.99)
     assert held.inbox.hand_on(5.0501)
-    meant = at_once.inbox.newest
-    assert held.inbox.newest == meant.replaced(
-        stamp_s=pytest.approx(meant.stamp_s + 0.06), valid_for_s=pytest.approx(meant.valid_for_s - 0.06)
-    )
+    meant, played = at_once.inbox.newest, held.inbox.newest
+    assert (played.stamp_s, played.valid_for_s) == pytest.approx((meant.stamp_s + 0.06, meant.valid_for_s - 0.06))
+    assert meant.replaced(stamp_s=played.stamp_s, valid_for_s=played.valid_for_s) == played
     assert held.inbox.in_force.stamp_s == meant.stamp_s
 
 

@@ -1,17 +1,21 @@
 import msgspec
 
 from tormagd.config import Config, checked
-from tormagd.daemon.reload import LIVE, reread
+from tormagd.daemon.reload import reread
+from tormagd_client.endpoints import Endpoints
 
 RUNNING = Config()
+GUARDED = {"curve": {"server_secret": "s", "also_local": True}}
 
 
 def test_what_only_a_loop_looks_at_is_taken_over():
-    read = checked({"sources": {"priority": ["robot"], "playout_ms": 60.0}, "realtime": {"watchdog_ms": 800.0}}, Config)
-    again = reread(RUNNING, read)
-    assert set(again.taken) == set(LIVE), "a key in the list that is not carried over would be told as in force"
+    guarded = msgspec.structs.replace(RUNNING, endpoints=checked(GUARDED, Endpoints))
+    sources = {"priority": ["robot"], "playout_ms": 60.0, "keys": {"robot": ["0123:4567:89ab:cdef"]}}
+    read = checked({"sources": sources, "endpoints": GUARDED, "realtime": {"watchdog_ms": 800.0}}, Config)
+    again = reread(guarded, read)
     assert reread(again.config, read) == (read, (), ())
-    assert again == (read, ("realtime.watchdog_ms", "sources.playout_ms", "sources.priority"), ())
+    taken = ("realtime.watchdog_ms", "sources.keys.robot", "sources.playout_ms", "sources.priority")
+    assert again == (read, taken, ())
 
 
 def test_what_something_was_built_from_is_named_and_stays():

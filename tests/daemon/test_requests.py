@@ -9,7 +9,7 @@ from tormagd.daemon.tally import Peer
 
 
 def waiting(client: str, number: int = 0, opens: int = 0) -> Waiting:
-    return Waiting([client.encode()], str(number).encode(), Peer(""), opens)
+    return Waiting([client.encode()], str(number).encode(), Peer(""), 0, opens)
 
 
 def taken(requests: Requests) -> list[str]:

@@ -416,6 +416,19 @@ def test_a_silence_of_the_device_is_put_down_to_a_host_that_kept_the_loop_waitin
     assert names_host == ["doctor" in each.remedy for each in told] == [is_blamed, False, is_blamed, False]
 
 
+def test_a_command_that_is_repeated_is_logged_once_a_second(alone: Running, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        for _ in range(5):
+            alone.command("stop")
+        alone.tick(1_000)
+        alone.command("stop")
+    asked = "the device is asked to open the gap"
+    assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("stop")] == [
+        f"stop: DISABLED to FAULT: {asked}",
+        f"stop: FAULT to FAULT: {asked}; 4 times more before",
+    ]
+
+
 def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
     alone: Running, caplog: pytest.LogCaptureFixture
 ) -> None:

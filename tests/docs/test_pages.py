@@ -1,4 +1,4 @@
-"""The documentation says what is there: pages written from types are up to date, what is shown can be typed."""
+"""The documentation is true: generated pages are up to date, and what is shown can be typed."""
 
 import ast
 import importlib
@@ -44,12 +44,10 @@ DECISION = ["Question", "Decision", "Why", "Given up"]
 
 
 def name_of(page):
-    """As it is told in a failure."""
     return str(page.relative_to(ROOT))
 
 
 def blocks(text):
-    """Lines of code blocks, without what follows as a comment."""
     for _, language, body in FENCE.findall(text):
         if language in ("", "sh", "bash"):
             yield from body.splitlines()
@@ -57,12 +55,10 @@ def blocks(text):
 
 
 def spans(text):
-    """Code within a line."""
     return re.findall(r"`([^`\n]+)`", FENCE.sub("", text))
 
 
 def commands(lines):
-    """What of it is ours to check, as lists of words."""
     for line in lines:
         for part in re.split(r" && | \| |; ", line.split(" #")[0].split(" < ")[0].strip().removesuffix(" &")):
             found = COMMAND.fullmatch(part)
@@ -71,7 +67,6 @@ def commands(lines):
 
 
 def parser_of(words):
-    """The parser of a command, and its arguments; None where it has none here."""
     for begin, make in PARSERS.items():
         size = len(begin.split())
         if words[:size] == begin.split():
@@ -80,12 +75,10 @@ def parser_of(words):
 
 
 def known_options(parser):
-    """Every option of a command and of its subcommands."""
     return {*parser._option_string_actions}.union(*(known_options(each) for _, each in subparsers(parser)))
 
 
 def require_there(words):
-    """A tool, a module or a target that exists, with options that it names."""
     if words[0] == "make":
         targets = [word for word in words[1:] if "=" not in word]
         assert all(re.search(rf"^{target}:", MAKEFILE, re.MULTILINE) for target in targets), words
@@ -97,14 +90,14 @@ def require_there(words):
         tool = ROOT / words[1]
         source = tool.read_text(encoding="utf-8")
         parts = [*tool.parent.glob(f"*/{words[2].replace('-', '_')}.py")] if words[2:] else []
-        # options that several tools have in common stand in a module that they import
+        # several tools share options in a module that they import
         parts += [tool.parent / room / f"{name}.py" for room, name in IMPORTED.findall(source)]
         source += "".join(file.read_text(encoding="utf-8") for file in parts if file.exists())
         assert all(f'"{word}"' in source for word in words[2:] if word.startswith("--")), words
 
 
 def parsed(lines):
-    """Each command in them that has a parser here, with that and its arguments; the others have to be there."""
+    """Return each command that has a parser here; the others must exist."""
     for words in commands(lines):
         found = parser_of(words)
         if found is None:
@@ -152,18 +145,14 @@ def test_every_decision_has_the_same_four_parts(page):
     assert re.findall(r"^## (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE) == DECISION
 
 
-# -- what a message tells a user to type is there: in a wheel, where there is no checkout and no make ------------------
-
-
 SOURCES = sorted(file for room in ("tormagd", "firmware_protocol", "client") for file in (ROOT / room).rglob("*.py"))
 NAMED = re.compile(r"\b(tormagctl(?: --?[\w-]+)*|tormag-lab|python -m|python|make) ([a-z][\w./-]*)|\b(tools/\w+\.py)")
 TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 PROSE = ("of", "are")
-"What may follow `tormagctl` where a sentence speaks of the program."
+"What may follow `tormagctl` in a sentence about the program."
 
 
 def messages(source):
-    """The strings of a module that are not documentation."""
     tree = ast.parse(source.read_text(encoding="utf-8"))
     told = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.Expr)}
     for each in ast.walk(tree):
@@ -172,7 +161,7 @@ def messages(source):
 
 
 def is_there(program, word, tool):
-    """Whether an installed wheel has it; words after `make` and `python` that are no targets and no files are prose."""
+    """Whether an installed wheel has it."""
     if tool or program == "python":
         return LAB is None or not (tool or word.endswith(".py"))
     if program == "make":
@@ -200,9 +189,6 @@ def test_no_message_sends_an_operator_to_a_file_of_the_checkout():
     assert [(name_of(source), text) for source in SOURCES for text in messages(source) if file.search(text)] == []
 
 
-# -- committed pictures are of the figures that are committed beside them ----------------------------------------------
-
-
 DOCS = ROOT / "docs"
 GENERATED = ("inverse_trade.md", "learned_inverse.md", "reproduction.md")
 SHOWN = re.compile(r"\]\(([\w/]+\.png)\)")
@@ -210,7 +196,6 @@ DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 
 
 def drawn():
-    """Every picture that is drawn from committed figures, and these."""
     yield "images/scenes.png", measured().scenes
     yield "images/scenes_trade.png", measured()
     for path in sorted(DOCS.glob("evidence/*.json")):

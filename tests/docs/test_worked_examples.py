@@ -1,4 +1,4 @@
-"""The guides' worked examples run as they stand there, on a synthetic excerpt of what they fetch or measure."""
+"""The guides' worked examples run as printed, on a synthetic excerpt of what they fetch or measure."""
 
 import re
 import subprocess
@@ -21,7 +21,7 @@ from tormagd.scenes.scene import load_scene
 
 GUIDES = Path(__file__).parents[2] / "docs" / "guides"
 FETCHED = ("curl ", "tormag-lab bench-sweep ")
-"What a reader waits for: each test puts an excerpt in its place."
+"Each test puts an excerpt in their place."
 
 
 @pytest.fixture
@@ -31,13 +31,11 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def lines_of(page: str) -> Iterator[str]:
-    """The example's commands, but for those that fetch."""
     [block] = re.findall(r"^(?:### An|An) example.*?^```\n(.*?)^```", (GUIDES / page).read_text(), re.M | re.S)
     return (line for line in block.splitlines() if not line.startswith(FETCHED))
 
 
 def run(page: str, *more: str) -> None:
-    """Run the example of a page, with `more` arguments for its last command."""
     lines = list(lines_of(page))
     for line in lines:
         words = line.split() + list(more if line is lines[-1] else ())

@@ -17,7 +17,7 @@ import pytest
 from tormagd_client import Client, ClientError, RefusedError, UnreachableError
 
 PATIENCE_S = 60.0
-"Longer than anything takes on a busy machine; only a failure waits for it."
+"Only a failure waits so long."
 
 
 class Rig:
@@ -34,7 +34,7 @@ class Rig:
         self.config.write_text(
             'scene = "coronary"\n[realtime]\nfifo_priority = 50\n'  # only a warning where it is refused
             f'[device]\nport = "{self.port}"\nprofiles = "{folder}/profiles"\nmeasurement_timeout_ms = 50.0\n'
-            "[rates]\ncontrol_hz = 1000\n"  # a motor log wants that
+            "[rates]\ncontrol_hz = 1000\n"  # a motor log needs that
             f'[black_box]\nfolder = "{folder}/boxes"\n[endpoints]\n'
             + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
         )
@@ -47,17 +47,14 @@ class Rig:
         self._wait_for_link()
 
     def start_again(self, folder: Path) -> None:
-        """Ends everything and starts it anew in another folder: for a scenario that the host spoiled."""
         self.close()
         self._start(folder)
 
     def start_simulator(self) -> None:
-        """A device behind the port."""
         self._load_simulator()
         self._plug_in()
 
     def start_daemon(self) -> None:
-        """A daemon that has found its device."""
         self._load_daemon()
         self._wait_for_link()
 
@@ -68,7 +65,6 @@ class Rig:
             os.sched_setscheduler(self.simulator.pid, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(40))
 
     def _plug_in(self) -> None:
-        """A symbolic link to the simulator's line stands for the stable name that udev gives a real one."""
         path = self.simulator.stdout.readline().strip()
         assert path.startswith("/")
         self.port.unlink(missing_ok=True)
@@ -84,7 +80,6 @@ class Rig:
         self.until(lambda: self.status()["link"]["state"] == "RUNNING", "the link runs")
 
     def refused(self, name: str) -> str:
-        """The code with which a command is refused; empty where it is carried out."""
         try:
             self.client.request(name)
         except RefusedError as error:
@@ -92,11 +87,9 @@ class Rig:
         return ""
 
     def status(self) -> dict[str, Any]:
-        """The daemon's status."""
         return self.client.request("status")
 
     def until(self, reached: Callable[[], bool], what: str) -> None:
-        """Waits for a condition that each new look may find; fails saying what was waited for."""
         until_s = time.monotonic() + PATIENCE_S
         while True:
             with contextlib.suppress(UnreachableError):
@@ -106,7 +99,6 @@ class Rig:
             time.sleep(0.05)
 
     def arm(self) -> None:
-        """Homes, where that is still to do, and enables."""
         if not self.status()["is_homed"]:
             self.client.request("home")
         self.until(lambda: self.status()["is_homed"] and not self.status()["is_busy"], "homed")
@@ -114,12 +106,11 @@ class Rig:
         self.until(lambda: not self.refused("enable"), "enabled")
 
     def render(self, force_N: float) -> None:
-        """Asks for a force, and waits until it is there."""
         self.client.publish(force_N, 30_000.0)
         self.until(lambda: abs((self.status()["measured_cf"] or 0.0) - force_N) < 0.06, f"{force_N} N")
 
     def make_neutral(self) -> None:
-        """Disabled, at rest, no fault, no setpoint in force; started anew where it does not get there."""
+        """Bring it to disabled, at rest and without a fault or setpoint; start it anew if that fails."""
         try:
             self.client.publish(0.0, 1.0)
             if self.status()["operating_state"] != "FAULT":
@@ -131,18 +122,15 @@ class Rig:
             self.start_again(Path(tempfile.mkdtemp(dir=self.folder.parent)))
 
     def end(self, child: "subprocess.Popen[str]", number: signal.Signals) -> int:
-        """Sends a signal; the exit code."""
         child.send_signal(number)
         return child.wait(timeout=PATIENCE_S)
 
     def truth(self) -> "np.ndarray[Any, Any]":
-        """What the simulator wrote; ends it."""
         assert self.simulator is not None
         self.end(self.simulator, signal.SIGTERM)
         return np.genfromtxt(self.truth_path, delimiter=",", names=True)
 
     def close(self) -> None:
-        """Ends what still runs."""
         for child in (self.daemon, self.simulator):
             if child is not None and child.poll() is None:
                 child.kill()
@@ -152,20 +140,18 @@ class Rig:
 
 @pytest.fixture(scope="module")
 def shared_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    """A device and a daemon that has found it, which outlive a test but not its module: they take a processor."""
+    """A device and a daemon for a whole module, because they take a processor."""
     with contextlib.closing(Rig(tmp_path_factory.mktemp("rig"))) as made:
         yield made
 
 
 @pytest.fixture
 def rig(shared_rig: Rig) -> Rig:
-    """The shared one, disabled and at rest; for tests that end no process."""
     shared_rig.make_neutral()
     return shared_rig
 
 
 @pytest.fixture
 def new_rig(tmp_path: Path) -> Iterator[Rig]:
-    """One of its own: not homed yet, and its processes may be ended."""
     with contextlib.closing(Rig(tmp_path)) as made:
         yield made

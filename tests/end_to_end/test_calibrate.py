@@ -14,7 +14,6 @@ pytestmark = pytest.mark.live
 
 
 def test_an_interrupt_leaves_no_file_and_a_sweep_becomes_a_model_that_says_what_it_is(new_rig, tmp_path):
-    # patient because the machine may be busy
     program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(new_rig.config), "--wait", "20", "--json"]
     command = [*program, "calibrate", "--yes"]
     an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, [*command, "--motors"], tmp_path / "log.csv")

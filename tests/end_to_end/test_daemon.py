@@ -1,6 +1,6 @@
-"""The daemon as its users meet it: real processes, a real pty, real sockets. Nothing here asserts a duration.
+"""The daemon as its users meet it: real processes, a real pty, real sockets.
 
-What its loops do is shown in virtual time (tests/daemon/test_running_daemon.py, tests/closed_loop). Here processes are
+Its loops are tested in virtual time (tests/daemon/test_running_daemon.py, tests/closed_loop). Here processes are
 killed, unplugged and started again, and another one reads what they leave.
 """
 
@@ -34,7 +34,6 @@ def test_a_daemon_that_is_killed_unplugged_and_ended(new_rig):
 
 
 def killed_it_leaves_a_whole_recording(rig) -> None:
-    """The recorder outlives the daemon, and says what the recording is of."""
     path = rig.folder / "a.mcap"
     ctl = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(rig.config), "--wait", "30"]
     recorder = subprocess.Popen([*ctl, "record", str(path)])
@@ -66,7 +65,7 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
         for schema, _, message in make_reader(file).iter_messages():
             if schema.id not in validators:
                 validators[schema.id] = Draft202012Validator(json.loads(schema.data))
-            # one in a while, for it takes 10 ms
+            # only some, because it takes 10 ms
             if message.sequence % 500 == 0:
                 validators[schema.id].validate(json.loads(message.data))
     assert len(validators) == 2

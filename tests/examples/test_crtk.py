@@ -1,4 +1,4 @@
-"""The ROS 2 example's translation, without ROS: CRTK's messages as anything that has their fields."""
+"""The ROS 2 example's translation, with stand-ins for CRTK's messages."""
 
 import math
 import runpy

@@ -1,5 +1,4 @@
-"""Every publisher in examples/ is run against sockets that answer as the daemon does: it waits for homing, sends what
-the table of setpoints says, and sends nothing where it is refused."""
+"""Every publisher in examples/ against sockets that answer as the daemon does."""
 
 import json
 import re
@@ -24,13 +23,12 @@ EXAMPLES = ROOT / "examples"
 ROWS = ((0.0, 0.6), (0.01, 0.7), (0.02, 1.0))
 BUSY, SKEWED = ("busy", "homing"), ("skewed", "the carriages are 1.4 mm apart")
 ASKED = (["home", "enable", "enable"], ["arm", "status", "status"])
-"By those without our client, and by the others."
+"Of those without our client, and of the others."
 PATIENCE_MS = 30_000
 
 
 @pytest.fixture(scope="session")
 def cpp(tmp_path_factory):
-    """The C++ publisher, compiled."""
     if shutil.which("g++") is None:
         pytest.skip("g++ is not installed")
     headers = "#include <zmq.hpp>\n#include <msgpack.hpp>\n"
@@ -47,7 +45,6 @@ def cpp(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def node():
-    """The one in JavaScript."""
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
     if not (EXAMPLES / "node" / "node_modules").is_dir():
@@ -57,18 +54,15 @@ def node():
 
 @pytest.fixture(scope="session")
 def python():
-    """The one of the README."""
     return [sys.executable, str(EXAMPLES / "python" / "publish.py")]
 
 
 @pytest.fixture(params=["python", "cpp", "node"])
 def publisher(request):
-    """The command line of each."""
     return request.getfixturevalue(request.param)
 
 
 def answer(command, refusal):
-    """What the daemon says to `enable`, or of an `arm` when it is asked for its status."""
     if command == "enable":
         error = refusal and {"code": refusal[0], "message": refusal[1], "hint": "home"}
         return {"ok": False, "error": error} if refusal else {}
@@ -77,7 +71,7 @@ def answer(command, refusal):
 
 
 def played(publisher, tmp_path, refusals):
-    """What it asked, what it published, and how it ended, where arming meets the refusals, one by one."""
+    """Return what it asked and published and how it ended, when arming meets these refusals."""
     profile = tmp_path / "profile.csv"
     profile.write_text("t_s,force_N\n" + "".join(f"{t},{force}\n" for t, force in ROWS))
     asked: list[Any] = []
@@ -140,17 +134,13 @@ def test_it_says_how_to_call_it(publisher):
     assert done.stderr.count("\n") == 1
 
 
-# -- layouts for PlotJuggler and Foxglove show what recordings and telemetry have, by their names ----------------------
-
-
 SCHEMAS = {TELEMETRY_TOPIC: plain_schema(Telemetry), TICKS_TOPIC: TICK_SCHEMA}
 PAIRS = ("duty", "measured_jp")
-"Lists of a number for each carriage; the others are of codes, as many as there are."
+"Lists of a number for each carriage; the others are of codes."
 
 
 def fields(schema: dict[str, Any], prefix: str, join: str) -> Iterator[tuple[str, str]]:
-    """Everything in a message and its type: `prefix`, `join` and the name, and of a list each item's number."""
-    for name, inner in schema.get("properties", {}).items():  # what a map holds is named by who publishes
+    for name, inner in schema.get("properties", {}).items():  # the publisher names what a map holds
         path = f"{prefix}{join}{name}"
         if inner["type"] == "object":
             yield from fields(inner, path, join)
@@ -161,7 +151,6 @@ def fields(schema: dict[str, Any], prefix: str, join: str) -> Iterator[tuple[str
 
 
 def leaves(node: str | dict[str, Any]) -> Iterator[str]:
-    """The panels of a Foxglove layout: a panel, or two parts that share a place."""
     if isinstance(node, str):
         yield node
         return

@@ -23,7 +23,7 @@ def test_what_is_told_counts_by_the_order_that_was_drawn(monkeypatch: pytest.Mon
     rows: list[list[object]] = []
     monkeypatch.setitem(trials.run.__globals__, "offered", offered)
     answers = iter(["1", "neither", "1"])
-    pairs = [(2.0, True), (1.5, False), (1.1, True)]  # of the last there is no wall
+    pairs = [(2.0, True), (1.5, False), (1.1, True)]  # the last has no wall
     told = trials.run("folder", rows.append, pairs, lambda question: next(answers))
     assert [call.args[1] for call in offered.call_args_list[:4]] == pytest.approx([0.6, 0.3, 0.3, 0.45])
     assert (told[2.0], told[1.5], told[1.1]) == ([True], [False], [])

@@ -1,7 +1,6 @@
-"""Twenty hostile files of each kind are refused by size, kind or shape, in one sentence, by whoever reads that kind.
+"""Twenty hostile files of each kind are refused by size, kind or shape, by whoever reads that kind.
 
-Each is read in place of each kind that is read anywhere. A reader has to refuse it in one printable sentence, within a
-second of processor time, and without 100 MB of memory.
+A reader must refuse each in one printable sentence, within a second of processor time, and without 100 MB of memory.
 """
 
 import os
@@ -85,7 +84,6 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
     "a header of 2^63 bytes": _write((2**63 - 1).to_bytes(8, "little") + b"{}"),
     "a header of arrays in each other": _write((60_000).to_bytes(8, "little") + b"[" * 60_000),
 }
-"How each is made, at a path that is not there yet."
 
 
 def _profile(path: Path) -> None:
@@ -115,14 +113,13 @@ REFUSALS = (ConfigError, PlantError, ModelFileError, ForceFileError, ProfileErro
 
 
 def make(name: str, folder: Path) -> Path:
-    """One of HOSTILE, in a folder, under a name that fits every kind."""
     path = folder / "hostile.csv"
     HOSTILE[name](path)
     return path
 
 
 def refusal(name: str, kind: str, folder: Path) -> str:
-    """What is wrong with how a file of HOSTILE is refused in place of one of READERS; empty where nothing is."""
+    """Return what is wrong with the refusal of a HOSTILE file in place of one of READERS."""
     path, start_s = make(name, folder), time.process_time()
     before_kB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
@@ -215,9 +212,6 @@ def test_what_is_as_deep_as_allowed_or_only_looks_deeper_is_read(text: str) -> N
 def test_what_is_deeper_or_no_number_is_refused_with_its_place(text: str, said: str) -> None:
     with pytest.raises(TomlError, match=re.escape(said)):
         toml_tables(text)
-
-
-# -- a force over time has one reader, whoever it is for ---------------------------------------------------------------
 
 
 FORCE_READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_forces)

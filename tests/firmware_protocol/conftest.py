@@ -13,7 +13,7 @@ Exchange = Callable[[list[str]], list[str]]
 
 @pytest.fixture(scope="session")
 def exchange(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Exchange:
-    """Puts requests, one a line, to the sources under the sanitizers (see host/exchange.c), and gives the answers."""
+    """Give requests, one a line, to the sources under the sanitizers (host/exchange.c), and return the answers."""
     probe = tmp_path_factory.mktemp("probe") / "probe.c"
     probe.write_text("int main(void) { return 0; }\n", encoding="ascii")
     command = [c_compiler, "-fsanitize=address,undefined", str(probe), "-o", str(probe.with_suffix(""))]

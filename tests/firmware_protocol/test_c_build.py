@@ -1,4 +1,4 @@
-"""The C sources keep to C99 and to what a bare microcontroller has; where they cannot be built, that is said."""
+"""The C sources keep to C99 and to what a bare microcontroller has."""
 
 import re
 import shutil
@@ -19,12 +19,12 @@ BEYOND_STRICT = ("-Wconversion", "-Wshadow", "-Wvla", "-Wstrict-prototypes", "-W
 
 @pytest.fixture(scope="module")
 def objects(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Each firmware source compiled by itself, freestanding of the other host code, under more warnings still."""
+    """Compile each firmware source by itself, under more warnings still."""
     folder = tmp_path_factory.mktemp("objects")
     built = []
     for name in FIRMWARE:
         target = folder / f"{name}.o"
-        # no stack protector and no fortification: their symbols are the host compiler's, not the sources'
+        # their symbols would be the host compiler's
         flags = ["-O1", "-fno-stack-protector", "-U_FORTIFY_SOURCE", *STRICT, *BEYOND_STRICT]
         command = [c_compiler, *flags, "-c", str(ROOM / f"{name}.c"), "-o", str(target)]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -42,7 +42,7 @@ def test_the_firmware_needs_no_heap_and_hardly_a_library(objects: list[Path]) ->
     assert ["tormag_device_tick"] in [words[2:] for words in symbols]
     defined = {words[-1] for words in symbols if words[-2] != "U"}
     assert {words[-1] for words in symbols if words[-2] == "U"} - defined <= ALLOWED_FROM_OUTSIDE
-    # all state is the caller's: no variable of the library's own, initialised or not
+    # all state is the caller's
     assert {words[-1] for words in symbols if words[-2] in "bBdDC"} == set()
 
 
@@ -62,11 +62,11 @@ def test_the_firmware_does_not_recurse_and_its_stack_is_bounded(c_compiler: str,
     for caller, callee in re.findall(r'sourcename: "([^"]+)" targetname: "([^"]+)"', graph):
         calls[caller].add(callee)
     assert "tormag_device_tick" in stack
-    # an order in which every function stands behind those it calls; a recursion has none and raises CycleError
+    # every function after those that it calls; a recursion raises CycleError
     deepest: dict[str, int] = {}
     for node in TopologicalSorter(calls).static_order():
         deepest[node] = stack.get(node, 0) + max((deepest[callee] for callee in calls.get(node, ())), default=0)
-    assert set(deepest) - set(stack) <= ALLOWED_FROM_OUTSIDE  # nothing of a size that is not known, no pointers
+    assert set(deepest) - set(stack) <= ALLOWED_FROM_OUTSIDE  # nothing of unknown size, no pointers
     assert 100 < max(deepest.values()) < 512
 
 

@@ -46,8 +46,6 @@ pytestmark = pytest.mark.usefixtures("library")
 
 
 class Carriages:
-    """Two carriages that follow the duties, crudely, and whatever is put wrong with them."""
-
     def __init__(self, left_mm: float, right_mm: float) -> None:
         self.positions_mm = [left_mm, right_mm]
         self.starts_mm = [left_mm, right_mm]
@@ -90,7 +88,7 @@ class Carriages:
 
 
 class Twins(CompiledFirmware):
-    """Both firmwares as one device's: whatever happens to it they do the same, and can be seen to."""
+    """Both firmwares as one device's, checked to do the same."""
 
     def __init__(self, plant: PlantParameters = PLANT) -> None:
         super().__init__(plant)
@@ -147,8 +145,6 @@ class Twins(CompiledFirmware):
 
 
 class Bench:
-    """The twins with two carriages, and what a host and the world do to them."""
-
     def __init__(self, left_mm: float = 46.8, right_mm: float = 46.5) -> None:
         self.twins = Twins()
         self.carriages = Carriages(left_mm, right_mm)
@@ -191,7 +187,6 @@ class Bench:
                 break
 
     def settle(self) -> None:
-        """Mend everything, wait until the drives are off, and clear."""
         self.carriages.mend()
         self.tick(20)
         for _ in range(100):
@@ -211,7 +206,7 @@ class Bench:
 
 
 def life(bench: Bench, generator: random.Random) -> Iterator[str]:
-    """One random thing after the other, by name, each met in the state that the one before has left."""
+    """Do one random thing after the other, each in the state that the one before has left."""
     carriages = bench.carriages
 
     def duty() -> float:
@@ -261,7 +256,7 @@ def test_twins_agree_step_by_step_whatever_happens(
 
 
 COUNTS = st.integers(-(2**31), 2**31 - 1) | st.sampled_from([32767, 32768, -32768, -32769, 65535])
-"""Any, and those where positions run over."""
+"""Any, and those where positions overflow."""
 
 
 @settings(max_examples=15, deadline=None)
@@ -309,7 +304,7 @@ def test_twins_agree_on_sensors_that_no_device_could_have(steps: list[tuple[str,
 
 @pytest.fixture(scope="module")
 def told() -> Twins:
-    """One life that leads through every mode and every fault, then at random."""
+    """Live through every mode and every fault, then at random."""
     bench = Bench()
     carriages = bench.carriages
     bench.home()
@@ -324,8 +319,8 @@ def told() -> Twins:
     bench.drive(-1.0, -1.0, count=100)
     carriages.held, carriages.current_A = True, -3.5
     bench.drive(-1.0, -1.0, count=600)  # OVERCURRENT, then RETRACT_FAILED: a stall
-    # RETRACT_FAILED: a motor without current, at once; at a travelling one only after 8 s; not creeping at a stalling
-    # current: 0.05 mm in 0.3 s is progress enough
+    # a motor without current, at once; a travelling one only after 8 s; not a creeping one: 0.05 mm in 0.3 s is
+    # progress enough
     for current_A, drift_mm_s, ticks, tick_s in (
         (0.01, 0.0, 700, TICK_S),
         (0.025, 0.0, 830, 10.0 * TICK_S),
@@ -361,7 +356,7 @@ def told() -> Twins:
     bench.restart()
     bench.drive(-0.7, -0.7, count=100)
     bench.command(Retract)
-    bench.drive(-0.7, -0.7, count=1200)  # not obeyed before it has let go
+    bench.drive(-0.7, -0.7, count=1200)  # not obeyed before a Drive OFF
     assert bench.twins.mode is DeviceMode.IDLE
     list(islice(life(bench, random.Random(20240515)), 20))
     return bench.twins
@@ -401,7 +396,6 @@ def test_what_does_not_fit_its_signal_is_not_sent(name: str, value: float) -> No
 
 
 def duty(tick: int, position_mm: float) -> float:
-    """What brings a carriage to -15 mm, then to -5."""
     return min(max(2.0 * ((-15.0 if tick < 4500 else -5.0) - position_mm), -1.0), 1.0)
 
 

@@ -66,7 +66,6 @@ by_name = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.m
 
 
 def random_value(signal: Signal, generator: random.Random) -> float:
-    """A value anywhere in a signal's range, on a step or between two."""
     if signal.type is float and generator.random() < 0.7:
         return generator.uniform(signal.minimum, signal.maximum)
     step = generator.choice((signal.lowest, signal.highest, generator.randint(signal.lowest, signal.highest)))
@@ -74,12 +73,11 @@ def random_value(signal: Signal, generator: random.Random) -> float:
 
 
 def values_of(message: Message) -> dict[str, float]:
-    """The values of a message by their signals' names."""
     return {name: getattr(message, name) for name in message.__match_args__}
 
 
 def cantools_payload(message: Message) -> bytes:
-    """The same message packed by cantools, with a CRC computed bit by bit."""
+    """Pack the message by cantools, with a CRC computed bit by bit."""
     definition = DATABASE.get_message_by_name(type(message).__name__)
     values = values_of(message)
     if not isinstance(message, Drive | State):
@@ -138,7 +136,7 @@ def test_any_bytes_of_the_right_length_and_crc_are_a_message_or_a_decode_error(
     try:
         message = decode(layout.function, payload)
     except DecodeError as error:
-        assert layout.message.__name__ in str(error)  # noqa: PT017  either outcome is right, this one with a name
+        assert layout.message.__name__ in str(error)  # noqa: PT017 either outcome is right, this one with a name
         return
     assert encode(message) == payload
 
@@ -342,7 +340,7 @@ def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
     for message in (Drive(0.0, 0.0, DriveMode.OFF, 1), State(0, 0, 0, 1)):
         payload = encode(message)
         serial_ms = 0.01 * len(encode_frame(FUNCTION[type(message)], 0, payload))
-        # ISO 11898-1 with the most stuffing: a bit for every four after the first of the 34 + 8 n that are stuffed
+        # ISO 11898-1 with the most stuffing: a bit for every four after the first of 34 + 8 n
         can_ms = 0.001 * (47 + 8 * len(payload) + (34 + 8 * len(payload) - 1) // 4)
         said = f"{type(message).__name__} on its way"
         assert f"| {said} | {serial_ms:.2f} ms serial, at most {math.ceil(100 * can_ms) / 100:.2f} ms CAN |" in PAGE
@@ -352,11 +350,9 @@ def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
 
 AT_REST = Sensors(0, 0, 0.0, 0.0, 0.0, 0, Switches(0), 12.0, 25.0)
 ASKED = 0.25
-"""A duty."""
 
 
 def in_mode(mode: DeviceMode) -> Firmware:
-    """A homed device that has met its host, brought there by what a host says."""
     firmware = Firmware(load_plant("sample_1"))
     firmware.receive(0.0, Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255), AT_REST)
     firmware.homed = True
@@ -385,7 +381,7 @@ SAID: dict[str, Message] = {
 
 
 def taken() -> list[tuple[str, DeviceMode, str]]:
-    """The cells of the page's table: what is said, in which mode, and what comes of it."""
+    """Return the cells of the page's table: what is said, in which mode, and what comes of it."""
     head, _, *rows = re.findall(r"^\|(.*)\|$", PAGE.partition("### What each mode takes")[2].partition("###")[0], re.M)
     modes = [DeviceMode[name.strip()] for name in head.split("|")[1:]]
     cells = [[cell.strip() for cell in row.split("|")] for row in rows]
@@ -431,7 +427,6 @@ REFUSALS = 4
 
 
 def structure(layout: Layout) -> type[ctypes.Structure]:
-    """struct tormag_..._t of a message."""
     names = [signal.name for signal in layout.signals] + ["crc"] * layout.protected
     fields = [(name, STEP_TYPES[code]) for name, code in zip(names, layout.format[1:], strict=True)]
     return type(layout.message.__name__, (ctypes.Structure,), {"_fields_": fields})
@@ -442,13 +437,10 @@ class Signals(ctypes.Union):
 
 
 class CMessage(ctypes.Structure):
-    """struct tormag_message."""
-
     _fields_ = [("function", ctypes.c_uint8), ("signals", Signals)]
 
 
 def c_decode(library: ctypes.CDLL, function: int, payload: bytes) -> tuple[int, dict[str, int]]:
-    """The result and, if it is OK, the steps of the message's signals."""
     message = CMessage()
     result = library.tormag_decode(
         ctypes.byref(message), ctypes.c_uint8(function), payload, ctypes.c_size_t(len(payload))
@@ -462,7 +454,6 @@ def c_decode(library: ctypes.CDLL, function: int, payload: bytes) -> tuple[int, 
 
 
 def c_encode(library: ctypes.CDLL, function: int, name: str, steps: dict[str, int]) -> tuple[int, bytes]:
-    """The result and, if it is OK, the payload; a checksum field is filled with what must not be sent."""
     message = CMessage(function=function)
     signals = getattr(message.signals, name)
     for signal, step in (steps | {"crc": 0xA5}).items():

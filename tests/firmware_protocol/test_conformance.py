@@ -1,7 +1,7 @@
 """The conformance kit passes the simulated device on both carriers, in both languages, and finds what is wrong by name.
 
-Everything runs in virtual time but one live session. A wrong device is the simulated one with one error planted: in its
-firmware (`Rogue`), on its wire (`Wire`), or as a fault of the simulator's own.
+A wrong device is the simulated one with one error planted: in its firmware (`Rogue`), on its wire (`Wire`), or as a
+fault of the simulator's own.
 """
 
 import io
@@ -64,14 +64,13 @@ SAMPLE = load_plant("sample_1")
 NEAR_HOME = msgspec.structs.replace(
     SAMPLE, assumed=msgspec.structs.replace(SAMPLE.assumed, start_left_mm=46.2, start_right_mm=45.8)
 )
-"""Homing takes less time, and the origin still moves by more than it may."""
+"""Shorter, with an origin that still moves too far."""
 
 
 # -- ports in virtual time -----------------------------------------------------------------------------------------
 
 
 def as_it_is(_device: object, *said: Any) -> Any:
-    """A hook that changes nothing; what it is about comes last."""
     return said[-1]
 
 
@@ -80,8 +79,6 @@ def nothing(_device: object, *_what: object) -> None:
 
 
 class Wire:
-    """A serial port of a simulated device, in virtual time: a `BytePort`."""
-
     def __init__(self, device: Any) -> None:
         self.device = device
         self.time_s = 0.0
@@ -103,8 +100,6 @@ class Wire:
 
 
 class Bus(Wire):
-    """The same of a CAN bus: a `FramePort`."""
-
     def write(self, identifier: int, data: bytes) -> None:  # type: ignore[override]
         self.device.receive(self.time_s, CanFrame(self.down(identifier), data))
 
@@ -134,7 +129,6 @@ UNTESTED = {"uptime_of_2_31_us", "uptime_of_2_32_us", *(one.name for one in benc
 
 
 def passed(line: Line, checks: Sequence[Check] = CHECKS) -> set[str]:
-    """The names of those of the checks that the line has; all that can be tested passed."""
     results = run(hosted(line), [one for one in checks_on(line) if one in checks])
     assert {result.check.name for result in results if result.passed is None} <= UNTESTED
     assert [(result.check.name, result.seen) for result in results if result.passed is False] == []
@@ -143,7 +137,7 @@ def passed(line: Line, checks: Sequence[Check] = CHECKS) -> set[str]:
 
 
 LONG = (mismatch_in_every_mode, *stroke.CHECKS, *opening.CHECKS, any_uptime, *bench.CHECKS, left_open)
-"""What takes long, and is the same on every carrier and, to the bit, in either language."""
+"""These take long, and are the same on every carrier and in either language."""
 SHORT = [one for one in CHECKS if one not in LONG or one is left_open]
 
 
@@ -252,7 +246,6 @@ HASH_REVERSED = int.from_bytes(SCHEMA_HASH.to_bytes(4, "little"), "big")
 
 
 def fitting(message: Message, **right: int) -> Message:
-    """As if a Hello had said what is right."""
     return message.replaced(**right) if isinstance(message, Hello) else message
 
 
@@ -291,7 +284,6 @@ def sets(
     when: Callable[[Rogue, Message], bool] = lambda device, message: True,
     **state: object,
 ) -> Callable[[Rogue, float, Message], None]:
-    """A message of that kind puts the firmware in this state."""
 
     def hook(device: Rogue, time_s: float, message: Message) -> None:
         if isinstance(message, kind) and when(device, message):
@@ -324,7 +316,6 @@ def hello_resets(device: Rogue, time_s: float, message: Message, sensors: Sensor
 
 
 def extends(device: Rogue, time_s: float, *_message: Message) -> None:
-    """Any message does, or any tick."""
     device.real._drive_s = time_s
 
 
@@ -363,7 +354,6 @@ def home_keeps_origin(device: Rogue, time_s: float, measured: Measured) -> Measu
 
 
 def homed_before_zero(device: Rogue, time_s: float, measured: Measured) -> Measured:
-    """HOMED shows 40 ms before State is in the new origin."""
     if device.real.homed and device.zeroed_s < 0.0:
         device.zeroed_s = time_s + 0.04
     state, sense = measured
@@ -373,7 +363,6 @@ def homed_before_zero(device: Rogue, time_s: float, measured: Measured) -> Measu
 
 
 def opens_with(share: float) -> Callable[[Rogue, Output], Output]:
-    """While it opens, its bridges give this share of the right duties."""
 
     def drives(device: Rogue, output: Output) -> Output:
         if device.real.mode is not DeviceMode.RETRACTING:
@@ -384,7 +373,6 @@ def opens_with(share: float) -> Callable[[Rogue, Output], Output]:
 
 
 def is_over(device: Rogue, time_s: float, seconds: float, mode: DeviceMode) -> bool:
-    """Whether it has been in this mode for so long."""
     if device.real.mode is not mode:
         device.since_s = time_s
     return time_s - device.since_s > seconds
@@ -404,7 +392,6 @@ def clears_itself(device: Rogue, time_s: float) -> None:
 
 
 def blind_while(blind: Callable[[Rogue, float], bool]) -> Callable[[Rogue, float], None]:
-    """The command timeout is not judged then."""
 
     def ticks(device: Rogue, time_s: float) -> None:
         device.real._drive_s = time_s if blind(device, time_s) else device.drive_s
@@ -443,7 +430,6 @@ def browns_out(device: Rogue, time_s: float) -> None:
 
 
 def remembering() -> Callable[[Rogue], None]:
-    """A memory that outlives the reset, with a zero that is off."""
     boots: list[object] = []
 
     def boot(device: Rogue) -> None:
@@ -535,7 +521,7 @@ SWAPPED = {DeviceMode.RUN: DeviceMode.HOMING, DeviceMode.HOMING: DeviceMode.RUN}
 
 
 class Reframed(Wire):
-    """Takes the device's frames apart and puts them together otherwise."""
+    """Takes the device's frames apart and puts them together differently."""
 
     def __init__(self, device: VirtualDevice) -> None:
         super().__init__(device)
@@ -549,7 +535,6 @@ class Reframed(Wire):
         return b"".join(self.frame(frame.function, frame.payload) for frame in frames)
 
     def frame(self, function: int, payload: bytes) -> bytes:
-        """What it makes of a frame; here, the right one."""
         self._sequence = (self._sequence + 1) % 256
         return encode_frame(function, self._sequence, payload)
 
@@ -567,13 +552,10 @@ def sense_first(wire: Reframed, function: int, payload: bytes) -> bytes:
 
 
 def streams(wire: Reframed, data: bytes) -> bytes:
-    """The newest State again every millisecond, asked or not."""
     return Reframed.up(wire, data) + (Reframed.frame(wire, FUNCTION[State], wire.state) if wire.state else b"")
 
 
 class Late(Wire):
-    """All that the device says is so many ms on its way."""
-
     late = 10
 
     def __init__(self, device: VirtualDevice) -> None:
@@ -586,7 +568,7 @@ class Late(Wire):
 
 
 class Lenient(Wire):
-    """Mends what the device would refuse: so it obeys what it must not."""
+    """Repairs what the device would refuse, so that it obeys what it must not."""
 
     mended: Callable[..., bytes]
     count = 0
@@ -597,12 +579,10 @@ class Lenient(Wire):
 
 
 def framed(body: bytes) -> bytes:
-    """A whole frame of function, sequence and payload."""
     return encode_frame(body[0], body[1], body[2:10])
 
 
 def with_crc8(body: bytes) -> bytes:
-    """A Drive's body with its CRC-8 made right."""
     return body[:-1] + bytes((crc8(body[:1] + body[2:-1]),)) if body[0] == FUNCTION[Drive] and len(body) == 9 else body
 
 
@@ -617,7 +597,6 @@ def commands_without_crc_16(wire: Lenient, stretch: bytes) -> bytes:
 
 
 def completed(wire: Lenient, stretch: bytes) -> bytes:
-    """A frame that lacks its last byte is taken for one."""
     if cobs_decode(stretch) is None and len(stretch) == 11:
         for missing in (b"\x01", b"\x55"):
             if (body := cobs_decode(stretch + missing)) is not None:
@@ -626,7 +605,6 @@ def completed(wire: Lenient, stretch: bytes) -> bytes:
 
 
 def joined(wire: Wire, data: bytes) -> bytes:
-    """Waits for the whole length, whatever comes: two halves make one frame."""
     first, _, second = data[:-1].partition(DELIMITER)
     return first + second + DELIMITER if second and len(first + second) == 12 else data
 
@@ -639,13 +617,11 @@ def noise_is_a_drive(wire: Lenient, stretch: bytes) -> bytes:
 
 
 def deafened(wire: Lenient, stretch: bytes) -> bytes:
-    """Noise is ignored, and so is the whole frame behind it."""
     was_deaf, wire.is_deaf = wire.is_deaf, len(stretch) > 13
     return b"" if was_deaf and len(stretch) == 12 else stretch + DELIMITER
 
 
 def mending(payload: Callable[[bytes], bytes]) -> Callable[[Lenient, bytes], bytes]:
-    """Mends function, sequence and payload of a whole frame."""
 
     def mended(wire: Lenient, stretch: bytes) -> bytes:
         body = cobs_decode(stretch)
@@ -694,7 +670,6 @@ K = TypeVar("K")
 
 
 def wrong(kind: type[K], **hooks: object) -> type[K]:
-    """One with these in place of its own."""
     return type(kind.__name__, (kind,), hooks)
 
 
@@ -902,7 +877,7 @@ PLANTED = (
     ),
     rogue("Hello resets", "no_reset", "hello_in_run", receive=hello_resets),
     rogue("latched keeps homed", "status_consistent", "silence_latches", ticked=latched_keeps_homed),
-    # what kills: errors that an earlier kit did not see
+    # errors that an earlier kit did not see
     rogue("latch clears itself", "silence_latches", ticked=clears_itself),
     wire("commands without CRC-16", "frame_crc_16", mended=commands_without_crc_16),
     rogue(
@@ -988,7 +963,6 @@ PLANTED = (
             fitting(message, schema_hash=SCHEMA_HASH) if device.real.mode is DeviceMode.HOMING else message
         ),
     ),
-    # and what a second look found missing
     rogue(
         "no Status at high duty",
         "duty_makes_speed",
@@ -1081,11 +1055,10 @@ SAID = {
     "never opens": "THE GAP MAY BE SHUT",
     "Sense first": "1000 times a Sense before its State",
 }
-"""Of some errors: what was seen says enough to find them."""
+"""What must be seen of some errors."""
 
 
 def hosted(line: Any, uptime_s: float | None = None) -> Host:
-    """A host that can reset the simulated device."""
     messages = line.port.device.messages
     return Host(line, uptime_s=uptime_s, reset=lambda how: messages._reset(messages._time_s))
 
@@ -1119,8 +1092,6 @@ def test_a_device_that_cannot_be_met_is_not_moved() -> None:
 
 
 class Asleep(Wire):
-    """This process is not run for 60 ms, once, in the middle of something."""
-
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
         if self.device.messages.firmware.mode is DeviceMode.RUN and not hasattr(self, "slept"):
             self.slept = True
@@ -1141,7 +1112,6 @@ def test_a_check_that_this_computer_spoiled_is_tried_again() -> None:
 
 @pytest.fixture
 def ran(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Runs the command on a line in virtual time."""
 
     def run_on(line: Line, *arguments: str) -> int:
         monkeypatch.setattr(command, "open_line", lambda *_: line)
@@ -1210,8 +1180,6 @@ def test_a_check_that_there_is_not_is_refused(ran: Callable[..., int], capsys: p
 
 
 class Interrupted(Wire):
-    """Ctrl-C, or a port that goes, 0.1 s into RUN."""
-
     error: type[BaseException] = KeyboardInterrupt
     until_s = 0.0
 

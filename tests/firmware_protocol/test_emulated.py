@@ -1,4 +1,4 @@
-"""The firmware's program for a Cortex-M4, run by QEMU, does what the same sources do on this computer, to the bit."""
+"""The firmware's program for a Cortex-M4, run by QEMU, does the same as on this computer, to the bit."""
 
 import json
 import shutil
@@ -55,7 +55,7 @@ class Timed(CompiledFirmware):
         return super().receive(round(time_s * CYCLES_PER_S) / CYCLES_PER_S, message, sensors)
 
     def tick(self, time_s, sensors):
-        # a timer's first tick comes a millisecond after the reset, not with it
+        # a timer's first tick comes a millisecond after the reset
         return super().tick(round(time_s * CYCLES_PER_S) / CYCLES_PER_S, sensors) if time_s > 0.0 else None
 
     def measurement(self, time_s, sensors):
@@ -63,7 +63,6 @@ class Timed(CompiledFirmware):
 
 
 def life(boot: FirmwareKind) -> list[object]:
-    """What a device says and does that is met, homed, driven in, left alone, cleared, and reset by its watchdog."""
     device = VirtualDevice(AT_ONCE, SteadyHand(), [parse_fault("frozen@1.75")], boot=boot)
     commands: dict[int, Message] = {2: HELLO, 9: Home(1), 1690: Clear(2), 1721: Retract(3)}
     seen: list[object] = []

@@ -111,13 +111,13 @@ def test_a_flipped_bit_in_a_frame_is_found(frame: Frame, data: st.DataObject) ->
     encoded = bytearray(wire(frame))
     position = data.draw(st.integers(0, len(encoded) - 2))
     encoded[position] ^= 1 << data.draw(st.integers(0, 7))
-    assume(encoded[position] != 0)  # that cuts the frame in two, which is another test
+    assume(encoded[position] != 0)  # a zero cuts the frame in two, which is another test
     decoder = FrameDecoder()
     assert (decoder.feed(bytes(encoded)), decoder.statistics.corrupt) == ([], 1)
 
 
 @pytest.mark.parametrize("start", [0, 100, 250])
-@pytest.mark.parametrize("missing", [1, 7, 239])  # with more, the next would look like one that was overtaken
+@pytest.mark.parametrize("missing", [1, 7, 239])  # with more, the next would look overtaken
 def test_gaps_in_the_sequence_are_counted_through_zero(start: int, missing: int) -> None:
     sent = numbered(missing + 2, start)
     decoder = FrameDecoder()

@@ -16,7 +16,6 @@ ROOM = Path(firmware_protocol.__file__).parent
 
 @pytest.fixture
 def room(tmp_path: Path) -> Path:
-    """A copy of the room's sources and generated files, to be damaged."""
     for name in ("tormag.dbc", "README.md", "enumerations.py", "layouts.py", "wire.py"):
         shutil.copy(ROOM / name, tmp_path)
     for folder in ("vectors", "c"):

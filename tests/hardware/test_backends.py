@@ -1,4 +1,4 @@
-"""What each port and bus is besides the contract: how it is chosen and opened, and how it fails."""
+"""Each port and bus beyond the contract: how it is chosen and opened, and how it fails."""
 
 import contextlib
 import errno
@@ -53,7 +53,6 @@ def bus_frame(message: Message) -> CanFrame:
 
 
 def opened(device: Device) -> CanBackend:
-    """The backend that the configuration asks for."""
     backend = choose(device, Rates()).open()
     assert isinstance(backend, CanBackend)
     return backend
@@ -63,12 +62,10 @@ STATUS_FRAME = bus_frame(STATUS)
 
 
 def wait_readable(backend: SerialPort | CanBackend) -> None:
-    """Until something has come: the daemon itself waits for nothing."""
     assert select.select([backend._fd], [], [], 5.0)[0]
 
 
 def next_of(backend: CanBackend) -> list[Message]:
-    """What comes next, together."""
     while not (received := backend.receive()):
         wait_readable(backend)
     return received
@@ -78,8 +75,6 @@ def next_of(backend: CanBackend) -> list[Message]:
 
 
 class Line(NamedTuple):
-    """A pseudo-terminal whose far end the test holds."""
-
     far: int
     near: int
     device: Device
@@ -154,8 +149,6 @@ def test_a_port_that_cannot_be_set_up_is_not_opened(
 
 
 class Bus:
-    """A served bus whose far end the test holds."""
-
     def __init__(self, folder: Path) -> None:
         self.device = Device(backend="can", options={"interface": "tormagsim"}, port=str(folder / "can"))
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -165,12 +158,10 @@ class Bus:
         self.far, _ = self._listener.accept()
 
     def put(self, *frames: CanFrame) -> None:
-        """Frames that the backend finds on the bus."""
         for frame in frames:
             self.far.send(to_socket(frame))
 
     def close(self) -> None:
-        """Takes everything away."""
         self.backend.close()
         self.far.close()
         self._listener.close()
@@ -281,7 +272,6 @@ def test_a_damaged_line_is_counted_and_the_next_is_read(line: Line, damaged: byt
 
 @pytest.fixture
 def failing() -> Iterator[Callable[..., CanBackend]]:
-    """Makes a backend of a bus that hands out what it is given, and raises what it is given."""
     reads, writes = os.pipe()
 
     def make(*events: can.Message | Exception) -> CanBackend:
@@ -297,7 +287,7 @@ def failing() -> Iterator[Callable[..., CanBackend]]:
 
 
 def behind_python_cans(number: int) -> can.CanOperationError:
-    """The system's error as python-can wraps it where it has no place for the number."""
+    """Return the error as python-can wraps it where it has no place for the number."""
     error = can.CanOperationError("Could not read from serial device")
     error.__cause__ = OSError(number, "Input/output error")
     return error
@@ -345,7 +335,6 @@ FINE = "tormagd.hardware.serial_backend:DRIVER"
 
 
 def install(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
-    """Pretends that these plugins are installed."""
     points = [metadata.EntryPoint(name, value, ENTRY_POINTS) for name, value in entries.items()]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == ENTRY_POINTS else [])
 
@@ -430,7 +419,6 @@ USB = "/dev/ttyUSB7"
 
 
 def timer_of(port: str, sysfs: Path, text: str = "16\n") -> Path:
-    """The driver's latency timer of a port."""
     timer = sysfs / Path(port).name / "latency_timer"
     timer.parent.mkdir()
     timer.write_text(text)

@@ -42,7 +42,7 @@ COMMANDS = {Home: DeviceRequest.HOME, Retract: DeviceRequest.RETRACT, Clear: Dev
 
 
 class Firmware:
-    """As much of a device as a connection can see: it answers, counts nonces and forgets them when it is reset."""
+    """As much of a device as a connection can see."""
 
     def __init__(self) -> None:
         self.accepted: list[type[Message]] = []
@@ -70,8 +70,6 @@ class Firmware:
 
 
 class Port:
-    """A backend over nothing: what the device says waits in a queue."""
-
     def __init__(self, bench: "Bench") -> None:
         self.bench = bench
         self.waiting: deque[Message] = deque()
@@ -110,8 +108,6 @@ class Port:
 
 
 class Bench:
-    """A connection with everything around it: clock, event loop, port, device and the core that is told of losses."""
-
     def __init__(self) -> None:
         self.ms = 0
         self.firmware = Firmware()
@@ -159,7 +155,7 @@ class Bench:
         self.accepted_before = len(self.firmware.accepted)
 
     def pass_ms(self, ms: int, is_stalled: bool = False) -> None:
-        """Lets time pass; a stalled host does not notice it."""
+        """Let time pass; a stalled host does not notice it."""
         for _ in range(ms):
             self.ms += 1
             self.firmware.boot_ms += 1
@@ -172,7 +168,6 @@ class Bench:
                 self.beat()
 
     def beat(self) -> None:
-        """The daemon's period."""
         self.connection.receive(self.now_s)
         self.look()
         self.connection.exchange(self.now_s, 0.0, 0.0, DriveMode.OFF, self.request, self.number)
@@ -426,7 +421,6 @@ class Cables(RuleBasedStateMachine):
         assert self.bench.losses >= self.bench.seen[1:].count(LinkState.RUNNING) - 1
 
     def teardown(self) -> None:
-        """Mended, it runs, and the gap is opened if that was the last wish."""
         heal(self.bench)
         self.bench.pass_ms(2_300)
         assert self.bench.connection.state is LinkState.RUNNING

@@ -1,8 +1,7 @@
 """One suite for every transport: the daemon's core, link and backend against a device at the end of a bad line.
 
-Everything is real but the time: the control core, the link, the backend with its driver, the kernel's pty or socket,
-the device with its wire. Time is virtual, so that every case is the same every time: the far end hands what the device
-has sent to the kernel when the virtual clock says so, spoiled by a seeded line, and waits until it is readable.
+Everything is real but the time: the far end hands what the device has sent to the kernel's pty or socket when the
+virtual clock says so, spoiled by a seeded line, and waits until it is readable. So every case is the same every time.
 """
 
 import contextlib
@@ -57,33 +56,26 @@ from tormagd.simulation.slcan_door import SlcanDoor
 
 CONFIG = Config()
 PATIENCE_S = 10.0
-"Longer than a kernel takes to hand anything over; only a failure waits for it."
+"Only a failure waits so long."
 PERIOD_S = 1e-3
 MOVING_S = 0.3
-"Into the closing of the gap: where the line goes bad."
 OPENING_S = 2.4
-"What the slower of two openings takes, with the device's own timeout before it."
+"The slower of two openings, with the device's own timeout before it."
 FORCE_N = 1.4
 CLOSED_MM, OPEN_MM = 46.9, 95.1
-"The stops of the gap, and a little."
 SETTLED_TICKS = 200
-"At the end of a case; on a good line the gap has long arrived by then, and nothing is saturated."
+"At the end of a case, when the gap has long arrived."
 MIN_NUMBERS = 30
 "One sample holds more in its nested values, even of a device that is not there."
 COASTING_MM = 8.0
-"How far the carriages may still close after a fault on a late line: what was on its way, and their own speed."
-
-
-# -- lines: as the fault matrix has them, and one more ---------------------------------------------------------------
+"How far the carriages may still close after a fault on a late line."
 
 
 def descriptor(backend: Any) -> int:
-    """What is readable when something has come: the daemon waits for nothing."""
     return int(backend._fd)
 
 
 def in_bursts(period_s: float) -> Transfer:
-    """Nothing for so long, then all of it at once."""
     waiting: list[bytes] = []
     periods = 0
 
@@ -99,8 +91,6 @@ def in_bursts(period_s: float) -> Transfer:
 
 
 class Case(NamedTuple):
-    """A kind of line and what has to come of it."""
-
     way: MakeTransfer = whole
     tolerance_N: float = math.inf
     faults: frozenset[Fault] = frozenset()
@@ -118,13 +108,13 @@ CASES = {
     "clean": Case(tolerance_N=0.05),
     "one byte at a time": Case(tolerance_N=0.05, is_bytewise=True),
     "20% loss": Case(partial(losing, 0.2), tolerance_N=0.05, counted=("lost",)),
-    # State carries a CRC everywhere, Sense and Status only on serial: there a force or a fault bit may be a wrong one
+    # State carries a CRC everywhere, Sense and Status only on serial: there a force or a fault bit may be wrong
     "5% corruption": Case(
         partial(damaging, 0.05), tolerance_N=0.5, faults=frozenset(Fault), counted=("corrupt", "resynchronisations")
     ),
     "duplicates": Case(doubling, tolerance_N=0.05),
     "reordering": Case(partial(reordering, 0.2), tolerance_N=0.05, uncounted=("lost", "corrupt")),
-    # what the device says answers a drive of 60 ms ago: a loop around that would swing
+    # what the device says answers a drive of 60 ms ago, and a loop around that would swing
     "30 ms delay": Case(partial(delaying, 0.03), faults=TOO_LATE, named=TOO_LATE),
     "burst": Case(partial(in_bursts, 0.06), faults=TOO_LATE, named=TOO_LATE),
     # lost, and since then the port was opened again and the device asked who it is
@@ -132,25 +122,17 @@ CASES = {
 }
 
 
-# -- transports: a device with its end of one, and what the daemon opens to come to it --------------------------------
-
-
 class PtyEnd(Pty):
-    """A far end at a pseudo-terminal."""
-
     end: bytes
     carried = said = arrived = b""
 
     def read(self) -> bytes:
-        """What the door hears."""
         return self.carried
 
     def write(self, data: bytes) -> None:
-        """What the door says."""
         self.said += data
 
     def units(self, now_s: float) -> list[bytes]:
-        """What the device has sent by now."""
         self.exchange(now_s, ())  # type: ignore[attr-defined]
         *units, self.said = self.said.split(self.end)
         return [unit + self.end for unit in units]
@@ -160,7 +142,6 @@ class PtyEnd(Pty):
         self.exchange(now_s, self.descriptors())  # type: ignore[attr-defined]
 
     def hear(self) -> bytes:
-        """The unit that the backend has just sent."""
         while self.end not in self.arrived:
             assert select.select(self.descriptors(), [], [], PATIENCE_S)[0], "the backend sent nothing"
             self.arrived += Pty.read(self)
@@ -168,7 +149,6 @@ class PtyEnd(Pty):
         return unit + self.end
 
     def say(self, unit: bytes, backend: Backend) -> None:
-        """Hands a unit to the kernel, and waits until the backend can read it."""
         expected = _waiting(descriptor(backend)) + len(unit)
         os.write(self.descriptors()[0], unit)
         while _waiting(descriptor(backend)) < expected:
@@ -197,8 +177,6 @@ class SlcanEnd(PtyEnd, SlcanDoor):
 
 
 class PacketEnd:
-    """A far end where a frame is a packet."""
-
     def __init__(self, device: VirtualDevice) -> None:
         self.device = CanDevice(device.messages)
 
@@ -238,8 +216,6 @@ class TormagsimEnd(PacketEnd):
 
 
 class BusEnd(PacketEnd):
-    """A far end at any bus of python-can's; the bus may echo what one sends."""
-
     def __init__(self, device: VirtualDevice, interface: str, channel: str, **options: object) -> None:
         super().__init__(device)
         self.configured = Device(backend="can", options={"interface": interface}, port=channel)
@@ -289,7 +265,7 @@ TRANSPORTS: dict[str, Callable[[VirtualDevice, Path], FarEnd]] = {
 
 
 MARKS = {
-    # all who use this group on a machine hear each other: these tests do not run beside one another
+    # all hosts of this group on a machine hear each other: these tests do not run beside one another
     "udp_multicast": pytest.mark.live,
     "socketcan": pytest.mark.skipif(
         not Path("/sys/class/net/vcan0").exists(),
@@ -303,11 +279,8 @@ def _waiting(fd: int) -> int:
     return int(struct.unpack("i", fcntl.ioctl(fd, termios.FIONREAD, bytes(4)))[0])
 
 
-# -- the line ------------------------------------------------------------------------------------------------------
-
-
 class Line:
-    """What the closed loop takes for its device: the real backend, a bad line, and the device behind it."""
+    """The closed loop's device: the real backend, a bad line, and the device behind it."""
 
     def __init__(self, far: FarEnd, device: VirtualDevice, case: Case) -> None:
         self.far, self._device = far, device
@@ -321,7 +294,6 @@ class Line:
         return self._device.truth
 
     def exchange(self, now_s: float) -> list[Message]:
-        """What the backend has for the link now."""
         units = self._up(now_s, self.far.units(now_s))
         for unit in self._down(now_s, []):
             self.far.take(now_s, unit)
@@ -334,23 +306,19 @@ class Line:
         return [*messages, *self.backend.receive()]
 
     def send(self, now_s: float, message: Message) -> None:
-        """The link's message goes through the backend."""
         self.backend.send(message)
         for unit in self._down(now_s, [self.far.hear()]):
             for piece in self._pieces(unit):
                 self.far.take(now_s, piece)
 
     def transmit(self, now_s: float) -> bytes:
-        """As the virtual device's: what came, framed again."""
         return b"".join(self._to_host.pack(message) for message in self.exchange(now_s))
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """As the virtual device's."""
         for message in self._from_host.unpack(data):
             self.send(now_s, message)
 
     def close(self) -> None:
-        """Gives both ends back."""
         self.backend.close()
         self.far.close()
 
@@ -359,8 +327,6 @@ class Line:
 
 
 class Tap:
-    """A line as a connection's backend, and everything it has heard."""
-
     def __init__(self, line: Line) -> None:
         self._line = line
         self.statistics, self.close = line.backend.statistics, line.backend.close
@@ -382,7 +348,6 @@ def core() -> Core:
 
 
 def a_device() -> VirtualDevice:
-    """One that has homed soon."""
     plant = load_plant("sample_1")
     near = msgspec.structs.replace(plant.assumed, start_left_mm=46.0, start_right_mm=45.5)
     return VirtualDevice(msgspec.structs.replace(plant, assumed=near), parse_hand("steady"), (), 1)
@@ -390,7 +355,6 @@ def a_device() -> VirtualDevice:
 
 @pytest.fixture
 def moving(core: Core) -> ClosedLoop:
-    """A loop that is armed and closing its gap, on a perfect line."""
     loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), a_device())
     loop.arm()
     list(loop.run(MOVING_S, publisher(loop.now_s)))
@@ -398,7 +362,6 @@ def moving(core: Core) -> ClosedLoop:
 
 
 def publisher(from_s: float) -> Callable[[float], object]:
-    """Somebody who wants FORCE_N every 10 ms."""
     return stream(from_s + np.arange(1_000) * 0.01, np.full(1_000, FORCE_N))
 
 
@@ -415,8 +378,7 @@ def lines(tmp_path: Path) -> Iterator[Callable[..., Line]]:
 
 
 def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
-    """While somebody wants FORCE_N: no duty over its limit, nothing that is not a number, and no carriage where it
-    cannot be."""
+    """Yield ticks, each checked for its duty, its numbers and the carriages' places."""
     for number, sample in enumerate(loop.run(seconds, publisher(loop.now_s))):
         assert max(abs(sample.output.left_duty), abs(sample.output.right_duty)) <= CONFIG.position.duty_limit
         assert CLOSED_MM < sample.truth.gap_mm < OPEN_MM
@@ -456,7 +418,6 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
 
 
 def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
-    """From the fault on nothing is driven, and the gap opens, whatever the line does."""
     samples = []
     for sample in ticks(loop, OPENING_S):
         samples.append(sample)
@@ -480,7 +441,7 @@ def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Ca
     assert connection.state is LinkState.RUNNING
     states = sum(isinstance(message, State) for message in tap.heard)
     assert states > 100
-    # on serial every frame has a number, and the second is not given out; on CAN only State has, and the link knows
+    # on serial every frame has a number, and the second is dropped; on CAN only State has, and the link drops it
     assert connection.report().repeated == (len(tap.heard) if transport == "serial" else states // 2)
 
 

@@ -53,7 +53,6 @@ def status(nonce: int = 0, **changes: object) -> Status:
 
 
 def running(nonce: int = 0) -> DeviceLink:
-    """A link that knows its device, at time 0."""
     link = DeviceLink(0.0)
     assert [type(message) for message in link.due(0.0)] == [Hello]
     told(link, 0.0, US, status(nonce), Sense(0.0, 0.0, 0.0, 0.0), State(0.0, 0.0, 0.0, 0))
@@ -68,7 +67,6 @@ def link() -> DeviceLink:
 
 @pytest.fixture
 def unmet() -> DeviceLink:
-    """One that has heard nothing."""
     return DeviceLink(0.0)
 
 
@@ -78,7 +76,6 @@ def told(link: DeviceLink, now_s: float, *messages: Message) -> None:
 
 
 def due(link: DeviceLink, from_s: float, until_s: float, heard: bool = True) -> list[tuple[float, Message]]:
-    """What the link sends, asked every millisecond while the device says something that means nothing."""
     sent = []
     for tick in range(round(from_s * 1e3), round(until_s * 1e3)):
         now_s = tick * 1e-3
@@ -317,7 +314,6 @@ NUMBERS = [
 
 
 def with_numbers(measurement: Measurement, numbers: dict[str, float]) -> Measurement:
-    """With other numbers, those of its link among them."""
     of_link = {name: number for name, number in numbers.items() if name in LinkQuality.__match_args__}
     own = {name: number for name, number in numbers.items() if name not in of_link}
     return measurement.replaced(**own, link=measurement.link.replaced(**of_link))
@@ -356,7 +352,6 @@ def test_each_switch_is_read_by_itself(switches: Switches) -> None:
 
 
 def through_the_wire(message: Message) -> Message:
-    """What arrives of a message: quantised and wrapped."""
     return decode(FUNCTION[type(message)], encode(message))
 
 

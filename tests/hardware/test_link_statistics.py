@@ -20,14 +20,10 @@ from tormagd.hardware.link_statistics import (
 PERIOD_S = 1e-3
 
 
-# -- round trip ----------------------------------------------------------------------------------------------------
-
-
 def exchange(
     trip: RoundTrip, ticks: Iterable[int], way_ticks: int, lost: frozenset[int] = frozenset(), paused: range = range(0)
 ) -> None:
-    """Drives every millisecond; each that is not lost is answered `way_ticks` later, and where that is while the device
-    is `paused`, right after."""
+    """Answer each Drive that is not lost `way_ticks` later, or right after a pause."""
     states = 0
     answers: dict[int, list[str]] = {}
     for tick in ticks:
@@ -59,9 +55,9 @@ def trip() -> RoundTrip:
 @pytest.mark.parametrize(
     ("way_ticks", "ticks", "lost"),
     [
-        # a USB adapter that keeps bytes back for 16 ms has 16 Drives under way at a time
+        # a USB adapter that holds bytes back for 16 ms has 16 Drives under way at a time
         *((way_ticks, 1_400, ()) for way_ticks in (1, 2, 16, 120)),
-        # made good by the next Hello
+        # the next Hello makes it good
         (3, 2_400, (1_500, 1_501)),
         # one lost Drive makes all of them a period too long; the second shows in the Status of tick 1320
         (3, 1_324, (1_010, 1_300)),
@@ -115,11 +111,7 @@ def test_a_status_tells_no_round_trip_of_a_drive_that_was_not_sent_or_is_not_ans
     assert trip.report() is None
 
 
-# -- clock ---------------------------------------------------------------------------------------------------------
-
-
 def heard(device_s: Callable[[float], float], ticks: int) -> DeviceClock:
-    """A clock of which something is heard every millisecond."""
     clock = DeviceClock()
     for tick in range(ticks):
         clock.add(tick * PERIOD_S, device_s(tick * PERIOD_S))
@@ -197,13 +189,10 @@ def test_a_clock_that_stands_still_is_a_drift_like_any_other() -> None:
     assert heard(lambda _now_s: 1.0, 10_000).fit().drift_ppm == pytest.approx(-1e6, rel=1e-3)
 
 
-# -- what a step is told of both -----------------------------------------------------------------------------------
-
-
 NOISE = random.Random(1)
 NOW_AND_THEN = frozenset(tick for tick in range(1, 20_000) if NOISE.random() < 0.05)
 UNANSWERED = {every: frozenset(tick for tick in range(1, 4_000) if tick % every) for every in (2, 3)}
-"""The States of a device that answers every other Drive fall behind the Drives by hundreds a second."""
+"""The States fall behind the Drives by hundreds a second."""
 
 
 @pytest.mark.parametrize(
@@ -258,11 +247,7 @@ def test_a_clock_that_stands_is_known_at_once_and_forgiven_when_it_goes() -> Non
     assert abs(clock.drift) < 1e-4
 
 
-# -- what is lost, damaged and not taken, within the last second -------------------------------------------------------
-
-
 def watched(looks: list[Counts]) -> LinkQuality:
-    """The quality after these counters, a look apart."""
     watch, now_s, quality = LinkWatch(0.0), 0.0, LinkQuality()
     total = Counts()
     for step in looks:

@@ -40,8 +40,6 @@ def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(pack) -> None:
         pack(Drive(float("nan"), 0.0, DriveMode.RUN, 0))
 
 
-# -- serial --------------------------------------------------------------------------------------------------------
-
 drives = st.builds(
     Drive,
     left_duty=st.integers(-10_000, 10_000).map(lambda steps: steps * 1e-4),
@@ -81,9 +79,6 @@ def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:
         assert (stream.unpack(encode_frame(*frame)), stream.statistics.corrupt) == ([], corrupt)
     assert stream.statistics.refused.keys() == {"function 99", "Home", "Drive"}
     assert stream.unpack(encode_frame(6, 3, b"\x05")) == [Home(5)]
-
-
-# -- CAN -----------------------------------------------------------------------------------------------------------
 
 
 def state(counter: int) -> State:
@@ -186,15 +181,12 @@ def test_what_was_taken_apart_gives_the_same_to_another_stream() -> None:
     assert stream.pack(Home(3)) == stream.sent
 
 
-# -- what an exchange takes of a bus, by the DBC: the bound over every payload -----------------------------------------
-
 DBC = Path(firmware_protocol.__file__).parent / "tormag.dbc"
 STUFFABLE_BITS, FIXED_BITS = 34, 13
-"Start, identifier, control and CRC of a classical base frame; delimiters, acknowledge, end and gap to the next."
+"Of a classical base frame: start, identifier, control and CRC; delimiters, acknowledge, end and gap."
 
 
 def max_bits(length: int) -> int:
-    """Of a frame with as many stuff bits as its data can need (Davis et al., Real-Time Systems 35, 2007)."""
     stuffable = STUFFABLE_BITS + 8 * length
     return stuffable + (stuffable - 1) // 4 + FIXED_BITS
 
@@ -205,5 +197,5 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
     each_tick = {message.name for message in database.messages if message.cycle_time == 1}
     layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
     assert len(layouts) == len(each_tick) == 3
-    # as firmware_protocol/README.md says
+    # Davis et al., Real-Time Systems 35, 2007; as firmware_protocol/README.md says
     assert sum(max_bits(struct.calcsize(layout.format)) for layout in layouts) == EXCHANGE_BITS == 395

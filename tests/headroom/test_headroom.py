@@ -1,4 +1,4 @@
-"""What the machine is measured with; no test here asserts how long anything takes."""
+"""What the machine is measured with."""
 
 import asyncio
 import json

@@ -29,9 +29,7 @@ from tormagd.physics.errors import DomainError
 from tormagd.scenes.measured import measured
 from tormagd.scenes.scene import Solver, load_scene, shipped_scenes
 
-torch.set_num_threads(1)  # a second thread costs more than it saves at this size, and waits for a busy processor
-
-# -- models whose shape over the field is known -----------------------------------------------------------------------
+torch.set_num_threads(1)  # a second thread costs more than it saves at this size
 
 
 RANGES = {
@@ -44,7 +42,6 @@ RANGES = {
 
 
 def make_model(weight: np.ndarray, bias: np.ndarray, output: np.ndarray, constant: float) -> ForceModel:
-    """Build a model of scaled weights over the ranges of a torque element."""
     metadata = ModelMetadata(
         element=Element.TORQUE,
         insert="synthetic",
@@ -60,7 +57,6 @@ def make_model(weight: np.ndarray, bias: np.ndarray, output: np.ndarray, constan
 
 @pytest.fixture(scope="session")
 def rising() -> ForceModel:
-    """Force that rises with the field everywhere, 50 units."""
     rng = np.random.default_rng(7)
     weight = rng.normal(size=(50, 4))
     weight[:, 2] = np.abs(weight[:, 2]) + 0.1
@@ -68,23 +64,18 @@ def rising() -> ForceModel:
 
 
 def of_field(slopes: list[float], bias: float, output: list[float], constant: float) -> ForceModel:
-    """A model whose force depends on the field alone."""
     weight = np.zeros((len(slopes), 4))
     weight[:, 2] = slopes
     return make_model(weight, np.full(len(slopes), bias), np.array(output), constant)
 
 
 BUMP = of_field([8.0, -8.0], 4.0, [1.5, 1.5], -2.0)
-"Force that rises to a greatest value near 450 mT and falls again, the same on both sides."
+"The force rises to its greatest value near 450 mT and falls again, the same on both sides."
 LOPSIDED = of_field([40.0, -4.0], 4.0, [1.5, 1.5], -2.0)
-"Force that rises steeply to its greatest value near 450 mT and falls gently."
+"The force rises steeply to its greatest value near 450 mT and falls gently."
 PLATEAU = of_field([500.0], 0.0, [1.0], 0.0)
-"Force that climbs steeply at 450 mT and is flat to the last bit on both sides."
+"The force climbs steeply at 450 mT and is flat to the last bit on both sides."
 CREEPING = of_field([500.0, 1.0], 0.0, [1.0, 1e-14], -0.9)
-"The plateau, with a rise of 8 units of rounding across it."
-
-
-# -- what all of them promise -----------------------------------------------------------------------------------------
 
 
 REACHED_MT = (100.0, 750.0)
@@ -93,7 +84,7 @@ Make = Callable[[ForceModel], FieldSolver]
 
 
 class Subject(NamedTuple):
-    """A search, how near the root it comes on the smooth model (mT), and what it promises beyond."""
+    """A search, how near the root it comes on the smooth model, and what it promises beyond."""
 
     make: Make
     accuracy_mT: float
@@ -125,7 +116,6 @@ FORGETFUL = [name for name in ANY_SHAPE if not SUBJECTS[name].is_continuous]
 
 @cache
 def solver(name: str, model: ForceModel) -> FieldSolver:
-    """The search on that model, made once."""
     return SUBJECTS[name].make(model)
 
 
@@ -254,9 +244,6 @@ def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> 
         assert solution == searcher.solve(curve, force, last)
 
 
-# -- row by row and by the nearest points ------------------------------------------------------------------------------
-
-
 RANGE_MT = (100.0, 800.0)
 
 
@@ -339,16 +326,13 @@ def test_the_grid_has_both_ends_and_no_wider_step() -> None:
     assert 2.9 < np.diff(grid).max() <= 3.0
 
 
-# -- Newton on the whole range of a force that rises: the root that Brent's method finds, from any last field ----------
-
-
 KNOWN = Known(((0.0, 1.0), (0.0, 60.0), RANGE_MT, (CIP, CIP)), 6.0)
 
 Steps = list[tuple[float, float, float]]
-"""Of each unit: 1/mT, the field, mT, at which it opens half, and N."""
+"Of each unit: 1/mT, the field at which it opens half, and N."
 
 SMOOTH = (0.005, 450.0, 5.0)
-"It gives every network a slope of 1e-4 N/mT at least, so that a root is where its force is, beyond rounding."
+"It gives every network a slope of 1e-4 N/mT at least, which puts the root beyond rounding."
 
 steps = st.lists(st.tuples(st.floats(1e-4, 100.0), st.floats(-300.0, 1200.0), st.floats(1e-6, 5.0)), max_size=10)
 fields = st.floats(*RANGE_MT)
@@ -363,7 +347,6 @@ def curve_of(units: Steps, constant_N: float = -0.5) -> ForceCurve:
 
 
 def solved(curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-    """The answer, as far as every answer has to be so."""
     solution = RisingSearch(RANGE_MT).solve(curve, force_N, last_field_mT)
     assert RANGE_MT[0] <= solution.field_mT <= RANGE_MT[1]
     assert (solution.predicted_force_N, solution.confidence) == (
@@ -431,9 +414,6 @@ def test_flat_stretches_do_not_stop_it(rate: float) -> None:
             assert solved(curve, stair + 0.5, last).field_mT == pytest.approx(150.0 + 100.0 * stair, abs=ACCURACY_MT)
 
 
-# -- the search of a scene: by name, or Newton's method, which no measured scene has a reason to leave -----------------
-
-
 BUILT = {"newton": RisingSearch, "nearest": NearestFieldSearch, "torch": NearestFieldSearch, "thesis": ordered.RowByRow}
 
 
@@ -451,7 +431,6 @@ def test_a_named_search_is_built_with_its_settings(rising: ForceModel, name: str
 
 
 def stating(model: ForceModel, **metrics: float) -> ForceModel:
-    """The same network with these figures in its file."""
     metadata = msgspec.structs.replace(model.metadata, metrics=metrics)
     return ForceModel(metadata, model.hidden_weight, model.hidden_bias, model.output_weight, model.output_bias)
 

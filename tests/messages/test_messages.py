@@ -59,13 +59,11 @@ values = st.recursive(
 
 
 def changed(base: dict[str, Any], **fields: Any) -> bytes:
-    """The packed map with some fields replaced."""
     packed: bytes = msgpack.packb(base | fields)
     return packed
 
 
 def refusal(data: bytes, kind: type[Any] = Setpoint) -> str:
-    """Why the message is refused."""
     with pytest.raises(MessageError) as caught:
         decode(data, kind)
     return str(caught.value)
@@ -229,10 +227,10 @@ def test_oversize_is_refused_before_it_is_read(size: int) -> None:
         b"",
         b"\x80",
         b"\xc1",
-        b"\xdf\xff\xff\xff\xff",  # a map that claims 2^32 - 1 entries
+        b"\xdf\xff\xff\xff\xff",  # claims 2^32 - 1 entries
         b"\xdd\xff\xff\xff\xff",
         b"\xc6\xff\xff\xff\xff",
-        b"\x91" * MAX_MESSAGE_BYTES,  # arrays in arrays in arrays
+        b"\x91" * MAX_MESSAGE_BYTES,  # nested arrays
         b"\x81\xa1a" * (MAX_MESSAGE_BYTES // 3),
         b"\x81\x01\x01",  # a key that is no text
         b"\x81\x90\x01",  # a key that cannot be hashed

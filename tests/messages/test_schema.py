@@ -94,7 +94,7 @@ V1: dict[type[msgspec.Struct], str] = {
     Description: "version build configuration scene model profile firmware serial_number portrait configuration_file",
     PortraitReport: "force_N rate_N_s",
 }
-"The keys of `v: 1`, each with the meaning and the unit that docs/messages.md gives it."
+"The keys of `v: 1`, with the meaning and the unit of docs/messages.md."
 WORDS = {int: "int", float: "float", str: "str", bool: "bool", Any: "any"}
 
 
@@ -115,7 +115,6 @@ def test_every_struct_that_leaves_the_daemon_is_pinned() -> None:
 
 
 def in_words(kind: Any) -> str:
-    """A field's type as the page has it."""
     arguments = get_args(kind)
     if get_origin(kind) in (types.UnionType, Union):
         (known,) = (each for each in arguments if each is not type(None))
@@ -128,7 +127,6 @@ def in_words(kind: Any) -> str:
 
 
 def rows(heading: str) -> list[tuple[str, str, str]]:
-    """The table under a heading of the page."""
     (section,) = re.findall(rf"^### {heading}\n(.*?)(?=^##|\Z)", PAGE, re.DOTALL | re.MULTILINE)
     found = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+) \|$", section, re.MULTILINE)
     assert len(found) == section.count("\n|") - 2 + section.startswith("|"), f"{heading}: a row that is none"

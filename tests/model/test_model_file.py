@@ -157,7 +157,6 @@ def test_a_file_without_a_memory_is_of_an_element_that_remembers_nothing(saved: 
 
 
 def said(field: str, text: str) -> Change:
-    """Sets a field of the header to this text."""
     return lambda header: header["__metadata__"].update({field: text})
 
 
@@ -191,7 +190,6 @@ MEANINGS: list[tuple[str, Any, str]] = [
     ("memory", {"lag_mT": -1.0}, r"memory\.lag_mT"),
     ("colour", "red", "colour"),
 ]
-"""Of another meaning, though each is what JSON can say."""
 
 BROKEN = [
     ("element", "tactical", "element"),
@@ -336,7 +334,6 @@ def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelM
 
 @pytest.fixture
 def of_two(model: ForceModel) -> ForceModel:
-    """One network of two inserts, whose fields overlap and whose iron differs."""
     whole = model.metadata.ranges | {"cip_percent": (20.0, 40.0)}
     boxes = {
         f"MRE-50-{iron:g}": whole | {"field_mT": fields_mT, "cip_percent": (iron, iron)}
@@ -372,7 +369,7 @@ def test_a_model_of_several_inserts_is_loaded_in_the_box_of_the_one_that_is_aske
 def test_not_rising_counts_in_the_boxes_alone(of_two: ForceModel) -> None:
     weight = np.zeros((6, 4))
     weight[:, 2] = 0.5, -0.5, 0.0, 0.0, 0.0, 0.0
-    # rises where either insert's fields are, falls with more iron: the whole's ranges have corners that neither has
+    # it rises where either insert's fields are, and falls with more iron, in corners that neither insert has
     whole = replace(of_two, hidden_weight=weight, output_weight=np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]))
     assert not_rising_share(whole) == 0.0
     assert not_rising_share(replace(of_two, hidden_weight=-np.abs(weight), output_weight=np.ones(6))) == 1.0
@@ -388,9 +385,6 @@ def test_a_box_that_is_none_is_refused(of_two: ForceModel) -> None:
             msgspec.structs.replace(of_two.metadata, boxes={"MRE-50-20": box})
 
 
-# -- the force curve: the model's, torch's and a 50-digit calculation's force, and how far it is trusted ---------------
-
-
 BOX = ((0.0, 0.0, 100.0, 40.0), (1.0, 60.0, 800.0, 40.0))
 Array = np.ndarray
 
@@ -402,7 +396,6 @@ def shipped() -> ForceModel:
 
 @pytest.fixture(scope="module")
 def steep(metadata: ModelMetadata) -> ForceModel:
-    """Large weights over narrow ranges."""
     rng = np.random.default_rng(4)
     narrow = msgspec.structs.replace(
         metadata,
@@ -416,7 +409,6 @@ def steep(metadata: ModelMetadata) -> ForceModel:
 
 
 def states(count: int) -> Array:
-    """Features (count x 4), a third of them up to ten ranges outside the box, and share of iron too."""
     rng = np.random.default_rng(11)
     rows = rng.uniform(*BOX, (count, 4))
     rows[::3] += rng.normal(size=(len(rows[::3]), 4)) * (3.0, 200.0, 2000.0, 10.0)
@@ -424,7 +416,6 @@ def states(count: int) -> Array:
 
 
 def exact_N(model: ForceModel, row: list[float]) -> mpmath.mpf:
-    """The network in physical units with 50 digits."""
     weight, bias, output, constant = model.physical
     with mpmath.workdps(50):
         total = mpmath.mpf(constant)
@@ -533,16 +524,12 @@ def test_confidence_follows_its_formula(
     )
 
 
-# -- what a model knows of relaxation ----------------------------------------------------------------------------------
-
-
 def test_the_daemon_remembers_what_the_grey_box_does() -> None:
     model = load_model(model_path("tactile_mre_c", Path()), element="tactile")
     grey = GreyBox(model, model.metadata.memory.free, model.metadata.memory.added)
     element = build_core(Config(scene="radial_pulse", rates=Rates(control_hz=500, inference_hz=83))).element
     gap_range_mm = element.portrait.gap_mm[-1], element.portrait.gap_mm[0]
     lab, memory = GreyBoxMemory(grey, 0.01), ElementMemory(element.memory, element.nominal, element.field, gap_range_mm)
-    # after a long rest without load
     memory.free, memory.added = element.memory.free.relaxed(0.0), element.memory.added.relaxed(0.0)
     memory.field_mT, memory.time_s = 140.0, 0.0
     draw = np.random.default_rng(4)

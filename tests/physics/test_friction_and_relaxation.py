@@ -9,9 +9,6 @@ from hypothesis import given, strategies as st
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 
-# -- friction ----------------------------------------------------------------------------------------------------------
-
-
 FRICTION = Friction(presliding_stiffness_N_mm=8.0, viscous_N_s_mm=0.0005, static_ratio=1.15, stribeck_speed_mm_s=5.0)
 frictions = st.builds(
     Friction,
@@ -69,7 +66,7 @@ def test_the_dry_force_never_exceeds_the_level(
     force, deflection = friction.advance(start_mm, speed_mm_s, kinetic_N, dt_s)
     assert math.isfinite(force)
     level_N = friction.level_N(speed_mm_s, kinetic_N)
-    # below 1e-300 a float has not the digits for a relative bound
+    # below 1e-300 a float lacks the digits for a relative bound
     assert abs(friction.presliding_stiffness_N_mm * deflection) <= level_N * (1 + 1e-12) + 1e-300
 
 
@@ -94,9 +91,6 @@ def test_a_closed_cycle_costs_the_hand_work(
         force_N, deflection_mm = friction.advance(deflection_mm, (after - before) / dt_s, kinetic_N, dt_s)
         works_mJ.append(force_N * (after - before))
     assert sum(works_mJ[steps:]) > 0.0
-
-
-# -- relaxation --------------------------------------------------------------------------------------------------------
 
 
 SERIES = PronySeries(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0))

@@ -1,4 +1,4 @@
-"""Field, force and attraction over the gap, and the inserts: against published figures and 50 digits; their domains."""
+"""Field, force and attraction over the gap, and the inserts, against published figures and 50 digits; their domains."""
 
 import math
 import pickle
@@ -27,9 +27,6 @@ from tormagd.physics.force import (
 from tormagd.physics.inserts import INSERTS, Insert, MeasuredForceRange, insert, relative_permeability
 from tormagd.physics.magnets import CuboidMagnet, attraction_N
 from tormagd.physics.relaxation import PronySeries
-
-# -- the field over the gap --------------------------------------------------------------------------------------------
-
 
 LAWS: list[FieldLaw] = [ThesisFieldLaw(), PowerFieldLaw(), PowerFieldLaw(coefficient=0.462, exponent=-1.33)]
 
@@ -72,9 +69,6 @@ def test_flux_density_over_the_radial_moment() -> None:
     assert flux_density_T(3.1e-3, 3.2, 0.004) == pytest.approx(3.1e-3 * 0.8 / 0.004)
 
 
-# -- the force of the brake --------------------------------------------------------------------------------------------
-
-
 OF_MOMENT = (stretch_minus_one, brake_force_N, d_force_d_moment)
 STIFF = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
 
@@ -104,7 +98,6 @@ def over_gaps(seed: int) -> Iterator[Case]:
 
 
 def over_loads(seed: int) -> Iterator[Case]:
-    """Up to the very edge of the domain, where the force is most sensitive."""
     for elastomer, geometry, rng in corners_and_random(seed):
         share = rng.choice((1.0, 10 ** rng.uniform(-6.0, 0.0)))
         yield Case(share * max_radial_moment_Tm(elastomer, geometry), elastomer, geometry)
@@ -114,7 +107,6 @@ def over_loads(seed: int) -> Iterator[Case]:
 def test_float64_force_and_slope_agree_with_50_digits(cases: Callable[[int], Iterator[Case]], count: int) -> None:
     admitted = 0
     for case in islice(cases(1), count):
-        # as `tools/numerics.py` computes it in 50 digits
         truth = reference(Batch(case.elastomer, case.geometry, None, np.array([])), case.moment)
         if case.moment > max_radial_moment_Tm(case.elastomer, case.geometry):
             assert truth.stretch < 0.05
@@ -200,9 +192,6 @@ def test_the_edge_of_the_domain_is_admitted_and_nothing_beyond() -> None:
         d_force_d_gap(5.0, PowerFieldLaw(), STIFF, TORMAG)
 
 
-# -- the attraction of the magnets, against the published 64-term sum in 50 digits, and against magpylib ---------------
-
-
 BLOCK = CuboidMagnet(width_m=0.040, depth_m=0.040, thickness_m=0.020, remanence_T=1.45)
 SLAB = CuboidMagnet(width_m=0.060, depth_m=0.015, thickness_m=0.008, remanence_T=1.2)
 
@@ -247,16 +236,12 @@ def test_agrees_with_the_published_sum_for_any_block_out_to_the_last_gap() -> No
         attraction_N(1.01 * last_mm, magnet)
 
 
-# -- the twelve inserts against the thesis's tables ----------------------------------
-
-
 def modelled_range_N(item: Insert) -> float:
     near, far = brake_force_N(ThesisFieldLaw().radial_moment_Tm(np.array([45.0, 95.0])), item.elastomer, TORMAG)
     return float(near - far)
 
 
 THESIS = [f"MRE-{shore}-{cip}" for shore in (10, 30, 50) for cip in (10, 20, 30, 40)]
-"Three matrices by four fillings."
 
 
 def test_the_twelve_inserts_of_the_thesis_are_there() -> None:
@@ -306,9 +291,6 @@ def test_what_makes_no_sense_is_refused_by_its_key(odd: dict[str, object]) -> No
         msgspec.convert(row | odd, Insert)
 
 
-# -- what every law keeps: type and shape of arrays, and its domain, by name -------------------------------------------
-
-
 SERIES = PronySeries(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0))
 
 
@@ -321,7 +303,7 @@ ONE_BY_ONE: list[tuple[Callable[[Any], Any], float, float, float]] = [
     ),
     (lambda gap: attraction_N(gap, BLOCK), 0.02, 200.0, 300),
 ]
-"""Each with a range, and by how many of its last digits a number of an array may differ."""
+"Each with a range, and by how many of its last digits a number of an array may differ."
 
 
 @pytest.mark.parametrize(("law", "low", "high", "digits"), ONE_BY_ONE)
@@ -337,8 +319,6 @@ def test_arrays_keep_type_and_shape_and_agree_with_floats(
     assert isinstance(law(0.5 * (low + high)), float)
 
 
-# -- what is refused ---------------------------------------------------------------------------------------------------
-
 NO_NUMBER = (math.nan, math.inf)
 Refused = tuple[Callable[..., Any], tuple[Any, ...], str]
 
@@ -346,7 +326,6 @@ Refused = tuple[Callable[..., Any], tuple[Any, ...], str]
 def in_each_place(
     function: Callable[..., Any], values: tuple[float, ...], names: tuple[str, ...], bad: tuple[float, ...]
 ) -> list[Refused]:
-    """Each of these values in turn is bad, and is named."""
     return [
         (function, (*values[:place], wrong, *values[place + 1 :]), name)
         for place, name in enumerate(names)
@@ -357,7 +336,6 @@ def in_each_place(
 def alone_and_among(
     function: Callable[..., Any], good: float, bad: Iterable[float], name: str, *rest: Any
 ) -> list[Refused]:
-    """Each bad value by itself, and in an array with a good one."""
     return [(function, (value, *rest), name) for one in bad for value in (one, np.array([good, one]))]
 
 

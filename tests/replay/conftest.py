@@ -1,4 +1,4 @@
-"""What the replay's tests share: one core, and one flight that ended with a fault."""
+"""One core, and one flight that ended with a fault."""
 
 import sys
 from collections.abc import Callable
@@ -29,8 +29,6 @@ def core() -> Core:
 
 @pytest.fixture(scope="session")
 def fly(core: Core) -> Fly:
-    """A flight of a simulated device with these faults, armed, which renders a pulse until `until_s`; on a bus, or else
-    behind a serial port."""
     shipped = core
 
     def make(
@@ -54,11 +52,9 @@ def fly(core: Core) -> Fly:
 
 @pytest.fixture(scope="session")
 def ended(fly: Fly) -> Flight:
-    """Both encoders jump: ENCODER at 3.5 s."""
     return fly("encoder_jump@3.5", until_s=4.0)
 
 
 @pytest.fixture(scope="session")
 def path(ended: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its black box."""
     return ended.write(tmp_path_factory.mktemp("boxes") / "ended.mcap")

@@ -35,7 +35,6 @@ NS = 1_000_000_000
 
 
 def asked(now_s: float) -> TimedSetpoint:
-    """A pulse at 250 Hz."""
     stamp_s = math.floor(now_s * 250.0) / 250.0
     return TimedSetpoint(1.3 + 0.3 * math.sin(math.tau * 1.2 * stamp_s), stamp_s, 0.1)
 
@@ -64,7 +63,6 @@ class Flight:
         self._remember()
 
     def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
-        """One control period."""
         self._is_stepped = False
         due_ns = self._now_ns + NS // self.config.rates.control_hz
         self._now_ns, beat = due_ns, Beat(due_ns, due_ns, 0)
@@ -83,7 +81,6 @@ class Flight:
         return sample
 
     def answer(self) -> Answer | None:
-        """Of the search beside the plans, which takes some periods."""
         question = self._question
         if question is None or self._now_ns / NS - question.time_s < SEARCH_S:
             return None
@@ -91,20 +88,16 @@ class Flight:
         return self.planner.aim.answer_to(question)
 
     def ask(self, question: Question) -> None:
-        """What that is asked, where it is idle."""
         self._question = self._question or question
 
     def read(self, now_s: float, raw: Any) -> None:
-        """Something came: before the step."""
         self._journal.read(now_s, raw)
 
     def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
-        """And went out: after it."""
         self._stepped()
         self._journal.wrote(now_s, raw, unsent)
 
     def connected(self, memory: Any) -> None:
-        """A port was opened; or it is closed, and the core knows."""
         if memory is None:
             self._journal.lost_link()
         self._journal.connected(memory)
@@ -118,7 +111,6 @@ class Flight:
         self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory())
 
     def _drain(self, setpoint: TimedSetpoint | None) -> bool:
-        """Whether it is a new one."""
         before = self._inbox.newest
         self._inbox.in_force = None if setpoint is None else Taken(setpoint, "a", 0, setpoint.stamp_s)
         return setpoint is not None and (before is None or setpoint.stamp_s > before.stamp_s)
@@ -133,7 +125,6 @@ class Flight:
         return packer.take()
 
     def command(self, name: str) -> None:
-        """An operator's command, taken or refused."""
         conditions, is_refused = self.loop.conditions(), False
         try:
             self.loop.command(name)
@@ -142,11 +133,9 @@ class Flight:
         self._journal.commanded(name, self.loop.now_s, conditions, is_refused=is_refused)
 
     def confirm(self, wrong: Disputed) -> None:
-        """The operator says who is right."""
         self._inference.confirm(wrong)
 
     def until(self, reached: Callable[[], bool]) -> None:
-        """Ticks until then."""
         for _ in range(10_000):
             self.tick()
             if reached():
@@ -154,7 +143,6 @@ class Flight:
         raise AssertionError("it did not come to that")
 
     def arm(self) -> None:
-        """As an operator does."""
         self.until(lambda: self.loop.measurement is not None)
         self.command("enable")  # not homed: a refusal is part of what happened
         self.command("home")
@@ -163,24 +151,20 @@ class Flight:
         self.command("enable")
 
     def write(self, path: Path, **changes: str) -> Path:
-        """Its black box; `changes` are of the header."""
         write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.ring.parts())
         return path
 
 
 def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
-    """What the core makes of these entries."""
     return rerun(core, COLUMNS, entries, from_s)
 
 
 def frames(path: Path) -> list[dict[str, Any]]:
-    """What passed, as a stock reader finds it in a black box."""
     with path.open("rb") as file:
         return [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics="/frames")]
 
 
 def planted(box_entries: list[Any], tick: int, column: int, value: Any) -> list[Any]:
-    """The entries with one value of one tick (1 is the first) changed."""
     place = [place for place, entry in enumerate(box_entries) if is_tick(entry)][tick - 1]
     changed = [*box_entries[place][:column], value, *box_entries[place][column + 1 :]]
     return [*box_entries[:place], changed, *box_entries[place + 1 :]]

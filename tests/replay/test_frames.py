@@ -23,7 +23,7 @@ from tormagd.replay.rerun import ticks_of
 from tormagd.safety.codes import Fault
 
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5
-"And when the newest snapshot before it is, one of two a second."
+"And the newest snapshot before it, one of two a second."
 DAMAGED_FROM_S = 3.0
 
 
@@ -44,20 +44,17 @@ def box(request: pytest.FixtureRequest, path: Path, can_path: Path) -> BlackBoxF
 
 
 def place_of(entries: list[Any], name: str, tick: int) -> int:
-    """Of the entry with this name that comes before that tick's record."""
     return next(
         place for place in range(list(ticks_of(COLUMNS, entries))[tick - 1], 0, -1) if entries[place][0] == name
     )
 
 
 def with_raw(entries: list[Any], place: int, raw: Any) -> list[Any]:
-    """The entries with something else read or written there."""
     direction, time_s, _, *rest = entries[place]
     return [*entries[:place], [direction, time_s, raw, *rest], *entries[place + 1 :]]
 
 
 def damaged(raw: Any) -> Any:
-    """With one bit of a State turned over."""
     if isinstance(raw, bytes):
         return raw[:4] + bytes((raw[4] ^ 0x10,)) + raw[5:]
     (identifier, data), *others = raw
@@ -65,7 +62,6 @@ def damaged(raw: Any) -> Any:
 
 
 def number_of(entries: list[Any], place: int) -> int:
-    """Of the newest frame in that entry, as the file counts."""
     passed = [entry for entry in entries[: place + 1] if isinstance(entry, list) and entry[0] in ("read", "wrote")]
     return sum(len(entry[2]) if isinstance(entry[2], list) else 1 for entry in passed)
 
@@ -134,9 +130,6 @@ def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, t
     assert [entry[1] is None for entry in entries if entry[0] == "connected"] == [True, False]
     done = again(core, entries)
     assert (done.difference, done.ticks, done.frames) == (None, 3_400, number_of(entries, len(entries) - 1))
-
-
-# -- what would have happened instead: the simulator, with what was asked of the recorded one --------------------------
 
 
 def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A black box run again: bit for bit, from the middle too; what was changed in it is found; what is none is refused."""
+"""A black box run again: bit for bit, from the middle too; changes in it are found; other files are refused."""
 
 import contextlib
 import hashlib
@@ -45,9 +45,6 @@ def box(path: Path) -> BlackBoxFile:
     return read_black_box(path)
 
 
-# -- the same again ------------------------------------------------------------------------------------------------
-
-
 def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box: BlackBoxFile, path: Path) -> None:
     assert ended.loop.stepper.safety.faults == (Fault.ENCODER,)
     known = recorded(box, path.parent)
@@ -58,7 +55,7 @@ def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box:
 
 
 def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fly: Any, tmp_path: Path) -> None:
-    # a few of the thesis's fields: what is searched for does not matter here, and each is a pass of torch
+    # a few of the thesis's fields, because each is a pass of torch
     shipped = (ROOT / "examples" / "scenes" / "thesis.toml").read_text(encoding="utf-8")
     scene = tmp_path / "thesis.toml"
     scene.write_text(shipped.replace("step_mT = 1.0", "step_mT = 50.0"), encoding="utf-8")
@@ -151,7 +148,7 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     assert math.isnan(tried[2][0])
     done = again(core, box.entries)
     assert (done.difference, done.ticks, done.snapshots) == (None, 3_600, 7)
-    # a plan that fails here alone is no such plan
+    # a plan that fails only here is no such plan
     entries = [*box.entries[: place - 1], *box.entries[place + 1 :]]
     found = again(core, entries, 3.0).difference
     assert (found.tick, found.field, found.recorded, found.replayed) == (
@@ -166,9 +163,6 @@ def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxF
     places = list(ticks_of(COLUMNS, box.entries))
     done = again(core, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
     assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
-
-
-# -- what was changed is found -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -260,9 +254,6 @@ def test_what_is_not_as_it_was_is_told(box: BlackBoxFile, path: Path) -> None:
     assert [line.partition(":")[0] for line in told] == ["build", "platform", "scene", "configuration"]
 
 
-# -- what is no black box ------------------------------------------------------------------------------------------
-
-
 def run(path: Path) -> None:
     found = read_black_box(path)
     known = recorded(found, path.parent)
@@ -270,7 +261,6 @@ def run(path: Path) -> None:
 
 
 def refusal(path: Path) -> str:
-    """What `tormagd.replay` says of a file, which is one line."""
     with pytest.raises((RecordingError, ReplayError)) as refused:
         run(path)
     text = str(refused.value)
@@ -280,7 +270,6 @@ def refusal(path: Path) -> str:
 
 
 def stated(path: Path, header: dict[str, str], encoding: str, data: bytes) -> Path:
-    """A file with that header, whose one message is this."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()

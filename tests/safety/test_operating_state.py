@@ -44,7 +44,6 @@ faults = st.lists(st.sampled_from(Fault), max_size=3, unique=True).map(tuple)
 
 
 def refusal(state: SafetyState, name: str, present: Conditions = READY) -> RefusedError:
-    """Why a command is refused."""
     with pytest.raises(RefusedError) as caught:
         command(state, name, 0.0, present)
     assert caught.value.message
@@ -123,7 +122,7 @@ TAKEN: dict[str, tuple[OperatingState | tuple[OperatingState, DeviceRequest] | s
     "clear-fault": (DISABLED, ENABLED, PAUSED, DISABLED),
     "use-scene": (DISABLED, "tormagctl disable", "tormagctl disable", CLEAR),
 }
-"""Where each command leads and what it asks of the device, or what is hinted at where it is refused."""
+"Where each command leads and what it asks of the device, or the hint where it is refused."
 
 
 @pytest.mark.parametrize("present", OperatingState)
@@ -286,7 +285,6 @@ class Operating(RuleBasedStateMachine):
             return None
 
     def _check_request(self, before: SafetyState) -> None:
-        """A request number stands for one request, and only ever goes up, by one."""
         assert 0 <= self.state.request_number - before.request_number <= 1
         if self.state.request_number == before.request_number:
             assert self.state.request is before.request
@@ -329,9 +327,6 @@ def test_the_next_commands_of_each_fault_are_taken_and_arm_it(fault: Fault) -> N
         if name == "home":
             is_homed, state = True, homed_again(state, is_homed=False)
     assert (state.operating_state, next_commands(state, is_homed)) == (OperatingState.ENABLED, ())
-
-
-# -- codes: each one is explained, and every fault bit of the firmware has its own -------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,6 @@ def of_path(path: str) -> Core:
 
 
 def refused(name_or_path: str, *said: str, load: Callable[[str], object] = load_scene) -> None:
-    """The scene is, and these words say why."""
     with pytest.raises(ConfigError) as caught:
         load(name_or_path)
     assert [words for words in said if words not in str(caught.value)] == []
@@ -91,7 +90,6 @@ def test_a_name_of_no_file_lists_the_shipped_ones_or_says_why_it_is_none() -> No
 
 
 def contradicts(low: str, low_value: float, high: str, high_value: float) -> tuple[dict[str, str], tuple[str, str]]:
-    """Keys whose first may not reach the second, and what the refusal says."""
     keys = {low.replace(".", "__"): str(low_value), high.replace(".", "__"): str(high_value)}
     return keys, (f"{low} = {low_value:g}", f"under {high} = {high_value:g}")
 

@@ -15,7 +15,7 @@ def test_up_and_down_by_half_cosines_with_rests(tmp_path: Path) -> None:
     time_s, force_N = asked(Signal(bandwidth_hz=0.5, hold_s=1.0), tmp_path, RANGE_N, 100.0, 100)
     assert len(time_s) == len(force_N) == 400
     assert force_N[[0, 50, 100, 150, 200, 250, 300, 399]] == pytest.approx([0.5, 1.25, 2.0, 2.0, 2.0, 1.25, 0.5, 0.5])
-    # pi f times the range is the fastest that such a cosine gets
+    # pi f times the range is the steepest slope of such a cosine
     assert np.abs(np.diff(force_N)).max() * 100 == pytest.approx(np.pi * 0.5 * 1.5, rel=1e-3)
 
 

@@ -30,9 +30,6 @@ from tormagd.simulation.device import MessageDevice, Packet, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
 
-# -- a serial line -----------------------------------------------------------------------------------------------------
-
-
 SAMPLE_1 = load_plant("sample_1")
 HELLO = encode_frame(FUNCTION[Hello], 0, encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)))
 IDENTITY_BYTES = 1 + 2 + 8 + 2 + 1  # COBS, header, payload, CRC, delimiter
@@ -55,7 +52,6 @@ def test_bytes_take_ten_bits_each_in_both_directions(baud: int) -> None:
 
 
 def answered(device: MessageDevice, time_s: float, counter: int) -> Packet:
-    """The State that a Drive is answered with."""
     device.receive(time_s, FUNCTION[Drive], encode(Drive(0.0, 0.0, DriveMode.OFF, counter)))
     device.advance(time_s + 9e-4)
     answer = next(packet for packet in device.outbox if packet.function == FUNCTION[State])
@@ -185,9 +181,6 @@ def test_a_frame_survives_the_socket_and_what_is_none_is_refused() -> None:
         *(SOCKET_FRAME.pack(*one) for one in none),
     )
     assert {from_socket(packet) for packet in packets} == {None}
-
-
-# -- the bus -------------------------------------------------------------------------------------------------------
 
 
 def a_bus(bitrate: int = 1_000_000, node: int = 1) -> CanDevice:

@@ -14,9 +14,6 @@ from tormagd.simulation.faults import KNOWN, SIZED, Fault, FaultError, parse_fau
 from tormagd.simulation.hand import HandError, PressingHand, ReversingHand, SteadyHand, parse_hand
 from tormagd.simulation.parameters import PlantError, load_plant, plant_names, with_insert
 
-# -- plants ------------------------------------------------------------------------------------------------------------
-
-
 SAMPLE_1_TEXT, SECOND_TEXT = (
     resources.files("tormagd.simulation").joinpath(f"plants/{name}.toml").read_text(encoding="utf-8")
     for name in ("sample_1", "second")
@@ -30,7 +27,6 @@ def written(folder: Path, text: str) -> Path:
 
 
 def refused(folder: Path, text: str, *said: str) -> None:
-    """A plant's file with this text is, and these words say why."""
     with pytest.raises(PlantError) as refusal:
         load_plant(written(folder, text))
     assert [word for word in said if word not in str(refusal.value)] == []
@@ -143,9 +139,6 @@ def test_another_insert_keeps_what_the_sample_is_off_its_kind() -> None:
     assert with_insert(load_plant("sample_2"), "MRE-50-40") == load_plant("sample_2")
     with pytest.raises(DomainError, match="MRE-99-99"):
         with_insert(load_plant("sample_1"), "MRE-99-99")
-
-
-# -- hands and faults --------------------------------------------------------------------------------------------------
 
 
 def test_the_default_hand_turns_the_roller_at_42_mm_s() -> None:

@@ -1,4 +1,4 @@
-"""The simulator's doors: a process of its own, and hosts as the daemon or python-can's own interfaces open them."""
+"""The simulator's doors: a process of its own, and hosts that open them as the daemon or python-can do."""
 
 import contextlib
 import csv
@@ -48,7 +48,6 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 
 def descriptor(backend: Any) -> int:
-    """What is readable when something has come: the daemon waits for nothing."""
     return int(backend._fd)
 
 
@@ -71,14 +70,12 @@ def channel(process: "subprocess.Popen[str]") -> str:
 
 
 def ended(process: "subprocess.Popen[str]") -> None:
-    """Asks it to end, which it does without a word."""
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, output) == (0, ""), errors
 
 
 def meet(device: Device) -> None:
-    """Opens the line as the daemon does, repeats Hello until both Identity and Status have come, and closes it."""
     seen: set[type[Message]] = set()
     deadline_s = time.monotonic() + LIMIT_S
     with contextlib.closing(choose(device, Rates()).open()) as backend:
@@ -117,9 +114,6 @@ def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_no
     assert Path(path).is_socket()
     assert channel(start("--can", path)) == path
     meet(on_a_bus(path))
-
-
-# -- the serial door, and calls of the process -----------------------------------------------------------------------
 
 
 def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, tmp_path: Path) -> None:
@@ -170,19 +164,13 @@ def test_a_wrong_call_says_what_is_right_and_exits_with_2(
     assert said in errors
 
 
-# -- the bus's door ------------------------------------------------------------------------------------------------
-
-
 class Served:
-    """A door in this process, and the clock it lives by."""
-
     def __init__(self, path: Path) -> None:
         self.device = CanDevice(MessageDevice(load_plant("sample_1"), SteadyHand(), seed=1))
         self.door = CanDoor(self.device, path)
         self.now_s = 0.0
 
     def host(self) -> socket.socket:
-        """A host that has just come."""
         host = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         host.settimeout(LIMIT_S)
         host.connect(self.door.address)
@@ -190,7 +178,6 @@ class Served:
         return host
 
     def exchange(self, duration_s: float) -> None:
-        """Lets the door work for that long."""
         until_s = self.now_s + duration_s
         while True:
             readable, _, _ = select.select(self.door.descriptors(), [], [], 0.0)
@@ -214,7 +201,7 @@ def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
         bad = served.host()
         bad.send(packet)
         served.exchange(0.002)
-        while bad.recv(64):  # a Status may have come before the end
+        while bad.recv(64):
             pass
         bad.close()
     good.send(to_socket(CanFrame(0x081, encode(HELLO))))
@@ -282,9 +269,6 @@ def test_a_host_that_does_not_read_holds_nobody_up(served: Served) -> None:
     assert heard > 100, "a Status every 20 ms"
     lazy.close()
     busy.close()
-
-
-# -- the adapter ---------------------------------------------------------------------------------------------------
 
 
 DAMAGED_FRAMES = (

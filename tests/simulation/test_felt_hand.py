@@ -21,7 +21,6 @@ from tormagd.simulation.second_element import SecondElement
 
 STEP_S, END_S, GAP_MM = 1e-3, 4.0, 50.0
 STROKE = RecordedHand((0.2, 1.0, 2.2, 3.0), (0.0, 15.0, 15.0, 0.0))
-"Pushes, holds, withdraws."
 FINGER, WRIST, ARM = Impedance(0.005, 0.4, 0.005), Impedance(0.1, 0.4, 0.006), Impedance(1.0, 0.3, 0.02)
 BRAKES = ("sample_1", "sample_2", "second")
 at_each_brake = pytest.mark.parametrize("name", BRAKES)
@@ -35,7 +34,7 @@ def at_gap(name: str) -> PlantParameters:
 
 
 def at_brake(name: str, hand: FeltHand, seconds: float = END_S) -> np.ndarray:
-    """A row a step: place, mm, the brake's force and the hand's, N."""
+    """A row per step: place, mm, the brake's force and the hand's, N."""
     plant, rows = Plant(at_gap(name), hand), []
     for _ in range(round(seconds / STEP_S)):
         plant.advance(STEP_S)
@@ -44,17 +43,15 @@ def at_brake(name: str, hand: FeltHand, seconds: float = END_S) -> np.ndarray:
 
 
 def freely(hand: FeltHand) -> np.ndarray:
-    """Its places where no brake is."""
     return np.array([hand.moved_mm(step * STEP_S, lambda speed_mm_s: 0.0) for step in range(1, round(END_S / STEP_S))])
 
 
 def swung_mm(place_mm: np.ndarray) -> float:
-    """How far a handle went to and fro, beyond where it got to."""
     return float(np.abs(np.diff(place_mm)).sum() - abs(place_mm[-1] - place_mm[0]))
 
 
 def energies_mJ(rows: np.ndarray, impedance: Impedance) -> np.ndarray:
-    """What the intended stroke put in, what friction and the damper took, and what is in the mass and the spring."""
+    """What the stroke put in, what friction and damper took, and what is in mass and spring."""
     (place_mm, resisting_N, hand_N), dt_s = rows.T, END_S / len(rows)
     meant_mm = np.interp(dt_s * np.arange(len(place_mm) + 1), STROKE.times_s, STROKE.positions_mm)
     place_mm = np.append(0.0, place_mm)
@@ -67,7 +64,7 @@ def energies_mJ(rows: np.ndarray, impedance: Impedance) -> np.ndarray:
 
 
 def finely(name: str, impedance: Impedance, intended: RecordedHand, dt_s: float = STEP_S / 20.0) -> np.ndarray:
-    """The same equations by another, explicit method, in 20 times finer steps: rows as of `at_brake`."""
+    """The same equations by an explicit method in 20 times finer steps, with the rows of `at_brake`."""
     parameters = at_gap(name)
     element = (SecondElement if parameters.second else TorqueElement)(parameters, GAP_MM, dt_s)
     meant_mm = np.interp(dt_s * np.arange(round(END_S / dt_s) + 1), intended.times_s, intended.positions_mm).tolist()
@@ -147,6 +144,6 @@ def test_a_felt_hand_of_the_command_line_strokes_once_the_device_is_homed() -> N
         *(0.0, 0.0, 2.5, 5.0, 5.0, 2.5, 0.0, 0.0, 2.5),
     ]
     place_mm = at_brake("sample_1", hand, 13.0)[:, 0]
-    # the brake's force is 3 N, the spring 0.4 N/mm: it stays behind, and then does not come all the way back
+    # the brake's force is 3 N, the spring 0.4 N/mm: the handle stays behind
     assert place_mm[:10_000] == pytest.approx(0.0, abs=1e-9)
     assert place_mm.max() < 2.5

@@ -25,7 +25,8 @@ from tormagd.simulation.faults import KNOWN, SIZED, parse_fault
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-# -- the firmware, seen through the wire; the rules of the page are the conformance kit's, which it passes -------------
+# -- the rules of the page are the conformance kit's, which this firmware passes
+# -----------------------------------------
 
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
@@ -35,8 +36,6 @@ STATUS_PERIOD_S = 0.02
 
 
 class Port:
-    """The serial port of a simulated device, in virtual time: a `BytePort`."""
-
     def __init__(self, device: VirtualDevice) -> None:
         self.device = device
         self.time_s = 0.0
@@ -53,8 +52,6 @@ class Port:
 
 
 class Bench(Host):
-    """A simulated device and the conformance kit's host of it, which looks through the wire."""
-
     def __init__(self, faults: Iterable[str] = (), plant: PlantParameters | None = None) -> None:
         self.device = VirtualDevice(
             plant or load_plant("sample_1"), SteadyHand(), [parse_fault(fault) for fault in faults]
@@ -62,7 +59,6 @@ class Bench(Host):
         super().__init__(SerialLine(Port(self.device)))
 
     def go_to(self, gap_mm: float, seconds: float = 1.5) -> None:
-        """Run to a gap with a plain proportional loop on each carriage, starting homed."""
         target_mm = gap_mm / 2.0 - 47.5
         for _ in range(round(seconds / PERIOD_S)):
             state = self.last(State)
@@ -74,12 +70,10 @@ class Bench(Host):
             self.beat(Beat.RUN, duty, duty)
 
     def reaches(self, mode: DeviceMode, beat: Beat = Beat.NOTHING, limit_s: float = 10.0) -> None:
-        """Waits until Status shows the mode."""
         assert self.until(lambda: self.status.mode is mode, limit_s, beat), self.status
 
 
 def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "sample_1") -> Bench:
-    """A device homed and at that gap, in RUN, which is before 3.4 s."""
     sample = load_plant(plant)
     near_home = msgspec.structs.replace(sample.assumed, start_left_mm=46.0, start_right_mm=45.5)
     host = Bench(faults, msgspec.structs.replace(sample, assumed=near_home))
@@ -89,9 +83,6 @@ def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "s
     assert host.now_s < 3.4
     assert host.device.truth.gap_mm == pytest.approx(gap_mm, abs=0.3)
     return host
-
-
-# -- what must come before a run -----------------------------------------------------------------------------------
 
 
 def test_drive_run_is_refused_without_a_hello() -> None:
@@ -104,9 +95,6 @@ def test_drive_run_is_refused_without_a_hello() -> None:
     host.hello()
     host.run_until(host.now_s + 0.1, -0.5)
     assert host.status.mode is DeviceMode.RUN
-
-
-# -- homing --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -160,11 +148,8 @@ def test_duties_are_applied_in_steps_of_ten_bits() -> None:
     assert travel(513 * step) > travel(512 * step) > 60.0
 
 
-# -- ways out of a run ---------------------------------------------------------------------------------------------
-
-
 class Ending(NamedTuple):
-    """How a run from a gap of `gap_mm` ends, with these faults of the device, while the host drives so."""
+    """How a run from a gap of `gap_mm` ends, with these faults of the device and these duties of the host."""
 
     faults: tuple[str, ...]
     duties: tuple[float, float] | None
@@ -181,7 +166,6 @@ ENDINGS = {
     "silence": Ending((), None, 60.0, DeviceFault.COMMAND_TIMEOUT, DeviceFault.COMMAND_TIMEOUT, OPEN_MM, OPEN_MM),
     "a closed switch": Ending((), (-0.3, -0.3), 50.0, DeviceFault.END_STOP, DeviceFault.END_STOP, OPEN_MM, OPEN_MM),
     "skew": Ending((), (0.4, -0.4), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM),
-    # the other carriage is opened all the same
     "a blocked carriage": Ending(
         ("blocked_left@3.5",),
         (1.0, 0.0),
@@ -275,9 +259,6 @@ def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int
     while DeviceFault.RETRACT_FAILED not in host.status.faults:
         host.pass_time(0.01)
         assert host.now_s - started_s < within_s
-
-
-# -- injected faults -----------------------------------------------------------------------------------------------
 
 
 def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap() -> None:

@@ -1,4 +1,4 @@
-"""The simulated patient and its network, in virtual time, and its process before a daemon that is played."""
+"""The simulated patient and its network in virtual time, and its process before a daemon that is played."""
 
 import math
 from typing import Any
@@ -17,7 +17,6 @@ def felt_along(patient: Patient, handle_mm: np.ndarray) -> list[Felt]:
 
 
 def in_and_out(to_mm: float, seconds: float = 1.0) -> np.ndarray:
-    """To a place, a rest there, and back."""
     way = np.linspace(0.0, to_mm, round(seconds / STEP_S))
     return np.concatenate([way, np.full(500, to_mm), way[::-1], np.zeros(500)])
 
@@ -48,7 +47,6 @@ def test_the_wall_is_elastic_and_is_left_again() -> None:
 def test_a_beating_wall_pushes_in_its_own_time() -> None:
     patient = Patient(friction_N=0.0, wall_mm=5.0, beat_mm=0.5, beat_hz=2.0)
     force_N = np.array([felt.force_N for felt in felt_along(patient, np.append(0.0, np.full(1000, 6.0)))])
-    # the robot is there: 1 mm in, at 0.5 N/mm
     assert np.ptp(force_N[500:]) == pytest.approx(0.5, abs=0.01)
     assert force_N[500:].mean() == pytest.approx(0.5, abs=0.01)
 
@@ -72,7 +70,6 @@ def test_what_a_setpoint_says_in_each_mode() -> None:
 
 
 def arrivals(delay: NetworkDelay[int], messages: int = 20_000) -> list[tuple[float, float, int]]:
-    """When what arrived: the time, when it was sent, its number."""
     found = []
     for number in range(messages):
         delay.send(number * 1e-3, number)

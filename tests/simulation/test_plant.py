@@ -1,4 +1,4 @@
-"""Motor, gearbox, screw and carriage; element or pad, sensors; and the plant of all of it together."""
+"""Motor, gearbox, screw and carriage; element or pad, sensors; and the plant of all of them."""
 
 import itertools
 import math
@@ -18,9 +18,6 @@ from tormagd.simulation.parameters import PlantError, PlantParameters, load_plan
 from tormagd.simulation.plant import SUBSTEP_S, Plant
 from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.static_laws import pull_of_magnets_N, radial_moment_Tm
-
-# -- motor, gearbox, screw and carriage: against the data sheet, against closed forms, and for passivity ---------------
-
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
 
@@ -44,7 +41,6 @@ def turn(axis: Axis, duration_s: float, volts: float | None, attraction_N: float
 
 
 def changed(plant: PlantParameters, table: str, **values: object) -> PlantParameters:
-    """With these values in one of its tables."""
     return msgspec.structs.replace(plant, **{table: msgspec.structs.replace(getattr(plant, table), **values)})
 
 
@@ -53,8 +49,6 @@ def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
 
 
 def holding(plant: PlantParameters, gap_mm: float, wear: float = 1.0) -> tuple[float, float]:
-    """The magnets' attraction, N, and by how much friction at a screw holds more than that turns back, N m: power off,
-    without the guide's drag, and the friction divided by `wear`."""
     pull_N = float(pull_of_magnets_N(gap_mm, plant))
     screw_Nm = pull_N * plant.screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
     friction_Nm = (plant.gear.output_friction_Nm + screw_Nm) / wear
@@ -70,7 +64,7 @@ def test_no_load_speed_and_current_are_those_of_the_data_sheet() -> None:
 
 def test_stall_torque_and_current_are_those_of_the_data_sheet() -> None:
     axis = an_axis(changed(SAMPLE_1, "electronics", current_limit_A=20.0))
-    # up to full voltage so slowly that nothing but the torque pushes into the stop
+    # so slowly that only the torque pushes into the stop
     for step in range(steps(6.0)):
         axis.step(min(12.0, step * SUBSTEP_S * 3.0), 0.0)
     assert (axis.speed_rad_s, axis.current_A) == (0.0, pytest.approx(5.5, rel=0.05))
@@ -142,7 +136,6 @@ def test_attraction_and_holding_margin_over_the_stroke(name: str) -> None:
 def test_the_carriages_hold_with_the_power_off(name: str, gap_mm: float) -> None:
     plant = Plant(at_gap(load_plant(name), gap_mm), SteadyHand())
     plant.advance(1.0)
-    # nothing but the contact's springs: the screws do not turn at all
     assert plant.gap_mm == pytest.approx(gap_mm, abs=1e-6)
     assert plant.left.angle_rad == plant.right.angle_rad == 0.0
 
@@ -177,7 +170,7 @@ def test_the_substep_is_fine_enough_for_hard_motion(name: str, motion: str, drag
     parameters = at_gap(changed(load_plant(name), "screw", drag_left_N=drag_left_N), 60.0)
 
     def path(substep_s: float) -> np.ndarray:
-        """A row a tick: gap, um, force, mN, the left screw's way, um, and its current, mA."""
+        """A row per tick: gap, um, force, mN, the left screw's way, um, and its current, mA."""
         plant, rows = Plant(parameters, ReversingHand(0.5), substep_s=substep_s), []
         for tick in range(400):
             plant.advance(0.13e-3)
@@ -191,11 +184,10 @@ def test_the_substep_is_fine_enough_for_hard_motion(name: str, motion: str, drag
     coarse, fine = path(SUBSTEP_S), path(1e-5)
     assert np.ptp(fine[:, 0]) > 30.0
     gap_um, force_mN, screw_um, current_mA = np.abs(coarse - fine).max(axis=0)
-    # a bridge that opens at full speed opens up to half a substep late or early; otherwise an encoder's count is 1.8 um
+    # a bridge that opens at full speed opens up to half a substep late or early
     assert gap_um < (30.0 if motion == OPENING else 4.0)
     assert force_mN < (2.5 if motion == OPENING else 0.4)
     assert screw_um < (5.0 if motion == OPENING else 1.8)
-    # 24 V more, 0.27 ms ago
     assert current_mA < 600.0
 
 
@@ -214,7 +206,6 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
         for _ in range(steps(0.03)):
             before_m, angle_rad = axis.position_m, axis.angle_rad
             axis.step(volt, attraction_N)
-            # work on the rotor by the current of the step, and by the magnets on the carriage
             electric_J = 0.77 * axis.current_A * (axis.angle_rad - angle_rad)
             magnetic_J = -attraction_N * (axis.position_m - before_m)
             put_in_J += electric_J + magnetic_J
@@ -223,15 +214,12 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
             assert put_in_J + 0.01 * throughput_J + 1e-6 >= stored_J
 
 
-# -- element and sensors, and the plant of all of it -------------------------------------------------------------------
-
-
 STEP_S = 1e-3
 SPEED_MM_S = 41.9
 
 
 def without_memory(plant: PlantParameters) -> PlantParameters:
-    """The plant with its constitutive law alone: no hysteresis, relaxation, drift, Stribeck or viscous part."""
+    """The constitutive law alone: no hysteresis, relaxation, drift, Stribeck or viscous part."""
     replace = msgspec.structs.replace
     return replace(
         plant,
@@ -260,7 +248,7 @@ def test_the_joined_field_law_is_smooth_and_falls() -> None:
     gap_mm = np.linspace(44.0, 110.0, 66_001)
     slope = np.gradient(radial_moment_Tm(gap_mm, plant), gap_mm)
     assert np.all(slope < 1e-12)
-    # largest curvature of Eq. 7 is 1.206e-6 * 1.867 * 0.867 * x**-0.133: no kink where the laws meet
+    # the largest curvature of Eq. 7 is 1.206e-6 * 1.867 * 0.867 * x**-0.133: no kink where the laws meet
     assert np.max(np.abs(np.diff(slope)[45_000:])) < 5e-8
 
 
@@ -387,14 +375,10 @@ def test_time_may_be_cut_in_any_way() -> None:
     assert (pieces.truth, pieces.force_sensor.reading_N) == (whole.truth, whole.force_sensor.reading_N)
 
 
-# -- the pad -----------------------------------------------------------------------------------------------------------
-
-
 PADS = ("pad_1", "pad_2", "pad_3")
 
 
 def force_N(plant_name: str, gap_mm: float, depth_mm: float, *, seconds: float = 0.0) -> float:
-    """At once, or after being held."""
     element = PressedPad(load_plant(plant_name), gap_mm, STEP_S)
     for step in range(round(seconds / STEP_S) + 1):
         element.advance(step * STEP_S, gap_mm, depth_mm, 0.0)
@@ -407,7 +391,7 @@ def test_a_pad_pushes_harder_the_deeper_and_the_nearer_the_magnets(name: str) ->
     gaps = [force_N(name, gap, 2.0) for gap in (95.0, 80.0, 60.0, 45.0)]
     assert (depths[0], depths, gaps) == (0.0, sorted(depths), sorted(gaps))
     assert 3.0 < gaps[0] < 3.6 < 4.1 < gaps[-1] < 4.7
-    # the plates meet: deeper there is nothing to press
+    # the plates meet: there is nothing deeper to press
     assert force_N(name, 70.0, 9.0) == depths[-1]
 
 

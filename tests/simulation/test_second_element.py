@@ -13,7 +13,6 @@ SECOND = load_plant("second")
 
 
 def of(**values: object) -> PlantParameters:
-    """The second plant with these values of its element."""
     assert SECOND.second is not None
     return msgspec.structs.replace(SECOND, second=msgspec.structs.replace(SECOND.second, **values))
 
@@ -21,7 +20,6 @@ def of(**values: object) -> PlantParameters:
 def slid(
     gap_mm: float, plant: PlantParameters = SECOND, seconds: float = 0.2, speed_mm_s: float = SPEED_MM_S
 ) -> SecondElement:
-    """An element whose handle has slid for a while, since it rested."""
     element = SecondElement(plant, gap_mm, STEP_S)
     for _ in range(round(seconds / STEP_S)):
         element.advance(0.0, gap_mm, speed_mm_s)

@@ -1,4 +1,4 @@
-"""A package, and a machine of its own to install it on: systemd as process 1 of fresh namespaces, `boot.sh`."""
+"""A package, and a machine to install it on: systemd as process 1 of fresh namespaces, `boot.sh`."""
 
 import contextlib
 import ctypes
@@ -28,11 +28,11 @@ GROUPS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
 DEATH_SIGNAL = 1
 "PR_SET_PDEATHSIG: a test that is killed leaves no machine behind."
 PATIENCE_S = 60.0
-"Longer than anything takes on a busy machine; only a failure waits for it."
+"Only a failure waits so long."
 
 
 def missing() -> str:
-    """Why no such machine can be made here; empty where it can."""
+    """Return why no such machine can be made here."""
     if os.geteuid() != 0:
         return "not root"
     for program in ("unshare", "nsenter", "pivot_root", "systemctl"):
@@ -61,7 +61,7 @@ class Machine:
         place = self._folder / "machine"
         place.mkdir(exist_ok=True)
         packages = sysconfig.get_path("purelib")
-        # a control group of its own: the new process 1 is its root's, and sees nothing of this machine's
+        # the new process 1 is the root of its own control group, and sees nothing of this machine's
         self._group = _own_group(f"tormag-test-{os.getpid()}")
         self.log = self._folder / "console.log"
         command = ["unshare", *NAMESPACES, "sh", str(BOOT)]
@@ -77,13 +77,11 @@ class Machine:
         self.until(lambda: self.run("systemctl", "is-active", "basic.target", check=False) == "active", "booted")
 
     def start_again(self, folder: Path) -> None:
-        """Another one in its place, for a scenario that the host spoiled."""
         self.close()
         self._folder = folder
         self._boot()
 
     def run(self, *command: str, check: bool = True) -> str:
-        """What a command says on the machine, without the last line end."""
         inner = self._inner()
         if inner is None:
             assert self._process.poll() is None, self.log.read_text()
@@ -100,24 +98,21 @@ class Machine:
         return done.stdout.strip()
 
     def shows(self, unit: str, *names: str) -> list[str]:
-        """Properties of a unit."""
         shown = self.run("systemctl", "show", unit, *(f"--property={name}" for name in names))
         values = dict(line.split("=", 1) for line in shown.splitlines())
         return [values.get(name, "") for name in names]
 
     def until(self, reached: Callable[[], bool], what: str) -> None:
-        """Waits for a condition; fails saying what was waited for."""
         until_s = time.monotonic() + PATIENCE_S
         while not reached():
             assert time.monotonic() < until_s, f"not within {PATIENCE_S:g} s: {what}\n{self.log.read_text()}"
             time.sleep(0.05)
 
     def close(self) -> None:
-        """Ends all that runs on it."""
         self._process.kill()  # with --kill-child, its process 1 and so everything else
         self._process.wait()
         if self._group is not None:
-            # the kernel takes away a process after it has ended it
+            # the kernel removes a process after it has ended it
             until_s = time.monotonic() + PATIENCE_S
             while self._group.exists() and time.monotonic() < until_s:
                 for folder, _, _ in os.walk(self._group, topdown=False):
@@ -147,7 +142,7 @@ def _own_group(name: str) -> Path | None:
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """The package with this checkout in it, and links to where a `Machine` has what it imports in place of that."""
+    """Build the package of this checkout, with links to what a `Machine` imports."""
     if shutil.which("dpkg-deb") is None:
         pytest.skip("dpkg-deb is not installed")
     debians = subprocess.run(
@@ -180,7 +175,6 @@ def package(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Iterator[Machine]:
-    """A machine without the service, which sees `tmp_path` as /opt/shared."""
     why_not = missing()
     if why_not:
         pytest.skip(f"no machine of its own: {why_not}")
@@ -190,5 +184,4 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 
 @pytest.fixture
 def imports() -> dict[str, str]:
-    """The interpreter on a `Machine`, and where it imports from."""
     return {"python": PYTHON, "library": LIBRARY}

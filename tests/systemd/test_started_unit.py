@@ -1,7 +1,6 @@
-"""The package on a machine, from its installation to its removal: the unit without a device, with one, and when one of
-both hangs; what the kernel grants it; a second console beside it, with a recorder and a drop-in.
+"""The package on one machine, from its installation to its removal.
 
-One machine for all of that: to boot one, and to install on it, takes longer than most of what is shown.
+One machine serves all steps, because booting one, and installing on it, takes longer than most of them.
 """
 
 import re
@@ -20,7 +19,7 @@ ExecStart=/bin/sh -c '{python} -P -m tormagd.simulation --pty --seed 1 --truth /
     {{ read port; chgrp tormag $port; chmod 660 $port; ln -sfn $port /dev/%i; exec cat; }}'
 """
 LOG = "/tmp/tormagd.log"
-# what goes to the journal elsewhere; and the wait before a restart shows nothing
+# what goes to the journal elsewhere; and a restart without its wait
 SEEN = f"""
 [Service]
 StandardOutput=append:{LOG}
@@ -33,7 +32,7 @@ AmbientCapabilities=CAP_SYS_NICE
 CapabilityBoundingSet=CAP_SYS_NICE
 PrivateUsers=no
 """
-"What gives the daemon real time where nobody may raise LimitRTPRIO, as in a container without CAP_SYS_RESOURCE."
+"Gives the daemon real time where nobody may raise LimitRTPRIO, as in a container without CAP_SYS_RESOURCE."
 ASKS = "\n[realtime]\nfifo_priority = 50\nlock_memory = true\n"
 NOT_ALLOWED = "[Service]\nLimitRTPRIO=0\nLimitMEMLOCK=8M\n"
 DROP_INS = "/etc/systemd/system/{unit}.service.d"
@@ -43,44 +42,36 @@ FIFO = re.compile(r"pid (\d+)'s .* policy: SCHED_FIFO.*\npid \d+'s .* priority: 
 
 
 class Console:
-    """A console's service on a machine."""
-
     def __init__(self, machine, unit: str) -> None:
         self.machine, self.unit = machine, unit
 
     def stands(self, state: str, *words: str) -> bool:
-        """Whether it is in this state, and its status says all of that."""
         active, status = self.machine.shows(self.unit, "ActiveState", "StatusText")
         return active == state and all(word in status for word in words)
 
     def is_ready(self) -> bool:
-        """Whether its device is identified, and nothing else has happened."""
         return self.stands("active", "DISABLED", "next: tormagctl arm")
 
     def restarts(self) -> int:
-        """How often systemd has started it again."""
         (count,) = self.machine.shows(self.unit, "NRestarts")
         return int(count)
 
     def log(self) -> str:
-        """What it has said."""
         return self.machine.run("cat", LOG)
 
 
 def put(machine, path: str, text: str) -> None:
-    """Writes a file on the machine."""
     machine.run("sh", "-c", f"mkdir -p $(dirname {path}); cat > {path} <<'END'\n{textwrap.dedent(text)}\nEND")
 
 
 def files(machine) -> set[str]:
-    """Everything of ours that has been written on the machine, by the package or by the service."""
+    """Return everything of ours that package or service have written."""
     found = machine.run("find", "/opt/written", "/run", "-path", "*tormag*").splitlines()
     paths = {path.removeprefix("/opt/written") for path in found}
     return {path for path in paths if not path.startswith(OTHERS)}
 
 
 def shown(section: str) -> str:
-    """The configuration that a section of the guide shows."""
     text = GUIDE.read_text(encoding="utf-8").split(f"\n## {section}\n")[1]
     return textwrap.dedent(re.findall(r"(?:^    [\[\w].*\n)+", text, re.MULTILINE)[0])
 
@@ -100,7 +91,6 @@ def test_the_service_from_its_installation_to_its_removal(package, machine, impo
 
 
 def unpack(machine, package) -> None:
-    """Installs the package, or upgrades to it."""
     machine.run("dpkg", "--no-triggers", "--force-unsafe-io", "--install", f"/opt/shared/package/{package.name}")
 
 
@@ -125,7 +115,6 @@ def it_is_up_with_a_device_only(console) -> None:
 
 
 def real_time_is_granted_to_the_daemon_alone(console) -> None:
-    """To its control thread, and one below that to ZeroMQ's; not to the process that keeps its black box."""
     machine = console.machine
     main, group = machine.shows("tormagd", "MainPID", "ControlGroup")
     processes = machine.run("cat", f"/sys/fs/cgroup{group}/cgroup.procs").split()
@@ -134,14 +123,14 @@ def real_time_is_granted_to_the_daemon_alone(console) -> None:
     assert (control.pop(main), set(control.values())) == ("50", {"49"})
     assert found
     assert not any(found.values())
-    # what says so asks the daemon, and not whoever calls
+    # the answer asks the daemon, and not the caller
     said = machine.run("tormagctl", "doctor", check=False)
     assert "runs by /etc/tormag/tormagd.toml" in said
     assert "granted: realtime.fifo_priority = 50" in said
 
 
 def an_upgrade_lets_it_run(console, package) -> None:
-    """As the brake may hold something; systemd goes on hearing of it, and it finds its files."""
+    """The brake may hold something; systemd keeps hearing of it, and it finds its files."""
     machine = console.machine
     before = machine.shows("tormagd", "MainPID")
     unpack(machine, package)
@@ -166,19 +155,18 @@ def what_can_change_does_and_what_cannot_is_named(console) -> None:
 
 def a_hang_of_either_starts_it_again(console) -> None:
     machine = console.machine
-    # a device that says nothing any more while its port is open: the watchdog is not fed
+    # a silent device behind an open port: the watchdog is not fed
     machine.run("systemctl", "kill", "--signal=STOP", "simulator@tormag")
     machine.until(lambda: console.restarts() == 1, "the watchdog has killed it")
     machine.until(lambda: console.stands("activating", "waiting for the device"), "it waits again, not armed")
     machine.run("systemctl", "kill", "--signal=CONT", "simulator@tormag")
     machine.until(console.is_ready, "the device answers again")
-    # a daemon that is not run does not feed it either
+    # nor does a stopped daemon feed it
     machine.run("systemctl", "kill", "--kill-whom=main", "--signal=STOP", "tormagd")
     machine.until(lambda: console.restarts() == 2 and console.is_ready(), "it is started again")
 
 
 def another_console_stands_beside_it(console, left) -> None:
-    """As the guide has it, with a publisher's address that takes a drop-in, and a recorder."""
     machine = console.machine
     text = re.sub(r'port = ".*"', 'port = "/dev/left"', shown("Several consoles"))
     put(machine, "/etc/tormag/left.toml", re.sub('setpoint = ".*"', 'setpoint = "tcp://127.0.0.1:5555"', text) + ASKS)
@@ -190,7 +178,7 @@ def another_console_stands_beside_it(console, left) -> None:
     machine.run("systemctl", "start", "simulator@left", "tormagd@left", "tormag-record@left")
     machine.until(left.is_ready, "the other device is identified")
     machine.run("bash", "-c", ": < /dev/tcp/127.0.0.1/5555")
-    # what the kernel does not grant to it is said wherever somebody looks, and of the first console nowhere
+    # what the kernel does not grant it is reported everywhere, and nothing of the first console
     for command in ("status", "metrics", "doctor"):
         said = machine.run("tormagctl", "--endpoint", "ipc:///run/tormag-left/control", command, check=False)
         assert ("realtime.fifo_priority" in said, "realtime.lock_memory" in said) == (True, True), said
@@ -203,7 +191,7 @@ def another_console_stands_beside_it(console, left) -> None:
     assert console.is_ready()
     assert console.restarts() == 2
 
-    # the recorder ends before its daemon, with a whole file that no tick is missing in
+    # the recorder ends before its daemon, with a whole file that lacks no tick
     machine.run("systemctl", "stop", "tormagd@left")
     for unit in ("tormagd@left", "tormag-record@left"):
         assert machine.shows(unit, "ActiveState", "Result") == ["inactive", "success"]
@@ -212,7 +200,7 @@ def another_console_stands_beside_it(console, left) -> None:
 
 
 def a_stop_opens_the_gap(console) -> None:
-    """The carriages of a device that was never homed stand anywhere; the service has ended when they are apart."""
+    """The service ends only when the carriages are apart."""
     machine = console.machine
     machine.run("systemctl", "stop", "tormagd")
     assert machine.shows("tormagd", "ActiveState", "Result") == ["inactive", "success"]
@@ -223,7 +211,6 @@ def a_stop_opens_the_gap(console) -> None:
 
 
 def nothing_is_left(machine) -> None:
-    """Whatever package and service have made; what was put beside them is whose it is."""
     machine.run("rm", "-r", *(DROP_INS.format(unit=unit) for unit in ("tormagd", "tormagd@left")))
     machine.run("dpkg", "--no-triggers", "--purge", "tormagd")
     assert files(machine) == set()

@@ -32,7 +32,6 @@ INSTALLED = sorted(
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `make install DESTDIR=ROOT PREFIX=/usr` puts there besides the library."""
     made: Path = tmp_path_factory.mktemp("root")
     subprocess.run(
         ["sh", str(UNITS / "install.sh"), str(made), "/usr", sys.executable, str(UNITS.parent)], check=True, timeout=60
@@ -42,12 +41,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def unit(tmp_path: Path) -> Path:
-    """The unit with a program that exists here in place of /usr/bin/tormagd."""
     return runnable(UNITS / "tormagd.service", tmp_path)
 
 
 def runnable(unit: Path, folder: Path) -> Path:
-    """A copy whose program exists here, in a folder in which the names of others are known."""
+    """Return a copy whose program exists here."""
     copy = folder / unit.name
     program = shutil.which("true")
     changed = re.sub(r"^ExecStart=/usr/bin/\w+ ", f"ExecStart={program} ", unit.read_text(), flags=re.MULTILINE)
@@ -57,7 +55,6 @@ def runnable(unit: Path, folder: Path) -> Path:
 
 
 def commands() -> dict[str, argparse.ArgumentParser]:
-    """The commands of `tormagctl` by name."""
     (chosen,) = (action for action in parser()._actions if isinstance(action.choices, dict))
     return dict(chosen.choices)
 
@@ -89,7 +86,7 @@ def test_every_installed_unit_is_understood(root, tmp_path):
         instance = tmp_path / service.name.replace("@.", "@left.")
         if not instance.exists():
             instance.symlink_to(service)
-        # no man pages here; no user and no group either, which are made by sysusers.d
+        # no man pages here, and no user or group, which sysusers.d makes
         verified = analyze("verify", "--man=no", instance)
         assert (verified.returncode, verified.stderr) == (0, ""), instance.name
 
@@ -103,7 +100,7 @@ def test_the_unit_is_closed_to_what_it_does_not_need(unit, drop_ins, most):
         shutil.copy(UNITS / f"drop-ins/{name}.conf", opened)
     examined = analyze("security", "--offline=true", f"--threshold={most}", unit)
     assert examined.returncode == 0, examined.stdout
-    # and they are looked at: the open one is more open than that
+    # the open one is more open than that
     assert analyze("security", "--offline=true", "--threshold=4", unit).returncode != 0
 
 
@@ -118,7 +115,7 @@ def test_what_is_installed_lies_in_its_places(root):
     assert {path.relative_to(root / "usr/share/doc/tormagd") for path in files if "examples" in path.parts} == {
         example for example in examples if "__pycache__" not in example.parts
     }
-    # nothing of the folder that it was put together in: that is moved, or packed
+    # no trace of the folder that it was put together in
     assert [path for path in files if str(root).encode() in path.read_bytes()] == []
 
 

@@ -1,4 +1,4 @@
-"""The subcommands of `benchmark`: the keys of the contract, their arithmetic, figures of no machine in particular."""
+"""The subcommands of `benchmark`: their keys, their arithmetic, figures of no machine in particular."""
 
 import argparse
 import contextlib
@@ -25,9 +25,6 @@ from tormagd.scenes.scene import shipped_scenes
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.parameters import load_plant
 
-# -- inverse, its quick run --------------------------------------------------------------------------------------------
-
-
 KEYS = {
     "name", "dtype", "hidden", "p50_us", "p99_us", "p999_us", "solver_mae_mT", "plant_mae_mT", "plant_max_mT",
     "force_mae_N", "memory_kB", "pareto",
@@ -36,7 +33,6 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def result():
-    """The object, by way of the command line."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         assert benchmark.main(["inverse", "--quick", "--json"]) == 0
@@ -118,9 +114,6 @@ def test_the_committed_page_is_of_the_committed_figures() -> None:
     )
 
 
-# -- scenes: what the chosen way costs ---------------------------------------------------------------------------------
-
-
 SCENE_KEYS = {
     "name", "terms_in", "terms_out", "control_hz", "inference_hz", "solver", "rms_N", "rms_full_N", "tolerance_N",
     "cost_us_per_s", "cost_full_us_per_s", "daemon_share", "daemon_share_full", "plan_us", "judged",
@@ -137,12 +130,8 @@ def test_every_scene_has_the_keys_of_the_contract_and_costs_no_more_than_the_usu
         assert row["cost_us_per_s"] <= row["cost_full_us_per_s"]
 
 
-# -- step, on the plant: figures of the position loop that are promised to users ---------------------------------------
-
-
 @pytest.fixture(scope="module")
 def measured():
-    """One run on the sample the loop was tuned on."""
     found = step.measure(argparse.Namespace(plant="sample_1"))
     return found | {f"{name}, worst corner": margin for name, margin in found["corners"].items()}
 
@@ -157,7 +146,7 @@ def measured():
         ("overshoot_over_stroke", 0.0, 0.02),
         ("steady_error_um", 0.0, 5.0),
         ("skew_um", 0.0, 30.0),
-        # the stroke is limited by the motors, and the transfer function is the plant's
+        # the motors limit the stroke, and the transfer function is the plant's
         ("stroke_ratio", 1.0, 1.15),
         ("model_nrmse", 0.0, 0.05),
         ("gain_margin_dB, worst corner", MIN_GAIN_MARGIN_DB, math.inf),
@@ -173,11 +162,7 @@ def test_a_wrong_motor_is_noticed_in_the_comparison():
     assert step.nrmse(*step.model_step(heavy, load_plant("sample_1"), step.MODEL_DUTY)) > 0.1
 
 
-# -- timing, on made-up measurements -----------------------------------------------------------------------------------
-
-
 def block(lateness_us: float, merged: int) -> loop.Block:
-    """Ten seconds in which every tick was equally late."""
     ticks = 10_000 - merged
     return loop.Block(np.full(ticks, lateness_us), np.full(ticks, 50.0), ticks, merged, 10.0)
 

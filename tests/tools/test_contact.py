@@ -1,4 +1,4 @@
-"""What a hand feels of a wall, in virtual time: near the bound that stands beside it."""
+"""What a hand feels of a wall, in virtual time, near its bound."""
 
 import math
 
@@ -15,7 +15,6 @@ from tormagd.simulation.hand import FeltHand, Impedance
 
 @pytest.fixture(scope="module")
 def rows() -> dict[str, dict]:
-    """A firm wall, touched in three ways over 100 ms."""
     return {mode: judged(Case("draw 100", 0.3, 0.25, 30.0, 100.0, mode)) for mode in ("force", "way", "law_standby")}
 
 
@@ -51,8 +50,6 @@ def test_what_is_kept_is_told_by_mode(rows) -> None:
 
 
 class Trembling:
-    """A hand that slides, and then trembles 8 times a second around a place 5 mm further on."""
-
     def position_mm(self, time_s: float) -> float:
         onset_s = max(time_s - 12.0, 0.0)
         return 15.0 * min(time_s, 12.0) + 5.0 * min(onset_s, 1.0) + 0.5 * math.sin(math.tau * 8.0 * onset_s)

@@ -1,4 +1,4 @@
-"""What `make run` says: its verdict on made-up shows, its live line, and its table, which is the README's sample."""
+"""What `make run` says: its verdict on made-up shows, its live line, and its table, the README's sample."""
 
 import json
 import math
@@ -34,7 +34,6 @@ ASKED_N = 1.5 + 0.1 * np.sin(5.0 * AXIS_S)
 
 
 def shown(**changes):
-    """A show in which everything was in order."""
     group = {"hz": 500.0, "lateness_us": {"p50": 1, "p99": 2}, "exec_us": {"p50": 1, "p99": 2}}
     link = {"frames": 7, "lost": 0, "corrupt": 0, "repeated": 0}
     known = show.Shown(
@@ -55,14 +54,12 @@ def shown(**changes):
 
 
 def aborted(fault, host, spacing_s=1e-3):
-    """A show that a fault has ended."""
     with pytest.raises(show.ShowError) as caught:
         show.raise_fault({"faults": [fault]})
     return show.Aborted(caught.value, host, spacing_s)
 
 
 def rehearsals():
-    """Every case, well tracked."""
     return dict.fromkeys(demo.CASES, Followed(AXIS_S, ASKED_N, ASKED_N + 0.01, AXIS_S, AXIS_S, {}))
 
 
@@ -183,7 +180,7 @@ def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_cod
 
 @pytest.fixture
 def undrawn(monkeypatch) -> None:
-    """The picture of a show costs more than all that is said of it."""
+    """Skip the picture, which costs more than the rest."""
     monkeypatch.setattr(pictures, "show_picture", Mock())
 
 
@@ -203,11 +200,7 @@ def test_every_case_of_the_demo_is_played(case: Case) -> None:
     assert len(done.rendered_N) > 250
 
 
-# -- the hand that feels a wall ----------------------------------------------------------------------------------------
-
-
 def truth(push: int, wall: live_touch.Wall, most_mm: float, late_ms: int, waiting_N: float = 0.9) -> np.ndarray:
-    """A device's rows of a hand that goes 0.02 mm further each millisecond, and rests; what it feels comes late."""
     first, lasts = round(1e3 * live_touch.begins_s(push)), round(2e3 * live_touch.HALF_S)
     rows = np.zeros(first + lasts, [(name, float) for name in ("handle_mm", "handle_mm_s", "kinetic_N", "force_N")])
     pushed_mm = np.minimum(0.02 * np.arange(lasts), wall.place_mm + most_mm)
@@ -224,7 +217,6 @@ STIFF = tuple(wall._replace(stiffness_N_mm=5.0 * wall.stiffness_N_mm) for wall i
 
 
 def touched(late_ms: int = 150) -> dict[live_touch.Wall, Touch]:
-    """Both walls pressed 4 mm in, felt late."""
     return {wall: live_touch.touch_of(truth(push, wall, 4.0, late_ms), push, wall) for push, wall in enumerate(STIFF)}
 
 

@@ -1,4 +1,4 @@
-"""What `tools/endure.py` runs for long, for a moment; and that it would notice: what cannot fail proves nothing."""
+"""Every case of `tools/endure.py` for a moment, and that each can fail."""
 
 import contextlib
 import math
@@ -39,9 +39,6 @@ def test_a_wrong_command_line_is_refused(wrong: list[str]) -> None:
         endure.main(wrong)
 
 
-# -- fuzz ----------------------------------------------------------------------------------------------------------
-
-
 def test_both_languages_hear_the_vectors_and_a_difference_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     inputs = list(fuzz.payloads()), [*fuzz.streams(), b"\x82\x01\x07\0\xff\xff", b"\x89" * 12]
     try:
@@ -67,8 +64,6 @@ def test_without_clang_the_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> No
     assert (result["passed"], "clang is not on the path" in result["skipped"]) == (True, True)
 
 
-# -- in real time --------------------------------------------------------------------------------------------------
-
 KIND = stalls.Stop("daemon", 40.0, (), 0, 0)
 LONG = KIND._replace(took_ms=83.0, faults=("HOST_STALL",))
 
@@ -82,7 +77,7 @@ LONG = KIND._replace(took_ms=83.0, faults=("HOST_STALL",))
         (KIND, 1.0, 70.0, "force off by 1.000 N"),
         (LONG._replace(faults=("HOST_STALL", "LINK_LOST")), 1.0, 95.0, "told as HOST_STALL, LINK_LOST"),
         (LONG._replace(faults=()), 1.0, 95.0, "told as nothing"),
-        # on the edge of the device's timeout either may happen, but it has to be safe
+        # on the edge of the device's timeout either may happen, but it must be safe
         (LONG._replace(took_ms=50.0), 1.0, 70.0, "gap 70.0 mm, not open"),
     ],
 )
@@ -92,7 +87,7 @@ def test_a_stop_is_judged_by_what_it_really_was(stop: stalls.Stop, worst_N: floa
 
 
 def test_what_grows_or_is_missing_is_named() -> None:
-    # of a long run the first two minutes do not count
+    # the first two minutes of a long run do not count
     runs = ([1, 90, 100, 101, 102, 110, 104, 103], [*range(240), *(2_000 * [240]), 245])
     assert [soak.growth(run) for run in runs] == [10, 5]
     assert [soak.staying([3, 9, 5, 7, 6, 5, *last]) for last in ([9, 5], [7, 6])] == [0, 1]

@@ -10,7 +10,6 @@ from evidence import Part
 
 
 def printing(figures: dict[str, Any], status: int = 0, **fields: bool) -> Part:
-    """A part whose command prints these figures."""
     text = json.dumps(json.dumps(figures))
     return Part(f"-c 'import sys; print({text}); sys.exit({status})'", "{cases} cases", **fields)
 

@@ -1,4 +1,4 @@
-"""Far out: the table of stages and runs at the ends; `tools/numerics.py` on a sample; that each can fail."""
+"""The table of stages and runs at the ends, `tools/numerics.py` on a sample, and that each can fail."""
 
 import json
 import math
@@ -29,9 +29,6 @@ from tormagd.physics.force import (
     max_radial_moment_Tm,
 )
 from tormagd.safety.codes import Limit
-
-# -- the table of stages: nothing travels through any, what does is found, runs at the ends are judged -----------------
-
 
 EPISODES = 12
 
@@ -113,9 +110,6 @@ def test_every_float_of_plain_data_values_and_stages_is_seen() -> None:
     }  # fmt: skip
 
 
-# -- whole runs ----------------------------------------------------------------------------------------------------
-
-
 def test_the_ends_are_those_of_the_configuration_the_insert_and_the_device() -> None:
     found = {str(end) for end in ends()}
     assert {"motor.supply_V = 60", "rates.control_hz = 83", "trim.least = 1", "insert.gap_open_mm = 300"} <= found
@@ -151,9 +145,6 @@ def test_configurations_are_summed() -> None:
         "wrong": 1,
         "told": ["wrong: d", "stated: e"],
     }
-
-
-# -- tools/numerics.py itself, on a sample; that it can fail; and loads that it does not draw --------------------------
 
 
 TOOL = Path(__file__).parents[2] / "tools" / "numerics.py"

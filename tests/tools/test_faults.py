@@ -19,7 +19,7 @@ LOSING = (
     "device clock 30% slow",
     "bus full",
 )
-"""Faults beside SAMPLED of which the force is lost in a way of its own; one that goes on is not lost."""
+"""Their force is lost in ways of their own; one that goes on is not lost."""
 SAMPLED = (
     "daemon killed or cable cut",
     "daemon stalls for 45 ms",
@@ -56,16 +56,16 @@ ON_A_BUS_TOO = (
     "round trip of 15 ms",
     "from the start: wrong CRC-8 in State",
 )
-"""What is done to frames, and silence; behind the line both buses are one."""
+"""Behind the line both buses are one."""
 SAMPLED_S = 2.5
-"""How long a fault is watched here: the slowest gap is open after 2.2 s."""
+"""The slowest gap is open after 2.2 s."""
 JUDGED_S = 1.5
-"""How long where the judge is judged: one gap is open by then, the other has not moved."""
+"""One gap is open by then, the other has not moved."""
 
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The device was left open, and homes within 1.4 s; two seconds later a force is followed, by either."""
+    """The device was left open, and homes within 1.4 s; two seconds later it follows a force."""
 
     def left_open(name: str) -> PlantParameters:
         plant = load_plant(name)
@@ -78,17 +78,14 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def is_let_go_by_the_daemon(item: Injection) -> bool:
-    """At the scene's own rate, in a core that runs."""
     return item.host in ("stale", "other") or item.publisher == "nan"
 
 
 def fastest_plant(item: Injection) -> str:
-    """The device that loses the force fastest."""
     return "sample_2" if is_let_go_by_the_daemon(item) else "sample_3"
 
 
 def within_N_s(item: Injection) -> float:
-    """How fast the force may be lost."""
     force = load_scene("coronary").force
     # the carriages may have been behind the ramp, and catch up: half as fast again
     return 1.5 * force.release_N_s if is_let_go_by_the_daemon(item) else force.most_release_N_s
@@ -135,7 +132,7 @@ def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None
 
 
 RECOVERED = (
-    # a sensor is doubted until it agrees with the device, which is as it was
+    # a sensor is doubted until it agrees with the device
     ("force sensor reads nothing", "clear-fault, enable refused: sensor_doubted", ("enable",)),
     # what the device has latched comes back while its cause stands
     ("device too hot", "clear-fault, DEVICE_TEMPERATURE again", ("clear-fault", "home", "enable")),

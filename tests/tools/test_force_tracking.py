@@ -1,4 +1,4 @@
-"""How a force is followed: signals, draws, figures of one short run; the envelope. All devices are synthetic."""
+"""How a force is followed: signals, draws, figures of one short run; the envelope."""
 
 import json
 import math
@@ -46,7 +46,7 @@ def test_without_a_name_every_case_is_measured(monkeypatch: pytest.MonkeyPatch, 
 
 
 def course(*errors: tuple[float, float, float]) -> Followed:
-    """Ten seconds of 1 N without an error, but for these: from, to, s, and how much, N."""
+    """Return ten seconds of 1 N with these errors: from, to, s, and how much, N."""
     time_s = 1e-3 * np.arange(10_000)
     asked_N, felt_N, still = np.ones_like(time_s), np.ones_like(time_s), np.zeros_like(time_s)
     for from_s, to_s, much_N in errors:
@@ -82,7 +82,7 @@ def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Followed) -
     assert 0.01 <= least["foresight_rms_N"] < least["no_delay_rms_N"]
     rushed = track(load_plant("sample_1"), fast, "pulse", 0.0)
     assert rushed.since(0.0).rms_N >= least["foresight_rms_N"]
-    # as long as nothing is foreseen, which three swings are too few for
+    # nothing is foreseen yet, for which three swings are too few
     begun = fast._replace(time_s=fast.time_s[:250], force_N=fast.force_N[:250])
     at_first = ideal("sample_1", begun).figures()
     assert rms(rushed.error_N[rushed.time_s < 0.5]) >= at_first["no_delay_rms_N"]
@@ -122,7 +122,7 @@ def test_a_step_is_judged_once_it_arrived_a_second_later_and_by_its_greatest() -
     assert step_figures(found, BEGINS_S, IDEAL_S, 1.0) == pytest.approx(
         {"arrived_N": -0.05, "later_N": 0.02, "overshoot_N": 0.09}
     )
-    # downwards what falls short of the force asked is beyond it
+    # downwards a force below the one asked is beyond it
     assert step_figures(found, BEGINS_S, IDEAL_S, -1.0)["overshoot_N"] == pytest.approx(0.05)
 
 
@@ -155,16 +155,12 @@ def test_recorded_signals_are_in_the_devices_range(recordings, monkeypatch) -> N
         )
 
 
-# -- the envelope; all of its runs are `make evidence` -----------------------------------------------------------------
-
-
 ROOT = Path(__file__).parents[2]
 
 FLOOR_N = 0.6
 
 
 def judged(asked_N: float, along_N: np.ndarray, speed_mm_s: float = 42.0) -> envelope.Figures:
-    """A handle that turns steadily, a row a millisecond; the force asked is the same from the beginning."""
     time_s, same = 1e-3 * np.arange(1, len(along_N) + 1), np.ones_like(along_N)
     signed_N, speeds = along_N * math.copysign(1.0, speed_mm_s), speed_mm_s * same
     found = Followed(time_s, asked_N * same, signed_N, time_s * speed_mm_s, speeds, {})
@@ -172,7 +168,6 @@ def judged(asked_N: float, along_N: np.ndarray, speed_mm_s: float = 42.0) -> env
 
 
 def forces(excess_N: float, at: int, lasts: int) -> np.ndarray:
-    """Six seconds of 1 N, and for so many milliseconds more."""
     return 1.0 + excess_N * np.isin(np.arange(6_000), np.arange(at, at + lasts))
 
 

@@ -25,7 +25,7 @@ def test_a_stall_costs_the_beats_that_were_due_in_it():
         ({"waited": {"daemon": 0.02, "simulated device": 0.2}}, True),
         ({"waited_worst_ms": 24.0}, False),
         ({"waited_worst_ms": 60.0}, True),
-        ({"steal": 0.5}, False),  # what was stolen while nobody wanted it did no harm; a timer would have seen it
+        ({"steal": 0.5}, False),  # what was stolen while nobody wanted it did no harm
     ],
 )
 def test_what_was_taken_is_judged_by_what_a_program_would_have_missed(changes, took_much):
@@ -33,7 +33,6 @@ def test_what_was_taken_is_judged_by_what_a_program_would_have_missed(changes, t
 
 
 def looked(time_s: float, **waited_s: float) -> host.Counters:
-    """What the kernel's counters say of processes that have waited so long by then."""
     return host.Counters(time_s, stolen=0, ticks=round(100 * time_s), waited_s=waited_s, blocked_s=0.0)
 
 

@@ -1,4 +1,4 @@
-"""The pages that are made of tables and of evidence are what these make of them."""
+"""The pages that are made of tables and of evidence are up to date."""
 
 import json
 from collections import Counter
@@ -25,7 +25,7 @@ limit: MODEL_RANGE SENSOR_ZERO OFFSET_UNKNOWN
 cause: no_supply flood turns_round homes_shut worn_out scale real_device
 kit: overcurrent retract_failed uncommanded_motion supply temperature watchdog
 """
-"The red rows that are known: no cell of the matrix, nothing that can be done, or a check that takes a bench."
+"No cell of the matrix, nothing that can be done, or a check that takes a bench."
 
 
 @pytest.mark.parametrize(
@@ -74,9 +74,6 @@ def test_what_is_seen_at_once_is_stated_so() -> None:
     assert {FAULTS[fault].safe_ms for fault in at_once} == {51.0}
     late = [code for code, row in FAULTS.items() if row.safe_ms > 100.0 and row.shows.startswith("at once")]
     assert late == [Fault.SENSE_STALE, Fault.STATUS_STALE], "streams that are missed after 100 ms of nothing"
-
-
-# -- risk ----------------------------------------------------------------------------------------------------------
 
 
 def test_no_row_is_red_but_those_that_are_known() -> None:

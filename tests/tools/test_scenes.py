@@ -109,7 +109,6 @@ def test_a_scene_without_a_signal_cannot_be_measured(tmp_path: Path) -> None:
 
 
 REFUSING = Mock(submit=Mock(side_effect=ConnectionError("worker lost")))
-"Takes no run at all."
 
 
 def test_what_is_known_is_not_run_again(monkeypatch: pytest.MonkeyPatch) -> None:

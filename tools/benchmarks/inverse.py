@@ -1,6 +1,6 @@
-"""`benchmark inverse`: every search for the field on one workload in one run: time, memory, errors.
+"""`benchmark inverse`: every search for the field on one workload: time, memory, errors.
 
-One thread and the garbage collector frozen, as in the daemon. Synthetic data (`inverse_workload.py`).
+It runs in one thread with the garbage collector frozen, as in the daemon, on synthetic data (`inverse_workload.py`).
 """
 
 import argparse
@@ -48,9 +48,8 @@ BASELINES = ("thesis-linear", "linear-argmin", "vectorised-argmin")
 BASELINE_STEP_MT = 1.0
 STEPS_MT = {"torch": (1.0, 2.0, 5.0), "nearest": (1.0, 2.0, 5.0, 10.0, 20.0)}
 ENDS_MT = {"torch": (1.0,), "nearest": (2.0, 20.0)}
-"Steps on the networks that are not of the usual size."
 ENCODER_FIELD_MT = 0.02
-"About what one encoder count changes (1/560 mm, 5 to 22 mT/mm): smaller differences of error decide nothing."
+"About one encoder count (1/560 mm, 5 to 22 mT/mm): smaller differences of error decide nothing."
 
 
 class Effort(NamedTuple):
@@ -70,7 +69,7 @@ QUICK = Effort((10, 50), 1500, 12, 200, 1, 200, 10)
 
 
 class Case(NamedTuple):
-    """One search with its settings; 0 stands for a setting that it does not have."""
+    """One search with its settings; 0 stands for a setting that it lacks."""
 
     solver: str
     hidden: int = USUAL_HIDDEN
@@ -79,13 +78,11 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The solver with its settings; the baselines have none that vary."""
         step = f" {self.step_mT:g} mT" if self.step_mT and self.solver not in BASELINES else ""
         return self.solver + step + (f" k={self.neighbours}" if self.neighbours else "")
 
 
 def cases(hidden: tuple[int, ...]) -> Iterator[Case]:
-    """Every search at every size, at the usual size with every step, and what the shipped scenes choose."""
     for size in hidden:
         for solver in BASELINES:
             yield Case(solver, size, BASELINE_STEP_MT)
@@ -97,14 +94,12 @@ def cases(hidden: tuple[int, ...]) -> Iterator[Case]:
 
 
 def of_scene(name: str) -> Case:
-    """What the scene runs where it searches."""
     solver = load_scene(name).solver
     choice = named(NEWTON if solver.name == AUTO else solver.name, solver.step_mT or None, solver.neighbours or None)
     return Case(choice.solver, step_mT=choice.step_mT, neighbours=choice.neighbours)
 
 
 def make(case: Case, model: ForceModel) -> FieldSolver:
-    """The search: one of the daemon's, or a baseline."""
     if case.solver not in BASELINES:
         return build(named(case.solver, case.step_mT or None, case.neighbours or None), FIELDS_MT, model, rises=True)
     fields_mT = field_grid(FIELDS_MT, case.step_mT)
@@ -115,8 +110,6 @@ def make(case: Case, model: ForceModel) -> FieldSolver:
 
 
 class Argmin:
-    """The thesis's search as one array: the row of the grid that is nearest in force, and no look at the last field."""
-
     def __init__(self, model: ForceModel, fields_mT: Array) -> None:
         self._fields_mT, self._forces_N = fields_mT, ordered.batch(model, fields_mT)
 
@@ -127,7 +120,7 @@ class Argmin:
 
 
 class Bench:
-    """The workload with what the answers are held against, per network. It trains them."""
+    """The workload with the true answers for each network, which it trains."""
 
     def __init__(self, effort: Effort) -> None:
         self.effort = effort
@@ -139,7 +132,6 @@ class Bench:
         self.roots = {size: network_roots_mT(model, self.course) for size, model in self.models.items()}
 
     def sweep(self) -> tuple[list[dict[str, Any]], list[str]]:
-        """The rows of the table, and the searches that refused a network."""
         wanted = list(dict.fromkeys(cases(self.effort.hidden)))
         refused = [case for case in wanted if case.solver == NEWTON and self._falls(case.hidden)]
         runs = [Run(self, case) for case in wanted if case not in refused]
@@ -156,7 +148,7 @@ class Bench:
 
 
 class Run:
-    """One search on its network: fields of its first time along the course, and the time of every solve."""
+    """One search on its network: the first round's fields, and the time of every solve."""
 
     def __init__(self, bench: Bench, case: Case) -> None:
         self.case, self._bench, self._model = case, bench, bench.models[case.hidden]
@@ -170,12 +162,10 @@ class Run:
         self._times_us: list[Array] = []
 
     def advance(self) -> None:
-        """One round more, with the same answers as every round."""
         self._fields_mT, times_us = follow(self._solver, self._model, self._course, self._solves)
         self._times_us.append(times_us)
 
     def row(self) -> dict[str, Any]:
-        """The row of the table."""
         times_us = np.concatenate(self._times_us)
         return (
             {"name": self.case.name, "dtype": "float64"}
@@ -187,7 +177,7 @@ class Run:
         )
 
     def _errors(self) -> dict[str, float]:
-        """The solver's error (against the network's own nearest root) and the plant's, apart."""
+        """Return the solver's error (against the network's own nearest root) and the plant's."""
         along = self._course
         fields = self._fields_mT[: len(along.field_mT)]
         rooted = np.array([found.size > 0 for found in self._roots])
@@ -207,7 +197,7 @@ class Run:
 
 
 def follow(solver: FieldSolver, model: ForceModel, along: Course, solves: int) -> tuple[Array, Array]:
-    """Fields and times (us) of that many solves along the course, round and round; each is told the last field."""
+    """Return fields and times (us) of that many solves along the course; each gets the last field."""
     rows = along.rows()
     fields, times_ns = np.empty(solves), np.empty(solves)
     last: float | None = None
@@ -220,7 +210,7 @@ def follow(solver: FieldSolver, model: ForceModel, along: Course, solves: int) -
 
 
 def held_bytes(owner: object) -> int:
-    """Bytes of the arrays, tensors and lists that a search owns, beside the network that all of them share."""
+    """Return the bytes of the arrays, tensors and lists that a search owns, without the shared network."""
     total = 0
     for value in getattr(owner, "__dict__", {}).values():
         if isinstance(value, np.ndarray):
@@ -233,7 +223,7 @@ def held_bytes(owner: object) -> int:
 
 
 def mark_pareto(rows: list[dict[str, Any]]) -> None:
-    """Sets `pareto` on the rows that no faster one equals in plant error, to an encoder count."""
+    """Set `pareto` on the rows that no faster one equals in plant error, to an encoder count."""
     for row in rows:
         row["pareto"] = not any(
             other["p50_us"] < row["p50_us"] and other["plant_mae_mT"] < row["plant_mae_mT"] + ENCODER_FIELD_MT
@@ -242,19 +232,17 @@ def mark_pareto(rows: list[dict[str, Any]]) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark inverse`."""
     parser.add_argument("--quick", action="store_true", help="two small networks and few solves, for a test")
     parser.add_argument("--write", action="store_true", help="also write docs/inverse_trade.md and its plot")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The contract's object for `benchmark inverse`; with `--write`, also the page."""
     effort = QUICK if options.quick else FULL
     torch.set_num_threads(1)
     rows, refused = Bench(effort).sweep()
     mark_pareto(rows)
     usual = {row["name"]: row for row in rows if row["hidden"] == USUAL_HIDDEN}
-    # where a network refuses it, as a small one may, the scene would run the search that looks at a grid
+    # where a small network refuses it, the scene would run the search that looks at a grid
     fallback = usual[Case("nearest", step_mT=2.0, neighbours=named("nearest").neighbours).name]
     scenes = {name: load_scene(name).force.tolerance_rms_N for name in shipped_scenes()}
     chosen = {

@@ -1,7 +1,7 @@
 """The workload of `benchmark inverse`: a plant, networks trained on it, a course of forces, the networks' own roots.
 
-Synthetic. The plant is the simulator's torque element at rest in memory: its force law, field law, pre-sliding and
-Stribeck friction. Hysteresis and relaxation are left out, which no search could undo and which would hide the searches.
+The plant is the simulator's torque element without memory: its force law, field law, pre-sliding and Stribeck friction.
+Hysteresis and relaxation are left out, because no search could undo them and they would hide the searches.
 """
 
 import datetime
@@ -31,27 +31,24 @@ FIELDS_MT = (NOMINAL.field_mT(GAPS_MM[1]), NOMINAL.field_mT(GAPS_MM[0]))
 
 DISPLACEMENTS_MM = (1.4, 2.1)
 RATES_MM_S = (2.0, 55.0)
-"Near full mobilisation and in motion: before break-away the force is the hand's choice, and the inverse is ill-posed."
+"Near full mobilisation and in motion: before break-away the hand chooses the force, and the inverse is ill-posed."
 
 COVERED = (0.04, 0.96)
 ROOT_STEP_MT = 0.5
 
 
 class Course(NamedTuple):
-    """Features and forces along the course, in the order they are solved; the true field is the plant's."""
-
     displacement_mm: Array
     rate_mm_s: Array
     field_mT: Array
     force_N: Array
 
     def rows(self) -> list[tuple[float, float, float]]:
-        """(displacement_mm, rate_mm_s, force_N), as Python floats: what a solver is given."""
         return list(zip(self.displacement_mm.tolist(), self.rate_mm_s.tolist(), self.force_N.tolist(), strict=True))
 
 
 def plant_force_N(plant: PlantParameters, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
-    """The plant's force that long after a reversal at a steady rate, at the gap whose nominal field is `field_mT`."""
+    """Return the plant's force so far after a reversal at a steady rate, at the gap with nominal field `field_mT`."""
     gaps = np.array([min(max(NOMINAL.gap_mm(field), GAPS_MM[0]), GAPS_MM[1]) for field in field_mT.tolist()])
     elastomer = Elastomer(
         shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
@@ -71,7 +68,7 @@ def plant_force_N(plant: PlantParameters, displacement_mm: Array, rate_mm_s: Arr
 
 
 def course(plant: PlantParameters, solves: int) -> Course:
-    """A smooth course through the plant's range: slow and fast swings of the field, the handle's speed and travel."""
+    """Return a smooth course through the plant's range: slow and fast swings of field, speed and travel."""
     phase = 2 * np.pi * np.arange(solves) / solves
     middle, swing = sum(COVERED) / 2, (COVERED[1] - COVERED[0]) / 2
     share = middle + swing * (0.8 * np.sin(3 * phase) + 0.2 * np.sin(17 * phase))
@@ -82,7 +79,6 @@ def course(plant: PlantParameters, solves: int) -> Course:
 
 
 def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
-    """Rows at random over the box, with the plant's sensor noise."""
     draw = np.random.default_rng(seed)
     displacement, rate = draw.uniform(*DISPLACEMENTS_MM, rows), draw.uniform(*RATES_MM_S, rows)
     field = draw.uniform(*FIELDS_MT, rows)
@@ -92,7 +88,6 @@ def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
 
 
 def trained(data: Dataset, hidden: int, epochs: int) -> ForceModel:
-    """A network with that many units, trained by Levenberg-Marquardt; its metrics hold `validation_mae_N`."""
     model, _ = fit_model(
         *data.split(0.3, 0),
         element=Element.TORQUE,
@@ -106,7 +101,7 @@ def trained(data: Dataset, hidden: int, epochs: int) -> ForceModel:
 
 
 def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
-    """For each solve every field in range at which the network gives the force: a fine grid, then bisection."""
+    """Return for each solve every field in range at which the network gives the force."""
     grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
     found: list[Array] = []
     for displacement, rate, force in along.rows():

@@ -1,11 +1,9 @@
 """`benchmark latency`: from a setpoint that is sent to the first drive frame that reflects it.
 
-Each setpoint has a force of its own, so that the recording shows the first control tick whose plan used it. The frame
-of that tick has just been written when its row is stamped. A bare ZeroMQ hop of the same message is measured in the
-same run. Where the daemon has a real-time priority, the publisher and the far end of the hop have a lower one. What is
-measured is the way, not how long a sender waits for a processor.
-
-At worst a setpoint just misses a beat: it waits for the next, which plans for it and writes.
+Each setpoint has a force of its own, so that the recording shows the first control tick whose plan used it; its frame
+has just been written when the row is stamped. A bare ZeroMQ hop of the same message is measured in the same run. If the
+daemon has a real-time priority, publisher and hop have a lower one, so that no sender's wait for a processor is
+measured. At worst a setpoint just misses a beat: it waits for the next, which plans for it and writes.
 """
 
 import argparse
@@ -36,7 +34,6 @@ SPACING_S = (0.0015, 0.0025)
 COLUMNS = ("t_ns", "exec_us")
 SETTLE_NS = 500_000_000
 LOST_S = 10.0
-"For a message of the bare hop."
 BELOW = 10
 "The measurement's own processes are this far below the daemon's real-time priority."
 
@@ -47,7 +44,6 @@ WHOLE, HOP = "setpoint to wire", "bare ZeroMQ hop"
 
 
 def stages(ticks: list[tuple[Any, ...]]) -> Stages:
-    """The whole way and its parts, of what `first_ticks` found."""
     stamp_ns, written_ns, beat_us = (np.array(column) for column in zip(*ticks, strict=True))
     whole_us = (written_ns - stamp_ns) * 1e-3
     return {
@@ -58,7 +54,6 @@ def stages(ticks: list[tuple[Any, ...]]) -> Stages:
 
 
 def summary(found_us: Stages, count: int, realtime: RealTime) -> dict[str, Any]:
-    """The contract's object."""
     told = {name: quantiles(durations_us) for name, durations_us in found_us.items()}
     whole_us, hop_us = told.pop(WHOLE), told.pop(HOP)
     return {
@@ -72,7 +67,7 @@ def summary(found_us: Stages, count: int, realtime: RealTime) -> dict[str, Any]:
 
 
 def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[str, Any]]]:
-    """Publishes and records: when each force was sent, ns, and the ticks of that time."""
+    """Publish and record; return when each force was sent, ns, and the ticks of that time."""
     with context(priority_of_threads()) as ours, listening(ours, config.endpoints.recording, None) as recording:
         sent = publish(config.endpoints.setpoint, count)
         # only now: reading would set the pace
@@ -80,7 +75,6 @@ def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[st
 
 
 def publish(address: str, count: int) -> dict[float, int]:
-    """So many setpoints, each of its own force, to who binds there: when each was sent, ns."""
     with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher:
         publisher.setsockopt(zmq.LINGER, 1_000)
         publisher.connect(address)
@@ -101,7 +95,6 @@ def publish(address: str, count: int) -> dict[float, int]:
 
 
 def rows_until(recording: "zmq.Socket[bytes]", until_ns: int) -> list[dict[str, Any]]:
-    """What the daemon has recorded, up to that time."""
     rows: list[dict[str, Any]] = []
     while not rows or rows[-1]["t_ns"] < until_ns:
         if not recording.poll(5_000):
@@ -111,7 +104,7 @@ def rows_until(recording: "zmq.Socket[bytes]", until_ns: int) -> list[dict[str, 
 
 
 def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
-    """Of each setpoint when it was sent, ns, and of the first tick whose plan used it what COLUMNS names."""
+    """Return for each setpoint when it was sent, and COLUMNS of the first tick whose plan used it."""
     first: dict[float, dict[str, Any]] = {}
     for row in rows:
         first.setdefault(row["setpoint_cf"], row)
@@ -119,7 +112,6 @@ def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tupl
 
 
 def bare_hop(count: int) -> Array:
-    """The same message from PUB to SUB between two processes, us."""
     scheduling = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, ProcessPoolExecutor(1) as pool:
         address = f"ipc://{folder}/hop"
@@ -129,7 +121,6 @@ def bare_hop(count: int) -> Array:
 
 
 def receive(address: str, count: int, scheduling: tuple[int, int]) -> Array:
-    """The far end of the bare hop, scheduled like the near one."""
     os.sched_setscheduler(0, scheduling[0], os.sched_param(scheduling[1]))
     with context(priority_of_threads()) as ours, ours.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.RCVTIMEO, round(LOST_S * 1e3))
@@ -143,13 +134,11 @@ def receive(address: str, count: int, scheduling: tuple[int, int]) -> Array:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark latency`."""
     add_realtime_arguments(parser)
     parser.add_argument("--count", type=int, default=1_000, help="setpoints")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The object for these options: of so many setpoints through the daemon, then of as many through the bare hop."""
     realtime, count = realtime_settings(options), options.count
     stand = Stand(realtime, setpoint_hz=0)
     with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stand, Path(name)) as (config, _):

@@ -1,16 +1,12 @@
 """`benchmark loop`: how late the control loop is, beside a bare timer that carries the same clients.
 
-Daemon and stub run in alternating blocks, because a shared machine drifts: what counts is the ratio of a block to its
-neighbour. Both have the same heartbeat, event loop and scheduling, and publish a row for each tick. Both answer the
-same eight clients, each of which asks for status again as soon as it is answered. The stub has no controller and no
-device.
-
-Processor time is that of the daemon with its threads and children; wake-ups are voluntary switches of its threads. Each
-block has two halves: alone, then with the clients, and a subscriber that reads every tick (recording). A tick is fresh
-whose measurement came since the tick before it. With `--against` the daemon of another checkout takes its turn, on its
-own simulated device: the protocol changes, too. Where there is a C compiler, a host in C (`reference_host.c`) takes its
-turn. It has a device of its own, and nothing but wire, timer and two PIDs. It shows the limit of this wire on this
-machine.
+Daemon and stub run in alternating blocks, because a shared machine drifts: the ratio of neighbouring blocks counts.
+Both have the same heartbeat, event loop and scheduling, publish every tick, and answer the same eight clients, which
+ask for status without pause. Processor time is that of the daemon with its threads and children; wake-ups are voluntary
+switches of its threads. Each block runs alone, then with the clients and a subscriber that reads every tick. A tick is
+fresh if its measurement came since the last one. With `--against` the daemon of another checkout takes its turn. If
+there is a C compiler, so does a host in C (`reference_host.c`) with nothing but wire, timer and two PIDs: it shows this
+machine's limit.
 """
 
 import argparse
@@ -54,23 +50,19 @@ from tormagd_client.messages import Request
 
 TOOLS = Path(__file__).parents[1]
 LOG = "tormagd.log"
-"What the daemon says, in its folder."
 CLIENTS = 8
 SETPOINT_HZ, CONTROL_HZ = 500, 1_000
-"Plans come in every control period."
 PATIENCE_S = 60.0
 STARTS_MS = 20_000
-"Until the first tick, at most."
 WARM_UP_S = 1.0
 TELEMETRY_EVERY = 20
 SHARES = ("core_share", "alone_share")
 COLUMNS = ("t_ns", "lateness_us", "exec_us", "received_s")
-"What is read of a recorded tick; a stub has not all of them."
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
 class Block(NamedTuple):
-    """The ticks of one block, and `told`, what is told beside them: shares of a processor, wake-ups, plans, phases."""
+    """The ticks of one block, and in `told` shares of a processor, wake-ups, plans and phases."""
 
     lateness_us: Array
     exec_us: Array
@@ -78,23 +70,20 @@ class Block(NamedTuple):
     merged: int
     seconds: float
     fresh: int = 0
-    "Ticks whose measurement came since the tick before."
     told: dict[str, Any] = {}  # noqa: RUF012 nobody changes it
 
 
 class Pair(NamedTuple):
-    """A block of the daemon and one of the stub, one right after the other, and maybe one of another checkout."""
-
     daemon: Block
     bare: Block
     against: Block | None = None
     host: dict[str, Any] | None = None
-    "What the host in C says."
 
 
 class Stand(NamedTuple):
-    """What is measured: scheduling, how often setpoints come, of which checkout daemon and device are, and the rates of
-    control and of plans."""
+    """What is measured: scheduling, setpoint rate, the checkout of daemon and device, and the rates of control and
+    plans.
+    """
 
     realtime: RealTime
     setpoint_hz: int = SETPOINT_HZ
@@ -105,11 +94,9 @@ class Stand(NamedTuple):
 
 T = TypeVar("T")
 Running = tuple[Config, int]
-"""The configuration and the id of a process that keeps time."""
 
 
 def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
-    """The contract's object."""
     bare = merge([pair.bare for pair in pairs])
     both_us = [(quantiles(pair.daemon.lateness_us), quantiles(pair.bare.lateness_us)) for pair in pairs]
     result = _told([pair.daemon for pair in pairs]) | {
@@ -173,7 +160,7 @@ def _middle(found: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def block(started: Callable[[Path], contextlib.AbstractContextManager[Running]], seconds: float) -> Block:
-    """One block under the load of the clients; `started` begins what is measured, with its files in a folder."""
+    """Measure one block under the load of the clients; `started` begins what is measured."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, started(Path(folder)) as (config, pid):
         time.sleep(WARM_UP_S)
         _, *alone = spent(pid, lambda: time.sleep(seconds))
@@ -195,8 +182,9 @@ def block(started: Callable[[Path], contextlib.AbstractContextManager[Running]],
 
 
 def spent(pid: int, wait: Callable[[], T]) -> tuple[T, float, dict[str, float]]:
-    """What `wait` returns; meanwhile the process's share of a processor, and the wake-ups of its first thread (control)
-    and of all its threads, Hz."""
+    """Return what `wait` returns, the process's share of a processor meanwhile, and the wake-ups of its first thread
+    (control) and of all threads, Hz.
+    """
     started_s, before_s, before = time.monotonic(), processor_s(pid), wakeups(pid)
     result = wait()
     took_s, after = time.monotonic() - started_s, wakeups(pid)
@@ -206,7 +194,7 @@ def spent(pid: int, wait: Callable[[], T]) -> tuple[T, float, dict[str, float]]:
 
 
 def wakeups(pid: int) -> dict[int, int]:
-    """How often each thread of a process has been woken (proc_pid_status(5))."""
+    """Return how often each thread of a process has been woken (proc_pid_status(5))."""
     found = {}
     for thread in Path(f"/proc/{pid}/task").iterdir():
         with contextlib.suppress(OSError):  # it may have ended
@@ -216,7 +204,7 @@ def wakeups(pid: int) -> dict[int, int]:
 
 
 def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
-    """What the host in C prints, on a simulated device of its own; None without a C compiler."""
+    """Return what the host in C prints, on a simulated device of its own; None without a C compiler."""
     with contextlib.suppress(BuildError), contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
         host = built_host(folder)
@@ -229,14 +217,12 @@ def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
 
 
 def built_host(folder: Path) -> Path:
-    """The host in C, built in that folder."""
     host, sources = folder / "reference_host", [TOOLS / "reference_host.c", *(ROOM / f"{name}.c" for name in FIRMWARE)]
     subprocess.run([compiler(), *STRICT, "-O2", f"-I{ROOM}", *map(str, sources), "-lm", "-o", str(host)], check=True)
     return host
 
 
 def collect(socket: "zmq.Socket[bytes]", seconds: float, config: Config) -> Block:
-    """Reads tick rows for a while."""
     until_s = time.monotonic() + seconds
     rows: list[list[Any]] = []
     while time.monotonic() < until_s:
@@ -248,7 +234,6 @@ def collect(socket: "zmq.Socket[bytes]", seconds: float, config: Config) -> Bloc
 
 
 def as_block(rows: list[list[Any]], control_hz: int) -> Block:
-    """The ticks, rows of COLUMNS; how many periods had none, and how many ticks knew of a new state."""
     lateness_us, exec_us, received_s = np.array([row[1:] for row in rows], dtype=np.float64).T
     spanned_s = (rows[-1][0] - rows[0][0]) * 1e-9
     merged = max(0, round(spanned_s * control_hz) + 1 - len(rows))
@@ -257,7 +242,6 @@ def as_block(rows: list[list[Any]], control_hz: int) -> Block:
 
 
 def reported(address: str) -> dict[str, Any]:
-    """p50 and p99 of plans and of phases, as status has them; nothing where it says nothing, as the stub's."""
     with contextlib.closing(Client(Endpoints(control=address), 5.0)) as client:
         status = client.request("status")
     found = status.get("phases_us", {}) | {"plan_us": status.get("rates", {}).get("inference", {}).get("exec_us")}
@@ -267,7 +251,6 @@ def reported(address: str) -> dict[str, Any]:
 
 
 def merge(blocks: list[Block]) -> Block:
-    """All blocks as one; what is told beside them in the median."""
     told = [block.told for block in blocks if block.told]
     return Block(
         np.concatenate([block.lateness_us for block in blocks]),
@@ -281,7 +264,6 @@ def merge(blocks: list[Block]) -> Block:
 
 
 def draw(path: Path, phases_us: dict[str, dict[str, float]], control_hz: int) -> None:
-    """A PNG of one beat: a bar for each phase, to its p50 and on to its p99."""
     figure, axes = subplots((9, 0.5 * len(phases_us) + 1.5))
     names = list(phases_us)[::-1]
     axes.barh(names, [phases_us[name]["p99"] for name in names], color="#d8dee9", label="p99")
@@ -292,12 +274,10 @@ def draw(path: Path, phases_us: dict[str, dict[str, float]], control_hz: int) ->
 
 
 def quantiles(values: Array) -> dict[str, float]:
-    """p50, p99, p99.9 and the largest."""
     return {name: round(float(np.percentile(values, share)), 1) for name, share in QUANTILES.items()}
 
 
 def hammer(address: str, stop: Event) -> None:
-    """Eight clients that each ask for status as fast as they are answered."""
 
     def ask() -> None:
         with contextlib.closing(Client(Endpoints(control=address), 2.0)) as client:
@@ -311,7 +291,6 @@ def hammer(address: str, stop: Event) -> None:
 
 
 def write_config(folder: Path, port: str, stand: Stand) -> Path:
-    """A configuration with its sockets in `folder`."""
     path, realtime, (control_hz, inference_hz) = folder / "tormagd.toml", stand.realtime, stand.rates_hz
     tables = {
         "scene": stand.scene,
@@ -330,7 +309,7 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
 
 @contextlib.contextmanager
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
-    """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
+    """Run the daemon on a simulated device, homed and enabled, with setpoints arriving unless `setpoint_hz` is 0."""
     with contextlib.ExitStack() as stack:
         theirs = environment(stand.root, folder)
         start = partial(begun, stack, folder / LOG, environment=theirs)
@@ -349,7 +328,6 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
 
 
 def checkout(text: str) -> Path:
-    """The root of a checkout."""
     root = Path(text).resolve()
     if not (root / "tormagd" / "closed_loop.py").is_file() or not (root / "tools" / "benchmark.py").is_file():
         raise argparse.ArgumentTypeError(f"{text}: allowed is the root of a checkout, with tormagd/ and tools/ in it")
@@ -357,7 +335,7 @@ def checkout(text: str) -> Path:
 
 
 def environment(root: Path | None, folder: Path) -> dict[str, str]:
-    """For a process that runs package and tools of that checkout; None for what runs here, which may be installed."""
+    """Return the environment of a process that runs that checkout; None for what runs here."""
     if root is None:
         folders = [str(TOOLS), *filter(None, [os.environ.get("PYTHONPATH")])]
     else:
@@ -369,7 +347,6 @@ def environment(root: Path | None, folder: Path) -> dict[str, str]:
 
 @contextlib.contextmanager
 def stub_process(stand: Stand, folder: Path) -> Iterator[Running]:
-    """The bare timer, with the scheduling and the control rate of the stand."""
     config = load_config(write_config(folder, "/dev/null", stand))
     stub = multiprocessing.Process(target=bare_loop, args=(config,), daemon=True)
     stub.start()
@@ -382,7 +359,6 @@ def stub_process(stand: Stand, folder: Path) -> Iterator[Running]:
 
 
 def bare_loop(config: Config) -> None:
-    """A heartbeat that publishes its own lateness, and answers."""
     uvloop.run(_bare(config))
 
 
@@ -414,18 +390,15 @@ async def _bare(config: Config) -> None:
 
 
 def add_realtime_arguments(parser: argparse.ArgumentParser) -> None:
-    """What the kernel is asked for."""
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of what is measured; 0 for none")
     parser.add_argument("--keep-awake", action="store_true", help="idle processors do not sleep")
 
 
 def realtime_settings(options: argparse.Namespace) -> RealTime:
-    """The settings for these options."""
     return RealTime(options.fifo, lock_memory=True, keep_awake=options.keep_awake)
 
 
 def asked_for(realtime: RealTime) -> dict[str, Any]:
-    """The settings as they stand in a result."""
     return {
         "fifo_priority": realtime.fifo_priority,
         "keep_awake": realtime.keep_awake,
@@ -433,7 +406,6 @@ def asked_for(realtime: RealTime) -> dict[str, Any]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark loop`."""
     add_realtime_arguments(parser)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a block (%(default)s)")
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind (%(default)s)")
@@ -452,7 +424,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The object for these options."""
     ours = Stand(realtime_settings(options), rates_hz=tuple(options.rates))
     theirs = ours._replace(root=options.against)
     pairs = [

@@ -1,10 +1,10 @@
 """`benchmark scenes`: how exactly, and at what cost of the daemon, each scene is served.
 
-Without options it prints what the package carries. `--live` measures scenes again: the ways to serve one are rates and
-searches. Ways are screened on the scene's own signal and samples 1 to 3. The cheapest is chosen that does what the
-usual way does in every situation, on devices that decide. Others then judge. An error will do within TOLERATED of the
-scene's tolerance, or where it is at most WORSE of it over the usual way's. `--shares` measures what each way takes of a
-processor: daemons on simulated devices, in turns. `--store` writes the file that comes with the package.
+Without options it prints what the package carries. `--live` measures scenes again. The ways to serve a scene are rates
+and searches; they are screened on the scene's own signal and samples 1 to 3. The cheapest is chosen that does what the
+usual way does in every situation, on devices that decide; others then judge. An error is accepted within TOLERATED of
+the scene's tolerance, or at most WORSE of it over the usual way's. `--shares` measures what each way takes of a
+processor, with daemons on simulated devices in turns. `--store` writes the file that comes with the package.
 """
 
 import argparse
@@ -46,14 +46,11 @@ STORED = ROOT / "tormagd" / "scenes" / FILE
 RATES_HZ = (1_000, 500), (1_000, 83), (500, 500), (500, 83)
 "Of control and of plans: the usual ones, and what may be chosen in their place."
 SEARCHES = "newton", "nearest"
-"Those that need no torch."
 THESIS = OperatingPoint(500, 83, "thesis")
-"The thesis's own loop."
 FIRST_DECIDING, FIRST_JUDGING = 80, 100
-"Of the draws of the plant card; twice as many judge as decide."
+"Draws of the plant card; twice as many judge as decide."
 DRAWS = 10
 PAIRS, SETTLES_S, LASTS_S = 5, 3.0, 5.0
-"Of shares: how many turns, and how long each."
 SHARED_SCENE, FIFO = "coronary", 50
 KEYS = "daemon", "tick_us", "plan_us"
 
@@ -61,7 +58,6 @@ Runs = Callable[[Collection[Case]], dict[Case, float]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What is measured again."""
     parser.add_argument("--live", nargs="*", metavar="NAME", help="measure these scenes (names, files; none: all)")
     parser.add_argument("--shares", action="store_true", help="measure what each way takes of a processor")
     parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
@@ -69,7 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace) -> Json:
-    """`{scenes: [...], measured_machine_us}`: each scene's figures."""
     file = measured()
     if options.shares:
         ways = [*(OperatingPoint(*hz, search) for hz in RATES_HZ for search in SEARCHES), THESIS]
@@ -89,13 +84,11 @@ def measure(options: argparse.Namespace) -> Json:
 
 
 def store(file: Measurements, is_wanted: bool) -> None:
-    """Write the file that comes with the package, where that is wanted."""
     if is_wanted:
         STORED.write_bytes(msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n")
 
 
 def figures(scene: MeasuredScene, file: Measurements) -> Json:
-    """One scene's choice as numbers."""
     chosen, usual = file.share(scene.chosen), file.share(scene.usual.way)
     return {
         "name": scene.name,
@@ -117,7 +110,6 @@ def figures(scene: MeasuredScene, file: Measurements) -> Json:
 
 
 def measured_scene(name: str, runs: Runs) -> MeasuredScene:
-    """Measure one scene, whole; `runs` gives the outcomes of cases."""
     scene = load_scene(name)
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
@@ -143,14 +135,12 @@ def measured_scene(name: str, runs: Runs) -> MeasuredScene:
 
 
 def tried_way(name: str, way: OperatingPoint, runs: Runs) -> Tried:
-    """The scene's own signal on the samples."""
     cases = [case_of(name, way, device, "signal", is_learning=True) for device in SAMPLES]
     found = runs(cases)
     return Tried(way, tuple(found[case] for case in cases))
 
 
 def judge(name: str, scene: Scene, way: OperatingPoint, usual: OperatingPoint, runs: Runs) -> tuple[WorstDevice, ...]:
-    """The worst device of each group in each situation, beside the usual way."""
     tolerance_N = scene.force.tolerance_rms_N
     worst = []
     for group, situation, devices, learns in groups(scene):
@@ -165,7 +155,7 @@ def judge(name: str, scene: Scene, way: OperatingPoint, usual: OperatingPoint, r
 
 
 def groups(scene: Scene) -> list[tuple[str, str, tuple[str, ...], bool]]:
-    """Group, situation, devices, and whether they are learned: what decides, then what judges."""
+    """Return group, situation, devices, and whether they learn: what decides, then what judges."""
     if scene.element == "tactile":
         stays = [each for each in SITUATIONS if each not in OF_A_HANDLE]
         return [*(("deciding", each, SAMPLES, True) for each in stays), ("deciding", "signal", SAMPLES, False)]
@@ -185,12 +175,10 @@ def groups(scene: Scene) -> list[tuple[str, str, tuple[str, ...], bool]]:
 
 
 def case_of(name: str, way: OperatingPoint, device: str, situation: str, is_learning: bool) -> Case:
-    """The run of a scene served in this way."""
     return Case(name, device, situation, way.search, is_learning, way.control_hz, way.inference_hz)
 
 
 def shares_of(ways: list[OperatingPoint]) -> list[Share]:
-    """What each way takes, in the median of turns over all of them."""
     found: dict[OperatingPoint, list[Share]] = {way: [] for way in ways}
     for turn in range(PAIRS):
         for way in ways if turn % 2 == 0 else ways[::-1]:
@@ -202,7 +190,6 @@ def shares_of(ways: list[OperatingPoint]) -> list[Share]:
 
 
 def share_of(way: OperatingPoint) -> Share:
-    """One run of a daemon that serves SHARED_SCENE in this way, with setpoints as often as plans."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
         scene = Path(folder) / "scene.toml"
         stated = scene_path(SHARED_SCENE).read_text(encoding="utf-8")

@@ -1,7 +1,7 @@
 """`benchmark step`: how fast and how exactly the gap follows, on the plant in virtual time.
 
-The device's physical limit comes from the plant itself. It is full voltage one way, then full voltage the other way,
-with the switch timed so that it comes to rest at the target.
+The device's physical limit comes from the plant itself: full voltage one way, then the other, switched so that it comes
+to rest at the target.
 """
 
 import argparse
@@ -28,9 +28,8 @@ from tormagd.simulation.plant import Plant
 
 START_MM, STEP_MM = 60.0, 1.0
 STROKE_MM = (46.0, 94.0)
-"The stroke within both ends' braking distance; the figure is scaled to the full 50 mm."
+"Within both ends' braking distance; the figure is scaled to the full 50 mm."
 STROKE_GAPS_MM = (47.0, 51.0, 57.0, 64.0, 71.0, 78.0, 85.0, 93.0)
-"Where the overshoot is measured too, opening and closing by STEP_MM."
 MODEL_GAP_MM, MODEL_DUTY, MODEL_S = 70.0, 0.5, 0.15
 "A duty step from rest in the middle of the stroke, with which H(z) is compared."
 WATCHED_S = 0.6
@@ -39,8 +38,6 @@ TICK_S = 1e-3
 
 
 class Step(NamedTuple):
-    """One step of the gap, seen by the encoders; the plant's true error beside it."""
-
     rise_s: float
     overshoot: float
     settling_5pct_s: float
@@ -50,10 +47,9 @@ class Step(NamedTuple):
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The contract's keys, for steps that open and that close; the worse of both is what counts."""
     config, parameters = Config(), load_plant(options.plant)
     gc.collect()
-    gc.disable()  # what is kept here is no garbage, and need not be looked through again and again
+    gc.disable()  # what is kept here is no garbage
     started_s = time.thread_time()
     loop = settled_loop(config, parameters)
     steps = [step(loop, START_MM + STEP_MM), step(loop, START_MM)]
@@ -78,8 +74,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
-    """A loop that is homed, enabled, and at rest at START_MM."""
-    # a handle in motion would feel forces over the scene's at the closed end, which is a fault
+    # a moving handle would feel forces over the scene's at the closed end, which is a fault
     device = VirtualDevice(parameters, RecordedHand((0.0,), (0.0,)), seed=1)
     loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
     loop.arm(gap_plan(95.0))
@@ -88,7 +83,6 @@ def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
 
 
 def step(loop: ClosedLoop, target_mm: float) -> Step:
-    """One step to a gap, from rest."""
     before = loop.stepper.measured
     if before is None:
         raise RuntimeError("the loop has no measurement")
@@ -110,14 +104,13 @@ def step(loop: ClosedLoop, target_mm: float) -> Step:
 
 
 def stroke(loop: ClosedLoop) -> float:
-    """Time from the first to the last millimetre of the stroke, opening, s."""
     drive(loop, STROKE_MM[0], 3.0)
     gap = np.array([sample.truth.gap_mm for sample in drive(loop, STROKE_MM[1], 3.0)])
     return float(np.argmax(gap > STROKE_MM[1] - 0.05) + 1) * TICK_S
 
 
 def overshoot_over_stroke(loop: ClosedLoop) -> float:
-    """The largest overshoot of steps from STROKE_GAPS_MM, both ways, share of the step."""
+    """Return the largest overshoot of steps from STROKE_GAPS_MM, both ways, as a share of the step."""
     worst = 0.0
     # the first step that closes would go past the end of the stroke
     for gap_mm, target_mm in [(gap_mm, gap_mm + way) for gap_mm in STROKE_GAPS_MM for way in (STEP_MM, -STEP_MM)]:
@@ -128,8 +121,7 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
 
 
 def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[Array, Array]:
-    """Both carriages' mean position every tick from the start of a duty step, mm: as the encoders count it, and by
-    H(z)."""
+    """Return both carriages' mean position every tick of a duty step, by the encoders and by H(z)."""
     plant = Plant(_at_rest(parameters, MODEL_GAP_MM), SteadyHand())
     volts = duty * parameters.electronics.supply_V
     counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
@@ -143,18 +135,17 @@ def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[
     geared = msgspec.structs.replace(motor, inertia_kg_m2=motor.inertia_kg_m2 / motor.gear_efficiency)
     transfer = zero_order_hold(geared, TICK_S)
     driving = np.full(count + 1, duty - math.copysign(motor.coulomb_V / motor.supply_V, duty))
-    from scipy.signal import lfilter  # takes 0.6 s to import, and who only runs a loop needs it not
+    from scipy.signal import lfilter  # takes 0.6 s to import, and only this needs it
 
     return measured, lfilter(transfer.numerator, transfer.denominator, driving)
 
 
 def nrmse(measured: Array, modelled: Array) -> float:
-    """|measured - modelled| / |measured - mean(measured)|, norms."""
     return float(np.linalg.norm(measured - modelled) / np.linalg.norm(measured - measured.mean()))
 
 
 def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: float) -> tuple[float, float]:
-    """The fastest the plant can do, s: the rise from 10 to 90 %, and from rest to rest."""
+    """Return the plant's fastest rise from 10 to 90 %, and from rest to rest, s."""
     low, high = 0.0, 4.0
     for _ in range(16):  # to less than a tick of the plant
         middle = (low + high) / 2.0
@@ -169,7 +160,7 @@ def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: floa
 
 
 def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, switch_s: float) -> tuple[Array, float]:
-    """True gap every 0.1 ms until rest, and the time of that, for full voltage that turns round at `switch_s`."""
+    """Return the true gap every 0.1 ms until rest, and that time, for full voltage reversed at `switch_s`."""
     gaps: list[float] = []
     time_s, tick = 0.0, TICK_S / 10.0
     plant = Plant(_at_rest(parameters, start_mm), SteadyHand(), substep_s=tick)
@@ -192,12 +183,10 @@ def _at_rest(parameters: PlantParameters, gap_mm: float) -> PlantParameters:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark step`."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
 
 
 def drive(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
-    """Asks for one gap for a while."""
     return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(duration_s / TICK_S))]
 
 

@@ -1,10 +1,9 @@
 """`benchmark virtual-time`: how many times faster than real time the closed loop runs, and what limits it.
 
-The full plant with its firmware and protocol bytes runs twice. Once it is under the whole core that follows 500
-setpoints a second, once under the position loop alone. Each build of the core is a process of its own, and they take
-turns in stretches of some milliseconds. What a shared machine gives at a time, it gives to both. Processor time of one
-thread; the median over stretches. `python -m cProfile` says where it goes, in the interpreted
-build (`TORMAG_COMPILED=0`).
+The full plant with its firmware and protocol bytes runs under the whole core, which follows 500 setpoints a second, and
+under the position loop alone. Each build of the core is a process of its own; they take turns in stretches of some
+milliseconds, so that a shared machine's changes meet both. The figure is one thread's processor time, in the median
+over stretches. `python -m cProfile` says where it goes, in the interpreted build (`TORMAG_COMPILED=0`).
 """
 
 import argparse
@@ -36,29 +35,25 @@ MEAN_N, SWING_N, PULSE_HZ = 1.2, 0.3, 1.2
 STRETCH_TICKS = 100
 BUILDS = ("compiled", "interpreted")
 LASTS_S = 600.0
-"Of the pulse: longer than anybody measures."
 TIMES_S = np.arange(0.0, LASTS_S, 1.0 / SETPOINT_HZ)
 PULSE = stream(TIMES_S, MEAN_N + SWING_N * np.sin(2.0 * np.pi * PULSE_HZ * TIMES_S))
 
 
 def whole_core(loop: ClosedLoop) -> None:
-    """One tick, asked for a pulse without end."""
     loop.tick(PULSE(loop.now_s))
 
 
 def position_loop(loop: ClosedLoop) -> None:
-    """One tick without plans, asked for a step of the gap every 0.1 s."""
+    """Run one tick without plans, asked for a step of the gap every 0.1 s."""
     gap_mm = START_MM + STEP_MM * (int(loop.now_s * 10.0) % 2)
     loop.tick(plan=gap_plan(gap_mm, loop.now_s))
 
 
 LOOPS = {"whole_core": whole_core, "position_loop": position_loop}
 ARMED: dict[str, ClosedLoop] = {}
-"Of a process that is measured."
 
 
 def arm_loops() -> None:
-    """In a process that is measured, before all else."""
     config = Config()
     core = build_core(config)
     for name in LOOPS:
@@ -70,7 +65,6 @@ def arm_loops() -> None:
 
 
 def tick_us(name: str, ticks: int) -> float:
-    """In a process that is measured: the processor time of a tick of a loop over so many, us."""
     loop, tick = ARMED[name], LOOPS[name]
     started_s = time.thread_time()
     for _ in range(ticks):
@@ -79,11 +73,11 @@ def tick_us(name: str, ticks: int) -> float:
 
 
 Stretches = dict[str, dict[str, list[float]]]
-"""Processor times of a tick, us: a list for each build and loop; stretches of one number were run side by side."""
+"""Processor times of a tick, us, for each build and loop; stretches of one number ran side by side."""
 
 
 def compared(ticks: int) -> Stretches:
-    """Every build there is, `interpreted` always, `compiled` where there is one, taking turns."""
+    """Return every build, `interpreted` always, `compiled` if there is one, taking turns."""
     builds: dict[str, Executor] = {}
     with contextlib.ExitStack() as stack:
         for switch in ("0", "1"):
@@ -96,7 +90,6 @@ def compared(ticks: int) -> Stretches:
 
 
 def take_turns(builds: Mapping[str, Executor], ticks: int) -> Stretches:
-    """`ticks` of each loop and build, in stretches; who begins changes from one to the next."""
     found: Stretches = {name: {loop: [] for loop in LOOPS} for name in builds}
     order = list(builds)
     for _ in range(1 + max(1, ticks // STRETCH_TICKS)):
@@ -104,12 +97,12 @@ def take_turns(builds: Mapping[str, Executor], ticks: int) -> Stretches:
             for name in order:
                 found[name][loop].append(builds[name].submit(tick_us, loop, STRETCH_TICKS).result())
         order.append(order.pop(0))
-    # the first is not counted: caches and branches are learned
+    # the first is not counted: it fills caches
     return {name: {loop: taken_us[1:] for loop, taken_us in loops.items()} for name, loops in found.items()}
 
 
 def summary(found: Stretches, period_us: float) -> dict[str, Any]:
-    """The contract's object, null for a build that is not there: a period over the median tick."""
+    """Return a period over the median tick; null for a missing build."""
     return dict.fromkeys(BUILDS) | {
         name: {loop: round(period_us / statistics.median(taken_us), 2) for loop, taken_us in loops.items()}
         for name, loops in found.items()
@@ -117,12 +110,10 @@ def summary(found: Stretches, period_us: float) -> dict[str, Any]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark virtual-time`."""
     parser.add_argument("--seconds", type=float, default=10.0, help="virtual time of each loop")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The contract's object."""
     control_hz = Config().rates.control_hz
     found = compared(round(options.seconds * control_hz))
     return {"plant": PLANT, "seconds": options.seconds} | summary(found, 1e6 / control_hz)

@@ -1,1 +1,1 @@
-"""What takes long and breaks things: one case a module, whose one function takes how much of it is wanted."""
+"""The cases of `endure.py`: one a module, whose `run` takes how much of it is wanted."""

@@ -1,11 +1,11 @@
-"""Bytes that libFuzzer finds, put to the firmware's codec, framing and device under address and undefined sanitizers.
+"""libFuzzer's bytes, put to the firmware's codec, framing and device under address and undefined sanitizers.
 
-The corpus begins with the golden vectors and with lives that lead through every mode. What has to hold beside the
-sanitizers is in `firmware_protocol/c/fuzz`. A payload is taken only with the right CRC-8, a frame only where its own
-bytes come again from encoding it. A false accept is then no more likely than the CRC's odds. What was found for codec
-and framing Python hears afterwards, and must agree with the C in every frame, count and verdict.
+The corpus begins with the golden vectors and with runs that lead through every mode. What must hold besides the
+sanitizers is in `firmware_protocol/c/fuzz`: a payload is taken only with the right CRC-8, a frame only if encoding it
+gives its own bytes again, so a false accept is no more likely than the CRC's odds. Python then hears what was found for
+codec and framing, and must agree with the C in every frame, count and verdict.
 
-Lines that no bytes reach are named in BEYOND_REACH; of all others at least REACHED are to be run.
+Lines that no bytes reach are named in BEYOND_REACH; of all others at least REACHED must be run.
 """
 
 import json
@@ -28,14 +28,13 @@ from firmware_protocol.layouts import LAYOUTS
 VECTORS = Path(firmware_protocol.__file__).parent / "vectors"
 REACHED = 0.95
 LINE_BYTES = 4000
-"Bytes in one request to the C filter; its lines end at 8192 characters."
 BEYOND_REACH = (
     r"_init\(struct|_phys_range\(|_crc_is_in_range\(",  # generated, and nothing calls it
     r"-EINVAL",  # generated: the length was checked before
     r"^    default:$",  # the function code was checked before
-    r"^    if \(!isfinite\(",  # of a sensor that is not finite, which a port rules out
+    r"^    if \(!isfinite\(",  # for a sensor that is not finite, which a port rules out
 )
-"What its function's head or the lines about it look like."
+"Patterns of a function's head or of the lines about it."
 PROTECTED = {layout.function for layout in LAYOUTS if layout.protected}
 HELLO, HOME, CLEAR, RETRACT, RELEASE = (b"\x1e\0", b"\x06\0", b"\x0e\0", b"\x16\0", b"\x26\0")
 WAIT, CLOSE, OPEN, MEND = b"\xf8", b"\xff\x30", b"\xff\xd0", b"\x03"
@@ -45,7 +44,6 @@ RESTED = MEND + 8 * WAIT + CLEAR
 
 
 def run(seconds: int, seed: int) -> dict[str, Any]:
-    """So many seconds in total; the figures, and `failures`."""
     try:
         program = build(Target.FUZZ)
     except BuildError as error:
@@ -58,7 +56,7 @@ def run(seconds: int, seed: int) -> dict[str, Any]:
             for number, data in enumerate(seeds()):
                 (corpus / f"{number:04}").write_bytes(data)
             share_s = max(1, round(seconds / len(SEEDS)))
-            # what was begun with and found is run to its end too, however little the machine gave before
+            # the corpus and what was found are run to their end too, however slow the machine was
             for bound in (f"-max_total_time={share_s}", "-runs=0"):
                 executed, failed = fuzzed(program, corpus, seed, bound)
                 executions[name] += executed
@@ -81,7 +79,7 @@ def run(seconds: int, seed: int) -> dict[str, Any]:
 
 
 def fuzzed(program: Path, corpus: Path, seed: int, bound: str) -> tuple[int, list[str]]:
-    """How many inputs were run within libFuzzer's `bound`, and what did not hold, with the bytes that showed it."""
+    """Return how many inputs ran within libFuzzer's `bound`, and what failed, with its bytes."""
     name, crashes = corpus.name, corpus.with_name(f"{corpus.name}-crash-")
     command = [
         *(str(program), str(corpus), bound, f"-seed={seed}", "-print_final_stats=1", f"-artifact_prefix={crashes}"),
@@ -102,14 +100,12 @@ def fuzzed(program: Path, corpus: Path, seed: int, bound: str) -> tuple[int, lis
 
 
 def payloads() -> Iterator[bytes]:
-    """Function and payload of every message's vector."""
     vectors = json.loads((VECTORS / "messages.json").read_text(encoding="utf-8"))
     for vector in (*vectors["valid"], *vectors["invalid"]):
         yield bytes((vector["function"],)) + bytes.fromhex(vector["payload"])
 
 
 def streams() -> Iterator[bytes]:
-    """The frames' vectors, each whole stream in pieces of up to 127 bytes."""
     vectors = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
     for text in [
         *(vector["frame"] for vector in vectors["valid"]),
@@ -119,7 +115,6 @@ def streams() -> Iterator[bytes]:
 
 
 def lives() -> Iterator[bytes]:
-    """Frames on a device's line."""
     vectors = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
     for vector in vectors["valid"]:
         yield in_pieces(bytes.fromhex(vector["frame"]), 31, lambda size: size << 3 | 4)
@@ -136,21 +131,19 @@ def lives() -> Iterator[bytes]:
 
 
 def in_pieces(data: bytes, most: int, head: Callable[[int], int]) -> bytes:
-    """A stream as a harness reads it: before each piece, a byte that `head` makes of its size."""
+    """Return a stream as a harness reads it: each piece after a byte that `head` makes of its size."""
     pieces = [data[at : at + most] for at in range(0, len(data), most)]
     return b"".join(bytes((head(len(piece)),)) + piece for piece in pieces)
 
 
 SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {"codec": payloads, "framing": streams, "device": lives}
-"By target: the inputs that its corpus begins with."
 
 
 # -- which lines were run ------------------------------------------------------------------------------------------
 
 
 def covered(program: Path, folder: Path) -> tuple[float | None, list[str]]:
-    """Which share of the firmware's lines that bytes can reach the targets ran, by the profiles in `folder`, and those
-    that they did not."""
+    """Return the share of reachable firmware lines that ran, by the profiles in `folder`, and the others."""
     merged = folder / "all.profdata"
     merge = ["llvm-profdata", "merge", "-o", str(merged), *map(str, folder.glob("*.profraw"))]
     sources = [str(ROOM / f"{name}.c") for name in FIRMWARE]
@@ -172,7 +165,7 @@ def covered(program: Path, folder: Path) -> tuple[float | None, list[str]]:
 
 
 def is_out_of_reach(lines: list[str], number: int) -> bool:
-    """Whether no bytes reach the line, by its function's head, itself and the two lines before it."""
+    """Return whether no bytes reach the line, by its function's head, itself and the two lines before it."""
     heads = [line for line in lines[:number] if line and line[0].isalpha()]
     looks_like = "\n".join([*heads[-1:], *lines[number - 3 : number]])
     return any(re.search(looks, looks_like, re.MULTILINE) for looks in BEYOND_REACH)
@@ -182,7 +175,7 @@ def is_out_of_reach(lines: list[str], number: int) -> bool:
 
 
 def differences(of_codec: list[bytes], of_framing: list[bytes]) -> int:
-    """How many frames, counts and verdicts Python has otherwise than the C under sanitizers, of these inputs."""
+    """Return how many frames, counts and verdicts differ between Python and the C under sanitizers."""
     heard = [one for data in of_codec if data for one in (data, sealed(data))]
     requests, ours = [], []
     for data in heard:
@@ -206,7 +199,6 @@ def differences(of_codec: list[bytes], of_framing: list[bytes]) -> int:
 
 
 def verdict(function: int, payload: bytes) -> str:
-    """What Python's codec says of a payload, as the C filter writes it."""
     try:
         decode(function, payload)
     except DecodeError:
@@ -215,12 +207,12 @@ def verdict(function: int, payload: bytes) -> str:
 
 
 def sealed(data: bytes) -> bytes:
-    """An input of the codec with the right CRC-8 at its end, where its function has one."""
+    """Return an input of the codec with the right CRC-8, if its function has one."""
     return data[:-1] + bytes((crc8(data[:-1]),)) if data[0] in PROTECTED and len(data) > 1 else data
 
 
 def line_of(data: bytes) -> bytes:
-    """The stream that an input of the framing stands for; as firmware_protocol/c/fuzz/framing.c reads it."""
+    """Return the stream of an input of the framing, as firmware_protocol/c/fuzz/framing.c reads it."""
     line, at = bytearray(), 0
     while at < len(data):
         piece, at = data[at], at + 1

@@ -1,7 +1,6 @@
-"""The device unplugged during motion and plugged in again, over and over: what the daemon makes of it.
+"""The device unplugged during motion and plugged in again, over and over.
 
-It must latch a fault, find the device again, never arm by itself, and keep no descriptor. What a device does that is
-left alone is in the fault matrix.
+The daemon must latch a fault, find the device again, never arm by itself, and keep no descriptor.
 """
 
 import math
@@ -15,13 +14,11 @@ from tqdm import tqdm
 from endurance.stand import Figures, Stand, used
 
 CLOSING_MM = 85.0
-"The gap when the device is unplugged, on its way from 95."
 DOWN_S = (0.2, 1.6)
-"How long it is away: through every wait between two attempts to open."
+"How long it is away: covers every wait between two attempts to open."
 
 
 def run(transport: str, count: int, seed: int) -> Figures:
-    """`count` cycles on `serial` or `can`; the figures, and `failures`."""
     draw = random.Random(seed)
     with ExitStack() as stack:
         stand = Stand(stack, transport)
@@ -43,7 +40,6 @@ def run(transport: str, count: int, seed: int) -> Figures:
 
 
 def _cycle(stand: Stand, transport: str, draw: random.Random) -> dict[str, Any]:
-    """Arms, unplugs in motion, plugs in."""
     stand.arm()
     with stand.ticks() as read:
         stand.ask(draw.uniform(1.4, 1.8))

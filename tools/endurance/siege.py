@@ -1,9 +1,9 @@
-"""Who troubles the daemon gets nowhere, and `stop` is heard beside it.
+"""Attackers get nowhere with the daemon, and `stop` is heard beside them.
 
-One attack after the other runs as a process of its own. A hundred clients ask without pause. Hostile messages are each
-a valid one with one thing done to it that has to be refused. Strangers show no key, a wrong one, one that is not listed
-or one for something else. The last sends 10^5 messages a second to one endpoint. Meanwhile force is held and stopped,
-over and over. Nothing but the stop may latch, nothing hostile be taken, and what was refused or dropped is counted.
+Each attack is a process of its own: a hundred clients that ask without pause; hostile messages, each a valid one with
+one change that must be refused; strangers with no key, a wrong or an unlisted one, or one for something else; and 10^5
+messages a second to one endpoint. Meanwhile force is held and stopped, over and over. Only the stop may latch, nothing
+hostile may be taken, and what was refused or dropped must be counted.
 """
 
 import contextlib
@@ -32,10 +32,9 @@ from tormagd_client.messages import VERSION, Reply, Request, decode, encode
 CLIENTS = 100
 FLOOD_PER_S, STRANGERS_PER_S = 100_000.0, 600.0
 PACE = 0.95
-"Of what a publisher may send: what goes beyond is dropped unread, and would show nothing here."
+"Share of what a publisher may send: the excess is dropped unread, and would show nothing here."
 PER_BURST = 20
 LIVES_S = 0.5
-"A stranger gives up after this time."
 FORCE_N, HELD_S = 1.5, (0.2, 0.8)
 PATIENCE_S = 20.0
 SETPOINT: dict[str, Any] = {
@@ -71,11 +70,11 @@ HEADS = (b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xf
 "A map, an array, bytes and a text of 2^32-1, and what msgpack never means."
 
 Attack = Callable[[Endpoints, Path, Event, Any], None]
-"Goes on until the event, at a daemon whose keys are in this folder; the shared number says how often."
+"Runs until the event, at a daemon with keys in this folder; counts in the shared number."
 
 
 def hostile(draw: random.Random, valid: dict[str, Any], not_allowed: dict[str, tuple[Any, ...]]) -> list[bytes]:
-    """The parts of one message that must not be taken, made of a valid one."""
+    """Return variants of one valid message that must not be taken."""
     packed = msgspec.msgpack.encode(valid)
     name, lacking = draw.choice(list(not_allowed)), draw.choice([field for field in valid if field != "args"])
     ways = (
@@ -93,7 +92,6 @@ def hostile(draw: random.Random, valid: dict[str, Any], not_allowed: dict[str, t
 
 
 def paced(per_s: float, stop: Event) -> Iterator[int]:
-    """Numbers, so many a second on average, until the event."""
     start_s, number = time.monotonic(), 0
     while not stop.is_set():
         yield number
@@ -103,7 +101,6 @@ def paced(per_s: float, stop: Event) -> Iterator[int]:
 
 
 def busy_clients(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
-    """Clients that ask for status again as soon as they are answered."""
     request = encode(Request(v=VERSION, id=0, command="status"))
     with zmq.Context() as context:
         clients = [_peer(context, zmq.DEALER, endpoints.control) for _ in range(CLIENTS)]
@@ -118,7 +115,6 @@ def busy_clients(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> 
 
 
 def flood(name: str, endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
-    """Messages to one endpoint, valid ones and garbage; subscriptions where it takes nothing else."""
     kind, data = {
         "setpoint": (zmq.PUB, [msgspec.msgpack.encode(SETPOINT), os.urandom(100)]),
         "control": (zmq.DEALER, [encode(Request(v=VERSION, id=0, command="status"))]),
@@ -134,7 +130,6 @@ def flood(name: str, endpoints: Endpoints, _keys: Path, stop: Event, times: Any)
 
 
 def messages(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
-    """Hostile setpoints, and hostile requests one after the other."""
     draw = random.Random(1)
     with zmq.Context() as context:
         publisher = _peer(context, zmq.XPUB, endpoints.setpoint)
@@ -151,7 +146,6 @@ def messages(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None
 
 
 def strangers(endpoints: Endpoints, keys: Path, stop: Event, times: Any) -> None:
-    """Peers that are not let in to telemetry, each a try of its own."""
     server, publisher = load_public(keys / f"{SERVER}{PUBLIC}"), load_pair(keys / f"publish{SECRET}")
     with zmq.Context() as context:
         alive: list[tuple[float, zmq.Socket[bytes]]] = []
@@ -187,7 +181,6 @@ ATTACKS: dict[str, Attack] = {
 
 
 def run(stand: Stand, count: int, seed: int) -> Figures:
-    """`count` stops beside each attack; the figures, and `failures`."""
     draw, spawn = random.Random(seed), get_context("spawn")
     failures: list[str] = []
     figures: Figures = {}
@@ -206,7 +199,6 @@ def run(stand: Stand, count: int, seed: int) -> Figures:
 
 
 def judged(name: str, times: int, took_ms: Sequence[float], status: dict[str, Any], code: int | None) -> list[str]:
-    """What did not hold beside an attack that went on so often and ended with that code."""
     drops = {drop["endpoint"] for drop in status["peers"]["drops"]}
     refused = {"messages": status["setpoints"]["refused"], "strangers": status["peers"]["refused"]}.get(name, 1)
     checks = {
@@ -220,7 +212,6 @@ def judged(name: str, times: int, took_ms: Sequence[float], status: dict[str, An
 
 
 def _stop(stand: Stand, draw: random.Random) -> float:
-    """Holds force for a while and stops."""
     stand.arm()
     since_s = time.monotonic()
     stand.ask(FORCE_N)

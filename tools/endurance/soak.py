@@ -1,7 +1,7 @@
 """The same thing for a long time: does memory grow, do descriptors leak, is every tick recorded?
 
 A daemon renders force, is recorded, and a new client asks for its status every half second. Growth counts after two
-minutes, or a quarter of a shorter time, when what is made once has been made.
+minutes, or a quarter of a shorter time, when everything that is made once exists.
 """
 
 import math
@@ -25,7 +25,6 @@ ALLOWED_KB = {"daemon": 2_048, "recorder": 16_384}
 
 
 def run(stand: Stand, count: int, seed: int) -> Figures:
-    """`count` samples, two a second; the figures, and `failures`."""
     path = stand.folder / "soak.mcap"
     ctl = ("-m", "tormagd.ctl.main", "--config", str(stand.folder / "tormagd.toml"))
     processes = {"daemon": stand.daemon, "recorder": stand.begin(*ctl, "record", str(path))}
@@ -57,7 +56,6 @@ def run(stand: Stand, count: int, seed: int) -> Figures:
 
 
 def failures(grown_kB: dict[str, int], stayed: dict[str, int], ticks: list[int]) -> list[str]:
-    """What did not hold, in words; `ticks` are the numbers of those that were recorded."""
     found = [
         f"{name}: memory grew by {grown} kB, allowed {ALLOWED_KB[name]}"
         for name, grown in grown_kB.items()
@@ -70,19 +68,18 @@ def failures(grown_kB: dict[str, int], stayed: dict[str, int], ticks: list[int])
 
 
 def recorded(path: Path) -> list[int]:
-    """The numbers of the ticks in a recording."""
     with path.open("rb") as file:
         messages: Any = make_reader(file).iter_messages(topics=[TICKS_TOPIC])
         return [int(msgspec.json.decode(message.data)["tick"]) for _, _, message in messages]
 
 
 def staying(values: list[int]) -> int:
-    """By how many more there are in the last quarter than in the second, whatever comes and goes."""
+    """Return the increase from the second to the last quarter, whatever comes and goes."""
     quarter = len(values) // 4
     return min(values[-quarter:]) - min(values[quarter : 2 * quarter])
 
 
 def growth(values: list[int]) -> int:
-    """By how much the largest is above the first, once what is made once has been made."""
+    """Return the growth of the largest once everything that is made once exists."""
     settled = min(len(values) // 4, round(SETTLED_S / SAMPLE_S))
     return max(values[settled:]) - values[settled]

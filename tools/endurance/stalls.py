@@ -1,7 +1,7 @@
 """Daemon and device stopped for some milliseconds while force is held: does it go on, or is it safe?
 
-SIGSTOP and SIGCONT around a pause, whose true length is measured and decides: a busy machine makes it longer. Shorter
-than the device's own timeout of 50 ms nothing may latch, and the plant's force must stay within 0.1 N. From 60 ms on
+Each pause is a SIGSTOP and a SIGCONT. Its true length is measured and decides, because a busy machine makes it longer.
+Below the device's own timeout of 50 ms nothing may latch, and the plant's force must stay within 0.1 N. From 60 ms on
 the gap must be open in the end, and one fault must say what happened.
 """
 
@@ -18,16 +18,14 @@ from endurance.stand import Figures, Stand, is_at_rest
 FORCE_N, ALLOWED_N = 1.5, 0.1
 PAUSES_MS = (5.0, 15.0, 25.0, 35.0, 45.0, 60.0, 83.0, 400.0)
 SURVIVED_MS, OPENS_MS = 48.0, 52.0
-"A pause that really was longer than these is the device's timeout with a period on either side."
+"The device's timeout, with a period on either side."
 OPEN_MM = 94.0
 SETTLED_S, WATCHED_S = 0.7, 0.6
 TOLD = {"daemon": "HOST_STALL", "device": "MEASUREMENT_STALE"}
-"What the one fault after a long stop has to be called."
+"Name of the one fault after a long stop."
 
 
 class Stop(NamedTuple):
-    """One process stopped once, and the faults that came of it. `rest_ns` is when nothing moved any more."""
-
     process: str
     took_ms: float
     faults: tuple[str, ...]
@@ -35,7 +33,6 @@ class Stop(NamedTuple):
     rest_ns: int
 
     def failure(self, worst_N: float, gap_mm: float) -> str:
-        """What did not hold, given the plant's worst force error until it rested, and the gap there; else nothing."""
         if self.took_ms <= SURVIVED_MS and self.faults:
             return f"fault {', '.join(self.faults)}"
         if self.took_ms <= SURVIVED_MS and worst_N > ALLOWED_N:
@@ -48,7 +45,6 @@ class Stop(NamedTuple):
 
 
 def run(stand: Stand, count: int, seed: int) -> Figures:
-    """`count` stops of either process by turns; the figures, and `failures`."""
     draw = random.Random(seed)
     stops: list[Stop] = []
     for number in tqdm(range(count), desc="stalls", unit="stop", disable=None):
@@ -69,7 +65,6 @@ def run(stand: Stand, count: int, seed: int) -> Figures:
 
 
 def _hold(stand: Stand) -> None:
-    """Holds force, settled."""
     while True:
         stand.arm()
         since_s = time.monotonic()

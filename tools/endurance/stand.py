@@ -1,4 +1,4 @@
-"""A daemon on a simulated device, as processes, and who operates it: what every case in real time runs on."""
+"""A daemon on a simulated device, as processes, and its operator: what every case in real time runs on."""
 
 import contextlib
 import os
@@ -24,7 +24,7 @@ from tormagd_client import Client, ClientError
 from tormagd_client.keys import SECRET, SERVER, generate
 
 FIFO_PRIORITY, DEVICE_PRIORITY = 50, 55
-"Of the daemon, and of the device, which stands for a machine of its own. Only where they are granted."
+"Of the daemon, and of the device, which stands for a machine of its own; used if granted."
 BACKENDS = {"serial": 'backend = "serial"', "can": 'backend = "can"\noptions.interface = "tormagsim"'}
 DOORS = {"serial": "--pty", "can": "--can"}
 NEUTRAL_N, LASTS_MS = 0.3, 60_000.0
@@ -33,18 +33,15 @@ LOOK_S = 0.02
 UNHANDLED = ("Traceback", "CRITICAL", "Exception ignored")
 
 Figures = dict[str, Any]
-"What a case comes to: JSON, with the list `failures` of what did not hold."
 
 
 class Stand:
     """Daemon, device and an operator's client. All of it ends with `stack`."""
 
     def __init__(self, stack: ExitStack, transport: str = "serial") -> None:
-        """Raises TimeoutError."""
         self._stack = stack
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
         self.latched: list[tuple[str, float, float]] = []
-        "Faults that no case has asked for, and from when to when each came, CLOCK_MONOTONIC."
         stack.enter_context(carried(DEVICE_PRIORITY))
         self.plug_in(transport)
         self.keys = self.folder / "keys"
@@ -65,16 +62,15 @@ class Stand:
         )
         self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(config))
         self.endpoints = load_config(config).endpoints
-        # patient, because the host may be busy: what is to come in time is measured, not waited for
+        # patient, because the host may be busy: timing is measured, not waited for
         self.client = stack.enter_context(Client(self.endpoints, 10.0))
         self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
 
     def begin(self, *arguments: str) -> "subprocess.Popen[str]":
-        """A Python of ours, what it says kept in the folder."""
         return begun(self._stack, self.folder / "log", *arguments, environment=os.environ | {"OMP_NUM_THREADS": "1"})
 
     def plug_in(self, transport: str) -> None:
-        """Begins a device; a symbolic link to its line stands for the stable name that udev gives a real one."""
+        """Start a device; a symbolic link to its line stands for udev's stable name."""
         simulated = ("--seed", "1", "--truth", str(self.folder / "truth.csv"))
         self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], *simulated))
         line, port = first_line(self.device), self.folder / "device"
@@ -82,11 +78,9 @@ class Stand:
         port.symlink_to(line)
 
     def status(self) -> dict[str, Any]:
-        """The daemon's status."""
         return self.client.request("status")
 
     def until(self, reached: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
-        """The status in which that is so."""
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s and self.daemon.poll() is None:
             with contextlib.suppress(ClientError):
@@ -96,11 +90,9 @@ class Stand:
         raise TimeoutError(f"not within {PATIENCE_S:g} s: {what}\n{(self.folder / 'log').read_text()[-2_000:]}")
 
     def ask(self, force_N: float) -> None:
-        """Publishes a force that stays valid for long."""
         self.client.publish(force_N, LASTS_MS)
 
     def arm(self) -> None:
-        """Clears, homes and enables, whatever was before, at a low force."""
 
         def is_armed(status: dict[str, Any]) -> bool:
             if status["operating_state"] != "ENABLED":
@@ -112,14 +104,13 @@ class Stand:
         self.until(is_armed, "enabled")
 
     def see_faults(self, since_s: float) -> bool:
-        """Keeps the faults that have latched since; whether there are any."""
         faults = self.status()["faults"]
         self.latched += [(fault, since_s, time.monotonic()) for fault in faults]
         return bool(faults)
 
     @contextlib.contextmanager
     def ticks(self) -> Iterator[Callable[[], list[dict[str, Any]]]]:
-        """Gives a function that gives the control ticks since it was last called, by their columns."""
+        """Give a function that returns the control ticks since its last call."""
         with zmq.Context() as context, listening(context, self.endpoints.recording, None) as recorder:
 
             def read() -> list[dict[str, Any]]:
@@ -131,23 +122,20 @@ class Stand:
             yield read
 
     def truth(self) -> Array:
-        """Ends the device; what no sensor has seen, columns t_ns, force_N and gap_mm."""
+        """End the device; return its true t_ns, force_N and gap_mm."""
         end(self.device)
         return np.loadtxt(self.folder / "truth.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
 
     def unhandled(self) -> list[str]:
-        """What the processes said of what nobody has handled."""
         lines = (self.folder / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         return [line for line in lines if any(sign in line for sign in UNHANDLED)]
 
 
 def used(child: "subprocess.Popen[str]") -> tuple[int, int]:
-    """Descriptors and memory in kB that a process has now."""
     folder = Path(f"/proc/{child.pid}")
     pages = int((folder / "statm").read_text().split()[1])
     return len(list((folder / "fd").iterdir())), pages * os.sysconf("SC_PAGE_SIZE") // 1024
 
 
 def is_at_rest(status: dict[str, Any]) -> bool:
-    """Whether the link runs, and the device neither homes nor opens."""
     return status["link"]["state"] == "RUNNING" and not status["is_busy"]

@@ -1,4 +1,4 @@
-"""The cases of `numerics.py`: devices and loads out to the extremes, and what they are in 50 digits or more."""
+"""The cases of `numerics.py`: devices and loads out to the extremes, and their values in 50 digits or more."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,14 +11,13 @@ from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw, PowerFieldLa
 from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
 DIGITS = 65
-"""Digits computed with: 50 are wanted, and differences over a step near the end of Eq. 7 lose the others."""
+"""50 are wanted, and differences over a step near the end of Eq. 7 lose the others."""
 
 GRAIN = mp.mpf(10) ** -10
-"""Relative step of the reference's differences: their truncation is 1e-20."""
 
 
 class Batch(NamedTuple):
-    """Inputs x of one device: gaps (mm) through a field law, or radial moments (T m) where `field` is None."""
+    """Inputs x of one device: gaps (mm) through a field law, or radial moments (T m) if `field` is None."""
 
     elastomer: Elastomer
     geometry: Geometry
@@ -27,7 +26,7 @@ class Batch(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """In 50 digits at one x: is lambda1 >= 0.05; values, by quantity, and the condition number of each."""
+    """At one x in 50 digits: is lambda1 >= 0.05; the quantities' values and condition numbers."""
 
     admissible: bool
     stretch: float
@@ -36,7 +35,7 @@ class Reference(NamedTuple):
 
 
 def draw_batch(rng: np.random.Generator, size: int) -> Batch:
-    """One device and `size` inputs; every range of the requirement is reached, its ends often."""
+    """Draw one device and `size` inputs; every required range is reached, its ends often."""
 
     def log_uniform(low: float, high: float) -> float:
         pick = rng.uniform(-0.1, 1.1)
@@ -63,9 +62,9 @@ def draw_batch(rng: np.random.Generator, size: int) -> Batch:
 
 
 def reference(batch: Batch, x: float) -> Reference:
-    """The thesis's formulas as printed (Eq."""
+    """Evaluate the thesis's formulas as printed."""
     with mp.workdps(DIGITS):
-        # Eq. 7 bends at 95 mm, so that a step is measured from there
+        # Eq. 7 bends at 95 mm, so a step is measured from there
         scale = min(mp.mpf(x), 95 - mp.mpf(x)) if isinstance(batch.field, ThesisFieldLaw) else mp.mpf(x)
         step = scale * GRAIN
         points = [_force(batch, mp.mpf(x) + place * step) for place in (-1, 0, 1)] if scale > 0 else []
@@ -100,7 +99,7 @@ def _moment(field: FieldLaw | None, x: Any) -> Any:
 
 
 def _force(batch: Batch, x: Any) -> tuple[Any, Any] | None:
-    """(lambda1, F); None where lambda1 is not real and positive."""
+    """Return (lambda1, F), or None if lambda1 is not real and positive."""
     g0, mu_r = mp.mpf(batch.elastomer.shear_modulus_Pa), mp.mpf(batch.elastomer.relative_permeability)
     geometry = batch.geometry
     r_i, r_o, t = (mp.mpf(v) for v in (geometry.inner_radius_m, geometry.outer_radius_m, geometry.thickness_m))

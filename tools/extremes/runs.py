@@ -30,7 +30,7 @@ SENT_HZ = 137.3
 
 
 class End(NamedTuple):
-    """Some key at one end of what is accepted: of the `config`, the scene's `insert`, or the `plant`'s electronics."""
+    """A key at one end of what is accepted, of the `config`, the scene's `insert`, or the `plant`'s electronics."""
 
     section: str
     key: str
@@ -41,7 +41,7 @@ class End(NamedTuple):
 
 
 def ends() -> list[End]:
-    """Both ends of every number that shapes control, and of the device's own."""
+    """Return both ends of every number that shapes control, and of the device's own."""
     parts = {section: getattr(Config(), section) for section in SECTIONS} | {"insert": load_scene(SCENE).insert}
     found = [End(section, key, value) for section, part in parts.items() for key, value in _ends_of(type(part))]
     return found + [End("plant", key, value) for key, *both in OF_PLANT for value in both]
@@ -57,15 +57,16 @@ def _ends_of(struct: type) -> Iterator[tuple[str, float]]:
 
 
 class Became(NamedTuple):
-    """What became of a configuration: `refused` at the border; `ran`; `stated` where it may not be enabled or a fault
-    ended it; or `wrong`. `why` has its ends and the text."""
+    """The outcome of a configuration: `refused` at the border; `ran`; `stated` if it may not be enabled or a fault
+    ended it; or `wrong`.
+    """
 
     kind: str
     why: str
 
 
 def drawn_ends(count: int, seed: int) -> list[tuple[End, ...]]:
-    """Every end by itself, then pairs of them at random, `count` in all; of fewer than there are, some at random."""
+    """Return every end by itself, then random pairs, `count` in all; or some at random if there are more."""
     rng, each = random.Random(seed), ends()
     if count < len(each):
         return [(one,) for one in rng.sample(each, count)]
@@ -74,7 +75,6 @@ def drawn_ends(count: int, seed: int) -> list[tuple[End, ...]]:
 
 
 def became(case: tuple[End, ...], seconds: float) -> Became:
-    """Builds the core for these ends, arms the simulated device, and asks it for a force for so long."""
     name = ", ".join(map(str, case))
     try:
         core, plant = _built(case)
@@ -120,7 +120,6 @@ def _ran(core: Core, plant: PlantParameters, seconds: float) -> tuple[str, str]:
 
 
 def summed(found: list[Became]) -> dict[str, Any]:
-    """Of all configurations: how many of each kind, and first what was wrong, then what was stated."""
     told = sorted((each for each in found if each.kind in ("wrong", "stated")), key=lambda each: each.kind != "wrong")
     counts = Counter(each.kind for each in found)
     return {

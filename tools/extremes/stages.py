@@ -1,10 +1,9 @@
-"""Every stage of the core, fed with what it should never see: the part of `numerics.py` that looks for a number that
-travels.
+"""Every stage of the core, fed with what it should never see: the part of `numerics.py` that looks for bad numbers.
 
-A stage is fed at its border. Where another check stands before it, that is named, and the stage gets whatever passes
-that check. Else it gets NaN, infinities and the largest floats, too. In each episode a fresh stage has healthy inputs,
-then hostile ones, then healthy ones again. What is not finite afterwards, in what came out or in a field of the stage,
-has travelled. A stage that refused is made anew, as its owner does.
+A stage is fed at its border. If another check stands before it, that is named, and the stage gets whatever passes the
+check; otherwise it gets NaN, infinities and the largest floats too. In each episode a fresh stage has healthy inputs,
+then hostile ones, then healthy ones again. A number that is not finite afterwards, in the output or in a field of the
+stage, has travelled. A stage that refused is made anew, as its owner does.
 """
 
 import contextlib
@@ -34,26 +33,23 @@ REFUSALS = (DomainError, ConfigError, MessageError, RefusedError, EncodeError, D
 UNNAMED = (ArithmeticError, ValueError, TypeError, LookupError, AssertionError, RuntimeError)
 USUAL_STEPS, HOSTILE_STEPS, AFTER_STEPS = 3, 6, 3
 SHARE = 0.25
-"Of the numbers of a hostile step, so many are hostile."
+"Share of the numbers of a hostile step that are hostile."
 MAX_TOLD = 3
 MEANT = {("out.Plan.stamp_s", -math.inf)}
 "An infinity that a record states: it follows no setpoint."
 
 
 class Draw:
-    """The inputs of an episode, step by step: the usual ones, or some of `strange`."""
-
     def __init__(self, rng: random.Random, strange: tuple[float, ...]) -> None:
         self._rng, self._strange, self.has_nan = rng, strange, False
         self.now_s = self.last_s = 10.0
         self.steps, self.is_hostile = 0, False
 
     def turn(self, is_hostile: bool) -> None:
-        """The next step of it begins."""
         self.steps, self.is_hostile, self.has_nan = self.steps + 1, is_hostile, False
 
     def step(self, period_s: float) -> float:
-        """The time of this step: a period on, or while it is hostile also the same again, earlier or much later."""
+        """Return the time of this step: a period on; in a hostile step maybe the same, earlier or much later."""
         self.last_s = self.now_s
         self.now_s += self._rng.choice((0.0, -0.5, 5.0, period_s)) if self.is_hostile else period_s
         return self.now_s
@@ -64,11 +60,9 @@ class Draw:
         return value
 
     def bounded(self, usual: float) -> float:
-        """A number that has passed the core's borders."""
         return self._drawn(usual, BOUNDED)
 
     def positive(self, usual: float) -> float:
-        """A number above 0, where the stage is promised one."""
         return abs(self.bounded(usual)) or usual
 
     def _drawn(self, usual: float, strange: tuple[float, ...]) -> float:
@@ -76,8 +70,7 @@ class Draw:
 
 
 class Stage(NamedTuple):
-    """One row of the table. `make` gives a fresh stage, or whatever `feed` is given; `feed` takes one step of it and
-    gives what came out."""
+    """One row of the table. `make` gives a fresh stage; `feed` takes one step of it and returns what came out."""
 
     name: str
     make: Callable[[], Any]
@@ -87,8 +80,7 @@ class Stage(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What became of a stage. It counts steps with hostile inputs, those that it refused by name, and those after which
-    a limit or a fault was told."""
+    """The outcome of a stage: steps with hostile inputs, those refused by name, and those with a limit or a fault."""
 
     stage: str
     border: str
@@ -102,7 +94,6 @@ class Row(NamedTuple):
 
 
 def tried(stage: Stage, episodes: int, seed: int) -> Row:
-    """One stage through so many episodes."""
     rng = random.Random(f"{seed} {stage.name}")
     counts: Counter[str] = Counter()
     told: list[str] = []
@@ -147,7 +138,7 @@ def _tell(counts: Counter[str], told: list[str], kind: str, what: str) -> None:
 
 
 def leaves(thing: object, path: str = "") -> Iterator[tuple[str, float]]:
-    """Every float of plain data, of values and of stages, with where it is."""
+    """Yield every float of plain data, values and stages, with its place."""
     if isinstance(thing, float):
         yield path, thing
     elif isinstance(thing, dict):
@@ -157,7 +148,7 @@ def leaves(thing: object, path: str = "") -> Iterator[tuple[str, float]]:
         for place, each in enumerate(thing):
             yield from leaves(each, f"{path}.{place}")
     elif hasattr(thing, "__dict__") or hasattr(thing, "__mypyc_attrs__"):
-        with contextlib.suppress(TypeError):  # where it has no fields
+        with contextlib.suppress(TypeError):  # for what has no fields
             yield from leaves(plain(thing), path)
 
 

@@ -64,9 +64,8 @@ from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, DeviceRequest, SafetyState, command
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
-"Of a tick, of a plan, and of what `Stepper` lets a tick take."
+"Periods of a tick and of a plan, and the longest tick of `Stepper`."
 BEGINS_S = 9.9
-"A stage that begins at a time, just before the first step."
 CONFIG = Config(scene="coronary")
 BOUNDS = device_bounds(CONFIG.trim)
 READY = Conditions(True, True, True, False, False)
@@ -78,12 +77,11 @@ OWN, MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
     "config",
     "Planner, of plans",
 )
-"Checks that stand before a stage, beside its own."
+"Checks in front of a stage, beside its own."
 
 
 @cache
 def core() -> Core:
-    """The shipped core that all are fed beside."""
     return build_core(CONFIG)
 
 
@@ -91,7 +89,7 @@ def core() -> Core:
 
 
 def measurement(draw: Draw) -> Measurement:
-    """Of a healthy homed device at a gap of 80 mm, but for what is drawn."""
+    """Return a healthy homed device's measurement at a gap of 80 mm, except for what is drawn."""
     return Measurement(
         number=draw.steps,
         received_s=draw(draw.now_s),
@@ -115,7 +113,6 @@ def measurement(draw: Draw) -> Measurement:
 
 
 def measured(draw: Draw) -> Measured:
-    """What `measure` makes of it: never anything that has not passed `Stepper`'s border."""
     some, now_s = draw.bounded, draw.now_s
     turn = Turn(1.0 if some(1.0) >= 0.0 else -1.0, some(0.0), some(42.0 * now_s))
     handle = Handle(min(abs(some(MOBILISED_MM)), MOBILISED_MM), some(42.0), turn, abs(some(42.0)))
@@ -136,7 +133,7 @@ def measured(draw: Draw) -> Measured:
 
 
 def setpoint(draw: Draw) -> TimedSetpoint:
-    """A force of about 1.2 N, in a third of the steps with a preview, in a quarter with a wall."""
+    """Return about 1.2 N, in a third of the steps with a preview, in a quarter with a wall."""
     preview = tuple([draw(1.2) for _ in range(8)]) if draw.steps % 3 == 0 else ()
     made = TimedSetpoint(draw(1.2), draw(draw.now_s), draw(0.1), None, None, preview, draw(0.05) if preview else 0.0)
     if draw.steps % 4 == 1:
@@ -145,14 +142,12 @@ def setpoint(draw: Draw) -> TimedSetpoint:
 
 
 def plan(draw: Draw) -> Plan:
-    """For a gap of 79 mm."""
     at_s = draw(draw.now_s)
     at = Plan(1, at_s, 1.2, draw(0.0), draw(1.2), draw(1.1), draw(200.0), draw(79.0), draw(-5.0), draw(1.0), ())
     return at.replaced(gap_acceleration_mm_s2=draw(0.0), min_gap_mm=draw(45.0), sensor_doubted_s=draw(0.0))
 
 
 def usual(now_s: float) -> Draw:
-    """Draws nothing strange at that time."""
     draw = Draw(random.Random(0), ())
     draw.now_s = now_s
     return draw
@@ -162,7 +157,6 @@ def usual(now_s: float) -> Draw:
 
 
 def stepper() -> Stepper:
-    """Enabled, at a gap of 80 mm, which its plans ask for."""
     made = core().stepper(BEGINS_S)
     for tick in range(1, 4):
         draw = usual(BEGINS_S + tick * PERIOD_S)
@@ -174,7 +168,6 @@ def stepper() -> Stepper:
 
 
 def step(stage: Stepper, draw: Draw) -> object:
-    """One tick."""
     duty = stage.step(draw(draw.now_s), measurement(draw), plan(draw))
     faults = stage.safety.faults
     if Fault.NOT_FINITE in faults:
@@ -183,12 +176,10 @@ def step(stage: Stepper, draw: Draw) -> object:
 
 
 def planner() -> Planner:
-    """Of a device of which nothing is known."""
     return core().planner(BEGINS_S)
 
 
 def planning(stage: Planner, draw: Draw) -> object:
-    """One plan."""
     now_s, told_s = draw.now_s, draw(draw.now_s)
     try:
         made = stage.plan(now_s if math.isfinite(told_s) else told_s, setpoint(draw), measured(draw))
@@ -241,7 +232,7 @@ def strength(stage: Strength, draw: Draw) -> object:
 def slow_friction(stage: SlowFriction, draw: Draw) -> object:
     stage.follow(draw(1.1), draw(10.0))
     stage.rescale(draw(1.1), draw(1.1), abs(draw(5.0)))
-    if UNSEEN.force_N(stage.followed_N) > 0.1:  # as `believe` has it
+    if UNSEEN.force_N(stage.followed_N) > 0.1:  # as in `believe`
         stage.update(UNSEEN, abs(draw(1.0)) % 6.0, draw(1.2), PLAN_S)
     return stage.factor_at(abs(draw(1.0)))
 
@@ -295,7 +286,7 @@ def governor(stage: Governor, draw: Draw) -> object:
 
 
 def forecast(stage: Forecast, draw: Draw) -> object:
-    if not stage.history or len(stage.history) < 800:  # of what it needs to forecast
+    if not stage.history or len(stage.history) < 800:  # what it needs to forecast
         for place in range(150):
             stage.update(draw.step(0.01), 1.2 + 0.2 * math.sin(0.6 * place))
     stage.update(draw.step(0.01), draw(1.2))
@@ -320,7 +311,6 @@ def skill(stages: list[Skill], draw: Draw) -> object:
 
 
 def aim() -> list[Any]:
-    """With what is remembered and believed."""
     made, believe = core(), planner().believe
     begun = Aim(CONFIG, made.scene, made.element)
     begun.begin(BEGINS_S, 0, 0.0)
@@ -355,7 +345,6 @@ def portrait(stage: Portrait, draw: Draw) -> object:
 
 
 def carriages() -> Carriages:
-    """At rest, 80 mm apart."""
     made = Carriages(CONFIG, core().scene)
     made.begin(80.0)
     return made
@@ -368,7 +357,7 @@ def driving(stage: Carriages, draw: Draw) -> object:
 
 
 def elapsed_s(draw: Draw) -> float:
-    """A time between two ticks, as `Stepper` bounds it."""
+    """Return a time between two ticks, as `Stepper` bounds it."""
     return min(draw.positive(PERIOD_S), LONGEST_S)
 
 
@@ -384,7 +373,7 @@ def reference(stages: list[Reference], draw: Draw) -> object:
 
 
 def motor(_: object, draw: Draw) -> object:
-    """Of what a configuration accepts: some of the keys are at an end of it."""
+    """Feed a motor with some configuration keys at an end of what is accepted."""
     if not draw.is_hostile:
         return []
     ends = [
@@ -435,7 +424,7 @@ def filtered(values: list[float], draw: Draw) -> object:
 
 
 def tables(_: object, draw: Draw) -> object:
-    """Of five points: also of equal ones, and of some that are a denormal apart or do not rise."""
+    """Feed five points: also equal ones, and some that are a denormal apart or do not rise."""
     points = [draw(each) for each in (0.0, 1.0, 2.0, 3.0, 4.0)]
     points = points if draw.steps % 3 else sorted(points)
     gaps_mm = [95.0, 80.0, 65.0, 50.0, 35.0]
@@ -472,7 +461,6 @@ def search(stage: Any, draw: Draw) -> object:
 
 
 def link() -> DeviceLink:
-    """That runs."""
     made = DeviceLink(BEGINS_S)
     made.receive(BEGINS_S, Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, 1))
     made.receive(BEGINS_S, Sense(0.1, 0.1, 0.6, 0.0))
@@ -480,7 +468,6 @@ def link() -> DeviceLink:
 
 
 def linked(stage: DeviceLink, draw: Draw) -> object:
-    """One exchange, with times that repeat themselves and go back."""
     now_s = draw.now_s
     if draw.steps % 20 == 0:
         stage.receive(now_s, Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), draw(23.0), draw(12.0), 0, 1))
@@ -508,7 +495,6 @@ def safety(stages: list[SafetyState], draw: Draw) -> object:
 
 
 def stages() -> list[Stage]:
-    """The table."""
     made, position = core(), CONFIG.position
     element = made.element
     range_mT, scene = element.nominal.fields_mT, made.scene

@@ -1,1 +1,1 @@
-"""The faults of `faults.py`: what is put where, what came of it, and what leads out."""
+"""The faults of `faults.py`: where each is put, what came of it, and what leads out."""

@@ -1,4 +1,4 @@
-"""Lines that are not what they should be, between a host and a simulated device: serial, and CAN."""
+"""Bad serial lines and CAN buses between a host and a simulated device."""
 
 import random
 from collections.abc import Callable
@@ -17,23 +17,19 @@ SEED = 7
 
 
 Transfer = Callable[[float, list[bytes]], list[bytes]]
-"""One direction of a line: what comes out of it now, of these units, frames as bytes, and earlier ones."""
 MakeTransfer = Callable[[], Transfer]
 
 
 def whole() -> Transfer:
-    """Brings every unit at once."""
     return lambda _now_s, units: units
 
 
 def losing(share: float) -> Transfer:
-    """Loses a share of the units."""
     draw = random.Random(SEED)
     return lambda _now_s, units: [unit for unit in units if draw.random() >= share]
 
 
 def damaging(share: float) -> Transfer:
-    """Flips a bit in a share of the units."""
     draw = random.Random(SEED)
 
     def flipped(unit: bytes) -> bytes:
@@ -44,12 +40,11 @@ def damaging(share: float) -> Transfer:
 
 
 def doubling() -> Transfer:
-    """Every unit comes twice."""
     return lambda _now_s, units: [unit for unit in units for _ in range(2)]
 
 
 def reordering(share: float) -> Transfer:
-    """A share of the units is overtaken by the next."""
+    """Let a share of the units be overtaken by the next."""
     draw, waiting = random.Random(SEED), list[bytes]()
 
     def carry(_now_s: float, units: list[bytes]) -> list[bytes]:
@@ -66,7 +61,6 @@ def reordering(share: float) -> Transfer:
 
 
 def delaying(delay_s: float) -> Transfer:
-    """Every unit comes so much later."""
     waiting: list[tuple[float, bytes]] = []
 
     def carry(now_s: float, units: list[bytes]) -> list[bytes]:
@@ -82,7 +76,7 @@ DeviceT = TypeVar("DeviceT", bound=SerialDevice | CanDevice)
 
 
 class _Spoilt(Generic[DeviceT]):
-    """A device behind a wire that is in order until it is spoilt."""
+    """A device behind a wire that is sound until it is spoilt."""
 
     def __init__(self, device: DeviceT) -> None:
         self._device = device
@@ -119,12 +113,12 @@ class BadSerialLine(_Spoilt[SerialDevice]):
 
 
 class BadBus(_Spoilt[CanDevice]):
-    """The same on a bus, above its own CRC: in an adapter, or in a driver. Another node may fill it too."""
+    """The same on a bus, above its own CRC: in an adapter or a driver. Another node may fill it too."""
 
     def __init__(self, device: CanDevice) -> None:
         super().__init__(device)
         self.foreign_frames_ms = 0.0
-        "So many another node sends a millisecond, and wins every arbitration."
+        "Frames of another node, which win every arbitration."
         self._owed = 0.0
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
@@ -144,10 +138,9 @@ class BadBus(_Spoilt[CanDevice]):
 
 
 def unit_of(frame: CanFrame) -> bytes:
-    """A frame as bytes."""
     return frame.data + frame.identifier.to_bytes(2, "big")
 
 
 def frame_of(unit: bytes) -> CanFrame:
-    """The frame of a unit: whatever was flipped, a controller hands out 11 bits of identifier."""
+    """Return the frame of a unit: whatever was flipped, a controller hands out 11 bits of identifier."""
     return CanFrame(int.from_bytes(unit[-2:], "big") & 0x7FF, unit[:-2])

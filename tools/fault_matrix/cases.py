@@ -1,4 +1,4 @@
-"""The faults of the matrix: what is put where, what it has to be named, and how it has to end."""
+"""The faults of the matrix: where each is put, how it must be named, and how it must end."""
 
 from functools import partial
 from typing import NamedTuple
@@ -15,7 +15,7 @@ LIMITED = "limited"
 "The force stays within the scene's range, and no fault opens the gap."
 HELD_OR_OPENS = "held or opens"
 STAYS = "stays"
-"Nothing can open the gap, or nothing has been driven: it closes by no more than MAX_CLOSED_MM."
+"Nothing can open the gap, or nothing has been driven: it closes by at most MAX_CLOSED_MM."
 
 SERIAL, CAN = "serial", "can"
 
@@ -34,7 +34,7 @@ class Injection(NamedTuple):
     sensor: str | None = None
     publisher: str | None = None
     within_ms: float | None = None
-    "By when the reaction has to be on its way, where that is not what the table of codes says."
+    "When the reaction must have begun, unless the table of codes says so."
     is_driven: bool = True
     buses: tuple[str, ...] = (SERIAL, CAN)
 
@@ -104,7 +104,7 @@ MATRIX = (
         "firmware hangs, its watchdog resets it",
         ("MEASUREMENT_STALE",),
         device="frozen",
-        within_ms=151.0,  # nothing can act before the watchdog has, after 100 ms
+        within_ms=151.0,  # nothing can act before the watchdog, after 100 ms
     ),
     # the force sensor and the handle
     Injection("force sensor stuck", ("SENSOR",), sensor="stuck"),

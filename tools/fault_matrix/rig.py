@@ -1,4 +1,4 @@
-"""What a fault is put into: a daemon's core, a device, the line between them, and who publishes the force."""
+"""What a fault is put into: a daemon's core, a device, the line between them, and a publisher."""
 
 import math
 from collections import deque
@@ -27,20 +27,15 @@ from tormagd.simulation.plant import Plant
 FORCE_N = 1.8
 SWING_N = 0.1
 OFFSET_N = 0.8
-"Of a broken force sensor."
 HOGGED_MS = 12
 HOGGED_EVERY_MS = 100
 OTHER_N = 0.6
-"What the source asks for that takes over."
 REPLAYED_MESSAGES = 500
 CLOCK_STEP_S = 3_600
 REALTIME_S = 1_700_000_000
-"What the computers' clocks show at the beginning."
 
 
 class Rig:
-    """A daemon's core and a device, with a line between them that may go bad, and a publisher that may, too."""
-
     def __init__(
         self, injection: Injection, plant: str, bus: str, injected_s: float, boot: FirmwareKind = Firmware
     ) -> None:
@@ -75,7 +70,6 @@ class Rig:
         return self.loop.simulated.truth.force_N - asked_N(self.loop.now_s)
 
     def tick(self) -> Sample | None:
-        """One control period; None where the daemon does nothing in it."""
         is_away = self.is_dead or self._stalled_ms > 0
         self._stalled_ms -= 1
         if self._hogged_ms is not None:
@@ -87,17 +81,14 @@ class Rig:
         return self.loop.tick(self.publisher(self.loop.now_s))
 
     def run(self, duration_s: float) -> Iterator[Sample | None]:
-        """The ticks of the next `duration_s`."""
         for _ in range(round(duration_s * self.config.rates.control_hz)):
             yield self.tick()
 
     def rest(self, duration_s: float) -> None:
-        """Lets so much time pass."""
         for _ in self.run(duration_s):
             pass
 
     def spoil(self, injection: Injection) -> None:
-        """Line, force sensor, host and publisher go bad now."""
         self.line.spoil(injection.way)
         if isinstance(self.line, BadBus):
             self.line.foreign_frames_ms = injection.fill_frames_ms
@@ -111,7 +102,6 @@ class Rig:
         self.publisher.spoil(injection)
 
     def mend(self) -> None:
-        """All that is wrong is put right now; what came of it stays."""
         plant = self.loop.simulated.plant
         if isinstance(plant.force_sensor, LyingSensor):
             plant.force_sensor = plant.force_sensor.mended
@@ -125,16 +115,16 @@ def _coronary() -> Core:
 
 
 def asked_N(now_s: float) -> float:
-    """The force that is asked for; it swings a little, because a fault may hide from a rest."""
+    """Return the force that is asked for; it swings a little, because a fault may hide from a rest."""
     return FORCE_N + SWING_N * math.sin(math.tau * now_s)
 
 
 Lie = Callable[[float, float], float]
-"What is shown, of the first reading and of the true one now."
+"The reading shown, from the first and the present true reading."
 
 
 class LyingSensor:
-    """A force sensor in place of a plant's own, which lies from now on."""
+    """A force sensor that lies from now on."""
 
     def __init__(self, plant: Plant, lie: Lie) -> None:
         self.mended, self._lie, self._first_N = plant.force_sensor, lie, plant.force_sensor.reading_N
@@ -145,7 +135,6 @@ class LyingSensor:
         return min(max(self._lie(self._first_N, self.mended.reading_N), -20.0), 20.0)
 
     def advance(self, time_s: float, force_N: float) -> None:
-        """As the sensor itself."""
         self.mended.advance(time_s, force_N)
 
 
@@ -156,12 +145,10 @@ LIES: dict[str, Lie] = {
     "saturated": lambda *_: math.inf,
     "dead": lambda *_: 0.0,
 }
-"Of a broken sensor; the handle turns forwards, and so readings are positive."
+"Broken sensors; the handle turns forwards, so readings are positive."
 
 
 class Publisher:
-    """A force setpoint every 2 ms, until it falls silent."""
-
     def __init__(self) -> None:
         self.is_silent = self.is_other = False
         self._newest: TimedSetpoint | None = None
@@ -174,12 +161,11 @@ class Publisher:
         return self._newest
 
     def spoil(self, injection: Injection) -> None:
-        """It falls silent, or another one takes over, where the injection says so."""
         self.is_silent, self.is_other = injection.host == "stale", injection.host == "other"
 
 
 class DaemonsBorder:
-    """A publisher whose messages go through the daemon's inbox, as bytes; something may be wrong with them."""
+    """A publisher whose messages go through the daemon's inbox as bytes, and may be wrong."""
 
     def __init__(self) -> None:
         self.is_silent = False
@@ -197,7 +183,6 @@ class DaemonsBorder:
         return self._inbox.newest
 
     def spoil(self, injection: Injection) -> None:
-        """From now on something is wrong, or nothing."""
         self.is_silent, self._wrong, self._kept = False, injection.publisher or "", None
         if self._wrong == "restarted":
             self._session, self._seq = 2, 0

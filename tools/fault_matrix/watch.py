@@ -1,4 +1,4 @@
-"""What a fault brought about, tick by tick, and whether that is what had to come of it."""
+"""What a fault brought about, tick by tick, and whether that is right."""
 
 from typing import NamedTuple
 
@@ -12,19 +12,17 @@ from tormagd.safety.operating_state import OperatingState, RefusedError
 SAFE_N = 1.0
 OPEN_MM = 94.0
 LOSS_MS = 50
-"A loss of force is what a hand feels of it: the greatest over so long."
+"A loss of force is what a hand feels of it: the greatest in this time."
 MAX_OFF_N = 0.15
-"A force that is held is off by no more, in the mean of the last second,"
+"A held force is off by no more, in the mean of the last second,"
 MAX_OVER_N = 0.3
-"and never too great by more."
+"and too great by no more at any time."
 MAX_CLOSED_MM = 3.0
-"What is not driven, or homed, closes by no more than a few mm."
 REFUSED_MS = 100.0
-"A command is refused by then: at once."
 
 
 class Cell(NamedTuple):
-    """One row of the matrix. A time is null where it did not come to that within 6 s."""
+    """One row of the matrix. A time is null if it did not come to that within 6 s."""
 
     bus: str
     fault: str
@@ -50,10 +48,7 @@ class Cell(NamedTuple):
 
 
 class Watch:
-    """What the injection brought about, tick by tick."""
-
     def __init__(self, rig: Rig, usual: dict[str, None], *, is_driven: bool) -> None:
-        """Watches `rig` from now on."""
         loop = rig.loop
         self._rig, self._loop = rig, loop
         self._has_run = is_driven
@@ -68,7 +63,6 @@ class Watch:
         self._off_N: list[float] = []
 
     def see(self, sample: Sample | None) -> None:
-        """Takes one tick; `sample` is None while the daemon is dead."""
         truth, firmware = self._loop.simulated.truth, self._loop.simulated.firmware
         if sample is not None:
             self._host |= dict.fromkeys(map(str, sample.safety.faults))
@@ -99,12 +93,10 @@ class Watch:
             self._since_s.setdefault(what, self._loop.now_s)
 
     def refuse(self, error: RefusedError) -> None:
-        """A command was refused."""
         self._refusal = f"{error.code}: {error.message.partition(': ')[2]}"
         self._note("noticed", True)
 
     def cell(self, injection: Injection, bus: str) -> Cell:
-        """The row."""
         loop = self._loop
         state = loop.stepper.safety.operating_state
         mode = loop.simulated.firmware.mode.name
@@ -133,7 +125,7 @@ class Watch:
         )
 
     def _stated_ms(self, injection: Injection) -> float | None:
-        """By when the reaction has to be on its way, by the table of the code that was told."""
+        """Return when the reaction must have begun, by the table of the code that was told."""
         if injection.within_ms is not None:
             return injection.within_ms
         for name in injection.names:
@@ -148,7 +140,7 @@ class Watch:
         return None
 
     def _reacted_ms(self, injection: Injection) -> float | None:
-        """When the device began to open, where it does, or let go; when it was told otherwise."""
+        """Return when the device began to open or let go; if it does not, when it was told so."""
         if self._refusal:
             return self._since("noticed")
         if not self._has_run:
@@ -166,7 +158,6 @@ class Watch:
         return is_told and (first is None or first in names or names[0].startswith("device:"))
 
     def _ended(self, safe: str, noticed_ms: float | None) -> tuple[bool, float | None]:
-        """Whether it ended as stated, and since when."""
         has_opened = {"open", "below"} <= set(self._since_s)
         last_second, is_not_over = self._off_N[-1000:], max(self._off_N) < MAX_OVER_N
         is_held = abs(sum(last_second) / len(last_second)) < MAX_OFF_N and is_not_over

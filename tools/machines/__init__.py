@@ -1,1 +1,1 @@
-"""What stands for another machine or is one, and what this one took from a measurement."""
+"""Other machines, real or simulated, and what this one took from a measurement."""

@@ -1,9 +1,9 @@
 """What the host takes from a real-time program while it runs, as the kernel and bare timers see it.
 
 Nothing here asks the program itself: a program that holds itself up must not be able to blame the host. Bare timers
-(`bare_timer.py`) stand on every processor, above the daemon's priority where that is allowed. So each of them misses
-exactly what its processor did not give. `steal` is what the hypervisor gave to others, and a process has *waited* where
-it was ready to run and stood in a queue. The workers that carry a pty's bytes (`wire.py`) are processes, too.
+(`bare_timer.py`) stand on every processor, above the daemon's priority if that is allowed, so each misses exactly what
+its processor did not give. `steal` is what the hypervisor gave to others, and a process has *waited* while it was ready
+to run. The workers that carry a pty's bytes (`wire.py`) are processes, too.
 """
 
 import contextlib
@@ -21,34 +21,32 @@ from typing import IO, NamedTuple
 from machines.wire import workers
 
 PERIOD_NS = 1_000_000
-"Between the beats of a bare timer."
 MAX_TIMERS = 8
-"Processors that are watched at most; a timer costs 2% of one."
+"A timer costs 2% of a processor."
 LOOK_S = 0.2
-"How often the kernel's counters are read."
 STALL_MS = 10.0
-"A bare timer that stood still so long has found a stall: a fifth of the time after which a device opens by itself."
+"A fifth of the time after which a device opens by itself."
 HOST_SHARE = 0.5
-"Of the time that a device waits for a command: a processor that stood still for less is not why something was late."
+"Share of a device's patience: a processor that stood still for less did not make something late."
 MIN_KEPT = 0.99
 "Share of its beats below which a bare timer says that the host does not leave enough."
 MAX_WAITED = 0.1
-"""Share of the time above which a process that waits for a processor has not been left enough."""
+"""Share of the time above which a waiting process was not left enough."""
 MAX_WAIT_MS = 25.0
 """Over what MAX_WAITED allows between two looks."""
 MAX_BLOCKED = 0.02
-"""Share of the time above which waiting for disk or memory is taken for a hold-up."""
+"""Share of the time above which waiting for disk or memory is a hold-up."""
 
 
 class Stall(NamedTuple):
-    """A time without a beat: from when the first missed beat was due until the next one came, CLOCK_MONOTONIC, s."""
+    """A time without a beat, from the first missed beat to the next, CLOCK_MONOTONIC."""
 
     start_s: float
     end_s: float
 
 
 class Counters(NamedTuple):
-    """The kernel's counters at one time: ticks stolen and in all, and how long each watched process has waited, s."""
+    """The kernel's counters at one time: ticks stolen and in all, and each watched process's wait."""
 
     time_s: float
     stolen: int
@@ -67,7 +65,7 @@ class Host(NamedTuple):
     waited: dict[str, float]
     blocked: float = 0.0
     waited_worst_ms: float = 0.0
-    "The most that a process has waited between two looks, less MAX_WAITED of that time."
+    "The longest wait of a process between two looks, less MAX_WAITED of that time."
 
     @property
     def took_much(self) -> bool:
@@ -93,8 +91,6 @@ class Host(NamedTuple):
 
 
 class HostWatch:
-    """Bare timers on the processors, and a thread that reads the kernel's counters. A context manager."""
-
     def __init__(self, fifo_priority: int, log: IO[str]) -> None:
         command = [sys.executable, str(Path(__file__).parents[1] / "bare_timer.py"), "--fifo", str(fifo_priority)]
         self._timers = [
@@ -110,7 +106,7 @@ class HostWatch:
     def __enter__(self) -> "HostWatch":
         for timer in self._timers:
             assert timer.stdout is not None
-            timer.stdout.readline()  # it stands: before, it would see nothing, and the host would be taken for quiet
+            timer.stdout.readline()  # before the timer stands it would see nothing, and the host would pass for quiet
         self._looking.start()
         return self
 
@@ -118,11 +114,10 @@ class HostWatch:
         self.end()
 
     def wait_for(self, name: str, pid: int) -> None:
-        """Also watches how long this process waits for a processor; by its main thread."""
+        """Also watch how long this process's main thread waits for a processor."""
         self._pids = self._pids | {name: pid}
 
     def end(self) -> None:
-        """Ends the timers and collects what they found; more than once does nothing."""
         if self._ended.is_set():
             return
         self._ended.set()
@@ -136,7 +131,6 @@ class HostWatch:
                 self._stalls.append([Stall(*pair) for pair in json.loads(printed)])
 
     def between(self, start_s: float, end_s: float) -> Host:
-        """What was taken between two times of CLOCK_MONOTONIC."""
         # the kernel counts a wait when it is over: what led to the end is seen by a look after it
         looks = [look for look in self._looks if start_s - LOOK_S <= look.time_s <= end_s + LOOK_S]
         if len(looks) < 2:
@@ -162,13 +156,13 @@ class HostWatch:
 
 
 def waited_over_s(before: Counters, after: Counters) -> float:
-    """The most that a process, which both looks saw, has waited between them, less MAX_WAITED of that time."""
+    """Return the longest wait of a process between two looks, less MAX_WAITED of that time."""
     waits_s = [after.waited_s[name] - waited_s for name, waited_s in before.waited_s.items() if name in after.waited_s]
     return max(max(waits_s, default=0.0) - MAX_WAITED * (after.time_s - before.time_s), 0.0)
 
 
 def kept(stalls: list[Stall], start_s: float, end_s: float) -> float:
-    """Share of its beats that a bare timer with these stalls kept between two times: each stall is one beat."""
+    """Return the share of its beats that a bare timer kept: each stall is one beat."""
     period_s = PERIOD_NS * 1e-9
     missed = sum(
         int((min(stall.end_s, end_s) - max(stall.start_s, start_s)) / period_s)
@@ -179,8 +173,7 @@ def kept(stalls: list[Stall], start_s: float, end_s: float) -> float:
 
 
 def processor_s(pid: int) -> float:
-    """Processor time that a process and all that it has begun have had, s; what has ended counts where it was waited
-    for."""
+    """Return the processor time of a process and all its children, s; ended ones count if they were waited for."""
     ticks = 0
     waiting = [pid]
     while waiting:
@@ -194,17 +187,16 @@ def processor_s(pid: int) -> float:
         with contextlib.suppress(OSError):  # so may a thread
             for thread in Path(f"/proc/{member}/task").iterdir():
                 waiting.extend(int(child) for child in (thread / "children").read_text(encoding="ascii").split())
-        # a name may hold spaces and parentheses: what is counted stands behind the last one (proc_pid_stat(5))
+        # a name may hold spaces and parentheses, so the fields are counted from the last one (proc_pid_stat(5))
         ticks += sum(int(field) for field in stat.rpartition(")")[2].split()[11:15])
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def counters(pids: dict[str, int]) -> Counters:
-    """The counters now (proc_stat(5), Documentation/scheduler/sched-stats), without processes that are gone."""
     fields = [int(field) for field in Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
     waited_s = {}
     for name, pid in pids.items():
-        # a kernel without schedstats has no such file: then nobody is known to have waited
+        # a kernel without schedstats has no such file, and then no wait is known
         with contextlib.suppress(OSError, IndexError):
             waited_s[name] = (
                 int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9

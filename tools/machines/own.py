@@ -1,8 +1,7 @@
-"""Runs a module as on a machine of its own: FIFO and locked memory, where the kernel grants them.
+"""Runs a module as on a machine of its own: FIFO and locked memory, if the kernel grants them.
 
 `own.py PRIORITY [--waits] MODULE [ARGUMENT ...]`. What stands for another computer (the device, the robot that
-publishes) would otherwise wait for this one's processors, and for its pages. Where the kernel takes idle ones back, a
-page that returns from a disk comes late. After 50 ms a state is stale.
+publishes) would otherwise wait for this one's processors and pages; a page that returns from a disk comes too late.
 """
 
 import importlib
@@ -15,7 +14,6 @@ from tormagd.daemon.realtime import prepare
 
 
 def own_machine(priority: int, module: str, *arguments: str, waits: bool = False) -> list[str]:
-    """What the interpreter is given to run `module` so."""
     return ["-P", __file__, str(priority), *["--waits"][: int(waits)], module, *arguments]
 
 

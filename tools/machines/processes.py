@@ -23,7 +23,6 @@ def begun(
     is_read: bool = True,
     environment: dict[str, str] | None = None,
 ) -> "subprocess.Popen[str]":
-    """A Python that ends with the stack."""
     with log.open("a") as said:
         stdout = subprocess.PIPE if is_read else said
         child = subprocess.Popen([sys.executable, *arguments], stdout=stdout, stderr=said, text=True, env=environment)
@@ -32,13 +31,13 @@ def begun(
 
 
 def first_line(child: "subprocess.Popen[str]") -> str:
-    """What it prints first, as a simulated device its port; empty where it ended before."""
+    """Return the first printed line, such as a simulated device's port; empty if it ended before."""
     assert child.stdout is not None
     return child.stdout.readline().strip()
 
 
 def is_linked(client: Client, daemon: "subprocess.Popen[str]", patience_s: float) -> bool:
-    """Waits until the daemon has its device; whether it came to that."""
+    """Wait until the daemon has its device; return whether it has."""
     until_s = time.monotonic() + patience_s
     while time.monotonic() < until_s and daemon.poll() is None:
         with contextlib.suppress(ClientError):
@@ -49,13 +48,12 @@ def is_linked(client: Client, daemon: "subprocess.Popen[str]", patience_s: float
 
 
 def received(socket: "zmq.Socket[bytes]") -> list[dict[str, Any]]:
-    """Waits for the next control ticks that a daemon tells, some 20 ms of them; each by its columns."""
     batch = decode_ticks(socket.recv())
     return [dict(zip(batch.columns, row, strict=True)) for row in batch.rows]
 
 
 def end(child: "subprocess.Popen[Any]", number: signal.Signals = signal.SIGTERM) -> int:
-    """Asks a process for its orderly end, and kills it where that does not come; its exit code."""
+    """Ask a process to end, and kill it if it does not; return its exit code."""
     child.send_signal(number)
     try:
         return child.wait(PATIENCE_S)

@@ -1,8 +1,8 @@
-"""The wire of a pty: workers of the kernel carry its bytes, at ordinary priority, as those of a USB adapter too.
+"""The wire of a pty: kernel workers carry its bytes at ordinary priority, as those of a USB adapter do.
 
-With all processors busy they came up to 90 ms late while daemon and device kept every beat (Linux 6.18). The device's
-states are stale then, whatever the daemon does. Where it is the daemon that is measured, and the kernel grants it, the
-workers get a real-time priority. New ones are made at any time, so they are looked for again and again.
+With all processors busy they came up to 90 ms late while daemon and device kept every beat (Linux 6.18), and the
+device's states are stale then. To measure the daemon alone, the workers get a real-time priority, if the kernel grants
+it. New ones are made at any time, so they are looked for again and again.
 """
 
 import contextlib
@@ -12,13 +12,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 WORKERS = "kworker/u"
-"Those that are bound to no processor: a terminal's bytes wait for one of them (drivers/tty/tty_buffer.c)."
+"Unbound workers: a terminal's bytes wait for one of them (drivers/tty/tty_buffer.c)."
 LOOK_S = 0.25
 
 
 @contextlib.contextmanager
 def carried(priority: int) -> Iterator[None]:
-    """The workers at this SCHED_FIFO priority meanwhile, where the kernel grants it; then at ordinary priority."""
+    """Keep the workers at this SCHED_FIFO priority, if granted; afterwards at ordinary priority."""
     ended = threading.Event()
     keeper = threading.Thread(target=keep, args=(priority, ended))
     keeper.start()
@@ -30,14 +30,12 @@ def carried(priority: int) -> Iterator[None]:
 
 
 def keep(priority: int, ended: threading.Event) -> None:
-    """Looks for workers until the event, or until they are refused."""
     while schedule(os.SCHED_FIFO, priority) and not ended.wait(LOOK_S):
         pass
     schedule(os.SCHED_OTHER, 0)
 
 
 def schedule(policy: int, priority: int) -> bool:
-    """Puts every worker under the policy; False where that is not granted."""
     for worker in workers().values():
         with contextlib.suppress(ProcessLookupError):  # they come and go
             try:
@@ -48,7 +46,6 @@ def schedule(policy: int, priority: int) -> bool:
 
 
 def workers() -> dict[str, int]:
-    """The workers of now: a name for each, and its process."""
     found = {}
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # they come and go

@@ -7,26 +7,23 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
 SECOND = "second"
-"The plant of other structure: it judges, and nothing else."
 FIRST_DRAW = 40
-"Of those of the plant card that only judge: on earlier ones constants were chosen."
+"The first draw of the plant card that only judges: constants were chosen on earlier ones."
 TURNING_GAP_MM = 67.0
 "The field is drawn at this gap; the drawn exponent turns the law about it."
 SEED = 2026
 
 
 def device(name: str) -> PlantParameters:
-    """A plant that comes with the package, by its name, or `draw N` of the plant card."""
+    """Return a shipped plant by its name, or `draw N` of the plant card."""
     return drawn_device(int(name.split()[1])) if name.startswith("draw") else load_plant(name)
 
 
 def judging(draws: int) -> list[str]:
-    """The samples, the second plant, and the names of so many draws that only judge."""
     return [*SAMPLES, SECOND, *(f"draw {number}" for number in range(FIRST_DRAW, FIRST_DRAW + draws))]
 
 
 def drawn_device(number: int) -> PlantParameters:
-    """Draw `number` of the plant card."""
     random = np.random.default_rng((SEED, number))
     nominal = load_plant("sample_1")
 

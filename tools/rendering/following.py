@@ -27,15 +27,11 @@ Levels = list[tuple[float, float]]
 Publisher = Callable[[float], TimedSetpoint | None]
 
 RATE_HZ = 500
-"Setpoints a second."
 PREVIEW_S = 0.07
-"How far a preview tells what follows."
 FILE_PREVIEW_S = 0.4
-"How far one does that plays a recording."
 VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2
-"Time between enabling and the first setpoint of a rehearsal."
 
 
 class Tracking(NamedTuple):
@@ -48,7 +44,7 @@ class Tracking(NamedTuple):
 
 
 def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
-    """Compares two signals of one length, sample by sample: nothing is removed from the error, no mean and no delay."""
+    """Compare two signals of one length, sample by sample, without removing a mean or a delay."""
     error = rendered_N - reference_N
     deviation = reference_N - reference_N.mean()
     return Tracking(
@@ -60,8 +56,7 @@ def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
 
 
 class Followed(NamedTuple):
-    """What a run showed, a row for each control tick. `time_s` is since its beginning, s. Forces are those asked and
-    truly rendered, signed as the handle moves, N."""
+    """What a run showed, a row for each control tick. Forces are signed as the handle moves."""
 
     time_s: Array
     asked_N: Array
@@ -81,16 +76,13 @@ class Followed(NamedTuple):
         return self.along_N - self.asked_N
 
     def since(self, start_s: float) -> Tracking:
-        """The figures from a time on."""
         inside = self.time_s >= start_s
         return tracking(self.asked_N[inside], self.rendered_N[inside])
 
     def mean_N(self, begins_s: float) -> float:
-        """The mean error over MEAN_S."""
         return float(self.error_N[(self.time_s >= begins_s) & (self.time_s < begins_s + MEAN_S)].mean())
 
     def worst_N(self, begins_s: float, ends_s: float) -> float:
-        """The greatest of the means over MEAN_S in between."""
         return max(abs(self.mean_N(at_s)) for at_s in np.arange(begins_s, ends_s - MEAN_S, MEAN_S))
 
 
@@ -103,7 +95,7 @@ def armed(
     is_ideal: bool = False,
     boot: FirmwareKind = Firmware,
 ) -> ClosedLoop:
-    """A device that was homed and enabled, and counts as having `shown` so much of itself."""
+    """Return a loop that was homed and enabled, with a device that has `shown` so much of itself."""
     device = VirtualDevice(plant, hand, seed=1, boot=boot)
     stepper = ideal_stepper(core, device.messages.plant) if is_ideal else core.stepper()
     loop = ClosedLoop(core.config, stepper, core.planner(), device)
@@ -113,7 +105,7 @@ def armed(
 
 
 def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Learned = NOTHING_LEARNED) -> ClosedLoop:
-    """The same in the scene `coronary` with a hand that stood meanwhile, and goes along its legs from now on."""
+    """Return the same in the scene `coronary`, with a hand that stood meanwhile and now goes along its legs."""
     hand = WaitingHand()
     loop = armed(build_core(Config(scene="coronary")), plant, hand, shown)
     hand.begin(legs, loop.now_s)
@@ -121,8 +113,7 @@ def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Learned = NOTHING_L
 
 
 def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float, lead_s: float = 0.0) -> Followed:
-    """Plays what is published for so long, or until a fault; rows count from `lead_s` after `start_s`, a time of the
-    loop's."""
+    """Play what is published for so long, or until a fault; rows count from `lead_s` after `start_s`."""
     rows: list[tuple[float, ...]] = []
     held: Counter[str] = Counter()
     faults: tuple[str, ...] = ()
@@ -148,13 +139,11 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float,
 
 
 def taught(loop: ClosedLoop) -> Believe:
-    """What is believed of the loop's device."""
     assert loop.planner is not None, "this loop plans"
     return loop.planner.believe
 
 
 def asked_at(levels: Levels) -> Callable[[float], float]:
-    """The force asked at a time."""
     ends = np.cumsum([lasts_s for lasts_s, _ in levels]).tolist()
 
     def force_N(time_s: float) -> float:
@@ -164,7 +153,7 @@ def asked_at(levels: Levels) -> Callable[[float], float]:
 
 
 def publisher(times_s: Array, forces_N: Array, preview_s: float) -> Publisher:
-    """Each force at its time; with a preview, what follows it up to `preview_s` in even steps."""
+    """Publish each force at its time, with what follows up to `preview_s` in even steps."""
     live = stream(times_s, forces_N)
     period_s = 1.0 / RATE_HZ
     ahead_s = period_s * np.arange(1, round(preview_s / period_s) + 1)
@@ -182,8 +171,7 @@ def publisher(times_s: Array, forces_N: Array, preview_s: float) -> Publisher:
 
 
 class Case(NamedTuple):
-    """What `make run` rehearses beside its real-time figures: a plant, a hand, and the gap speed the controller may use
-    (None: the configured one)."""
+    """A rehearsal of `make run`: a plant, a hand, and the gap speed of the controller (None: the configured one)."""
 
     label: str
     plant: str = "sample_1"
@@ -195,11 +183,10 @@ Rehearsals = dict[Case, Followed]
 
 
 def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array, boot: FirmwareKind = Firmware) -> Followed:
-    """Homes, enables, plays the profile."""
     if case.gap_speed_mm_s is not None:
         slow = msgspec.structs.replace(config.position, gap_speed_mm_s=case.gap_speed_mm_s)
         config = msgspec.structs.replace(config, position=slow)
-    # what is played is not the scene's own signal, which the daemon refuses where the gap is too slow for it
+    # what is played is not the scene's own signal, which the daemon refuses if the gap is too slow for it
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
     loop = armed(build_core(config, scene), device_of(case.plant), parse_hand(case.hand), boot=boot)
     start_s = loop.now_s + LEAD_IN_S

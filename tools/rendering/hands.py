@@ -16,24 +16,19 @@ SWING_S, SWING_STEP_S, SWINGS_FOR_S = 5.3, 0.02, 90.0
 
 
 class WaitingHand:
-    """Stands until it goes along legs, which begin at a time of the device's."""
-
     def __init__(self) -> None:
         self._goes: Hand | None = None
 
     def begin(self, legs: Legs, start_s: float) -> None:
-        """Goes along them from `start_s` on, and stands after the last."""
         times_s = np.cumsum([start_s, *(lasts_s for lasts_s, _ in legs)])
         places_mm = np.cumsum([0.0, *(lasts_s * speed_mm_s for lasts_s, speed_mm_s in legs)])
         self._goes = RecordedHand(tuple(times_s.tolist()), tuple(places_mm.tolist()))
 
     def position_mm(self, time_s: float) -> float:
-        """Of the roller's surface."""
         return 0.0 if self._goes is None else self._goes.position_mm(time_s)
 
 
 def swinging(handle: Handle) -> Hand:
-    """A hand whose speed swings between a scene's."""
     low, high = math.log(handle.least_mm_s), math.log(handle.most_mm_s)
     time_s = np.arange(0.0, SWINGS_FOR_S, SWING_STEP_S)
     speed_mm_s = np.exp((low + high) / 2.0 + (high - low) / 2.0 * np.sin(2.0 * math.pi * time_s / SWING_S))
@@ -41,7 +36,7 @@ def swinging(handle: Handle) -> Hand:
 
 
 def flicks() -> Legs:
-    """42 mm/s, and up to 200 mm/s and down again within half a second each, both ways."""
+    """Return 42 mm/s, with up to 200 mm/s and down again within half a second each, both ways."""
     legs: Legs = []
     for direction in (1.0, -1.0, 1.0, -1.0):
         rise = [(0.02, direction * (42.0 + 158.0 * step / 25.0)) for step in range(26)]
@@ -50,7 +45,7 @@ def flicks() -> Legs:
 
 
 def reversals(seed: int) -> Legs:
-    """Turns and stops every 1..4 s, at speeds from a creep to 300 mm/s."""
+    """Turn and stop every 1..4 s, at speeds from a creep to 300 mm/s."""
     random = np.random.default_rng(seed)
     legs, direction = [], 1.0
     for _ in range(20):
@@ -62,7 +57,7 @@ def reversals(seed: int) -> Legs:
 
 
 def ladder() -> Legs:
-    """From 5 to 300 mm/s and back again, three seconds each."""
+    """Go from 5 to 300 mm/s and back again, three seconds each."""
     speeds = (5.0, 8.0, 15.0, 42.0, 100.0, 200.0, 300.0)
     return [(3.0, speed) for speed in (*speeds, *(-speed for speed in speeds[::-1]))]
 

@@ -1,7 +1,7 @@
 """The first part of `make run`: a hand that feels the brake pushes into two walls, in real time.
 
 The hand is the simulated device's own. Behind a network of 100 ms round trip one patient has a soft wall, the next a
-stiff one. Each tells it as a law once it is met. What carriages of this speed leave is from virtual time.
+stiff one; each sends it as a law once it is met. What carriages of this speed leave is from virtual time.
 """
 
 import contextlib
@@ -35,7 +35,6 @@ STAYS_S, READY_S = 0.15, 0.4
 "A patient stays until the handle has been back for so long, and begins at least so long before a push."
 TICKS_HZ = 1000
 FELT_N = 1.2
-"Well above what waits."
 
 
 class Wall(NamedTuple):
@@ -50,7 +49,6 @@ WALLS = (Wall("soft", 0.1, 4.0), Wall("stiff", 0.5, 15.5))
 
 
 def felt(watched: HostWatch) -> dict[Wall, Touch]:
-    """The show from the first process to the last, and what each push was."""
     with contextlib.ExitStack() as stack:
         rig = enabled(stack, watched, str(SCENE), "--hand", HAND)
         # both are loaded before the first push: there is less than a second between two
@@ -63,7 +61,6 @@ def felt(watched: HostWatch) -> dict[Wall, Touch]:
 
 
 def pushed(rig: Rig, wall: Wall, patient: "subprocess.Popen[str]") -> int:
-    """Lets the patient begin, until the hand has been at its wall; which push that was."""
     first_line(patient)
     now_s = time.monotonic() - rig.power_on_s
     push = next_push(now_s)
@@ -80,24 +77,21 @@ def pushed(rig: Rig, wall: Wall, patient: "subprocess.Popen[str]") -> int:
 
 
 def patient_of(wall: Wall) -> list[str]:
-    """What the interpreter is given for the patient of this wall, who waits at first."""
+    """Return the interpreter's arguments for the patient of this wall, who waits at first."""
     told = f"--mode=law --delay-ms={ROUND_TRIP_MS / 2.0} --wall-mm={wall.place_mm} --friction-N=0"
     options = [str(RUN_DIR), *told.split(), f"--stiffness-N-mm={wall.stiffness_N_mm}"]
     return own_machine(PUBLISHER_FIFO, "tormagd.simulation.patient", *options, waits=True)
 
 
 def begins_s(push: int) -> float:
-    """When the hand sets out for this push, s of the device's time."""
     return PRESSES_AT_S + 2.0 * HALF_S * push
 
 
 def next_push(now_s: float) -> int:
-    """The first that a patient who begins now is in time for."""
     return max(math.ceil((now_s + READY_S - PRESSES_AT_S) / (2.0 * HALF_S)), 0)
 
 
 def touch_of(truth: Any, push: int, wall: Wall) -> Touch:
-    """One push of what the device wrote, from when the hand sets out until it rests again."""
     first = round(TICKS_HZ * begins_s(push))
     rows = truth[first : first + round(TICKS_HZ * 2.0 * HALF_S)]
     depth_mm = rows["handle_mm"] - rows["handle_mm"][0] - wall.place_mm
@@ -106,7 +100,7 @@ def touch_of(truth: Any, push: int, wall: Wall) -> Touch:
 
 
 def figures(wall: Wall, run: Touch) -> Json:
-    """What was there and what was felt where the handle turns, and how long after the wall's it was felt."""
+    """Return what was there and what was felt where the handle turns, and how much later it was felt."""
     turn = int((run.time_s < HALF_S).sum()) - 1
     return {
         "stiffness_N_mm": wall.stiffness_N_mm,
@@ -120,12 +114,11 @@ def figures(wall: Wall, run: Touch) -> Json:
 
 @cache
 def bound_ms(wall: Wall) -> float | None:
-    """How much later carriages of this speed have it felt; the robot's lag is one more delay there."""
+    """Return how much later carriages of this speed have it felt, apart from the robot's lag."""
     late_ms = ROUND_TRIP_MS + ROBOT_LAG_MS
     case = Case("sample_1", HAND_N_MM, wall.stiffness_N_mm, PUSH_MM_S, late_ms, "law_standby", is_known=False)
     return reached_ms(ideal(case), wall.stiffness_N_mm, FELT_N)
 
 
 def lateness(later_ms: float | None) -> str:
-    """Against the wall's own force at the handle's place."""
     return "never" if later_ms is None else f"{abs(later_ms):.0f} ms {'late' if later_ms >= 0.0 else 'early'}"

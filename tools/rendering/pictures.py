@@ -16,7 +16,6 @@ CLOSE_UP_S = 4.0
 
 
 def show_picture(path: Path, scene: Scene, shown: Shown, rehearsals: Rehearsals, figures: list[str]) -> None:
-    """Writes a PNG, stamped with these figures: the run, a close-up, the error, the samples, the hand that stops."""
     time_s, asked_N, rendered_N = shown.time_s, shown.asked_N, shown.rendered_N
     figure, axes = subplots((13.0, 10.5), 3, 2)
     figure.suptitle("A measured human pulse, rendered as friction force by the simulated device", fontsize=14)
@@ -35,7 +34,6 @@ def show_picture(path: Path, scene: Scene, shown: Shown, rehearsals: Rehearsals,
 
 
 def touch_picture(path: Path, touched: dict[Wall, Touch], figures: list[str]) -> None:
-    """Writes a PNG, stamped with these figures: of each wall what was there, was felt, and is on the handle."""
     figure, axes = subplots((13.0, 5.2), 1, len(touched), sharey=True)
     figure.suptitle(
         f"A hand pushes into a wall at {PUSH_MM_S:g} mm/s and draws back, over a round trip of {ROUND_TRIP_MS:g} ms",

@@ -1,9 +1,8 @@
 """One scene in one situation on the simulated device in virtual time: how far the true force is off.
 
-The situations are what a scene meets in use. They are its own signal, steps, a hold, a handle that reverses or creeps,
-and a publisher that seldom sends. In the last a hand pushes into a wall. What is asked begins after an approach; from
-LEARN_S on the error counts. A frozen run learns until then, and no more. Runs are spread over any
-`concurrent.futures.Executor`.
+The situations are those of use: the scene's own signal, steps, a hold, a handle that reverses or creeps, a publisher
+that seldom sends, and a hand that pushes into a wall. What is asked begins after an approach; the error counts from
+LEARN_S on. A frozen run learns only until then. Runs are spread over any `concurrent.futures.Executor`.
 """
 
 import math
@@ -32,22 +31,22 @@ LEARN_S = 4.0
 APPROACH_S = 2.0
 "The first force is held for so long before what is asked begins."
 OPEN_MM = 0.1
-"So near its open end a gap is open: too much force there is the device's, and no error of any model."
+"This near its open end a gap is open: too much force is then the device's, not the model's."
 STEP_S, HOLD_S = 1.0, 30.0
 HELD = 0.8
-"Of the scene's range: what is held."
 REVERSES_S, CREEP_MM_S, LASTS_S = 1.5, 1.0, 90.0
 SELDOM_HZ = 20.0
 CONTACT_MM, PUSH_MM_S, HAND_N_MM = 8.0, 30.0, 0.3
-"How deep a wall is pushed, mm, for the greatest force, how fast, and the hand's stiffness."
+"Depth of a wall, mm, for the greatest force, the push's speed, and the hand's stiffness."
 OF_A_HANDLE = "reversing", "creeping", "contact"
-"What no finger in a pad does."
+"What a finger in a pad cannot do."
 SITUATIONS = "signal", "steps", "hold", "seldom", *OF_A_HANDLE
 
 
 class Case(msgspec.Struct, frozen=True):
-    """One run. `search` takes the place of the scene's own where it is given. Setpoints come `inference_hz` times a
-    second, or as often as scene or situation say where that is less."""
+    """One run. `search` replaces the scene's own. Setpoints come `inference_hz` times a second, or as often as scene or
+    situation say if that is less.
+    """
 
     scene: str
     device: str = "sample_1"
@@ -60,7 +59,7 @@ class Case(msgspec.Struct, frozen=True):
 
 
 def run(case: Case) -> float:
-    """RMS of the true force less the force asked, N; a run that ends in a fault counts as no force at all."""
+    """Return the RMS of the true less the asked force; a fault counts as no force at all."""
     if case.situation == "contact":
         return _touched(case)
     played, rows = Play(case), []
@@ -83,7 +82,6 @@ def run(case: Case) -> float:
 
 
 def _touched(case: Case) -> float:
-    """The error while a hand pushes into a wall that the patient tells."""
     core = core_of(case)
     most_N = core.scene.force.most_N
     wall = touching.Case(case.device, HAND_N_MM, most_N / CONTACT_MM, PUSH_MM_S, 0.0, "law", most_N=most_N)
@@ -96,7 +94,6 @@ def _touched(case: Case) -> float:
 
 
 def core_of(case: Case) -> Core:
-    """The controller of the case's scene at its rates, with its search."""
     rates = Rates(control_hz=case.control_hz, inference_hz=min(case.inference_hz, case.control_hz))
     stated = load_scene(case.scene)
     scene = msgspec.structs.replace(
@@ -108,8 +105,6 @@ def core_of(case: Case) -> Core:
 
 
 class Play:
-    """A case's loop, armed, and what is asked behind an approach."""
-
     def __init__(self, case: Case) -> None:
         self.core = core_of(case)
         scene = self.core.scene
@@ -131,7 +126,6 @@ class Play:
         self.publish = publisher(times, forces, FILE_PREVIEW_S if is_known else 0.0)
 
     def _asked(self, case: Case) -> tuple[Array, Array]:
-        """Times, s, and forces, N, until the case ends."""
         scene, rate_hz = self.core.scene, case.inference_hz
         low_N, high_N = max(scene.force.least_N, self.core.portrait.min_N), scene.force.most_N
         lasts_s = LEARN_S + (HOLD_S if case.situation == "hold" else case.seconds)
@@ -144,14 +138,12 @@ class Play:
 
 
 def plant_of(name: str, scene: Scene) -> PlantParameters:
-    """The device with the scene's insert; a pad is on the sample's carriages."""
     if scene.element == "tactile":
         return load_plant(name.replace("sample", "pad"))
     return with_insert(device(name), scene.insert.name)
 
 
 def hand_of(situation: str, scene: Scene) -> Hand:
-    """What moves the handle, or presses the pad."""
     if scene.finger is not msgspec.UNSET:
         return PressingHand(scene.finger.depth_mm)
     if situation == "reversing":
@@ -162,7 +154,6 @@ def hand_of(situation: str, scene: Scene) -> Hand:
 
 
 def sends_hz(case: Case, scene: Scene) -> float:
-    """How often the publisher sends."""
     if case.situation == "seldom":
         return SELDOM_HZ
     stated = msgspec.UNSET if scene.signal is None else scene.signal.setpoint_hz
@@ -172,7 +163,7 @@ def sends_hz(case: Case, scene: Scene) -> float:
 def signal_of(
     scene: Scene, name: str, range_N: tuple[float, float], longest_s: float, rate_hz: int
 ) -> tuple[Array, Array]:
-    """The scene's signal, up and down again until the time is over; a recording is played once."""
+    """Return the scene's signal, up and down again until the time is over; a recording is played once."""
     assert scene.signal is not None, "its forces are asked for"
     time_s, force_N = asked(scene.signal, Path(scene_path(name)).parent, range_N, longest_s, rate_hz)
     if not scene.signal.file and time_s[-1] < longest_s:
@@ -182,7 +173,6 @@ def signal_of(
 
 
 def run_all(cases: Collection[Case], executor: Executor, known: dict[Case, float]) -> dict[Case, float]:
-    """The outcome of every case, in their order."""
     for case, future in finished(executor, run, [case for case in dict.fromkeys(cases) if case not in known], "run"):
         known[case] = future.result()
     return {case: known[case] for case in cases}

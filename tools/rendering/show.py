@@ -1,7 +1,7 @@
-"""The real-time part of `make run`: the processes, the live view, and what became of it.
+"""The real-time part of `make run`: the processes, the live view, and the result.
 
-What stands for other machines (the device, the robot that publishes) gets FIFO below the daemon's where that is
-allowed. Outside the demonstration they do not share the daemon's processors.
+What stands for other machines (the device, the robot that publishes) gets FIFO below the daemon's if that is allowed.
+Outside the demonstration they do not share the daemon's processors.
 """
 
 import contextlib
@@ -61,14 +61,12 @@ RAMP_S, HOLD_S = 1.0, 3.0
 PULSE_START_S = RAMP_S + HOLD_S
 START_N = 0.6
 LOOK_S = 0.2
-"The longest wait for telemetry."
 PATIENCE_S = 60.0
-"For a start on a busy machine; only a failure waits for it."
+"For a start on a busy machine; only a failure waits so long."
 ANSWER_S = 5.0
 BEFORE_FAULT_S = 1.0
-"A stall that is to explain a fault was over for less than this when the fault was seen."
+"A stall explains a fault only if it ended less than this before the fault was seen."
 FASTEST = 0.1
-"Share of the ticks that is called the fastest."
 OF_TIME = frozenset(
     {
         Fault.HOST_STALL,
@@ -83,17 +81,14 @@ OF_TIME = frozenset(
         Fault.DEVICE_NOT_RUNNING,
     }
 )
-"""Faults by which daemon or device protect themselves from one that stands still; without a stall they mean something
-else."""
+"""Faults by which daemon or device protect themselves from one that stands still."""
 
 
 OUT_OF_TIME = frozenset({"not_fresh", "timeout", "not_begun", "not_homed"})
-"""Why a device could not be homed and enabled where somebody came too late."""
+"""Why a device could not be homed and enabled when something came too late."""
 
 
 class ShowError(Exception):
-    """A show that did not get to its end: one sentence with cause and remedy."""
-
     def __init__(self, cause: str, remedy: str, is_of_time: bool = False) -> None:
         super().__init__(f"{cause}; {remedy}")
         self.cause = cause
@@ -102,8 +97,6 @@ class ShowError(Exception):
 
 
 class Shown(NamedTuple):
-    """What was asked and rendered, and how daemon and host kept time meanwhile."""
-
     time_s: Array
     asked_N: Array
     rendered_N: Array
@@ -116,7 +109,6 @@ class Shown(NamedTuple):
     worst_stall_ms: float
     host: Host
     core_share: float
-    "Processor time of the daemon and what it has begun, over the time shown."
     plant: str = "sample 1"
 
 
@@ -129,23 +121,20 @@ class Aborted(NamedTuple):
 
 
 def profile(duration_s: float = PULSE_S) -> tuple[Array, Array]:
-    """Times, s, and forces, N, of the pulse behind its approach."""
     return with_approach(*pulse_profile(duration_s, MIN_N, MAX_N, RATE_HZ), START_N, RAMP_S, HOLD_S)
 
 
 def scored(time_s: Array, asked_N: Array, rendered_N: Array) -> Tracking:
-    """Tracking over the pulse, without the approach."""
     pulse = time_s >= PULSE_START_S
     return tracking(asked_N[pulse], rendered_N[pulse])
 
 
 def show(times_s: Array, forces_N: Array, scene: str = "pulse", plant: str = "sample_1") -> Shown | Aborted:
-    """Starts the processes, plays the profile with a live view, ends them in order."""
     return staged(lambda watched: play(watched, times_s, forces_N, scene, plant))
 
 
 def staged(played: Callable[[HostWatch], Found]) -> Found | Aborted:
-    """A show in an empty folder, and the host watched meanwhile; `played` may raise ShowError."""
+    """Run a show in an empty folder, with the host watched; `played` may raise ShowError."""
     shutil.rmtree(RUN_DIR, ignore_errors=True)
     RUN_DIR.mkdir(parents=True)
     with (
@@ -164,7 +153,7 @@ def staged(played: Callable[[HostWatch], Found]) -> Found | Aborted:
 
 
 class Rig(NamedTuple):
-    """An enabled device, its daemon and who records it; `power_on_s` is the device's, CLOCK_MONOTONIC."""
+    """An enabled device, its daemon and its recorder; `power_on_s` is the device's, CLOCK_MONOTONIC."""
 
     simulator: "subprocess.Popen[str]"
     daemon: "subprocess.Popen[str]"
@@ -173,7 +162,6 @@ class Rig(NamedTuple):
     power_on_s: float
 
     def end(self) -> dict[str, int]:
-        """Ends them in order; their exit codes."""
         return {
             "recorder": end(self.recorder, signal.SIGINT),
             "tormagd": end(self.daemon),
@@ -182,12 +170,10 @@ class Rig(NamedTuple):
 
 
 def start(stack: contextlib.ExitStack, name: str, *arguments: str, is_read: bool = False) -> "subprocess.Popen[str]":
-    """A process that ends with the stack; what it says is in a log of this name."""
     return begun(stack, RUN_DIR / f"{name}.log", *arguments, is_read=is_read)
 
 
 def enabled(stack: contextlib.ExitStack, watched: HostWatch, scene: str, *device: str) -> Rig:
-    """Starts device, daemon and recorder, homes and enables."""
     options = ("--pty", "--seed", "1", "--truth", str(RUN_DIR / "truth.csv"), *device)
     simulator = start(stack, "simulator", *own_machine(DEVICE_FIFO, "tormagd.simulation", *options), is_read=True)
     port, power_on_s = first_line(simulator), time.monotonic()
@@ -211,8 +197,6 @@ def enabled(stack: contextlib.ExitStack, watched: HostWatch, scene: str, *device
 
 
 def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant: str) -> Shown:
-    """One show from the first process to the last, and its figures, from the device's own truth and the daemon's
-    recording."""
     rows, formats = np.column_stack([times_s, forces_N]), ("%.4f", "%.5f")
     np.savetxt(RUN_DIR / "pulse.csv", rows, formats, delimiter=",", header="t_s,force_N", comments="")
     with contextlib.ExitStack() as stack:
@@ -260,7 +244,6 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
 
 
 def told_truth() -> Any:
-    """What the device wrote of itself: a row for each millisecond of its time."""
     try:
         return np.genfromtxt(RUN_DIR / "truth.csv", delimiter=",", names=True)
     except (OSError, ValueError) as error:
@@ -268,33 +251,26 @@ def told_truth() -> Any:
 
 
 def unreadable(error: Exception) -> ShowError:
-    """Where nothing can be said of a show."""
     return ShowError(f"what was recorded cannot be read: {error}", f"look at the logs in {RUN_DIR}")
 
 
 class Tick(TypedDict, total=False):
-    """What is asked of a recorded tick."""
-
     monotonic_s: float
     faults: tuple[str, ...]
 
 
 def ticks() -> list[Tick]:
-    """Those of the recording."""
     seen: list[Seen] = []
     read_recording(RECORDING, Tick, seen.append)
     return [each.message for each in seen if each.is_tick and "monotonic_s" in each.message]
 
 
 def between(known: list[Tick], start_s: float, end_s: float) -> Array:
-    """When those ticks were that lie between two times of CLOCK_MONOTONIC."""
     moments_s = np.array([tick["monotonic_s"] for tick in known])
     return moments_s[(moments_s >= start_s) & (moments_s <= end_s)]
 
 
 def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
-    """When the first fault of a show that ended early was latched, by its recording; whoever saw it at `seen_s` may
-    have been late."""
     try:
         known = ticks()
     except RecordingError:
@@ -305,7 +281,6 @@ def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
 
 
 def ended(name: str) -> ShowError:
-    """A process that is gone, by the last line of its log."""
     log = RUN_DIR / f"{name}.log"
     lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
     said = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
@@ -313,7 +288,6 @@ def ended(name: str) -> ShowError:
 
 
 def arm(client: Client) -> None:
-    """Homes and enables."""
     try:
         client.arm(PATIENCE_S, lambda step: print(f"arm: {step}"))
     except ClientError as error:
@@ -323,7 +297,6 @@ def arm(client: Client) -> None:
 
 
 def status(client: Client) -> dict[str, Any]:
-    """The daemon's status."""
     try:
         return client.request("status")
     except ClientError as error:
@@ -331,7 +304,6 @@ def status(client: Client) -> dict[str, Any]:
 
 
 def raise_fault(state: dict[str, Any]) -> None:
-    """Raises ShowError with the first fault that the daemon has latched, if it has."""
     if not state["faults"]:
         return
     fault = Fault(state["faults"][0])
@@ -343,7 +315,7 @@ def raise_fault(state: dict[str, Any]) -> None:
 def watch(
     is_done: Callable[[], bool], daemon: "subprocess.Popen[str]", client: Client, duration_s: float
 ) -> dict[str, float]:
-    """The live view until the publisher is done; the share of telemetry messages in which each limit was held."""
+    """Show the live view until the publisher is done; return the share of telemetry messages with each limit."""
     is_terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     held: Counter[str] = Counter()
     seen = 0
@@ -385,7 +357,7 @@ COLUMNS = 79
 
 
 def live_line(telemetry: Telemetry, elapsed_s: float, duration_s: float) -> str:
-    """One line: a bar of the measured force with a mark where it was asked, gap, limits; as many as fit."""
+    """Return one line: a bar of the measured force with a mark where it was asked, gap, and the limits that fit."""
     width, most = 18, 2.0
     measured, asked = telemetry.measured_cf or 0.0, telemetry.setpoint_cf or 0.0
     shown = "-" if telemetry.setpoint_cf is None else f"{asked:.2f}"

@@ -13,7 +13,6 @@ from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile, recorded, scaled
 
 PULSE_N = (1.4, 1.7)
-"The range of the demonstration's pulse."
 RATE_HZ = 500
 PULSE_S = 16.0
 "A recorded pulse is repeated up to this; the loops of `aac_nibp_pulse` end where they begin."
@@ -21,14 +20,13 @@ LOW_PASS_HZ = 20.0
 HAPTIC_S = 40.0
 "Of the 98 s recorded."
 SCALED_N = (0.62, 2.0)
-"From the shipped model's least force to the scenes' greatest."
 RISE_S = 0.1
 LASTS_S = (0.1, 0.6)
-"Of a touch of the palpation, and of the time between two."
+"Of a touch of the palpation, and between two."
 TOUCHES_N = (0.9, 2.0)
 TOUCHED_S = 16.0
 TRIM_S = 10.0
-"The time the trim is given before the figures of other devices than sample 1 begin."
+"The trim learns for this time before the figures of other devices than sample 1 begin."
 
 
 class Signal(NamedTuple):
@@ -41,7 +39,6 @@ class Signal(NamedTuple):
 
 
 def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
-    """The profile behind a ramp from `start_N` to its first force and a hold there, so that nothing jumps."""
     period_s = float(times_s[1] - times_s[0])
     ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
     hold = np.full(round(hold_s / period_s), forces_N[0])
@@ -50,12 +47,10 @@ def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float
 
 
 def pulse_signal(duration_s: float) -> Signal:
-    """The demonstration's pulse."""
     return Signal("pulse", *pulse_profile(duration_s, *PULSE_N, RATE_HZ))
 
 
 def recorded_signals() -> list[Signal]:
-    """Every signal of the folder that TORMAG_DATA names; none without."""
     return [
         *(_pulse(path, "finger pressure") for path in recorded("aac_nibp_pulse")),
         *(_pulse(path, "arterial pressure") for path in recorded("wfdb_mimicdb") if path.stem.endswith("_ABP")),
@@ -64,7 +59,7 @@ def recorded_signals() -> list[Signal]:
 
 
 def palpation(seed: int) -> Signal:
-    """A hand that feels its way: touches of random force, each within RISE_S, at random times (synthetic)."""
+    """Return a palpating hand: touches of random force, each within RISE_S, at random times (synthetic)."""
     random = np.random.default_rng(seed)
     time_s = np.arange(round(TOUCHED_S * RATE_HZ)) / RATE_HZ
     force_N = np.full(len(time_s), SCALED_N[0])
@@ -84,7 +79,7 @@ def _rising(since_s: Array) -> Array:
 def _pulse(path: Path, what: str) -> Signal:
     raw = np.loadtxt(path, delimiter=",", skiprows=1)
     period_s = float(np.median(np.diff(raw[:, 0])))
-    # there and back where the ends do not meet: a jump is none of the pulse's own
+    # there and back if the ends do not meet: a jump is none of the pulse's own
     values = raw[:, 1]
     if abs(values[-1] - values[0]) > 0.02 * np.ptp(values):
         values = np.concatenate([values, values[-2:0:-1]])
@@ -96,7 +91,7 @@ def _pulse(path: Path, what: str) -> Signal:
 
 
 def _haptic(path: Path) -> Signal:
-    """The commands of the first HAPTIC_S, as a force that somebody sends who plays the file: straight lines between."""
+    """Return the commands of the first HAPTIC_S, joined by straight lines, as a player of the file sends them."""
     raw = np.loadtxt(path, delimiter=",", skiprows=1)
     sent_s, first = np.unique(raw[:, 0], return_index=True)
     sent_s, sent_N = sent_s[sent_s <= HAPTIC_S], np.linalg.norm(raw[first, 1:4], axis=1)[sent_s <= HAPTIC_S]

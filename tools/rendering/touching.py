@@ -1,10 +1,9 @@
 """A hand that pushes into a wall and draws back, in virtual time, and what ideal carriages would make of it.
 
-The patient's tip is where the handle was half a round trip ago; what it feels comes back as late. The bound moves the
-gap by the device's own motors, which stop at once, along the device's true force over gap. It knows what the run's
-controller knows: the newest message, and the handle's place and speed. A hand that moves feels what was asked, with the
-friction of its speed. *Infinite* is the same without motors. *Opened* is the run until the hand pulls; from there its
-motors only open.
+The patient's tip is where the handle was half a round trip ago, and what it feels comes back as late. The bound moves
+the gap by the device's own motors, which stop at once, along the device's true force over gap; it knows what the run's
+controller knows. *Infinite* is the same without motors. *Opened* is the run until the hand pulls; from there its motors
+only open.
 """
 
 import math
@@ -37,16 +36,14 @@ SETPOINT_TICKS = 2
 BURST = 25.0
 "Setpoints that are lost in a row, in the mean: 50 ms."
 MAX_N = 2.0
-"What hand and wall come to rest at."
 FREE_MM = 20.0
-"From where the hand begins to push to the wall."
 LEARNING: Legs = [(2.0, 15.0), (0.8, 0.0)]
 LEARNT_S = sum(lasts_s for lasts_s, _ in LEARNING)
 LEARNS, LEARNS_FOR_S = 0.6, 1.6
-"Of the greatest force: what is asked while the hand slides, so that the device is known."
+"Share of the greatest force that is asked while the hand slides, so that the device is known."
 RESTS_S = 0.8
 ONSET_N, COUNTED_N = 0.2, 0.3
-"Over the waiting level: where a wall is felt, and what it has to reach to count."
+"Over the waiting level: where a wall is felt, and what it must reach to count."
 HELD_N = EARLY_N = 0.1
 PULLS_N = 0.05
 RESTING_MM_S = 1.0
@@ -56,7 +53,8 @@ MASS_KG = 0.15
 
 class Case(NamedTuple):
     """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without; jitter
-    and loss are the network's. `is_known`: a law tells the wall before it was met."""
+    and loss are the network's. If `is_known`, a law tells the wall before it was met.
+    """
 
     device: str
     hand_N_mm: float
@@ -71,8 +69,7 @@ class Case(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """A row for each tick from when the hand begins to push. It has time, s, the handle's place behind the wall's, mm,
-    and speed, mm/s."""
+    """A row for each tick of a push: time, s, the handle's place behind the wall's, mm, and speed, mm/s."""
 
     time_s: Array
     depth_mm: Array
@@ -85,8 +82,7 @@ class Touch(NamedTuple):
 
 
 def reached_ms(touch: Touch, wall_N_mm: float, force_N: float) -> float | None:
-    """From when the wall's force at the handle's place reaches it to when the kinetic force does; None where either
-    never does."""
+    """Return the time from when the wall's force at the handle's place reaches it until the kinetic force does."""
     there, felt = wall_N_mm * touch.depth_mm >= force_N, touch.kinetic_N >= force_N
     if not (there.any() and felt.any()):
         return None
@@ -94,8 +90,6 @@ def reached_ms(touch: Touch, wall_N_mm: float, force_N: float) -> float | None:
 
 
 class Link:
-    """A patient behind the network, and the newest setpoint that has come from there."""
-
     def __init__(self, case: Case, wall: Wall, withdraw_N: float) -> None:
         one_way_s, jitter_s = 5e-4 * case.round_trip_ms, 1e-3 * case.jitter_ms
         self._there: NetworkDelay[float] = NetworkDelay(one_way_s, jitter_s, case.loss, BURST, seed=1)
@@ -107,7 +101,6 @@ class Link:
         self._ticks = 0
 
     def update(self, now_s: float, handle_mm: float) -> TimedSetpoint | None:
-        """The tip is where the handle was; what came in between is of no use."""
         self._ticks += 1
         if self._ticks % SETPOINT_TICKS == 0:
             self._there.send(now_s, handle_mm)
@@ -129,7 +122,6 @@ class Link:
 
 @cache
 def core_with(standby_N: float | UnsetType = UNSET) -> Core:
-    """The controller of the scene `aorta_2`, at 1000 and 500 Hz, that waits at this force; nothing in it changes."""
     scene = load_scene("aorta_2")
     force = msgspec.structs.replace(scene.force, standby_N=standby_N)
     config = Config(scene="aorta_2", rates=Rates(control_hz=1000, inference_hz=500))
@@ -137,14 +129,11 @@ def core_with(standby_N: float | UnsetType = UNSET) -> Core:
 
 
 def core_of(case: Case) -> Core:
-    """The one that this case is played by."""
     core = core_with()
     return core_with(core.portrait.min_N + 0.3) if case.mode.endswith("standby") else core
 
 
 class Scenario:
-    """The hand and the patient of a case, and what shows of the touch."""
-
     def __init__(self, case: Case, core: Core) -> None:
         self._case, self.core = case, core
         self._hand = WaitingHand()
@@ -157,7 +146,6 @@ class Scenario:
         self._limits: set[str] = set()
 
     def begin(self, now_s: float) -> range:
-        """The hand sets out now; the ticks that it takes."""
         case = self._case
         push_s = (FREE_MM + case.most_N / case.wall_N_mm + case.most_N / case.hand_N_mm) / case.push_mm_s
         there: Legs = [(push_s, case.push_mm_s), (RESTS_S, 0.0)]
@@ -167,7 +155,6 @@ class Scenario:
         return range(round(sum(lasts_s for lasts_s, _ in legs) / PERIOD_S))
 
     def setpoint(self, now_s: float, truth: Truth) -> TimedSetpoint | None:
-        """The newest that the console has."""
         since_s = now_s - self._start_s
         sent = self._patient.update(now_s, truth.handle_mm)
         if since_s >= LEARNT_S:
@@ -175,11 +162,9 @@ class Scenario:
         return TimedSetpoint(LEARNS * self._case.most_N if since_s < LEARNS_FOR_S else 0.0, now_s, VALID_S)
 
     def pulls(self, truth: Truth) -> bool:
-        """Whether the hand draws back, and pulls."""
         return truth.time_s > self._turns_s and truth.force_N < -PULLS_N
 
     def see(self, truth: Truth, limits: tuple[Limit, ...] = ()) -> None:
-        """One tick."""
         time_s = truth.time_s - self._start_s - LEARNT_S
         if time_s >= 0.0:
             depth_mm = truth.handle_mm - self.wall.place_mm
@@ -188,14 +173,12 @@ class Scenario:
             self._limits.update(map(str, limits))
 
     def touch(self, faults: tuple[str, ...] = ()) -> Touch:
-        """All that showed."""
         time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N = np.array(self._rows).reshape(-1, 6).T
         limits = tuple(sorted(self._limits))
         return Touch(time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N, faults, limits)
 
 
 def rendered(case: Case, core: Core) -> Touch:
-    """Play one case by this controller."""
     scenario = Scenario(case, core)
     loop = armed(core, with_insert(device_of(case.device), core.scene.insert.name), scenario.felt)
     truth = loop.simulated.truth
@@ -210,7 +193,6 @@ def rendered(case: Case, core: Core) -> Touch:
 
 
 def opened(case: Case, core: Core) -> Touch:
-    """Play one case by this controller until the hand pulls."""
     scenario, parameters = Scenario(case, core), with_insert(device_of(case.device), core.scene.insert.name)
     loop = armed(core, parameters, scenario.felt)
     plant, has_pulled = loop.simulated.plant, False
@@ -228,7 +210,7 @@ def opened(case: Case, core: Core) -> Touch:
 
 
 def ideal(case: Case, *, has_motors: bool = True) -> Touch:
-    """The same by the bound; without motors the gap is at once where it should be."""
+    """Play the case by the bound; without motors the gap is at once where it should be."""
     parameters = device_of(case.device)
     scenario = Scenario(case, core_of(case))
     plant = Plant(parameters, scenario.felt)
@@ -244,7 +226,7 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
 
 
 class Bound:
-    """A gap that the device's own motors move, to where its true force is the one wanted."""
+    """A gap that the device's own motors move to where its true force is the wanted one."""
 
     def __init__(self, core: Core, brake: Brake, drive: Drive | None) -> None:
         self._core, self._drive, self._brake = core, drive, brake
@@ -255,7 +237,6 @@ class Bound:
         self._offset_N, self._scale = 0.0, 1.0
 
     def update(self, plant: Plant, setpoint: TimedSetpoint | None) -> None:
-        """Moves the gap for the next tick."""
         truth = plant.truth
         if abs(truth.force_N) > PULLS_N:
             self._is_pushing = truth.force_N > 0.0

@@ -1,6 +1,6 @@
 """Which tests name a code or a check: a scan of the test tree, which runs nothing.
 
-A test names what stands in its function, in its decorators, and in whatever else of its module these use.
+A test names what is in its function, in its decorators, and in whatever else of its module these use.
 """
 
 import ast
@@ -13,15 +13,13 @@ BEHAVIOUR = (
     *(f"{room}/**/test_*.py" for room in ("closed_loop", "control", "daemon", "end_to_end", "firmware_protocol")),
     *("hardware/test_*.py", "simulation/test_*.py", "tools/test_endurance.py", "tools/test_faults.py"),
 )
-"Where tests drive something: elsewhere a code is an example."
+"Folders whose tests drive something: elsewhere a code is an example."
 ENUMERATIONS = {"Fault": "fault.", "Limit": "limit.", "DeviceFault": "fault.DEVICE_"}
-"What the members of these are called here."
 Named = Mapping[str, Counter[str]]
-"How many tests of each file name a member, a text, a capital word in one; and a test itself, as FILE::FUNCTION."
+"How many tests of each file name a member, a text or a capital word; and a test itself, as FILE::FUNCTION."
 
 
 def named_tests(folder: Path) -> Named:
-    """Return what the tests of `folder` name."""
     named: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for path in sorted({path for place in BEHAVIOUR for path in folder.glob(place)}):
         file, said = path.relative_to(folder).as_posix(), _said_by_part(ast.parse(path.read_text(encoding="utf-8")))
@@ -37,7 +35,7 @@ def named_tests(folder: Path) -> Named:
 
 
 def _said_by_part(module: ast.Module) -> dict[str, set[str]]:
-    """Return what is said in each part of a module, by the names that the part defines."""
+    """Return what each part of a module names, by the names that the part defines."""
     said: defaultdict[str, set[str]] = defaultdict(set)
     for part in module.body:
         stored = (each.id for each in ast.walk(part) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store))
@@ -47,7 +45,7 @@ def _said_by_part(module: ast.Module) -> dict[str, set[str]]:
 
 
 def _said(part: ast.stmt) -> set[str]:
-    """Return the names, fixtures, members of ENUMERATIONS and texts of a part, and the capital words of its texts."""
+    """Return the names, fixtures, members of ENUMERATIONS and texts of a part, and the texts' capital words."""
     docstrings = {each.value for each in ast.walk(part) if isinstance(each, ast.Expr)}
     said: set[str] = set()
     for each in ast.walk(part):

@@ -39,19 +39,17 @@ evidence is missing. Severity and probability are a person's, of <code>docs/risk
 
 
 def page(rows: Sequence[Row]) -> str:
-    """Return the page, which is a file of its own: it has no other style or script."""
+    """Return the page, which needs no other file."""
     harmless = ", ".join(HARMLESS.split())
     says = f"<p>{len(rows)} rows, {len(red_rows(rows))} of them red. Limits without a hazard: {harmless}.</p>\n"
     return _HEAD + says + "".join(_of_hazard(hazard, rows) for hazard in (*Hazard, None)) + "</body>\n</html>\n"
 
 
 def red_rows(rows: Iterable[Row]) -> dict[str, tuple[str, ...]]:
-    """Return what each red row lacks, by its name."""
     return {row.name: row.missing for row in rows if row.missing}
 
 
 def _of_hazard(hazard: Hazard | None, rows: Sequence[Row]) -> str:
-    """Return heading and table of a hazard; None: of no hazard, empty where there are none."""
     lines = "".join(_line(row) for row in rows if row.hazard is hazard)
     if not lines:
         return ""
@@ -62,7 +60,6 @@ def _of_hazard(hazard: Hazard | None, rows: Sequence[Row]) -> str:
 
 
 def _line(row: Row) -> str:
-    """Return a row of a table; what is missing is said in its own cell."""
     cells = [(name, getattr(row, name)) for name in COLUMNS]
     cells += [("", row.judged.severity), ("", row.judged.probability)]
     told = "".join(

@@ -23,7 +23,7 @@ Text = Annotated[str, msgspec.Meta(max_length=60)]
 
 
 class Judged(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a person says of a row, by a scale of their own; empty: nothing yet."""
+    """A person's judgement of a row, by a scale of their own; empty: nothing yet."""
 
     severity: Text = ""
     probability: Text = ""
@@ -33,7 +33,6 @@ class Row(NamedTuple):
     """One row. What is empty of hazard, control, code, tests and evidence is missing."""
 
     name: str
-    "As the person's file calls it."
     hazard: Hazard | None
     cause: str
     control: str
@@ -48,7 +47,6 @@ class Row(NamedTuple):
 
 
 def rows(named: Named, cells: Sequence[Mapping[str, Any]], judged: Mapping[str, Judged]) -> list[Row]:
-    """Return all rows, of what the tests name, the cells of a run of the matrix, and a person's judgement."""
     told = _told(cells)
     made = [*_of_codes("fault", FAULTS_OF, FAULTS, named, told), *_of_codes("limit", LIMITS_OF, LIMITS, named, told)]
     made += [*_of_causes(named, told), *_of_kit(named)]
@@ -58,14 +56,12 @@ def rows(named: Named, cells: Sequence[Mapping[str, Any]], judged: Mapping[str, 
 
 
 def judgement(path: Path) -> dict[str, Judged]:
-    """Return what a person judges, by the name of the row."""
     tables = convert(path, dict[str, dict[str, Judged]])
     return {f"{kind}.{name}": judged for kind, table in tables.items() for name, judged in table.items()}
 
 
 def _told(cells: Sequence[Mapping[str, Any]]) -> Counter[str]:
-    """Return how many cells that held show each row of the matrix that there still is, and each code that they were to
-    show."""
+    """Return how many held cells show each present row of the matrix, and each code that they were to show."""
     told: Counter[str] = Counter()
     known = {injection.name for injection in MATRIX}
     for cell in cells:
@@ -81,12 +77,11 @@ def _told(cells: Sequence[Mapping[str, Any]]) -> Counter[str]:
 def _of_codes(
     kind: str, hazards: Mapping[Hazard, str], table: Mapping[Any, Explanation], named: Named, told: Counter[str]
 ) -> Iterator[Row]:
-    """Yield the rows of faults or limits: of those that the hazards name, and of those that no hazard does."""
     of_code = {name: hazard for hazard, names in hazards.items() for name in names.split()}
     for code in dict.fromkeys((*of_code, *(str(code) for code in table if code not in HARMLESS.split()))):
         name, row = f"{kind}.{code}", table.get(code)
         files = named.get(name, Counter[str]()).copy()
-        if code not in FAULTS or code not in LIMITS:  # else a word may mean either
+        if code not in FAULTS or code not in LIMITS:  # otherwise a word may mean either
             files[WORDED] += named.get(code, Counter())[WORDED]
         tests, evidence, hazard = _listed(files), _in_cells(told[name]), of_code.get(code)
         if row is None:
@@ -98,14 +93,13 @@ def _of_codes(
 
 
 def _of_causes(named: Named, told: Counter[str]) -> Iterator[Row]:
-    """Yield the rows of causes that no code names: a code is not missing there."""
     for each in CAUSES:
         tests = _listed(named.get(each.test or "no test", {}))
         yield Row(f"cause.{each.name}", each.hazard, each.cause, each.control, "-", tests, _in_cells(told[each.cell]))
 
 
 def _of_kit(named: Named) -> Iterator[Row]:
-    """Yield the rows of the kit's checks; their tests plant the error that they are to find, which is the evidence."""
+    """Yield the rows of the kit's checks; their tests plant the error that they must find, which is the evidence."""
     for check in CHECKS:
         tests = KIT if KIT in named.get(check.name, ()) else ""
         evidence = "planted error found" if tests else ""

@@ -7,7 +7,7 @@ from tormagd_client.messages import BeliefReport
 
 
 def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> dict[str, BeliefReport]:
-    """Return what is believed of the device at `now_s`, by name: value, standard deviation, unit, and whether it acts."""
+    """Return each thing believed of the device at `now_s`, by name, and whether it acts."""
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
     is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust

@@ -42,31 +42,30 @@ MIN_GAIN_MARGIN_DB = 4.0
 SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
 SOURCES += ("tormagd/hardware", "tormagd/control", "tormagd/assembly")
 SENSED_N = 0.001
-"A step of the force sensor's message."
 SETTLES_MM = 4.0 * 8.0 / 4480.0
-"To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
+"Friction holds the gap to within four counts of the encoders."
 STANDBY_N = 0.3
-"So much over the force of the open gap a hand may feel of a brake that waits."
+"A hand may feel this much over the open gap's force of a brake that waits."
 DEPTHS = 9
-"Between the scene's depth and the model's greatest, at which a pad's force is looked at whether it rises."
+"A pad's force is checked at this many depths for whether it rises."
 LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
-"So much of a scene's signal is held against the device's speed, as often as this, and so often in a period."
+"How much of a scene's signal is looked at, how often a second, and how often in a period."
 SEVERAL_BRANCHES = named("nearest", neighbours=16, reason="the force falls with the field somewhere")
-"With fewer neighbours answers jump between branches, more gain little: docs/tactile.md."
+"With fewer neighbours answers jump between branches; more gain little (docs/tactile.md)."
 IN_PORTRAIT = Choice("portrait", 0.0, 0, "the scene requires no rate: force over gap is one table")
 BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most exact")
-"At every tolerance and for every size of network: docs/inverse_trade.md, and docs/scenes.md on the device."
+"It is so at every tolerance and network size: docs/inverse_trade.md."
 
 
 ROUNDED_UP = 1.005
-"Three digits of a number times this are not below the number."
+"A number times this, to three digits, is not below the number."
 
 
 class Core(NamedTuple):
     """All that control of one scene needs, immutable. `planner` and `stepper` make the parts that keep state."""
 
     config: Config
-    "With the scene's own gap speed."
+    "It has the scene's own gap speed."
     scene: Scene
     element: Element
     margins: Margins
@@ -74,9 +73,9 @@ class Core(NamedTuple):
     model: str
     "The model's fingerprint."
     models: Path
-    "Where the scene's model was looked for, where it is no shipped one."
+    "Where the model was looked for."
     missed: Missed | None = None
-    "What the gap's speed alone leaves of the scene's signal; None where it states none."
+    "What the gap's speed alone leaves of the scene's signal."
 
     @property
     def gap_speed_mm_s(self) -> float:
@@ -87,16 +86,16 @@ class Core(NamedTuple):
         return self.element.portrait
 
     def planner(self, now_s: float = 0.0) -> Planner:
-        """Return a new planner that begins at `now_s`, with the gap open and nothing known of the device."""
         return Planner(self.config, self.scene, self.element, now_s)
 
     def stepper(self, now_s: float = 0.0) -> Stepper:
-        """Return a new stepper that begins at `now_s`, DISABLED, without a measurement."""
         return Stepper(self.config, self.scene, now_s)
 
 
 def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
-    """Build the core for `config.scene` from the scene's file and the file of the scene's model."""
+    """Build the core for a scene, by default `config.scene`. Raises ConfigError where scene, model and configuration do
+    not fit.
+    """
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
     config = _slowed(config, scene)
@@ -127,7 +126,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
-    """Return the scene's element as the model describes it, and the choice of the search for its field."""
+    """Return the scene's element and the choice of the search for its field."""
     terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
     require("insert.name, cip_percent", cip_percent, *model.feature_ranges[FEATURES.index("cip_percent")])
@@ -144,7 +143,7 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
 
 
 def sources_hash() -> str:
-    """Return the SHA-256, hexadecimal, of all sources that `plan` and `step` run; the compiled build gives the same."""
+    """Return the SHA-256 of all sources that `plan` and `step` run."""
     root, digest = Path(__file__).parents[2], hashlib.sha256()
     for room in SOURCES:
         for path in sorted((root / room).glob("**/*.py")):
@@ -154,12 +153,12 @@ def sources_hash() -> str:
 
 
 def platform_name() -> str:
-    """Return what else the bits of a result depend on, in words: the processor's kind, Python and NumPy."""
+    """Return what else the bits of a result depend on: processor, Python and NumPy."""
     return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
 def _brake(scene: Scene) -> tuple[ElementContact, FieldOfGap, float]:
-    """Return a brake's contact, the field in its elastomer over the gap, and its share of iron, percent by volume."""
+    """Return a brake's contact, the field over its gap, and its share of iron in percent."""
     fitted = insert(scene.insert.name)
     permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
     return Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction
@@ -171,7 +170,6 @@ def _pad(finger: Finger, model: ForceModel) -> tuple[ElementContact, FieldOfGap,
 
 
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
-    """Return the thesis's force law over the brake's gaps, scaled to the portrait `reach`, its force over the gap."""
     fitted, metres = scene.insert, 1e-3
     geometry = Geometry(
         fitted.inner_radius_mm * metres,
@@ -185,8 +183,7 @@ def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
 def _known_fields_mT(
     scene: Scene, model: ForceModel, contact: ElementContact, field: FieldOfGap
 ) -> tuple[tuple[float, float], bool]:
-    """Return the fields, least and greatest, mT, that the scene's gaps give and the model knows, and whether its force
-    rises."""
+    """Return the fields that the gaps give and the model knows, and whether the force rises in them."""
     low_mT, high_mT = model.field_range_mT
     low_mT = max(low_mT, field.field_mT(scene.insert.gap_open_mm))
     high_mT = min(high_mT, field.field_mT(scene.insert.gap_closed_mm))
@@ -207,7 +204,7 @@ def _known_fields_mT(
 
 
 def _stable_margins(config: Config) -> Margins:
-    """Return the stability margins of the position loop at the configured control rate."""
+    """Return the position loop's stability margins; raise ConfigError where they are too small."""
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
     if stability.phase_margin_deg < MIN_PHASE_MARGIN_DEG or stability.gain_margin_dB < MIN_GAIN_MARGIN_DB:
         raise ConfigError(
@@ -219,7 +216,6 @@ def _stable_margins(config: Config) -> Margins:
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
-    """Raise ConfigError where the voltage cannot open the scene's closed gap against friction and the magnets."""
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
     needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
     max_V = config.position.duty_limit * motor.supply_V / 2.0
@@ -231,8 +227,8 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
 
 
 def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
-    """Return what the gaps do not reach of the scene's greatest and standby forces, a line each with what is allowed."""
-    # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
+    """Return which of the scene's greatest and standby forces the gaps do not reach."""
+    # a lower least force is no error: no passive brake gives 0, and the limit F_MIN says so
     unmet = []
     if not reach.min_N < scene.force.most_N <= reach.max_N:
         unmet.append(
@@ -249,7 +245,6 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:
-    """Return the configuration with the scene's rates in place of its own; `config` itself unless `rates.of_scene`."""
     if not config.rates.of_scene:
         return config
     needed = scene.bandwidth
@@ -262,8 +257,6 @@ def at_rates_of(scene: Scene, config: Config) -> Config:
 
 
 def _slowed(config: Config, scene: Scene) -> Config:
-    """Return the configuration with the scene's gap speed; `config` itself where the scene states none, or no lower
-    one."""
     position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
     if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
         return config
@@ -271,7 +264,7 @@ def _slowed(config: Config, scene: Scene) -> Config:
 
 
 def approaches_s(core: Core) -> list[tuple[float, float]]:
-    """Return forces at which a brake may wait, N, each with the time of its gap to the middle of the scene's forces, s."""
+    """Return forces at which a brake may wait, N, and how long the gap takes from there to the middle force, s."""
     if core.scene.element == "tactile":
         return []
     reach, force = core.portrait, core.scene.force
@@ -281,12 +274,10 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
-    """Return the smallest difference of force, N, that the device makes and measures at forces up to `most_N`."""
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
 def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
-    """Return that the scene's resolution is finer than the device makes and measures, and what is allowed, as one line."""
     least_N = least_resolution_N(reach, scene.force.most_N)
     if scene.force.resolution_N >= least_N:
         return []
@@ -297,7 +288,7 @@ def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
-    """Return which of the handle's rates, or of a finger's depth and rate, the model was not trained on; empty if none."""
+    """Return which motions of the hand the model was not trained on."""
     depths_mm, rates_mm_s, *_ = model.feature_ranges
     handle, finger = scene.handle, scene.finger
     stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
@@ -311,7 +302,6 @@ def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
 
 
 def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
-    """Return what ideal carriages at the gap's speed miss of the scene's signal; None where the scene states no signal."""
     if scene.signal is None:
         return None
     # a scene whose greatest force is out of reach is asked for what is in reach
@@ -323,8 +313,7 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
 
 
 def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
-    """Return that ideal carriages miss the scene's signal by more than its tolerance, with the tolerance that they
-    keep."""
+    """Return whether ideal carriages miss the signal by more than its tolerance, as text."""
     if miss is None or miss.rms_N <= scene.force.tolerance_rms_N:
         return []
     worst = ", ".join(
@@ -339,9 +328,8 @@ def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
 
 
 def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
-    """Return that an opening gap could release the force faster than the scene allows, with what it has to allow."""
-    # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
-    # ceiling lets no gap make more than CEILING times the scene's greatest
+    """Return whether an opening gap releases the force faster than the scene allows, as text."""
+    # the weakest believable device makes a force at the least gap, where the gap's speed changes it most
     opening_mm_s, key = max(
         (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
         (config.position.gap_speed_mm_s, "position.gap_speed_mm_s"),
@@ -358,7 +346,6 @@ def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    """Return the search that `scene` names, with its settings; a setting that the scene leaves out is the usual one."""
     wanted = scene.solver
     if wanted.name == AUTO:
         if not scene.terms.rate:

@@ -10,12 +10,12 @@ from tormagd.safety.operating_state import Conditions, DeviceRequest
 
 
 def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool:
-    """Tell whether the carriages' positions are known: the device says that it is homed, and a step has taken them."""
+    """Tell whether the device says that it is homed and a step has taken its positions over."""
     return measurement is not None and measured is not None and measured.is_homed
 
 
 def is_busy(measurement: Measurement | None, pending: DeviceRequest, stepper: Stepper, output: Duty | None) -> bool:
-    """Tell whether the device homes or opens, or has not acknowledged a request yet: home, retract or clear."""
+    """Tell whether the device homes, opens, or has not acknowledged a request yet."""
     if measurement is None:
         return False
     is_asked = output is not None and output.request_number != stepper.safety.request_number
@@ -34,7 +34,6 @@ def conditions(
     *,
     sensor_doubted: bool,
 ) -> Conditions:
-    """Return the conditions at `now_s`, on the host's clock, on which operators' commands are taken."""
     measurement = connection.measurement
     old = "" if measurement is None else _late_stream(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
     return Conditions(
@@ -52,7 +51,7 @@ def conditions(
 
 
 def _late_stream(now_s: float, measurement: Measurement, timeout_s: float) -> str:
-    """Return which stream of the device has stopped, as in "no Sense for 312 ms"; empty where none has."""
+    """Return which stream has stopped, as in "no Sense for 312 ms"."""
     for name, came_s, longest_s in (
         ("State", measurement.received_s, timeout_s),
         ("Sense", measurement.sensed_s, SENSE_FAULT_S),

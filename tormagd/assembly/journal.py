@@ -1,8 +1,7 @@
-"""The journal: all inputs of the core, in their order. From them and a snapshot of the core a replay runs it again.
+"""The journal: all inputs of the core, in their order. A replay runs the core again from them and a snapshot.
 
-`plan` and `step` are deterministic, so their results need not be kept; they stand in the tick's record, for
-comparison. The conversation with the device is deterministic too, given what was read and when. What was written is
-kept for comparison.
+`plan` and `step` are deterministic, and so is the conversation with the device, given what was read and when. Their
+results stand in the journal for comparison only.
 """
 
 import struct
@@ -37,53 +36,49 @@ KNOWN = kinds(
     *(Measured, Handle, Travel, Turn, Wall, Leap, Reference, Plan, Outside),
     *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
 )
-"All records that stages keep or are given: the types that `exact` reads back."
+"All types that `exact` reads back."
 STEP = "step"
-"A step ran; its inputs stand in the next record."
 PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
-"A conversation began or ended. READ and WROTE, its other entries, are in `keeping`, for the black box's process."
+"A conversation began or ended. READ and WROTE are in `keeping`."
 STATE, MISSING = "state", "missing"
 MAX_ENTRIES = 4_096
-"So many entries that nobody took are dropped, and MISSING stands in their place."
+"When this many entries were not taken, MISSING takes their place."
 
 _LENGTH = struct.Struct(">I")
 _NONE = b"\xdd" + _LENGTH.pack(0)
-"An empty array, in msgpack's form whose length has four bytes."
+"An empty array whose length has four bytes."
 
 Entry = str | TickRecord | tuple[Any, ...]
 
 
 class Journal:
-    """The core's inputs since the last `take`, in their order. Every method but `take` adds an entry."""
+    """The core's inputs since the last `take`. Every other method adds an entry."""
 
     def __init__(self, *, is_kept: bool = True) -> None:
         self.is_kept = is_kept
         self._entries: list[Entry] = []
 
     def stepped(self) -> None:
-        """Note that a step ran, before it runs; its inputs stand in the record that `ticked` adds after it."""
+        """Note that a step is about to run; its inputs follow with `ticked`."""
         self._add(STEP)
 
     def ticked(self, record: TickRecord) -> None:
-        """Note the record of a control period that is over; it has the inputs and results of the last step."""
         self._add(record)
 
     def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """Note that a plan begins at `now_s` for `setpoint`, None without a publisher; it uses the newest measurement."""
         self._add((PLAN, now_s, setpoint))
 
     def foresaw(self) -> None:
-        """Note that a new forecast was made."""
         self._add((FORESEE,))
 
     def began_afresh(self, now_s: float) -> None:
-        """Note that a plan or forecast failed, and that planning began anew at `now_s`."""
+        """Note that a plan or forecast failed, and that planning began anew."""
         self._add((AFRESH, now_s))
 
     def taught(self, learned: Learned) -> None:
-        """Note that the estimators were set to what is known of the device from another day."""
+        """Note that the estimators were set to what is known from another day."""
         self._add((TEACH, learned))
 
     def confirmed(self, what: str) -> None:
@@ -91,50 +86,41 @@ class Journal:
         self._add((CONFIRM, what))
 
     def answered(self, answer: Answer) -> None:
-        """Note an answer of the search in its own process, for the next plan."""
         self._add((ANSWER, answer))
 
     def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
-        """Note an operator's command, the conditions it was decided on, and whether it was refused."""
         self._add((COMMAND, name, now_s, is_refused, conditions))
 
     def latched(self, fault: Fault) -> None:
-        """Note that a fault was latched that was found outside the step; the entry has its name as text."""
         self._add((LATCH, str(fault)))
 
     def lost_link(self) -> None:
-        """Note that the link to the device broke."""
         self._add((LOSE_LINK,))
 
     def read(self, now_s: float, raw: Received) -> None:
-        """Note what was read from the device at `now_s`, as `connection.Traffic`."""
         self._add((READ, now_s, raw))
 
     def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        """Note what was written to the device in one period, as `connection.Traffic`."""
         self._add((WROTE, now_s, raw, unsent))
 
     def connected(self, memory: Any) -> None:
-        """Note that a conversation begins from the state `memory`; None: that it is over."""
+        """Note that a conversation begins from the state `memory`, or with None that it is over."""
         self._add((CONNECTED, memory))
 
     def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
-        """Note the whole state of the core and of the conversation (None without one): a replay may begin here."""
+        """Note the whole state of the core and of the conversation: a replay may begin here."""
         if self.is_kept:
             self._add((STATE, plain(stepper), plain(planner), connection))
 
     def missed(self) -> None:
-        """Note that entries before this one were lost."""
         self._add((MISSING,))
 
     def take(self) -> list[Entry]:
-        """Return the entries since the last `take`, the oldest first, and remove them from the journal; empty where
-        none came."""
+        """Return and remove all entries."""
         entries, self._entries = self._entries, []
         return entries
 
     def _add(self, entry: Entry) -> None:
-        """Add an entry if the journal is kept; MAX_ENTRIES that nobody took are first replaced by MISSING."""
         if not self.is_kept:
             return
         if len(self._entries) >= MAX_ENTRIES:
@@ -143,19 +129,17 @@ class Journal:
 
 
 class Packer:
-    """Writer of entries as one growing msgpack array."""
+    """Writes entries as one growing msgpack array."""
 
     def __init__(self) -> None:
         self._bytes, self._count = bytearray(_NONE), 0
 
     def add(self, entries: Sequence[Entry]) -> None:
-        """Append entries; none changes nothing."""
         for entry in entries:
             _ENCODER.encode_into(entry, self._bytes, -1)
             self._count += 1
 
     def take(self) -> bytes:
-        """Return the array's bytes, and begin an empty array."""
         _LENGTH.pack_into(self._bytes, 1, self._count)
         packed = bytes(self._bytes)
         self._bytes, self._count = bytearray(_NONE), 0
@@ -163,7 +147,6 @@ class Packer:
 
 
 def _of_value(thing: Any) -> Any:
-    """Return a value as msgpack can write it."""
     if type(thing) is TimedSetpoint:
         return [getattr(thing, name) for name in thing.__match_args__]
     return plain(thing)

@@ -21,19 +21,19 @@ from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceBounds
 VERSION = 1
 MAX_BYTES = 4_096
 WARMTH_SD = 0.04
-"Deviation of the scale between two days: 0.7 % a kelvin, for a room 6 K warmer or colder (plant card)."
+"The scale differs by this between two days: 0.7 % a kelvin, for a room 6 K warmer or colder (plant card)."
 RELAXED_SD_N = 0.06
-"Deviation of the offset for an elastomer that has rested since."
+"The offset differs by this where the elastomer has rested since."
 ZERO_LASTS_S = 600.0
-"An older zero of the sensor is not used: the sensor may have drifted, or was tared; it is taken for tared."
+"The sensor may have drifted since an older zero, or was tared."
 
 
 class ProfileError(ValueError):
-    """A profile that cannot be used. The text says why."""
+    """A profile that cannot be used."""
 
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is known of a device, by its serial number, with an insert and a model, by its fingerprint."""
+    """What is known of a device with an insert and a model."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
@@ -50,8 +50,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     gains: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")] = ""
 
     def learned(self, now_ns: int, gains: str = "") -> Learned:
-        """Return what is still known of the device at CLOCK_REALTIME `now_ns`, driven with these `gains`, as of
-        `gains_of`."""
+        """Return what is still known at CLOCK_REALTIME `now_ns` of the device, driven with these `gains`."""
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
         is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
@@ -61,14 +60,13 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def gains_of(config: Config) -> str:
-    """Return the fingerprint of what the carriages are driven with: SHA-256 of [motor] and [position]."""
+    """Return the SHA-256 of [motor] and [position]."""
     return hashlib.sha256(msgspec.json.encode((config.motor, config.position))).hexdigest()
 
 
 def profile_of(
     learned: Learned, *, serial_number: int, insert: str, model: str, saved_ns: int, gains: str = ""
 ) -> Profile:
-    """Return the profile that keeps `learned` of the device `serial_number` with the insert `insert`."""
     return Profile(
         v=VERSION,
         serial_number=serial_number,
@@ -87,7 +85,7 @@ def profile_of(
 
 
 def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: DeviceBounds) -> Profile:
-    """Return the profile in `data`, the bytes of a profile's file; no file is read here."""
+    """Return the profile in `data`. Raises ProfileError where it is damaged or another device's."""
     try:
         profile = msgspec.json.decode(data, type=Profile)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -9,7 +9,7 @@ SHOWN = 3
 
 
 class Point(NamedTuple):
-    """A force, the rate that a signal asks there, and the greatest rate that the device gives there, N/s."""
+    """The rate that a signal asks at a force, and the greatest that the device gives there."""
 
     force_N: float
     asked_N_s: float
@@ -25,7 +25,7 @@ class Missed(NamedTuple):
 
 
 def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_speed_mm_s: float) -> Missed:
-    """Return what ideal carriages miss of forces (n >= 2, N) at rising times (n, s), which they follow without preview."""
+    """Return what ideal carriages without preview miss of forces at rising times."""
     tenth_N = max(max(forces_N) - min(forces_N), 1e-9) / 10.0
     furthest: dict[int, Point] = {}
     at_N, squares, outside = forces_N[0], 0.0, 0

@@ -1,1 +1,1 @@
-"""Commissioning: what is asked of a device to judge it, and what its ticks say. No clock, no I/O."""
+"""Commissioning: what is asked of a device to judge it, and what its ticks show. No clock, no I/O."""

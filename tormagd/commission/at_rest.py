@@ -1,4 +1,4 @@
-"""What a device shows before and after its forces: link, host, supply, homing, switches, and the way back."""
+"""Steps without force: link, host, supply, homing, switches, weight, and the way back."""
 
 import numpy as np
 
@@ -10,18 +10,17 @@ REST_S = 3.0
 BEGINS_S, HOMING_S = 2.0, 15.0
 OPENING_S = 12.0
 HUNG_S, SWINGS_S = 60.0, 3.0
-"Time to hang the weight, and for it to swing out."
 TOLD_S = 0.3
 "By then a device that opens has said so."
 PLACE_MM = (-0.3, 0.3)
-"Where a switch may be: twice what the weakest motors run on while they brake."
+"Allowed places of a switch: twice what the weakest motors run on while they brake."
 ANY_STATE = ("DISABLED", "ENABLED", "PAUSED")
 LINE = "look at the cable and at tormagctl firmware; guide bring-up, The link to the device"
 SWITCH = "look at the switch, its cable and the coupling between motor and screw"
 
 
 def link(known: Known) -> Course[list[Finding]]:
-    """Watch a device for REST_S without a setpoint, in any state but FAULT, and judge what carries every other step."""
+    """Watch a device for REST_S without a setpoint, in any state but FAULT."""
     ticks = yield from watch(REST_S, states=ANY_STATE)
     steps_s = np.diff(ticks["monotonic_s"])
     lost = ticks["link_unanswered"] + ticks["link_damaged"]
@@ -59,7 +58,6 @@ def link(known: Known) -> Course[list[Finding]]:
 
 
 def homing(_known: Known) -> Course[list[Finding]]:
-    """Disable the device, wait until its gap is open, home it, and return three findings."""
     yield from given("disable", lambda row: bool(row[_STATE] == "DISABLED"), BEGINS_S)
     yield from watch(TOLD_S, states=ANY_STATE)
     yield from given("", _is_idle, OPENING_S)
@@ -73,7 +71,6 @@ def homing(_known: Known) -> Course[list[Finding]]:
 
 
 def weight(known: Known) -> Course[list[Finding]]:
-    """Read the force sensor without and with a weight on it, and return one finding: its gain, read over hung."""
     assert known.weight_N is not None, "the step is left out without one"
     before = yield from watch(REST_S, states=ANY_STATE)
     begins_N = float(np.nanmean(before["device_force_N"]))
@@ -90,14 +87,13 @@ def weight(known: Known) -> Course[list[Finding]]:
 
 
 def way_back(_known: Known) -> Course[list[Finding]]:
-    """Disable the device, which opens the gap, and look whether the carriages meet their switches where they left them."""
+    """Disable the device, which opens the gap, and compare its switches with homing's."""
     ticks = yield from given("disable", _is_idle, OPENING_S)
     at = []
     for side in SIDES:
         is_closed = np.array([f"{side.upper()}_OPEN" in switches for switches in ticks["device_switches"]])
         place_mm = ticks[f"device_{side}_mm"][np.argmax(is_closed)] if is_closed.any() else np.nan
         at.append(finding(f"{side} switch, after the forces, at", place_mm, "mm", PLACE_MM, SWITCH))
-    # the daemon's own estimate: by now it has seen enough, and stalls of the host are taken out
     drift = ticks["device_clock_drift"][-1]
     clock = finding("device's clock runs fast by", drift, "ppm", (-1e3, 1e3), LINE, 1e6)
     return [_lasts("opening takes", ticks, 4.0, "look at the supply, the screws, and what rubs"), *at, clock]

@@ -1,4 +1,4 @@
-"""The calibration of a device: tables of a configuration, by its commissioning, from which a daemon begins."""
+"""A device's calibration: the configuration tables that its commissioning found."""
 
 import itertools
 import math
@@ -12,9 +12,9 @@ from tormagd.config import Config
 
 DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03)
 SURELY = 0.15
-"The identified motor is off by less, a warm one's resistance included."
+"Greatest error of the identified motor, a warm one's resistance included."
 RESTED, RELAXED = 1.45, 0.7
-"A device that has rested, or is cold, is stronger by less than this; one that is relaxed and warm is weaker by less."
+"A rested or cold device is stronger by less than this; a relaxed and warm one is weaker by less."
 DIGITS = "{:.4g}"
 
 
@@ -47,7 +47,7 @@ def calibration(report: Report, config: Config) -> str:
 
 
 def _position(config: Config) -> list[str]:
-    """Return the lines of the table [position], with the stiffest gains that are robust around the motor of `config`."""
+    """Return the table [position], with the stiffest gains that are robust around the motor of `config`."""
     position = config.position
     grid = itertools.product(DERIVATIVE_TIMES_S, (position.derivative_filter_s,), (position.integral_time_s,))
     period_s = 1.0 / config.rates.control_hz

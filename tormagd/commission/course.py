@@ -1,7 +1,7 @@
 """A course asks a device for something tick after tick, and says what it showed. It has no clock and does no I/O.
 
-A course is a generator. It yields what to ask for, is sent what was heard since, and returns what it found. Time is
-what it is told. So virtual time and a live device run the same courses.
+A course is a generator: it yields what to ask for, is sent what was heard since, and returns what it found. Time comes
+with what it hears, so virtual time and a live device run the same courses.
 """
 
 import math
@@ -48,20 +48,17 @@ NUMBERS = (
 )
 WORDS = ("operating_state", "device_mode", "device_switches", "faults")
 COLUMNS = (*NUMBERS, *WORDS)
-"Columns of the control ticks that a course is sent."
 PLACES = {name: place for place, name in enumerate(COLUMNS)}
 
 PREVIEW_STEP_S, PREVIEW_STEPS = 0.02, 15
-"Spacing, and length, of the forces that are told ahead."
+"Spacing and number of the forces that are told ahead."
 MOVING_MM_S = 5.0
 HANDLE_PATIENCE_S = 30.0
 CLEAR_N = 0.1
-"At the open end the firmware holds back a duty that would push on, and the least force grows with the device."
+"At the open end the firmware holds back a duty that would push on, and a device's least force varies."
 
 
 class Known(NamedTuple):
-    """The daemon's configuration, its control period, s, and the least and most force that it gives, N."""
-
     config: Config
     period_s: float
     least_N: float
@@ -69,13 +66,13 @@ class Known(NamedTuple):
     weight_N: float | None = None
 
     def force_N(self, share: float) -> float:
-        """Return the force at a share, 0 to 1, of the range, which begins CLEAR_N over the device's least force."""
+        """Return the force at a share of the range from CLEAR_N over the device's least force."""
         low_N = self.least_N + CLEAR_N
         return low_N + share * (self.most_N - low_N)
 
 
 class Asked(NamedTuple):
-    """What a course asks for: a force, N (None: no setpoint), and a command, given once ("": none)."""
+    """What a course asks for: a force (None: no setpoint), and a command, given once ("": none)."""
 
     force_N: float | None = None
     command: str = ""
@@ -83,8 +80,6 @@ class Asked(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """What a course is sent: the time, s, and the control ticks since it was last sent some."""
-
     now_s: float
     rows: Sequence[Row]
 
@@ -102,17 +97,14 @@ class StoppedError(Exception):
 
 
 class Device(Protocol):
-    """A device that takes commands and forces: a live daemon's, or a simulated one in virtual time."""
-
     def command(self, name: str) -> object:
         """Give one operator's command. Raises where it is refused."""
 
     def exchange(self, asked: Asked) -> Heard:
-        """Publish the force that is `asked`, if any, and return what was heard until the next is due."""
+        """Publish the force that is `asked`, and return what was heard until the next is due."""
 
 
 def drive(course: Course[Found], device: Device) -> Found:
-    """Run `course` on `device` to its end, and return what it found."""
     try:
         asked = next(course)
         while True:
@@ -128,7 +120,6 @@ def drive(course: Course[Found], device: Device) -> Found:
 
 
 def columns_of(rows: Iterable[Row]) -> Columns:
-    """Return the ticks as one array for each of COLUMNS, by name; without ticks all are empty."""
     by_name = zip(*rows, strict=True)
     table = dict(zip(COLUMNS, by_name, strict=False)) or dict.fromkeys(COLUMNS, ())
     return {
@@ -146,7 +137,7 @@ def watch(
     *,
     is_told_ahead: bool = False,
 ) -> Course[Columns]:
-    """Ask for a force, N, over the time, s, for `lasts_s`, and return all ticks as `columns_of`."""
+    """Ask for a force over time for `lasts_s`, and return all ticks."""
     rows: list[Row] = []
     ahead_s = [PREVIEW_STEP_S * number for number in range(1, 1 + PREVIEW_STEPS)] if is_told_ahead else []
     begun_s, t_s = math.nan, 0.0
@@ -161,7 +152,7 @@ def watch(
 
 
 def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: float | None = None) -> Course[Columns]:
-    """Give `command` once, and wait until the newest tick `is_done`; return all ticks heard as `columns_of`."""
+    """Give `command` once, wait until the newest tick `is_done`, and return all ticks."""
     begun_s, fresh = yield Asked(force_N, command)
     rows = list(fresh)
     while not (rows and is_done(rows[-1])):
@@ -175,7 +166,6 @@ def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: 
 
 
 def handle_moved(force_N: float) -> Course[None]:
-    """Ask for `force_N` until a tick shows the handle moving at MOVING_MM_S or more, either way; return nothing."""
     begun_s, fresh = yield Asked(force_N)
     while not any(abs(row[PLACES["handle_rate_mm_s"]] or 0.0) >= MOVING_MM_S for row in fresh):
         now_s, fresh = yield Asked(force_N)
@@ -189,7 +179,7 @@ def handle_moved(force_N: float) -> Course[None]:
 
 
 def _require_state(fresh: Sequence[Row], states: Sequence[str], before: Sequence[Row] = ()) -> None:
-    """Raise StoppedError, with `before` as its `rows`, for a tick in another operating state than `states`."""
+    """Raise StoppedError, with `before` as its `rows`, for a tick in another operating state."""
     for row in fresh:
         state = row[PLACES["operating_state"]]
         if state not in states:

@@ -1,4 +1,4 @@
-"""A finding: one measured value of a device, its interval, what is allowed, and what to do where it is not."""
+"""A finding: one measured value of a device, its interval, what is allowed, and a remedy."""
 
 import math
 
@@ -14,7 +14,7 @@ SURE = 2.0
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One row of a commissioning: a value in `unit`, which passes from `least` to `most`, these included."""
+    """One row of a commissioning: a value that passes from `least` to `most`, both included."""
 
     name: str
     value: float | None
@@ -30,7 +30,6 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def shown(self) -> str:
-        """The value with its interval and unit, for a person."""
         if self.value is None:
             return "not measured"
         width = f" ± {self.half_width:.2g}" if self.half_width else ""
@@ -50,7 +49,6 @@ def finding(
     scale: float = 1.0,
     half_width: float = 0.0,
 ) -> Finding:
-    """Return the finding of the mean of `values`, or of one number, times `scale`, which turns it into `unit`."""
     known = np.atleast_1d(np.asarray(values, dtype=np.float64)) * scale
     known = known[np.isfinite(known)]
     if not known.size:

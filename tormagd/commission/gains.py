@@ -1,8 +1,8 @@
 """From H(z) to the gains of the position loop: the stiffest that stay robust.
 
-For each derivative time, filter and integral time of a grid the largest proportional gain is taken whose margins hold
-at every corner. Corners are the motor's parameters up and down by a share, and several loop periods. Stiffest means the
-largest integral gain: how fast a disturbance of the carriage (drag, the magnets' pull) is taken away.
+For each derivative time, filter and integral time of a grid this takes the largest proportional gain whose margins hold
+at every corner: the motor's parameters up and down by a share, at several loop periods. Stiffest means the largest
+integral gain, which takes disturbances of the carriage (drag, the magnets' pull) away fastest.
 """
 
 import itertools
@@ -23,7 +23,7 @@ TICK_S = 1e-3
 
 
 class Corners(NamedTuple):
-    """How far the motor's parameters may be off, as a share, and the loop's periods, s, at which margins have to hold."""
+    """How far the motor's parameters may be off, as a share, and the loop's periods."""
 
     share: float = 0.3
     periods_s: Sequence[float] = (0.8 * TICK_S, TICK_S, 1.2 * TICK_S)
@@ -31,7 +31,7 @@ class Corners(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """One robust set of gains, and its smallest margins over the corners."""
+    """One robust set of gains, with its least margins over the corners."""
 
     proportional_per_mm: float
     integral_time_s: float
@@ -42,7 +42,7 @@ class Tuning(NamedTuple):
 
 
 def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, float]:  # noqa: B008  # immutable
-    """Return the least margins of the position loop over every corner: `gain_margin_dB`, `phase_margin_deg`, `corners`."""
+    """Return the least margins of the position loop over every corner."""
     gain, phase = [], []
     factors = (1.0 - corners.share, 1.0 + corners.share)
     for chosen in itertools.product(factors, repeat=len(corners.parameters)):
@@ -62,7 +62,7 @@ def tunings(
     grid: Iterable[tuple[float, float, float]],
     corners: Corners = Corners(),  # noqa: B008  # immutable
 ) -> Iterator[Tuning]:
-    """Yield the largest robust proportional gain for every point of the grid that has one, with its margins."""
+    """Yield the largest robust proportional gain for every point of the grid that has one."""
     for derivative_s, filter_s, integral_s in grid:
         position = msgspec.structs.replace(
             config.position,
@@ -80,12 +80,10 @@ def tunings(
 
 
 def stiffest(found: Iterable[Tuning]) -> Tuning | None:
-    """Return the tuning with the largest integral gain; None of none."""
     return max(found, key=lambda tuning: tuning.proportional_per_mm / tuning.integral_time_s, default=None)
 
 
 def _robust(config: Config, position: Position, gain: float, corners: Corners) -> tuple[float, float] | None:
-    """Return the smallest margins over the corners with this gain, dB and degrees; None where they are too small."""
     tried = msgspec.structs.replace(config, position=msgspec.structs.replace(position, proportional_per_mm=gain))
     found = corner_margins(tried, corners)
     gain_dB, phase_deg = found["gain_margin_dB"], found["phase_margin_deg"]

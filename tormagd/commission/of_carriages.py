@@ -17,25 +17,23 @@ from tormagd.config import Motor
 from tormagd.control.move.motor import PULL_DEPTH_MM, margins
 
 JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.5)
-"Levels of the jumps, as shares of the range: small and large ones, up and down, over the whole stroke."
+"Shares of the range: small and large jumps, up and down, over the whole stroke."
 JUMP_S = 0.6
 SLOW_S = 6.0
-"Time of the slow way, to and fro each."
 SMOOTH_S, SLOWEST_MM_S = 0.2, 0.5
 SINES_HZ = (24.0, 16.0, 8.0, 4.0, 2.0, 1.0)
-"The slow ones last: what they teach of the carriages' lag stays, and forces of a scene are slow."
+"The slow ones come last: what they teach of the carriages' lag stays, and a scene's forces are slow."
 SINE_S = 3.0
 SWING_N_S, SWING_N_S2 = 1.6, 100.0
-"Greatest slope of the sines, and of the slope: within speed and acceleration of the gap."
+"Greatest first and second derivative of the sines: within the gap's speed and acceleration."
 AT_HZ = 4.0
-"The sine by which gain and lag are judged."
 MIN_RATIO, MAX_BEHIND = 0.707, math.radians(45.0)
-"A carriage follows a sine with at least so much of its swing, and at most so far behind."
+"A carriage follows a sine with at least this share of its swing, and at most this far behind."
 MIN_BANDWIDTH_HZ = 12.0
 SIDES = ("left", "right")
 WINDOW_S = 0.021
 MOVING_M_S = 2e-3
-"A slower carriage may stand: its friction is then whatever it has to be."
+"A slower carriage may stand, where friction takes any value."
 THINNED = 20
 WEAK = "look at supply, motor, gearbox and screw; then at the gains"
 PLUG = "look at the motor's plugs, wires and brushes"
@@ -47,12 +45,12 @@ BACK_EMF = "voltage for speed over the configured"
 INERTIA = "inertia over motor.inertia_kg_m2"
 FRICTION = "friction over the configured"
 ALLOWED = {RESISTANCE: (0.75, 1.25), BACK_EMF: (0.88, 1.12), INERTIA: (0.6, 2.2), FRICTION: (0.75, 1.25)}
-"""By the name of a finding. Most friction is the gearbox's: a screw that runs dry adds a fifth."""
+"""Most friction is the gearbox's: a screw that runs dry adds a fifth."""
 REMEDIES = {RESISTANCE: PLUG, BACK_EMF: SCALE, INERTIA: COUPLED, FRICTION: GREASE}
 
 
 class Driven(NamedTuple):
-    """What one carriage's motor shows: ohm, V s and kg m2 as in `[motor]`, each with the half width of its interval."""
+    """What one carriage's motor shows, each value with the half width of its interval."""
 
     resistance_ohm: tuple[float, float]
     back_emf_V_s: tuple[float, float]
@@ -60,7 +58,6 @@ class Driven(NamedTuple):
 
 
 def nominals(motor: Motor) -> dict[str, float]:
-    """Return what the findings on a motor are shares of, by their names, which a side goes before: `left NAME`."""
     return {
         RESISTANCE: motor.resistance_ohm,
         BACK_EMF: motor.back_emf_V_s,
@@ -70,7 +67,7 @@ def nominals(motor: Motor) -> dict[str, float]:
 
 
 def carriages(known: Known) -> Course[list[Finding]]:
-    """Go slowly, jump and swing over the range, with the device enabled and its handle moved, and return 15 findings."""
+    """Go slowly, jump and swing over the range while the handle is moved."""
     levels_N = [known.force_N(share) for share in JUMP_SHARES]
     yield from ready(levels_N[0])
     times_s, forces_N = (0.0, SLOW_S, 2.0 * SLOW_S), (levels_N[0], known.most_N, levels_N[0])
@@ -95,7 +92,6 @@ def _sine(middle_N: float, swing_N: float, at_Hz: float) -> Callable[[float], fl
 
 
 def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
-    """Return how one carriage, `left` or `right`, answers the sines: gain and lag at AT_HZ, and its bandwidth."""
     ratios = {at_Hz: _ratio(sine, side, at_Hz) for at_Hz, sine in swings.items()}
     lag_s = -cmath.phase(ratios[AT_HZ]) / (math.tau * AT_HZ)
     most_Hz = max(SINES_HZ)
@@ -113,7 +109,6 @@ def _answers(swings: dict[float, Columns], side: str) -> list[Finding]:
 
 
 def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
-    """Return up to which frequency, Hz, a carriage follows, by its ratio at each; the highest where it follows all."""
     lacks = [
         (at_Hz, max(MIN_RATIO / max(abs(it), 1e-9), abs(cmath.phase(it)) / MAX_BEHIND))
         for at_Hz, it in sorted(ratios.items())
@@ -127,7 +122,7 @@ def _bandwidth_Hz(ratios: dict[float, complex]) -> float:
 
 
 def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
-    """Return a carriage's swing at `at_Hz` over half of the gap reference's: its size and, as its angle, its lead, rad."""
+    """Return a carriage's complex response at `at_Hz`, relative to half of the gap reference."""
     times_s = ticks["monotonic_s"] - ticks["monotonic_s"][0]
     whole = (times_s >= 1.0 / at_Hz) & (times_s < math.floor(SINE_S * at_Hz) / at_Hz)
     turning = np.exp(-2j * math.pi * at_Hz * times_s[whole])
@@ -139,7 +134,7 @@ def _ratio(ticks: Columns, side: str, at_Hz: float) -> complex:
 
 
 def _driven(known: Known, ticks: Columns, side: str) -> Driven:
-    """Return what a side's motor shows of itself while its carriage moves; NaN where that is too little."""
+    """Return the motor parameters of a side from its moving ticks."""
     motor, period_s = known.config.motor, known.period_s
     volts, current_A, slope_A_s, speed_m_s, acceleration, moves, window = smoothed(period_s, ticks, side)
     pull = smooth((ticks["left_mm"] + ticks["right_mm"] + PULL_DEPTH_MM) ** -4.0, window)
@@ -160,8 +155,6 @@ def _driven(known: Known, ticks: Columns, side: str) -> Driven:
 
 
 class Smoothed(NamedTuple):
-    """One carriage's columns, a row for each of n ticks, without the encoder's steps; all are smoothed alike."""
-
     volts: Array
     current_A: Array
     slope_A_s: Array
@@ -172,7 +165,6 @@ class Smoothed(NamedTuple):
 
 
 def smoothed(period_s: float, ticks: Columns, side: str) -> Smoothed:
-    """Return how the carriage `side`, `left` or `right`, moved, and by which voltage and current."""
     window = max(round(WINDOW_S / period_s), 1) | 1
     # a tick's duty acts until the next tick's measurement
     volts = smooth(np.roll(ticks[f"{side}_duty"], 1) * ticks["supply_V"], window)
@@ -185,13 +177,12 @@ def smoothed(period_s: float, ticks: Columns, side: str) -> Smoothed:
 
 
 def smooth(values: Array, window: int) -> Array:
-    """Return values (n) after two running means over `window` of them; towards both ends they fall to 0."""
+    """Return values (n) after two running means over `window`; both ends fall to 0."""
     kernel = np.convolve(np.full(window, 1.0 / window), np.full(window, 1.0 / window))
     return np.convolve(values, kernel, "same")
 
 
 def _motor_findings(known: Known, slow: Columns, side: str, driven: Driven) -> list[Finding]:
-    """Return a motor's resistance, back EMF, inertia and dry friction as shares of those in [motor], four findings."""
     torque_Nm = _friction_A(known.period_s, slow, side) * driven.back_emf_V_s[0]
     seen = zip(nominals(known.config.motor).items(), (*driven, (torque_Nm, 0.0)), strict=True)
     return [
@@ -201,7 +192,7 @@ def _motor_findings(known: Known, slow: Columns, side: str, driven: Driven) -> l
 
 
 def _friction_A(period_s: float, ticks: Columns, side: str) -> float:
-    """Return the current, A, that a carriage's dry friction takes: half of what opening takes more than closing."""
+    """Return the dry friction's current: half of what opening takes more than closing."""
     window = max(round(SMOOTH_S / period_s), 1)
     flat = np.full(window, 1.0 / window)
     current_A, place_mm = (np.convolve(ticks[f"{side}_{name}"], flat, "same") for name in ("current_A", "mm"))
@@ -213,6 +204,6 @@ def _friction_A(period_s: float, ticks: Columns, side: str) -> float:
 
 
 def identified(motor: Motor, driven: Sequence[Driven]) -> Motor:
-    """Return `motor` with the means of what its carriages show; what one of them does not show stays as it is."""
+    """Return `motor` with the means of what its carriages show."""
     means = {name: float(np.mean([getattr(each, name)[0] for each in driven])) for name in Driven._fields}
     return msgspec.structs.replace(motor, **{name: value for name, value in means.items() if math.isfinite(value)})

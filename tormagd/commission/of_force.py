@@ -1,4 +1,4 @@
-"""What the force shows: the sensor, the force over gap and rate, how steps are followed, and the element's memory."""
+"""What the force shows: the sensor, force over gap and rate, how steps are followed, and the element's memory."""
 
 import math
 from collections.abc import Sequence
@@ -23,25 +23,23 @@ from tormagd.commission.finding import Array, Finding, finding
 from tormagd.commission.regression import fitted
 
 SLIDING_MM_S = 20.0
-"A handle that is at least so fast has friction at speed, whatever its Stribeck speed."
+"A faster handle has friction at speed, whatever its Stribeck speed."
 MIN_SLIDING = 0.3
-"A handle that moves for less than this share of the time has taught little."
+"A handle that moves for a smaller share of the time has taught little."
 HOLD_S = 10.0
 PARTS = 5
-"In so many parts of that time the force is compared both ways."
 RAMPS_S = (6.0, 4.0, 4.0)
-"Time from the least to the most force; then the same time back."
 STEP_SHARES = (1.0, 0.0, 0.5, 1.0, 0.25, 0.75)
-"Levels of the steps, as shares of the range: none was held before."
+"Shares of the range: none was held before."
 STEP_S, ARRIVED_S = 2.0, 1.0
-"How long a step is held, and what of that is left to the carriages and the daemon's learning."
+"A step is held for STEP_S, of which ARRIVED_S is left to the carriages and the daemon's learning."
 ENABLE_S = 2.0
 _STATE = PLACES["operating_state"]
 RESTED_S, RISEN_S, HELD_S = 4.0, 0.5, 6.0
 FAST_MM_S = 40.0
 WORN = "compare the insert with the scene's; replace one that is worn or swollen"
 STRENGTH = (0.6, 1.5)
-"From what `[trim]` takes for the weakest device by default; of 60 healthy draws the weakest has 0.63."
+"The lower bound is the default `[trim]` for the weakest device; of 60 healthy draws the weakest has 0.63."
 GAINS = "let the daemon run by the calibration that this commissioning writes (device.calibrations)"
 SENSOR = "tare the sensor, look at its cable, shielding and supply"
 ELEMENT = (
@@ -50,7 +48,6 @@ ELEMENT = (
 
 
 def enabled(force_N: float) -> Course[None]:
-    """Enable a device that is not, with `force_N` as the setpoint until then; return nothing."""
     rows: Sequence[Row] = ()
     while not rows:
         _, rows = yield Asked(force_N)
@@ -59,13 +56,12 @@ def enabled(force_N: float) -> Course[None]:
 
 
 def ready(force_N: float) -> Course[None]:
-    """Enable a device that is not, at `force_N`, and wait until its handle moves."""
     yield from enabled(force_N)
     yield from handle_moved(force_N)
 
 
 def sensor(known: Known) -> Course[list[Finding]]:
-    """Hold one force for HOLD_S on a handle that is moved both ways, and return four findings on the sensor."""
+    """Hold one force on a handle that is moved both ways."""
     held_N = known.force_N(0.4)
     yield from ready(held_N)
     ticks = yield from watch(HOLD_S, lambda t_s: held_N)
@@ -99,7 +95,7 @@ def sensor(known: Known) -> Course[list[Finding]]:
 
 
 def force_over_gap(known: Known) -> Course[list[Finding]]:
-    """Go slowly over the whole range and back as RAMPS_S says, while the handle is moved, and return two findings."""
+    """Go slowly over the range and back while the handle is moved."""
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
     times_s = np.cumsum([0.0, *(lasts_s for lasts_s in RAMPS_S for _ in range(2))])
@@ -107,7 +103,7 @@ def force_over_gap(known: Known) -> Course[list[Finding]]:
     try:
         ticks = yield from watch(float(times_s[-1]), lambda t_s: float(np.interp(t_s, times_s, forces_N)))
     except StoppedError as error:
-        # the daemon stops a device that no believable one is: the row says how far off it is
+        # the daemon stops a device that it cannot believe: the row says how far off it is
         error.found = [_strength(columns_of(error.rows))]
         raise
     require_sliding(ticks)
@@ -129,7 +125,7 @@ def _strength(ticks: Columns) -> Finding:
 
 
 def steps(known: Known) -> Course[list[Finding]]:
-    """Step over the range as STEP_SHARES says, while the handle is moved, and return four findings."""
+    """Step over the range while the handle is moved."""
     levels_N = [known.force_N(share) for share in STEP_SHARES]
     yield from ready(levels_N[1])
     yield from watch(ARRIVED_S, lambda t_s: levels_N[1])
@@ -158,7 +154,7 @@ def steps(known: Known) -> Course[list[Finding]]:
 
 
 def memory(known: Known) -> Course[list[Finding]]:
-    """Step up, hold that gap, and return one finding: the force that dies away from 0.5 to 5 s after the step, %."""
+    """Step up, hold that gap, and return the share of the force that dies away."""
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
     yield from watch(RESTED_S, lambda t_s: low_N)
@@ -168,7 +164,7 @@ def memory(known: Known) -> Course[list[Finding]]:
     yield from given("resume", lambda row: bool(row[_STATE] == "ENABLED"), ENABLE_S, high_N)
     since_s = ticks["monotonic_s"] - ticks["monotonic_s"][0] + RISEN_S
     slides = (np.abs(ticks["handle_rate_mm_s"]) > FAST_MM_S) & np.isfinite(ticks["measured_cf"])
-    # F = a + b ln t, and the sensor's zero, which the handle's way turns over
+    # F = a + b ln t, and the sensor's zero, whose sign the handle's direction turns over
     rows = np.column_stack([np.ones_like(since_s), np.log(since_s / RISEN_S), _way(known, ticks)])[slides]
     values, widths = fitted(rows, ticks["measured_cf"][slides], np.floor(since_s[slides]))
     share = -math.log(10.0) / values[0]
@@ -177,7 +173,7 @@ def memory(known: Known) -> Course[list[Finding]]:
 
 
 def require_sliding(ticks: Columns) -> None:
-    """Raise StoppedError where the handle moved, either way, for less than MIN_SLIDING of the ticks, or there are none."""
+    """Raise StoppedError where the handle moved for less than MIN_SLIDING of the ticks."""
     rates = ticks["handle_rate_mm_s"]
     share = float(np.mean(np.abs(rates) >= MOVING_MM_S)) if rates.size else 0.0
     if share < MIN_SLIDING:
@@ -193,7 +189,7 @@ def _way(known: Known, ticks: Columns) -> Array:
 
 
 def _smooth(values: Array, window: int) -> Array:
-    """Return the running mean over `window` values; at both ends the first and the last go on."""
+    """Return the running mean, continued at both ends."""
     window = max(window, 1) | 1
     padded = np.pad(values, window // 2, mode="edge")
     return np.convolve(padded, np.full(window, 1.0 / window), "valid")

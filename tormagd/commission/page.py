@@ -1,4 +1,4 @@
-"""The page of a commissioning: a row for each finding, in one HTML file."""
+"""The page of a commissioning: one HTML file with a row for each finding."""
 
 from datetime import UTC, datetime
 from html import escape
@@ -13,7 +13,6 @@ KIT = "python -m firmware_protocol.conformance PORT --json > FILE, then --confor
 
 
 def page_of(report: Report) -> str:
-    """Return the HTML page of `report`: how it ended, the kit's checks that did not pass, and a row for each finding."""
     title = f"Commissioning of device {report.serial_number}"
     before = f"; the last one began {_date(report.last_ns)}" if report.last_ns else ""
     parts = [
@@ -31,7 +30,6 @@ def page_of(report: Report) -> str:
 
 
 def _verdict(report: Report) -> str:
-    """Return how it ended, and what failed, as HTML paragraphs."""
     said = []
     if report.stopped is not None:
         stopped = report.stopped
@@ -49,7 +47,6 @@ def _verdict(report: Report) -> str:
 
 
 def _conformance(report: Report) -> str:
-    """Return `report.conformance`, the kit's checks that did not pass, as an HTML table: check, seen, expected."""
     if report.conformance is None:
         return f"<p>No report was given. The kit owns the device, so it runs without the daemon: {escape(KIT)}</p>"
     if not report.conformance:
@@ -58,7 +55,7 @@ def _conformance(report: Report) -> str:
 
 
 def _rows(report: Report, step: str) -> list[list[str]]:
-    """Return the cells of a step's findings, under HEADS without the first; one row where it was not done."""
+    """Return the cells of a step's findings; one row where it was not done."""
     if step not in report.findings:
         is_without = step == "weight" and report.weight_N is None
         return [["--weight-N was not given" if is_without else "not done", *[""] * 6]]

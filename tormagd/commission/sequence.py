@@ -1,4 +1,4 @@
-"""The sequence of a commissioning: its steps in their order, what runs them, and the report that they leave.
+"""The steps of a commissioning in their order, what runs them, and the report that they leave.
 
 The report is kept after each step, so that a commissioning can be resumed.
 """
@@ -18,15 +18,12 @@ from tormagd.commission.of_force import force_over_gap, memory, sensor, steps
 from tormagd.config import Motor
 
 MAX_BYTES = 200_000
-"Most of a report's file."
 VERSION = 1
 Findings = Sequence[Finding]
 HANDLE = "turn the handle to and fro, about 20 turns a minute"
 
 
 class Step(NamedTuple):
-    """One step: its name, about how long it takes, s, what a person does meanwhile, and its course."""
-
     name: str
     lasts_s: float
     says: str
@@ -48,7 +45,7 @@ STEPS = (
 
 
 class Stopped(msgspec.Struct, frozen=True):
-    """Why a sequence ended early: in which step, with which code, the cause in a sentence, and what to do."""
+    """Why a sequence ended early."""
 
     step: str
     code: str
@@ -57,7 +54,7 @@ class Stopped(msgspec.Struct, frozen=True):
 
 
 def due(steps: Sequence[Step], known: Known, done: Mapping[str, Findings]) -> list[Step]:
-    """Return which of `steps` are to be run, in order: those not `done`, or `always` run, and `weight` only with one."""
+    """Return the `steps` to run: those not `done`, those `always` run, and `weight` only with one."""
     without = {"weight"} if known.weight_N is None else set()
     return [step for step in steps if step.always or step.name not in done.keys() | without]
 
@@ -68,7 +65,7 @@ def sequence(
     begins: Callable[[Step], object],
     ends: Callable[[Step, Findings], object],
 ) -> Course[Stopped | None]:
-    """Run the `steps`, in order, and return why it stopped early; None where all were done."""
+    """Run the `steps`, and return why they stopped early."""
     for step in steps:
         begins(step)
         try:
@@ -82,7 +79,7 @@ def sequence(
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A commissioning of one device: when it began, CLOCK_REALTIME, the findings by step, and how it ended."""
+    """A commissioning of one device."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)] = VERSION
     serial_number: int
@@ -106,7 +103,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return self.is_whole and not self.failed and not self.conformance
 
     def resumed(self, weight_N: float | None) -> "Report":
-        """Return the report to go on with, whose steps without findings are still to be done."""
+        """Return the report to go on with: steps without findings are still to be done."""
         stopped_in = "" if self.stopped is None else self.stopped.step
         findings = {
             step: found
@@ -126,11 +123,10 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def begun(before: Report | None, serial_number: int, now_ns: int, weight_N: float | None, motor: Motor) -> Report:
-    """Return a report without findings that begins at `now_ns`, ns of CLOCK_REALTIME, with `motor` in force."""
     report = Report(serial_number=serial_number, began_ns=now_ns, weight_N=weight_N, motor=motor)
     if before is None:
         return report
-    # one that was stopped before it found anything is no last one
+    # a report that stopped before any finding is no last one
     values, last_ns = (before.values, before.began_ns) if before.values else (before.last, before.last_ns)
     were, are = nominals(before.motor), nominals(motor)
     ratios = {f"{side} {name}": were[name] / are[name] for side in SIDES for name in are}

@@ -11,18 +11,18 @@ from tormagd.control.records import Measured, TimedSetpoint
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
 
 ROLLER_RATE_MM_S: Final = 42.0
-"Surface speed of the roller at the thesis's 20 rpm: the portrait is drawn for a handle in motion."
+"The thesis turns at 20 rpm; the portrait is drawn for a handle in motion."
 CREEP_MM_S: Final = 0.5
-"A slower handle is planned for at this rate: its friction is static."
+"A slower handle is planned for at this rate, because its friction is static."
 GONE_BACK_MM: Final = 0.01
-"A handle that has gone back by more may be turning: just over a count of its encoder."
+"A handle that has gone back by more (just over one encoder count) may be turning."
 PRESSED: Final = 0.9
-"A finger less deep than this share of the scene's depth is on its way in or out."
+"A finger that is less deep than this share of the scene's depth is on its way in or out."
 
 
 @final
 class Sliding:
-    """The sliding handle of a brake, which plans take as moving and with its friction mobilised."""
+    """The sliding handle of a brake. Plans take it as moving, with its friction mobilised."""
 
     def __init__(self) -> None:
         self.displacement_mm: Final = MOBILISED_MM
@@ -30,23 +30,21 @@ class Sliding:
         self.slides: Final = True
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the displacement, mm, and the rate, mm/s, that the force is planned for."""
         displacement_mm = MOBILISED_MM
         rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
         if setpoint is not None:
             if setpoint.displacement_mm is not None:
                 displacement_mm = setpoint.displacement_mm
-            # the device's fit is learned at the measured rate: at the stated one it would be another device's
+            # the device's fit is learned at the measured rate; at the stated rate it would describe another device
             if setpoint.rate_mm_s is not None and (measured is None or not self.is_known(measured)):
                 rate_mm_s = abs(setpoint.rate_mm_s)
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the motion to ask the model with for the present force: MOBILISED_MM, and the rate, mm/s, unsigned."""
         return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether friction is mobilised: whether the model can give the present force."""
+        """Tell whether friction is mobilised, so that the model can give the present force."""
         handle = measured.handle
         gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
         return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
@@ -62,7 +60,6 @@ class Pressing:
         self.slides: Final = False
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
-        """Return the depth, mm, and the rate, mm/s, that the force is planned for."""
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
             depth_mm, rate_mm_s = self.motion_now(measured)
@@ -74,13 +71,10 @@ class Pressing:
         return depth_mm, rate_mm_s
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
-        """Return the measured depth, mm, 0 or more, and its rate, mm/s, positive inwards."""
         return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
     def is_known(self, measured: Measured) -> bool:
-        """Tell whether the finger is deep enough: at least the share PRESSED of the scene's depth; not for NaN."""
         return measured.handle.displacement_mm >= PRESSED * self.displacement_mm
 
 
 ElementContact: TypeAlias = Sliding | Pressing
-"Either kind of contact."

@@ -41,7 +41,7 @@ _PAUSED: Final = OperatingState.PAUSED
 
 @final
 class Planner:
-    """Planning half of the core, for one device: turns the newest setpoint and measurement into a plan of the gap."""
+    """The planning half of the core: turns the newest setpoint and measurement into a plan of the gap."""
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begin at `now_s` with the gap open and nothing known of the device."""
@@ -55,40 +55,38 @@ class Planner:
         self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
         self.aim = Aim(config, scene, element)
         self.planned = self.aim.begin(now_s, 0, 0.0)
-        "The newest plan."
 
     def plan(
         self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None, is_followed: bool = True
     ) -> Plan:
-        """Make the next plan, keep it in `planned`, and return it."""
+        """Make the next plan, and keep it in `planned`."""
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
         is_believed = belief.sensor_doubted_s == 0.0 and self.believe.knows_zero(now_s)
         travel = self.way.update(measured, self.believe.zero.zero_N, is_sensor_believed=is_believed)
         held_N = None if is_followed else self._held_N(measured, belief.device)
-        # at the open gap the element's field lags, and gives more than the portrait: from there the path begins
+        # at the open gap the element's field lags and gives more than the portrait says
         device = belief.device.relaxed(self._portrait.min_N - self.believe.memory.open_N())
         ask = self.governor.update(now_s, setpoint, device, belief.lag_s, travel, held_N)
         plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
-        # how late the carriages are is learned from this plan's gap, and acts in the next one
+        # what is learned of the carriages' delay acts on the next plan
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan
         return plan
 
     def _held_N(self, measured: Measured | None, device: DeviceFit) -> float:
-        """Return the force of `device`, N, at the gap where it is: `measured`, or open where that is None or not homed."""
+        """Return the force of `device`, N, at the measured gap, or at the open gap while that is unknown."""
         portrait, planned = self._portrait, self.planned
         if measured is None or not measured.is_homed:
             return device.force_N(portrait.min_N)
-        # by as much the newest plan's gap differs from the portrait's: the element's memory, and the handle's rate
+        # the rest of the plan's gap is the element's memory and the handle's rate
         beside_mm = planned.gap_mm - portrait.gap_mm_at(device.model_N(planned.governed_N))
         if Limit.CEILING in planned.limits:
             beside_mm = 0.0
         return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
 
     def foresee(self) -> bool:
-        """Forecast the force for the next plans, and return whether a forecast was due."""
         return self.governor.foresee()
 
     @property
@@ -96,20 +94,17 @@ class Planner:
         return self.aim.question
 
     def answered(self, answer: Answer) -> None:
-        """Take the `answer` of the search that runs beside the plans."""
         self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
-        """Replace what is known of the device by `learned`."""
         self.believe.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute of device and sensor, as `Believe.confirm`; without a dispute do
-        nothing."""
+        """Settle a dispute between device and sensor by the operator's word."""
         self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
-        """Begin anew at `now_s` after a plan that failed, with nothing known of the device or of setpoints."""
+        """Begin again at `now_s` after a failed plan, with nothing known of the device or of setpoints."""
         self.believe.forget()
         self.governor.begin(now_s)
         self.planned = self.aim.begin(now_s, self.planned.number + 1, self.believe.memory.lag_mT)
@@ -117,13 +112,11 @@ class Planner:
 
 @final
 class Stepper:
-    """Driving half of the core, for one device: turns measurements and plans into duties, and latches faults."""
+    """The driving half of the core: turns measurements and plans into duties, and latches faults."""
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
-        """Begin disabled at `now_s`."""
         position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s = now_s
-        "When the newest step was."
         self.safety = SafetyState()
         slides = scene.element == "torque"
         home_mm, full_mm_s = scene.insert.gap_open_mm / 2.0, full_speed_mm_s(config.motor)
@@ -144,7 +137,7 @@ class Stepper:
         return self.safety.operating_state is _ENABLED
 
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
-        """Run one control period, for the newest `plan`: measure, latch the faults that show, and return the duties."""
+        """Run one control period: measure, latch the faults that show, and return the duties that follow `plan`."""
         last_s = self.time_s
         if not -math.inf < now_s < math.inf:
             require_number("now_s", now_s)
@@ -172,7 +165,7 @@ class Stepper:
         return self._drive(now_s, dt_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
-        """Take an operator's command `name`, one of `operating_state.COMMANDS`, and change `safety` by it."""
+        """Carry out an operator's command, one of `operating_state.COMMANDS`."""
         measured, before = self.measured, self.safety
         self.safety = command(before, name, now_s, self.watch.command_conditions(conditions, measured))
         if self.is_followed and before.operating_state is OperatingState.DISABLED:
@@ -181,11 +174,10 @@ class Stepper:
             self.watch.begin(now_s)
 
     def latch(self, fault: Fault) -> None:
-        """Latch a fault that was found outside the core."""
         self.safety = latch(self.safety, (fault,))
 
     def lose_link(self) -> None:
-        """Forget the device after its link broke: its newest measurement, and how fast its motors gain speed."""
+        """Forget the device whose link broke."""
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
         self.opening.rest(self.safety.request_number)
@@ -193,7 +185,6 @@ class Stepper:
         self.move.lose_device()
 
     def _judge(self, now_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Measured:
-        """Latch in `safety` the faults that show, and return `measured`."""
         measure = self.measure
         shown = self.watch.faults(
             now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
@@ -213,7 +204,7 @@ class Stepper:
         return measure.without_position(measured)
 
     def _hold(self, now_s: float) -> Duty:
-        """Return duties of 0 in mode RUN: the device answers, and friction holds the gap."""
+        """Return zero duties in mode RUN: the device keeps answering, and friction holds the gap."""
         limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
         if self.measure.leap is not None:
             limit = Limit.ENCODER
@@ -221,7 +212,6 @@ class Stepper:
         return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
 
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
-        """Return the duties that follow `plan`, or hold the gap while PAUSED, and count what the watch sees."""
         followed = None if self.safety.operating_state is _PAUSED else plan
         try:
             drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
@@ -232,7 +222,7 @@ class Stepper:
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
     def _begin_anew(self) -> Duty:
-        """Latch the fault NOT_FINITE, and return duties of 0 in mode OFF."""
+        """Latch NOT_FINITE, forget all motion, and stop driving."""
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()
         self.homing = Homing(self._ceiling_N)

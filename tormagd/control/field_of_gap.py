@@ -9,7 +9,7 @@ from tormagd.physics.field import PowerFieldLaw, flux_density_T
 
 @final
 class FieldOfGap:
-    """Flux density at the shaft's surface, mT, over the gap, mm, in one insert: Eq. 6 with a power law of the gap."""
+    """The flux density at the shaft's surface over the gap: Eq. 6 with a power law of the gap."""
 
     def __init__(self, law: PowerFieldLaw, relative_permeability: float, inner_radius_m: float) -> None:
         self._coefficient: Final = law.coefficient
@@ -22,13 +22,12 @@ class FieldOfGap:
         self._weakest_mT: Final = self.field_mT(farthest_mm)
 
     def field_mT(self, gap_mm: float) -> float:
-        """Return the flux density, mT, at the shaft's surface for `gap_mm`; a closer gap gives more."""
         if not self._range_mm[0] <= gap_mm <= self._range_mm[1]:
             raise DomainError("gap_mm", gap_mm, f"a number from {self._range_mm[0]:g} to {self._range_mm[1]:g}")
         return 1e3 * (self._coefficient * math.pow(gap_mm, self._exponent) * self._per_moment_T)
 
     def gap_mm(self, field_mT: float) -> float:
-        """Return the gap, mm, that gives `field_mT`; it may be no gap of the scene's."""
+        """Return the gap that gives `field_mT`; it may lie outside the scene's range."""
         if not self._weakest_mT <= field_mT <= self._strongest_mT:
             raise DomainError(
                 "field_mT", field_mT, f"a number from {self._weakest_mT:g} to {self._strongest_mT:g}, which gaps give"

@@ -2,5 +2,5 @@
 
 
 def low_pass(value: float, towards: float, dt_s: float, time_s: float) -> float:
-    """Return `value` after `dt_s` >= 0 on its way to `towards`, with the time constant `time_s` > 0 (implicit Euler)."""
+    """Return `value` after `dt_s` on its way to `towards` with the time constant `time_s` (implicit Euler)."""
     return value + dt_s / (time_s + dt_s) * (towards - value)

@@ -7,16 +7,16 @@ from tormagd.model.features import require_number
 from tormagd.physics.errors import DomainError
 
 STRETCHES: Final = 1024
-"Number of equal stretches that a rising list is divided into, to find a place fast: few points share one."
+"A rising list is divided into this many stretches, so that few points share one and a search is short."
 MIN_SPAN: Final = 1e-9
-"A list that spans less counts as spanning this much: no division by 0."
+"The least span of a list, against a division by 0."
 MIN_STEP: Final = 1e-200
-"Between neighbours that differ by less there is no finite slope."
+"Neighbours that differ by less have no finite slope between them."
 
 
 @final
 class Rising:
-    """A list (n >= 1) of finite numbers that rises, with a fast search for a value's place. The order is not checked."""
+    """A rising list of finite numbers (n >= 1) with a fast search for a value's place."""
 
     def __init__(self, values: list[float]) -> None:
         for place, value in enumerate(values):
@@ -25,18 +25,17 @@ class Rising:
                 raise DomainError("values", value, f"{values[place - 1]:g}, or {MIN_STEP:g} from there")
         self.values: Final = values
         self._per_unit: Final = STRETCHES / max(values[-1] - values[0], MIN_SPAN)
-        # how many points lie before each stretch, and last, before what is beyond them; values find theirs alike
         points_in = [0] * (STRETCHES + 1)
         for value in values:
             points_in[min(max(int((value - values[0]) * self._per_unit), 0), STRETCHES)] += 1
         self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     def after(self, value: float) -> int:
-        """Return how many numbers are at most `value`, 0..n, as `bisect_right` does: the index of the next greater one."""
+        """Return how many numbers are at most `value`, as `bisect_right` does."""
         values = self.values
         stretch = (value - values[0]) * self._per_unit
         if not stretch >= 0.0:
-            if stretch != stretch:  # NaN would be taken for the last, which is the closest gap
+            if stretch != stretch:  # NaN would be taken for the last place, which is the closest gap
                 raise DomainError("value", value, "a number")
             return 0
         place = self._points_before[int(stretch) if stretch < STRETCHES else STRETCHES]
@@ -46,12 +45,12 @@ class Rising:
 
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x`, linear between the points of `xs` and `ys` (n each; the lengths are not checked)."""
+    """Return y at `x`, linear between the points and constant beyond the ends."""
     return interpolated_before(xs.after(x), x, xs, ys)
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """Return y at `x` as `interpolated`, with the place `after` = `xs.after(x)` already known."""
+    """Return y at `x` for a known place `after` = `xs.after(x)`."""
     if after == 0:
         return ys[0]
     if after == len(ys):
@@ -62,7 +61,7 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """Return y at `steps` >= 0 from the first of evenly spaced `ys` (n >= 1), linear between them."""
+    """Return y at `steps` from the first of the evenly spaced `ys`, linear between them."""
     if not steps < len(ys) - 1:
         if steps != steps:
             raise DomainError("steps", steps, "a number")

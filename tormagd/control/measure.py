@@ -1,4 +1,4 @@
-"""Positions, speeds and the handle's motion from a device's measurements, their plausibility and their age."""
+"""Positions, speeds and the handle's motion from a device's measurements, with their plausibility and age."""
 
 from typing import Final, final
 
@@ -11,13 +11,13 @@ from tormagd.model.displacement import MOVING_MM_S, Turn
 
 RATE_FILTER_S: Final = 0.05
 QUICK_FILTER_S: Final = 0.01
-"Time constants of the handle's rate, and of the rate that shows a stop sooner."
+"The quicker of the handle's two rates shows a stop sooner."
 SLIDING_MM: Final = 0.3
-"Travel over which friction takes on the level of another rate; without travel its level stays."
+"Travel over which friction takes on the level of another rate."
 FAST_MM_S: Final = 2.0 * MOVING_MM_S
-"At higher rates friction hardly depends on the rate."
+"Friction hardly depends on the rate above this."
 MIN_DT_S: Final = 5e-6
-"Half a step of the device's clock: less time gives no speed."
+"Half a step of the device's clock: a shorter time gives no speed."
 
 
 @final
@@ -25,14 +25,13 @@ class Measure:
     """The stage that turns one device's messages into positions, filtered speeds and the handle's motion."""
 
     measured: Measured | None = None
-    "The newest record; None while the device has said nothing."
+    "None until the device has said something."
     leap: Leap | None = None
-    "The step of the encoders that no carriage makes, until the device has said whether it was reset; else None."
+    "A step of the encoders that no carriage can make, until the device has said whether it was reset."
 
     def __init__(
         self, home_mm: float, derivative_filter_s: float, turns: bool, full_speed_mm_s: float, period_s: float
     ) -> None:
-        """Take the constants of one device."""
         self.sight = Sight(period_s)
         self._home_mm: Final = home_mm
         self._derivative_filter_s: Final = derivative_filter_s
@@ -40,7 +39,7 @@ class Measure:
         self._full_speed_mm_s: Final = full_speed_mm_s
 
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
-        """Measure at `now_s`, one tick after `last_s`: return the new record, and keep it in `measured`."""
+        """Measure at `now_s`, one tick after `last_s`, and keep the record in `measured`."""
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
         self.sight.update(last_s, now_s, is_new)
@@ -55,21 +54,19 @@ class Measure:
         return measured
 
     def without_position(self, measured: Measured) -> Measured:
-        """Return `measured`, the newest record, marked as not homed, and keep it as the newest."""
+        """Mark the newest record as not homed, and return it."""
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
 
     def lose_device(self) -> None:
-        """Drop the newest measurement: `measured` is None, and the next one is taken at rest."""
         self.measured = None
 
     def forget(self) -> None:
-        """Drop the newest measurement and `leap`, and bring `sight` to its state before the first step."""
         self.measured, self.leap = None, None
         self.sight.forget()
 
     def begin(self, measurement: Measurement) -> None:
-        """Replace the newest record by one of `measurement` at rest: speeds are 0, and the handle has not travelled."""
+        """Replace the newest record by one of `measurement` at rest."""
         self.measured = self._first(measurement)
 
     def _first(self, measurement: Measurement) -> Measured:
@@ -89,14 +86,13 @@ class Measure:
         )
 
     def _measured(self, last: Measured | None, measurement: Measurement) -> Measured:
-        """Return the record of `measurement`, or `last` again where the device has said nothing new."""
         if last is None:
             return self._first(measurement)
         dt_s = measurement.device_time_s - last.device_time_s
         if measurement.number == last.number or dt_s < MIN_DT_S:
             return last
         left_mm, right_mm = self._home_mm + measurement.left_mm, self._home_mm + measurement.right_mm
-        # a handle without a new Sense has not stopped: its motion is judged over all the time since the last Sense
+        # a handle without a new Sense has not stopped: its motion is judged over the time since the last Sense
         handle, handle_time_s = last.handle, last.handle_time_s
         if measurement.sensed_s != last.sensed_s:
             handle = self._handle(last, measurement.handle_mm, measurement.device_time_s - handle_time_s)
@@ -117,13 +113,12 @@ class Measure:
         )
 
     def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
-        """Return the motion of a handle or finger that comes to `position_mm` on its encoder, `dt_s` > 0 after `last`."""
         before = last.handle
         travel_mm = position_mm - last.handle_mm
         rate_mm_s = low_pass(before.turn.direction * before.rate_mm_s, travel_mm / dt_s, dt_s, RATE_FILTER_S)
         quick_mm_s = low_pass(before.turn.direction * before.quick_mm_s, travel_mm / dt_s, dt_s, QUICK_FILTER_S)
         slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
-        # friction has one level at 42 and 300 mm/s, another at 4: a greater rate before counts as FAST_MM_S
+        # friction has one level at 42 and 300 mm/s and another at 4: a greater rate before counts as FAST_MM_S
         from_mm_s = min(before.sliding_mm_s, max(abs(rate_mm_s), FAST_MM_S))
         sliding_mm_s = from_mm_s + slid * (abs(rate_mm_s) - from_mm_s)
         if not self._turns:

@@ -1,4 +1,4 @@
-"""The nominal device: the model's force over the field, for the handle's present or planned motion."""
+"""The nominal device: the model's force over the field for the handle's present or planned motion."""
 
 from typing import Final, final
 
@@ -11,15 +11,13 @@ from tormagd.model.model_file import ForceModel
 
 @final
 class Nominal:
-    """The nominal element: the force that one model gives over the field. It has no state."""
-
     def __init__(self, model: ForceModel, contact: ElementContact, cip_percent: float, has_rate: bool) -> None:
         self._network: Final = model.network
         self.contact: Final = contact
         self._cip_percent: Final = cip_percent
         self._has_rate: Final = has_rate
         known_mm = model.feature_ranges[0]
-        # a handle is planned for with friction mobilised: before that no field gives the force, the hand chooses it
+        # a handle is planned for with friction mobilised: before that the hand sets the force, whatever the field
         mobilised_mm = within(contact.displacement_mm, known_mm)
         self._displacements_mm: Final = (mobilised_mm, mobilised_mm) if contact.slides else known_mm
         self._rates_mm_s: Final = model.feature_ranges[1]
@@ -27,7 +25,6 @@ class Nominal:
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        """Return the model's force over the field for the handle's present motion, held within the model's range."""
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.motion_now(measured)
@@ -36,7 +33,7 @@ class Nominal:
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
     ) -> tuple[ForceCurve, tuple[Outside, ...]]:
-        """Return the model's force over the field for the motion to plan for, and what of it is out of range."""
+        """Return the force over the field for the motion to plan for, and what of it is out of range."""
         if not self._has_rate:
             return self.only, ()
         displacement_mm, rate_mm_s = self.contact.planned(setpoint, measured)
@@ -49,6 +46,5 @@ class Nominal:
         return curve, outside
 
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
-        """Return the model's force over the field at this displacement, mm, and rate, mm/s."""
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

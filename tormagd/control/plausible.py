@@ -1,5 +1,4 @@
-"""Plausibility of encoders and end switches: no step faster than any motor, no place that is none, no switch against
-its place."""
+"""Plausibility of encoders and end switches: steps that no motor makes, places that do not exist, contradictions."""
 
 from typing import Final, final
 
@@ -8,19 +7,19 @@ from firmware_protocol.value import Value
 from tormagd.control.records import Measured
 
 LEAP_SPEEDS: Final = 3.0
-"No motor, and no pull of the magnets, moves a carriage faster than so many times the motor's own full speed."
+"Neither a motor nor the magnets' pull moves a carriage faster than this many times the motor's full speed."
 LEAP_MM: Final = 0.1
-"Backlash, a screw that springs back and the encoder's counts come to less than this."
+"Backlash, a screw that springs back and the encoder's resolution come to less than this."
 OVERRUN_MM: Final = 2.5
-"A carriage may overrun its switches, and be found beyond the closed end, by less than this."
+"A carriage overruns its switches or its closed end by less than this."
 CLOSED_END_MM: Final = 45.0
-"The device's smallest gap. A scene that closes less far may begin with carriages that another scene has left closer."
+"The device's smallest gap: another scene may have left the carriages closer than this scene closes."
 OPEN_SWITCH_MM: Final = 0.4
-"An open switch changes this near the zero that homing found there to 0.3 mm."
+"An open switch switches this near the zero that homing found there to within 0.3 mm."
 CLOSED_SWITCH_MM: Final = 1.0
 "A closed switch closes this near the closed end: the stroke is known to 2 %."
 TOLD_S: Final = 0.02
-"The place of a carriage is up to this much older, or newer, than the word of its switches."
+"The carriages' places and the switches' word may be this far apart in time."
 
 _LEFT_OPEN: Final = int(Switches.LEFT_OPEN)
 _RIGHT_OPEN: Final = int(Switches.RIGHT_OPEN)
@@ -30,7 +29,7 @@ _RIGHT_CLOSED: Final = int(Switches.RIGHT_CLOSED)
 
 @final
 class Leap(Value):
-    """A step of the encoders that no carriage makes, found at `seen_s`: by `left_mm` and `right_mm` within `within_s`."""
+    """A step of the encoders that no carriage can make."""
 
     def __init__(
         self,
@@ -49,7 +48,7 @@ class Leap(Value):
         self.right_from_mm: Final = right_from_mm
 
     def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
-        """Tell whether both carriages read places that they can have reached by `now_s` from before the step."""
+        """Tell whether both carriages can have come to where they read from before the step."""
         max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
             abs(measured.left_mm - self.left_from_mm) <= max_mm
@@ -63,7 +62,6 @@ class Leap(Value):
 def leap_between(
     last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
 ) -> Leap | None:
-    """Return the step of the encoders from `last` to `measured` if no carriage can make it, else None."""
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
     max_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
@@ -73,13 +71,12 @@ def leap_between(
 
 
 def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
-    """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`."""
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     return not (min_mm <= measured.left_mm <= max_mm and min_mm <= measured.right_mm <= max_mm)
 
 
 def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm: float) -> bool:
-    """Tell whether an end switch contradicts its carriage's place, for gaps from `closed_mm` to `open_mm`."""
+    """Tell whether an end switch contradicts its carriage's place."""
     inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
     left_open, left_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0
     right_open, right_closed = switches & _RIGHT_OPEN != 0, switches & _RIGHT_CLOSED != 0
@@ -91,7 +88,6 @@ def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm
 def _is_contradicted(
     at_mm: float, speed_mm_s: float, is_open: bool, is_closed: bool, inner_mm: float, home_mm: float
 ) -> bool:
-    """Tell whether a carriage's place `at_mm`, half of an even gap, contradicts the contacts at its two ends."""
     moved_mm = TOLD_S * abs(speed_mm_s)
     if is_closed and at_mm > inner_mm + moved_mm:
         return True

@@ -9,39 +9,33 @@ from typing import Final, final
 
 BLIND_S: Final = 0.005
 BLIND_PERIODS: Final = 5.0
-"""The loop is blind after both of these times without a new State: the carriages' places are not known well enough to
-drive them."""
+"Without a new State for longer than both, the carriages' places are too uncertain to drive them."
 UNSENSED_S: Final = 0.02
-"Without a new Sense for longer than this and BLIND_PERIODS, force and handle are not measured."
+"Without a new Sense for longer than both, force and handle are not measured."
 SHOWN_S: Final = 0.1
-"A stall is shown for this long after its end."
 
 
 @final
 class Sight:
-    """Whether the loop is blind, told from the times of steps and of new States; at first it is not."""
+    """Whether the loop is blind, told from the times of steps and of new States."""
 
     seen_s: float = math.inf
-    "When a new State was last found; inf before the first."
+    "inf before the first State."
     stalled_s: float
-    "When a stall last ended; -inf before the first."
     stall_s: float = 0.0
-    "How long that stall was, or the longest of stalls that came within SHOWN_S of each other."
+    "Length of the last stall, or of the longest within SHOWN_S of each other."
     is_blind: bool = False
     was_blind: bool = False
-    "Whether the loop was blind at the step before."
 
     def __init__(self, period_s: float) -> None:
         self.stalled_s = -math.inf
         self._blind_s: Final = max(BLIND_S, BLIND_PERIODS * period_s)
 
     def forget(self) -> None:
-        """Return to the state before the first step: not blind, no State seen, and no stall."""
         self.seen_s, self.stalled_s, self.stall_s = math.inf, -math.inf, 0.0
         self.is_blind = self.was_blind = False
 
     def has_stalled(self, now_s: float) -> bool:
-        """Tell whether a stall ended within SHOWN_S before `now_s`; not before the first stall."""
         return now_s - self.stalled_s < SHOWN_S
 
     def is_waiting(self, now_s: float) -> bool:
@@ -49,7 +43,7 @@ class Sight:
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 
     def update(self, last_s: float, now_s: float, is_new: bool) -> None:
-        """Take a step at `now_s`, after the last one at `last_s`, and update `is_blind` and `was_blind`."""
+        """Take a step at `now_s`, the step before being at `last_s`."""
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:
             before_s = self.stall_s if self.has_stalled(now_s) else 0.0
@@ -61,5 +55,4 @@ class Sight:
 
 
 def unsensed_s(period_s: float) -> float:
-    """Return the greatest age of a Sense, s, at this control period."""
     return max(UNSENSED_S, BLIND_PERIODS * period_s)

@@ -50,7 +50,8 @@ def calibrate_insert(
     by_law: bool,
     wait_s: float,
 ) -> Outcome:
-    """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and save it as `out`."""
+    """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and
+    save it as `out`."""
     law = ("--law",) if by_law else ()
     _ask_fitter("--insert", insert, *law)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:

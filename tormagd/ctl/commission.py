@@ -104,7 +104,8 @@ class Kept:
         self._write()
 
     def follow(self, run: Run, known: Known) -> None:
-        """Run the steps that are `due`, in order, and write the report after each; say each on stderr, with its number."""
+        """Run the steps that are `due`, in order, and write the report after each; say each on stderr, with
+        its number."""
         steps = due(STEPS, known, self.report.findings)
 
         def begins(step: Step) -> None:

@@ -101,7 +101,8 @@ def rates(config: Config, found: Headroom) -> Iterator[Rate]:
 
 
 def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: int, inference_hz: int) -> Rate:
-    """Judge the rate `hz` of `loop`, "control" or "inference", where the loops run at `control_hz` and `inference_hz`."""
+    """Judge the rate `hz` of `loop`, "control" or "inference", where the loops run at `control_hz` and
+    `inference_hz`."""
     late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us
     period = 1e-6 * control_hz
     if loop == "control":

@@ -17,7 +17,8 @@ def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) 
 
 
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
-    """Make the daemon's key pair where there is none, and one for each of `clients`, by role; or only one for `client`."""
+    """Make the daemon's key pair where there is none, and one for each of `clients`, by role; or only
+    one for `client`."""
     names = [name for listed in clients.values() for name in listed]
     if client is not None and names:
         raise usage_error("--client stands alone: it makes a pair that no list of this machine has", HINT)

@@ -132,7 +132,6 @@ def _families(status: Status) -> Iterator[Metric]:
         ("setpoints_accepted", "Setpoints that were taken", setpoints.accepted),
         ("setpoints_refused", "Setpoints that were not valid", setpoints.refused),
         ("setpoints_dropped", "Setpoints that were not read", setpoints.dropped),
-        ("setpoints_oversize", "Setpoints that were too large", setpoints.oversize),
         ("link_losses", "Times the link was lost", link.losses),
         ("link_frames", "Frames received since the port was opened", link.frames),
         ("link_corrupt_frames", "Of these, damaged", link.corrupt),

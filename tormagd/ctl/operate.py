@@ -161,7 +161,8 @@ def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tupl
 
 
 def require_no_fault(state: Status, what: str, then: str = "tormagctl clear-fault") -> None:
-    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to do; else return."""
+    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to
+    do; else return."""
     if state.operating_state != "FAULT":
         return
     # what the device met says more than that somebody stopped it

@@ -73,7 +73,8 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
-    """Print the outcome to stdout, as text or as one JSON object `{command, ok, result, error}`; return the exit code."""
+    """Print the outcome to stdout, as text or as one JSON object `{command, ok, result, error}`; return
+    the exit code."""
     is_done = outcome.exit_code is Exit.DONE
     text = _object(command, is_done, outcome.result, None) if as_json else outcome.text
     is_written = write_answer(text, f"tormagctl {command}")

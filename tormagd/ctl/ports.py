@@ -97,7 +97,8 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
 def _serial_port(
     machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
 ) -> ListedPort:
-    """Describe the serial port at `path`, which has no symbolic links; `info` is pyserial's, None where it lists none."""
+    """Describe the serial port at `path`, which has no symbolic links; `info` is pyserial's, None where
+    it lists none."""
     locking = machine.lock_owners(path)
     names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
     has_usb_id = info is not None and info.vid is not None

@@ -24,7 +24,8 @@ def replay(
     faults: Sequence[str],
     config_file: Path | None,
 ) -> Outcome:
-    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the simulated `plant`."""
+    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the
+    simulated `plant`."""
     arguments = [
         f"--from={from_s!r}",
         f"--plant={plant}",

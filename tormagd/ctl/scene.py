@@ -32,7 +32,8 @@ def scene(
     plant: str | None = None,
     **recorded: Any,
 ) -> Outcome:
-    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene, except for new."""
+    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene,
+    except for new."""
     named = name or config.scene
     if action == "new":
         if name is None:
@@ -109,7 +110,8 @@ def as_toml(tables: dict[str, Any]) -> str:
 
 
 def torque_range(scene: Scene) -> str:
-    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft, mNm, in words."""
+    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft,
+    mNm, in words."""
     radius_mm, force = scene.roller_radius_mm, scene.force
     if radius_mm is None:
         return ""

@@ -100,7 +100,8 @@ def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
 
 
 def _forces_of(out: Path, recorded: Recorded) -> Path | None:
-    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new CSV beside `out`."""
+    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new
+    CSV beside `out`."""
     is_converted = (recorded.column, recorded.scale, recorded.offset_N) != (None, None, None)
     if recorded.force is None:
         if is_converted:
@@ -208,7 +209,8 @@ def _from_answers(name: str) -> Tables:
 
 
 def _answer(question: str, usual: str) -> str:
-    """Ask one question on stderr, and return the line from stdin without spaces around it; an empty one takes `usual`."""
+    """Ask one question on stderr, and return the line from stdin without spaces around it; an empty one
+    takes `usual`."""
     print(f"{question} [{usual}]: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:

@@ -62,7 +62,8 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
 
 
 def _write(name: str, way: OperatingPoint, out: Path) -> None:
-    """Write the scene `name` with this way's rates and search to the new file `out`; relative paths in it are adapted."""
+    """Write the scene `name` with this way's rates and search to the new file `out`; relative paths in
+    it are adapted."""
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
     tables = {key: value for key, value in tables.items() if value is not None}

@@ -30,7 +30,7 @@ OLD_MS = 1_000.0
 "An older setpoint may still be valid; its age is shown."
 SURE_WINDOWS = 20
 "A clock's drift is shown once it is fitted over this many windows: ten seconds."
-SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
+SETPOINT_COUNTS = ("accepted", "refused", "dropped")
 LINK_COUNTS = ("losses", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 LINK_COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")
 
@@ -95,7 +95,7 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
         *_said("peers     ", peers.dropped and f"{peers.dropped} messages not read", colour.yellow),
         *(
             f"          {it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason} ({it.count})"
-            for it in (*peers.refusals[-1:], *peers.drops[:1])
+            for it in (*peers.refusals, *peers.drops)
         ),
     ]
 
@@ -144,7 +144,8 @@ def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
 
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
-    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and unit of each."""
+    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and
+    unit of each."""
     return ", ".join(
         f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
         for name, it in belief.items()

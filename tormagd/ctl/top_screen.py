@@ -145,7 +145,8 @@ def _grid(*widths: int, is_cut: bool = True) -> Table:
 
 
 def _timing(status: Status, width: int) -> Table:
-    """Return rows on how loops keep time, the link, setpoints, playout, what the kernel refused, following and belief."""
+    """Return rows on how loops keep time, the link, setpoints, playout, what the kernel refused,
+    following and belief."""
     table = _grid(LABEL, width - LABEL - 1)
     for name in ("control", "inference", "search"):
         group = status.rates.get(name)

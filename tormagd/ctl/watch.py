@@ -26,7 +26,8 @@ SPOILING = ("RANGE", "F_MAX")
 
 
 class Fate(msgspec.Struct, frozen=True):
-    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and what held them."""
+    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and
+    what held them."""
 
     accepted: int
     rendered_share: float | None

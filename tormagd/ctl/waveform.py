@@ -96,7 +96,8 @@ def beat(phase: float) -> float:
 
 
 def read_csv(path: Path) -> Waveform:
-    """Read a file of forces, N, into a waveform of straight lines between its rows, with time, s, from the first row."""
+    """Read a file of forces, N, into a waveform of straight lines between its rows, with time, s, from
+    the first row."""
     table = read_forces(path)
     start_s = table["t_s"][0]
     times_s = array("d", (time_s - start_s for time_s in table["t_s"]))

@@ -7,11 +7,11 @@ of the beat.
 
 import contextlib
 import logging
-import os
 import socket
 import struct
 import time
 from collections import Counter, deque
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -19,19 +19,25 @@ import zmq
 import zmq.utils.monitor
 from zmq.utils import z85
 
+from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.arrivals import Arrivals
-from tormagd.daemon.tally import Peer, Tally
+from tormagd.daemon.door import Door
+from tormagd.daemon.tally import Peer, Tally, shown
 from tormagd.keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
 
 CONNECTIONS = 200
 CONNECTIONS_PER_PEER = 160
-"Connections allowed to one endpoint, and to one address or process. More are cut off as soon as they are accepted."
-PEERS = 32
-"Refused peers that are counted apart."
-RECONNECT_S = 0.5
-"A peer that was cut off comes back within this time (libzmq's default is 0.1 s)."
+"Connections allowed to one endpoint, and to one address or process. For one more, another is cut off."
+CLOSING = 8
+"Connections that were cut off and are not closed yet; while there are so many, nobody is let in."
+TOLD_S = 60.0
+"How often a process that makes too many connections is named in the log."
+SHUT_NS = 100_000_000
+"How long nobody is let in to an endpoint at which somebody said too much."
+UPDATE_NS = 100_000
+"For how long events are handled in one slice."
 GUARDED = {
     zmq.ZAP_ENFORCE_DOMAIN: 1,
     zmq.HANDSHAKE_IVL: 2_000,
@@ -42,14 +48,17 @@ GUARDED = {
     zmq.TCP_KEEPALIVE_CNT: 4,
 }
 "Options of a guarded socket; times are in ms and s."
+LEFT, READ = 16, 65_536
+"Reads of what a peer that is cut off has sent, and bytes of each."
 AT_ONCE = 8
 "Events taken in one slice at most."
 WATCHED = (
-    zmq.EVENT_ACCEPTED
+    zmq.EVENT_LISTENING
+    | zmq.EVENT_ACCEPTED
+    | zmq.EVENT_ACCEPT_FAILED
     | zmq.EVENT_DISCONNECTED
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
 _CREDENTIALS = struct.Struct("3i")
 
@@ -80,46 +89,27 @@ class _Connections:
         self.monitor = endpoint.get_monitor_socket(WATCHED)
         self.addresses: dict[int, str] = {}
         self.admitted: Counter[str] = Counter()
-        self.turned_away: deque[str] = deque(maxlen=CONNECTIONS)
-        "Addresses whose keys were refused, and whose connections are not closed yet."
-        self.untold = 0
-        "Peers of refused keys that libzmq has not rejected yet."
-        self.taken_for_one: deque[str] = deque(maxlen=CONNECTIONS)
-        "Addresses of peers that left in the handshake and were counted as one of these."
+        self.refused: Counter[str] = Counter()
+        "How many open connections of an address were let in, or not, when libzmq asked about their keys."
         self.failed: str | None = None
         "Why the handshake failed of the connection that is closed next, as libzmq does at once; None: it did not fail."
-        self.cut: set[int] = set()
+        self.heard: set[int] = set()
+        "Connections by which a message has come."
+        self.cut: dict[int, str] = {}
+        "Addresses of connections that were cut off and are not closed yet."
+        self.door: Door
+        self.shut_ns = 0
+        "Until then, of the monotonic clock, nobody more is let in."
 
-    def told(self) -> str | None:
-        """Note that libzmq has rejected a peer for its key, and return whom the caller has to count as refused for
-        that."""
-        if self.untold:
-            self.untold -= 1
-            return None
-        address = self.taken_for_one.pop() if self.taken_for_one else ""
-        self.turned_away.append(address)
-        return address
-
-    def left_untold(self, address: str) -> bool:
-        """Tell whether a peer that broke off its handshake was counted already, when its key was refused."""
-        if not self.untold or (taken := self.left(address)) is None:
-            return False
-        self.untold -= 1
-        self.taken_for_one.append(taken)
-        return True
-
-    def gone(self) -> str:
-        still = Counter(self.addresses.values())
-        return next((address for address, count in self.admitted.items() if count > still[address]), "")
-
-    def left(self, address: str) -> str | None:
-        """Remove one entry of `address` from `turned_away`, and return it; None where there is none."""
-        if not address and self.turned_away:  # the peer had gone before its address was read
-            return self.turned_away.popleft()
-        if address not in self.turned_away:
-            return None
-        self.turned_away.remove(address)
-        return address
+    def crowded(self, address: str) -> int | None:
+        """Return the connection to cut off, now that one of `address` has come; None where there is room."""
+        of = Counter(self.addresses.values())
+        if of[address] <= CONNECTIONS_PER_PEER:
+            if len(self.addresses) <= CONNECTIONS:
+                return None
+            address = of.most_common(1)[0][0]
+        theirs = [descriptor for descriptor, each in self.addresses.items() if each == address]
+        return next((descriptor for descriptor in theirs if descriptor not in self.heard), theirs[-1])
 
 
 class Admission:
@@ -128,17 +118,14 @@ class Admission:
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
         self._keys, self._arrivals = keys, arrivals
         self.allowed: Allowed = keys.allowed if keys else {}
-        self.refusals = Tally(PEERS, "refused %d peers, the newest at %s", self.name)
-        self.left: deque[tuple[str, float]] = deque(maxlen=64)
-        "Addresses of publishers that left after a complete handshake, and when."
-        self.oversize = 0
-        "How often such a publisher came back at once: it had been cut off for a message that was too long."
+        self.refusals = Tally("refused %d peers, the newest at %s", self.name)
         self._endpoints: dict[str, _Connections] = {}
         # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
         self._zap = context.socket(zmq.ROUTER)
         self._zap.linger = 0
         self._zap.bind("inproc://zeromq.zap.01")
         self._parts = deque([(self._zap, self._admit)])
+        self._crowds = Allowance(1.0 / TOLD_S, 1.0)
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
@@ -157,17 +144,30 @@ class Admission:
         self._parts.append((known.monitor, partial(self._watch, known)))
         self._arrivals.watch(known.monitor)
 
+    def bound(self, name: str) -> None:
+        """Bound the connections of the endpoint `name` from now on."""
+        self._watch(self._endpoints[name])
+
+    def hear(self, name: str, descriptor: int) -> None:
+        """Note that a message has come by the connection `descriptor` of the endpoint `name`."""
+        self._endpoints[name].heard.add(descriptor)
+
     def update(self) -> bool:
-        """Handle up to AT_ONCE waiting events of one socket, the next in turn that has any; return False where none
-        has."""
+        """Handle waiting events, AT_ONCE of each socket, for about UPDATE_NS; return False where there are none."""
         # in turn: who knocks at one endpoint without pause must not keep everybody from the others
+        until_ns, is_done = time.monotonic_ns() + UPDATE_NS, False
+        for known in self._endpoints.values():
+            if len(known.cut) < CLOSING and until_ns > known.shut_ns:
+                known.door.open()
         for _ in range(len(self._parts)):
             self._parts.rotate()
             events, handle = self._parts[0]
             if self._arrivals.has(events):
                 handle()
-                return True
-        return False
+                is_done = True
+                if time.monotonic_ns() > until_ns:
+                    break
+        return is_done
 
     def close(self) -> None:
         """Stop watching the connections."""
@@ -205,10 +205,12 @@ class Admission:
                 if self._endpoints[name].is_guarded:
                     self.cut_off(name)
 
-    def cut_off(self, name: str, whose: str = "") -> None:
-        """Shut down the connections from the address `whose` to the endpoint `name`; an empty `whose` ends all."""
+    def cut_off(self, name: str, whose: int | str | None = None) -> None:
+        """Shut down a connection to the endpoint `name`, those of an address, or, None, all."""
+        if isinstance(whose, str):
+            self._endpoints[name].shut_ns = time.monotonic_ns() + SHUT_NS
         for descriptor, address in self._endpoints[name].addresses.items():
-            if address == whose or not whose:
+            if whose in (None, descriptor, address):
                 _end(descriptor, address)
 
     def _admit(self) -> None:
@@ -226,14 +228,12 @@ class Admission:
             self._arrivals.touch(self._zap)
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
-        """Tell whether the key `public` may use the endpoint `name`, and count the answer."""
+        """Tell whether the key `public` may use the endpoint `name`; count one that may not, with the reason."""
         known = self._endpoints[name]
         if self.has_role(public, MAY[name]):
-            self._count_oversize(name, address)
             known.admitted[address] += 1
             return True
-        known.turned_away.append(address)
-        known.untold += 1
+        known.refused[address] += 1
         listed = self.allowed.get(public)
         reason = "key not listed" if listed is None else f"role not allowed: {', '.join(sorted(listed.roles))}"
         self.refusals.add(name, Peer(address, public), reason)
@@ -246,84 +246,82 @@ class Admission:
                 return
             event = zmq.utils.monitor.recv_monitor_message(known.monitor, zmq.NOBLOCK)
             kind, value = event["event"], event["value"]
-            if kind == zmq.EVENT_ACCEPTED:
+            if kind == zmq.EVENT_LISTENING:
+                known.door = Door(value)
+            elif kind == zmq.EVENT_ACCEPTED:
+                known.door.is_open = False
                 self._accepted(known, value)
+            elif kind == zmq.EVENT_ACCEPT_FAILED:
+                known.door.is_open = False
             elif kind == zmq.EVENT_DISCONNECTED:
-                self._admit()  # a question about its key may still wait: it is counted once
+                self._arrivals.touch(self._zap)  # a question about its key may have come just now: it is counted once
+                self._admit()
                 self._disconnected(known, value)
-            elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                other = known.told()
-                if other is not None:
-                    self.refusals.add(known.name, Peer(other), PLAIN)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
-            elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
+            else:
                 known.failed = PLAIN if known.is_guarded else "left in the handshake"
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
-        """Note a new connection and its address, and end it where its address or its endpoint has too many."""
+        """Note a new connection and its address."""
         address = known.addresses[descriptor] = _address(descriptor)
-        if not address:
+        cut = known.crowded(address)
+        if cut is None:
             return
-        of_address = sum(each == address for each in known.addresses.values())
-        if of_address > CONNECTIONS_PER_PEER or len(known.addresses) > CONNECTIONS:
-            known.cut.add(descriptor)
-            _end(descriptor, address)
-        elif not known.is_guarded:
-            self._count_oversize(known.name, address)
+        address = known.cut[cut] = known.addresses.pop(cut)
+        _end(cut, address)
+        if self._crowds.grants(Peer(address), time.monotonic()):
+            log.warning(
+                "%s makes more connections to %s than %d, or than the %d of all: what is beyond is cut off; "
+                "next: end it, or let it use one socket for all its messages",
+                *(shown(address), known.name, CONNECTIONS_PER_PEER, CONNECTIONS),
+            )
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
-        """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as one too many."""
+        """Forget a closed connection, and count a refusal where its peer never got in, or was cut off as
+        one too many."""
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
-        was_asked = (
-            known.left(address) is not None if failed is None else failed == PLAIN and known.left_untold(address)
-        )
+        known.heard.discard(descriptor)
         if descriptor in known.cut:
-            known.cut.discard(descriptor)
-            failed = "too many connections"
-        if was_asked:
-            return  # counted when its key was refused
-        if failed is None and not address:  # a quick one: answered, and gone before its address was read
-            address = known.gone()
-        if failed is None and (not known.is_guarded or known.admitted[address]):
+            address, failed = known.cut.pop(descriptor), "too many connections"
+        elif failed in (None, PLAIN) and not address:  # a quick one: answered, and gone before its address was read
+            gone = known.admitted - Counter(known.addresses.values())
+            address = next(iter(+known.refused or gone), "")
+        if failed in (None, PLAIN) and known.refused[address]:
+            known.refused -= Counter((address,))
+        elif failed is None and (not known.is_guarded or known.admitted[address]):
             known.admitted -= Counter((address,))
-            if known.name == "setpoint" and address:
-                self.left.append((address, time.monotonic()))
         else:
-            # libzmq closes a peer of an old ZMTP version without an event of its own
             self.refusals.add(known.name, Peer(address), failed or PLAIN)
-
-    def _count_oversize(self, name: str, address: str) -> None:
-        """Add 1 to `oversize` where a publisher's address returns within RECONNECT_S of leaving; forget that leaving."""
-        # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
-        # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
-        # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
-        if name != "setpoint":
-            return
-        since_s = time.monotonic() - RECONNECT_S
-        for left in self.left:
-            if left[0] == address and left[1] > since_s:
-                self.left.remove(left)
-                self.oversize += 1
-                return
 
 
 def _address(descriptor: int) -> str:
     """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`."""
-    try:
-        with socket.socket(fileno=os.dup(descriptor)) as connection:
-            if connection.family == socket.AF_UNIX:
-                made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-                process, user, group = _CREDENTIALS.unpack(made)
-                return f"localhost:{user}:{group}:{process}"
-            return str(connection.getpeername()[0])
-    except OSError:
-        return ""
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        if connection.family == socket.AF_UNIX:
+            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+            process, user, group = _CREDENTIALS.unpack(made)
+            return f"localhost:{user}:{group}:{process}"
+        return str(connection.getpeername()[0])
+    return ""
 
 
 def _end(descriptor: int, address: str) -> None:
     """Shut down the connection `descriptor`, unless its peer is no longer `address`: descriptors are used again."""
-    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
-        if _address(connection.fileno()) == address:
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        if _address(descriptor) == address:
             connection.shutdown(socket.SHUT_RDWR)
+            for _ in range(LEFT):
+                if not connection.recv(READ, socket.MSG_DONTWAIT):
+                    return
+
+
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """Yield `descriptor` as a socket, which stays open."""
+    connection = socket.socket(fileno=descriptor)
+    try:
+        yield connection
+    finally:
+        connection.detach()

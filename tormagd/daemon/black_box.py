@@ -158,7 +158,8 @@ class BlackBox:
         self._stop_if_gone()
 
     def report(self) -> BlackBoxReport:
-        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since the start."""
+        """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since
+        the start."""
         return BlackBoxReport(
             folder="" if self._folder is None else str(self._folder),
             newest=self._newest,
@@ -167,7 +168,8 @@ class BlackBox:
         )
 
     def close(self) -> None:
-        """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and leave it then."""
+        """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and
+        leave it then."""
         beside = self._beside
         if beside is not None:
             self._send(End())

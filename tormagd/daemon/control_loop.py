@@ -1,6 +1,7 @@
 """The control loop, a phase of every beat: step on the newest measurement and plan, and drive."""
 
 import logging
+import math
 import time
 
 from tormagd.assembly.journal import Journal
@@ -13,6 +14,9 @@ from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, RefusedError, reason
+
+REPEATED_S = 1.0
+"How often a command that changes nothing is logged."
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +33,7 @@ class ControlLoop:
         self.timing = RateGroup("control", period_ns)
         self.arming: Arming | None = None
         self._known_faults: tuple[Fault, ...] = ()
+        self._told: dict[str, tuple[float, int]] = {}
 
     def drive(self, beat: Beat, plan: Plan) -> None:
         """Step the core along `plan`, and send its output to the device."""
@@ -74,7 +79,12 @@ class ControlLoop:
             self._journal.commanded(name, now_s, conditions, is_refused=True)
             raise
         self._journal.commanded(name, now_s, conditions, is_refused=False)
-        log.info("%s: %s", name, reason(name, source))
+        told_s, count = self._told.get(name, (-math.inf, 0))
+        if source is self.stepper.safety.operating_state and now_s - told_s < REPEATED_S:
+            self._told[name] = told_s, count + 1
+            return
+        self._told[name] = now_s, 0
+        log.info("%s: %s%s", name, reason(name, source), f"; {count} times more before" if count else "")
 
     def latch(self, fault: Fault) -> None:
         """Latch a fault that was found outside the step."""

@@ -179,6 +179,7 @@ class Daemon:
             self._causes.note_wait(beat.start_ns * 1e-9, (late_ns - self._phases.ran_ns()) * 1e-9)
         self._connection.receive(time.monotonic())
         self._endpoint.arrivals.look()
+        self._endpoint.hear()
 
     def _plan(self, beat: Beat) -> None:
         # before the step: a setpoint is driven in the beat that takes it

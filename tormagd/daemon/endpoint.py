@@ -7,15 +7,17 @@ and control goes on. `admission` decides who may connect, `allowance` how much e
 import contextlib
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import zmq
 
 from tormagd.config import Sources
-from tormagd.daemon.admission import MAY, Admission
+from tormagd.daemon.admission import CONNECTIONS, MAY, Admission
 from tormagd.daemon.allowance import Allowance
-from tormagd.daemon.arrivals import Arrivals, is_readable
+from tormagd.daemon.arrivals import Arrivals
 from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
 from tormagd.daemon.listeners import Listeners
 from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
@@ -24,8 +26,8 @@ from tormagd.daemon.tally import Peer, Tally
 from tormagd.keys import KeyRing
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
+from tormagd_client.keys import fingerprint
 from tormagd_client.messages import (
-    MAX_MESSAGE_BYTES,
     VERSION,
     ErrorReply,
     MessageError,
@@ -45,21 +47,29 @@ DRAIN = 32
 "Setpoints read in one beat at most; more wait for the next, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
-SUBSCRIPTIONS = 16
-"""What waits of one subscriber's subscriptions: libzmq works off all that there are in the thread that publishes."""
+UNREAD = {"setpoint": (4_096, 32), "telemetry": (512, 2), "recording": (512, 2), "control": (8_192, 16)}
+"""Bytes of a message at most, and messages of one peer that wait in libzmq; more wait with the peer. libzmq works off
+all subscriptions that wait in this thread: a thousand would make a tick late (`tools/endure.py siege`)."""
+UNSENT: dict[int, int] = {zmq.SUB: 1, zmq.XPUB: 100, zmq.ROUTER: 16}
+"Messages for one peer that wait in libzmq; what is more is dropped."
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. One that says more is cut off, and may connect again."
+HEARD_NS = 100_000
+"For how long subscribers are heard in one beat, at each socket."
 TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket in one beat at most, and for how long."
+HOPS, LONGEST_ROUTING_ID = 16, 255
+"Parts of an envelope, and bytes of each, at most."
+FIRSTS_PER_S, FIRST_BURST = 100.0, 100.0
+"How often a peer may say `stop` or `disable`. With one more, which is carried out, its connection is cut off."
 ANSWERS_NS = 300_000
 "For how long requests are answered in one beat."
-PEERS = 16
-"Peers whose messages were not read that are counted apart."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
 
+_fingerprint = cache(fingerprint)
 Answer = Callable[[Request], Any]
 "Returns the result, as plain data or packed already, or raises RefusedError."
 
@@ -90,15 +100,17 @@ class Endpoint:
             self.close()
             raise
         self._setpoints.subscribe(b"")
-        self.arrivals.watch(self._setpoints)
-        self.arrivals.watch(self._control)
+        for each in (self._setpoints, self._telemetry, self._recording, self._control):
+            self.arrivals.watch(each)
         self._is_in_parts = self._is_in_parts_of_request = False
         self.requests = Requests()
+        self._cut_off: deque[bytes] = deque(maxlen=CONNECTIONS)
+        self._firsts = Allowance(FIRSTS_PER_S, FIRST_BURST)
         self._allowance = Allowance(SETPOINTS_PER_S, SETPOINT_BURST)
         self._subscriptions = {
             name: Allowance(SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST) for name in ("telemetry", "recording")
         }
-        self._drops = Tally(PEERS, "%d messages were not read, the newest at %s", self.admission.name)
+        self._drops = Tally("%d messages were not read, the newest at %s", self.admission.name)
         self.listeners = Listeners()
 
     def take_setpoints(self) -> bool:
@@ -114,23 +126,49 @@ class Endpoint:
                 continue  # the rest of a message that was refused with its first part
             # both clocks at once, for each message: their difference shows which was set, and the loop may be held up
             now_s, realtime_ns = time.monotonic(), time.time_ns()
-            peer = self._sender(frame, "setpoint")
+            peer, _ = self._sender(frame, "setpoint")
             if not self._allowance.grants(peer, now_s):
                 self._drops.add("setpoint", peer, TOO_MUCH)
             elif peer.key and not self.admission.has_role(peer.key, MAY["setpoint"]):
                 self._drops.add("setpoint", peer, OFF_THE_LIST)
             else:
                 data = b"" if frame.more else frame.bytes
-                is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
+                key = peer.key and _fingerprint(peer.key)
+                is_newer = self.inbox.take(data, now_s, realtime_ns, key) or is_newer
         return self.inbox.hand_on(time.monotonic()) or is_newer
 
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
-        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its first part."""
-        self._send(self._telemetry, "telemetry", *topic, encode(message))
+        """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its
+        first part."""
+        with contextlib.suppress(zmq.Again):
+            self._telemetry.send_multipart([*topic, encode(message)], zmq.NOBLOCK)
+        self.arrivals.touch(self._telemetry)
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
         """Send control ticks to all subscribers of the recording, a row each with the fields `columns`."""
-        self._send(self._recording, "recording", encode_ticks(rows, columns))
+        with contextlib.suppress(zmq.Again):
+            self._recording.send(encode_ticks(rows, columns), zmq.NOBLOCK)
+        self.arrivals.touch(self._recording)
+
+    def hear(self) -> None:
+        """Read what subscribers say, for HEARD_NS at each socket; cut off those that say too much."""
+        for name, subscribed in (("telemetry", self._telemetry), ("recording", self._recording)):
+            if not self.arrivals.has(subscribed):  # asked once: with each question libzmq takes in more
+                continue
+            until_ns, cut = time.monotonic_ns() + HEARD_NS, set()
+            with contextlib.suppress(zmq.Again):
+                while time.monotonic_ns() < until_ns:
+                    frame = subscribed.recv(zmq.NOBLOCK, copy=False)
+                    peer: Peer | None = None  # where libzmq unsubscribes a peer that has gone
+                    with contextlib.suppress(zmq.ZMQError):
+                        peer, _ = self._sender(frame, name)
+                    if name == "telemetry":
+                        self.listeners.hear(frame.bytes, peer)
+                    if peer is not None and not self._subscriptions[name].grants(peer, time.monotonic()):
+                        self._drops.add(name, peer, TOO_MUCH)
+                        cut.add(peer.address)
+            for address in cut:
+                self.admission.cut_off(name, address)
 
     def take_requests(self, answer: Answer) -> None:
         """Take waiting requests from the socket, TAKEN at most, for TAKEN_NS; answer `stop` and `disable` at once."""
@@ -141,8 +179,16 @@ class Endpoint:
             waiting = self._next_request()
             if waiting is None:
                 continue
-            is_first = may_go_first(waiting.data) and self._is_answered_first(waiting, answer)
-            if not is_first and not self.requests.put(waiting):
+            is_dropped = False
+            if may_go_first(waiting.data) and self._is_answered_first(waiting, answer):
+                if not self._firsts.grants(waiting.peer, time.monotonic()):
+                    is_dropped = True
+                    self.admission.cut_off("control", waiting.connection)
+                    if _is_made(waiting.envelope[0]):
+                        self._cut_off.append(waiting.envelope[0])
+            else:
+                is_dropped = not self.requests.put(waiting)
+            if is_dropped:
                 self._drops.add("control", waiting.peer, TOO_MUCH)
             if time.monotonic_ns() >= until_ns:
                 return
@@ -162,13 +208,13 @@ class Endpoint:
         self.admission.refusals.tell(now_s)
 
     def report(self) -> PeersReport:
-        """Return the connections of each endpoint, refused peers, and peers whose messages were dropped."""
+        """Return the connections of each endpoint, and since the start the peers refused and the messages dropped."""
         return PeersReport(
             connections=self.admission.connections(),
             refused=self.admission.refusals.total,
             dropped=self._drops.total,
             refusals=self.admission.refusals.report(),
-            drops=tuple(sorted(self._drops.report(), key=lambda each: -each.count)),
+            drops=self._drops.report(),
         )
 
     def close(self) -> None:
@@ -182,9 +228,10 @@ class Endpoint:
         """Return a new socket of this `kind`, guarded where `endpoints` says so, bound to `address`, with bounded
         queues."""
         made = self._context.socket(kind)
-        options = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.SNDHWM: 1_000, zmq.RCVHWM: 1_000}
+        size, unread = UNREAD[name]
+        options = {zmq.LINGER: 0, zmq.BACKLOG: 512, zmq.MAXMSGSIZE: size, zmq.SNDHWM: UNSENT[kind], zmq.RCVHWM: unread}
         if kind == zmq.XPUB:
-            options |= {zmq.RCVHWM: SUBSCRIPTIONS, zmq.XPUB_VERBOSER: 1}  # each one, not only the first of a topic
+            options[zmq.XPUB_VERBOSER] = 1  # each subscription is passed on, not only the first of a topic
         for option, value in options.items():
             made.setsockopt(option, value)
         path = ipc_path(address)
@@ -195,48 +242,37 @@ class Endpoint:
                 self._files.append(file)
                 made.setsockopt(zmq.USE_FD, file.listener.detach())
             made.bind(address)
+            self.admission.bound(name)
         except zmq.ZMQError as error:
             raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}; name another") from error
         except OSError as error:
             raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
         return made
 
-    def _send(self, to: "zmq.Socket[bytes]", name: str, *parts: bytes) -> None:
-        """Send to all subscribers, then read what they say, DRAIN messages at most."""
-        # drops for a subscriber that does not keep up; it never blocks
-        with contextlib.suppress(zmq.Again):
-            to.send_multipart(parts, zmq.NOBLOCK)
-        now_s, allowance = time.monotonic(), self._subscriptions[name]
-        for _ in range(DRAIN):
-            if not is_readable(to):
-                return
-            frame = to.recv(zmq.NOBLOCK, copy=False)
-            peer: Peer | None = None  # where libzmq unsubscribes a peer that has gone
-            with contextlib.suppress(zmq.ZMQError):
-                peer = self._sender(frame, name)
-            if name == "telemetry":
-                self.listeners.hear(frame.bytes, peer)
-            if peer is not None and not allowance.grants(peer, now_s):
-                self._drops.add(name, peer, TOO_MUCH)
-                self.admission.cut_off(name, peer.address)
-
-    def _sender(self, frame: zmq.Frame, name: str) -> Peer:
+    def _sender(self, frame: zmq.Frame, name: str) -> tuple[Peer, int]:
+        """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection."""
+        connection = int(frame.get(zmq.SRCFD))
+        self.admission.hear(name, connection)
         key = str(frame.get("User-Id")) if name in self._guarded else ""
-        return Peer(str(frame.get("Peer-Address")), key)
+        return Peer(str(frame.get("Peer-Address")), key), connection
 
     def _next_request(self) -> Waiting | None:
         """Read the next message; None for a further part of a message read before, which is dropped."""
-        if self._is_in_parts_of_request:
+        envelope = [] if self._is_in_parts_of_request else [self._control.recv(zmq.NOBLOCK)]
+        if not envelope or envelope[0] in self._cut_off:
             self._is_in_parts_of_request = self._control.recv(zmq.NOBLOCK, copy=False).more
             return None
-        envelope = [self._control.recv(zmq.NOBLOCK)]
+        hops: list[bytes] = []
         part = self._control.recv(zmq.NOBLOCK, copy=False)
-        if part.more and not part.bytes:  # the delimiter of a REQ socket
-            envelope.append(b"")
+        while part.more and hops[-1:] != [b""] and len(hops) < HOPS and len(part) <= LONGEST_ROUTING_ID:
+            hops.append(part.bytes)
             part = self._control.recv(zmq.NOBLOCK, copy=False)
         self._is_in_parts_of_request = part.more
-        data = b"" if part.more else part.bytes
-        return Waiting(envelope, data, self._sender(part, "control"), self.requests.opens)
+        data = b""
+        if hops[-1:] == [b""] or all(map(_is_made, hops)):
+            envelope += hops
+            data = b"" if part.more else part.bytes
+        return Waiting(envelope, data, *self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
         """Carry out and answer a `stop` or `disable`, and return True, also where it was refused."""
@@ -293,6 +329,10 @@ class Endpoint:
         # the client may have gone meanwhile
         with contextlib.suppress(zmq.ZMQError):
             self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
+
+
+def _is_made(routing_id: bytes) -> bool:
+    return len(routing_id) == 5 and routing_id[0] == 0
 
 
 def context(io_priority: int) -> "zmq.Context[zmq.Socket[bytes]]":

@@ -78,6 +78,11 @@ class SetpointInbox:
         """Decode, judge and count one message; return True if another setpoint is in force after it."""
         try:
             setpoint = decode(data, Setpoint)
+            allowed = self.sources.keys.get(setpoint.source, (key,))
+            if key not in allowed:
+                raise MessageError(
+                    f"source {setpoint.source!r} from the key {key}: allowed by sources.keys is {', '.join(allowed)}"
+                )
             if not self.has_way:
                 _refuse_way(setpoint)
             name = setpoint.source
@@ -179,7 +184,6 @@ class SetpointInbox:
             accepted=self.accepted,
             refused=self.refused,
             dropped=self.dropped,
-            oversize=oversize,
             last_refusal=self.last_refusal,
             newest_source=self.holder,
             sources={name: source.sequence.seq for name, source in self._sources.items()},

@@ -5,12 +5,13 @@ A peer that subscribes to everything gets a topic only while another asks for it
 
 from collections import Counter
 
-from tormagd.daemon.tally import OTHERS, Peer
+from tormagd.daemon.tally import Peer
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC
 
 TOPICS = MOTION_TOPIC, VERDICT_TOPIC
 PEERS = 16
 "Peers that are counted apart: none takes away what another asked for."
+OTHERS = Peer("others")
 
 
 class Listeners:
@@ -33,7 +34,7 @@ class Listeners:
     def _count(self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
         """Count one subscription to `topic`, or its end, in `asked`."""
         if peer not in asked and (len(asked) >= PEERS or not is_subscription):
-            peer = None if peer is None else Peer(OTHERS)
+            peer = None if peer is None else OTHERS
         if is_subscription:
             asked[peer] += 1
         elif peer is None:

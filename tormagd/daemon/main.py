@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
         write_line(f"tormagd: {error.message}\n  next: {error.hint}", sys.stderr)
         return 2
     log_to_stderr()
-    # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
+    # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may end the process
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         load_config(options.config)  # refused before the rest is loaded, which takes a moment

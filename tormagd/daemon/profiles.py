@@ -54,7 +54,8 @@ class ProfileFolder:
             raise ProfileError(f"{path}: {error}") from error
 
     def write(self, profile: Profile) -> None:
-        """Write `profile` to its device's file, by way of another file: the old one stays until the new one is whole."""
+        """Write `profile` to its device's file, by way of another file: the old one stays until the new one
+        is whole."""
         path = self.path(profile.serial_number)
         try:
             self.folder.mkdir(mode=0o750, parents=True, exist_ok=True)
@@ -129,7 +130,8 @@ class Profiles:
             await asyncio.wait([self._writing])
 
     def report(self) -> ProfileReport:
-        """Return whether a profile is used, how old the one on the disk is, its folder, and why none is used or kept."""
+        """Return whether a profile is used, how old the one on the disk is, its folder, and why none is
+        used or kept."""
         return ProfileReport(
             is_used=self._is_used,
             age_s=None if self._saved_ns is None else round(max(0.0, (time.time_ns() - self._saved_ns) * 1e-9), 1),

@@ -11,12 +11,24 @@ from pathlib import Path
 from tormagd.config import RealTime
 from tormagd.slices import ask_for_slices
 
+OPEN_FILES = 1_024
+"Open files that the daemon needs: about 50 of its own, its four endpoints' connections (`admission`), and a reserve."
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _LATENCY = Path("/dev/cpu_dma_latency")
 """While it is open, no processor sleeps so deeply that waking takes longer than the us written to it (the kernel's
 Documentation/power/pm_qos_interface)."""
 
 log = logging.getLogger(__name__)
+
+
+def raise_open_files() -> None:
+    """Raise the soft limit of open files to the hard one."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < OPEN_FILES:
+        raise OSError(
+            f"the hard limit of open files is {hard}: allowed is {OPEN_FILES} or more; raise LimitNOFILE, or ulimit -Hn"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def prepare(settings: RealTime) -> list[str]:

@@ -35,8 +35,8 @@ def reread(running: Config, read: Config) -> Reread:
         sources=read.sources,
         realtime=msgspec.structs.replace(running.realtime, watchdog_ms=watchdog_ms),
     )
-    taken = tuple(key for key in differing if key in LIVE)
-    return Reread(config, taken, tuple(key for key in differing if key not in LIVE))
+    taken = tuple(key for key in differing if key.startswith(LIVE))
+    return Reread(config, taken, tuple(key for key in differing if not key.startswith(LIVE)))
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:

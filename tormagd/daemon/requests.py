@@ -14,11 +14,12 @@ WAITING = 1_024
 
 
 class Waiting(NamedTuple):
-    """A request as it came, still encoded, and the peer that sent it."""
+    """A request as it came, still encoded, the peer that sent it, and its connection, a descriptor."""
 
     envelope: list[bytes]
     data: bytes
     peer: Peer
+    connection: int
     opens: int
 
 

@@ -13,7 +13,7 @@ from tormagd.config import Config, load_config
 from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.daemon import Daemon
 from tormagd.daemon.profiles import state_folder
-from tormagd.daemon.realtime import prepare
+from tormagd.daemon.realtime import prepare, raise_open_files
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.hardware.backend import Backend, choose, installed
 from tormagd.keys import KeyRing

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from tormagd_client.messages import PeerReport
 
-OTHERS = "others"
 NEWS_S = 10.0
 
 log = logging.getLogger(__name__)
@@ -20,21 +19,17 @@ class Peer(NamedTuple):
 
 
 class Tally:
-    """Counts refusals by endpoint, peer and reason. `line` is the log's format, for a count and the newest entry."""
+    """Counts refusals, and keeps the newest: endpoint, peer, reason, and how often it came in a row."""
 
-    def __init__(self, most: int, line: str, name: Callable[[str], str]) -> None:
-        self.most, self._line, self._name = most, line, name
-        self.total = self._told = 0
+    def __init__(self, line: str, name: Callable[[str], str]) -> None:
+        self._line, self._name = line, name
+        self.total = self._told = self._in_a_row = 0
         self._tell_s = 0.0
-        self._counts: dict[tuple[str, Peer, str], int] = {}
+        self._newest = "", Peer(""), ""
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
         """Count one more refusal; beyond `most` entries, the oldest one is merged with others."""
         self.total += 1
-        self._add((endpoint, peer, reason), 1)
-        if len(self._counts) > self.most:
-            first = next(each for each in self._counts if each[1].address != OTHERS)
-            self._add((first[0], Peer(OTHERS), first[2].split(":")[0]), self._counts.pop(first))
 
     def report(self) -> tuple[PeerReport, ...]:
         """Return the entries, the newest last, with keys and addresses as people know them."""
@@ -46,13 +41,10 @@ class Tally:
     def tell(self, now_s: float) -> None:
         """Log the refusals since the last line and the newest entry, at most once in NEWS_S."""
         if self.total > self._told and now_s >= self._tell_s:
-            it = self.report()[-1]
+            (it,) = self.report()
             newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
             log.warning(self._line, self.total - self._told, newest)
             self._told, self._tell_s = self.total, now_s + NEWS_S
-
-    def _add(self, entry: tuple[str, Peer, str], count: int) -> None:
-        self._counts[entry] = self._counts.pop(entry, 0) + count
 
 
 def shown(address: str) -> str:

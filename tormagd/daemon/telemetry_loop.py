@@ -436,7 +436,7 @@ class TelemetryLoop:
                 "link": link,
                 "profile": self._profiles.report(),
                 "calibration": self._calibrations.report(),
-                "setpoints": self._endpoint.inbox.report(now_s, self._endpoint.admission.oversize),
+                "setpoints": self._endpoint.inbox.report(now_s),
                 "peers": self._endpoint.report(),
                 "rates": {group.name: group.report() for group in self._groups},
                 "phases_us": {name: spent.report for name, spent in self._phases.spent.items()},

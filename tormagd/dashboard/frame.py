@@ -11,11 +11,11 @@ from tormagd_client.messages import BeliefReport
 
 SHOWN_S = 20.0
 DRIVEN = ("ENABLED", "PAUSED")
-"States in which the planned field is made; in others the gap opens or is open."
+"The planned field exists in these states; in others the gap opens or is open."
 
 
 class Held(msgspec.Struct, frozen=True):
-    """A limit: its share of the seconds shown, 0..1, and whether it holds at their end."""
+    """A limit: its share of the seconds shown, and whether it holds at their end."""
 
     code: str
     share: float
@@ -23,7 +23,7 @@ class Held(msgspec.Struct, frozen=True):
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True):
-    """One update of the page: curves of equal length, the oldest first; `t_s` is since 1970, None is not known."""
+    """One update of the page: curves of equal length, the oldest first. `t_s` is since 1970; None is not known."""
 
     t_s: Sequence[float]
     asked_N: Sequence[float | None]
@@ -40,6 +40,6 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def late_counts(lateness_us: Iterable[float]) -> list[int]:
-    """Count these latenesses, us, by bar of the histogram that LATE_US bounds, one bar more than bounds."""
+    """Count latenesses by bar of the histogram that LATE_US bounds."""
     counts = Counter(bisect_right(LATE_US, late_us) for late_us in lateness_us)
     return [counts[bar] for bar in range(len(LATE_US) + 1)]

@@ -11,14 +11,12 @@ th,td{padding:.25rem .8rem;text-align:left;vertical-align:top;border-bottom:1px 
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """Return the whole page of these parts, one after the other; they are HTML and not escaped, `title` is plain
-    text."""
+    """Return the whole page. The parts are HTML and not escaped; `title` is plain text."""
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>\n'
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], is_bad: Sequence[bool] = ()) -> str:
-    """Return an HTML table of these texts; "None." where it has no row."""
     lines = ["".join(f"<td>{_with_code(cell)}</td>" for cell in row) for row in rows]
     if not lines:
         return "<p>None.</p>"

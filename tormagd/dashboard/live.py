@@ -19,19 +19,18 @@ from tormagd_client.printable import printable
 FRAME_S = 0.1
 STATUS_S = 1.0
 PORTRAIT_EVERY = 10
-"Of so many times, once it is asked too what the device can render, which changes slowly."
+"The portrait changes slowly, so only every tenth status poll asks for it."
 SILENT_S = 0.5
 KEPT = 1_000
-"Snapshots kept: those of `frame.SHOWN_S`."
+"Snapshots of `frame.SHOWN_S`."
 WAITING = 50
-"Events that may wait for one browser; then it misses the oldest."
+"Events that may wait for one browser, which then misses the oldest."
 
 
 class Live:
-    """Listens to one daemon and sends every browser the same events; `run` has to run beside the browsers."""
+    """Listens to one daemon and sends every browser the same events; `run` must run beside the browsers."""
 
     about: ClassVar[dict[str, Any]] = {"kind": "live"}
-    "What the page begins with."
 
     def __init__(self, client: AsyncClient, status: Status, description: Description) -> None:
         self._client, self._status = client, status
@@ -45,14 +44,14 @@ class Live:
         self._learn(status)
 
     async def run(self) -> None:
-        """Listen and publish to the browsers without end; a daemon that is gone is waited for."""
+        """Listen and publish without end; wait for a daemon that is gone."""
         async with asyncio.TaskGroup() as tasks:
             for each in (self._listen(), self._tell(), self._ask()):
                 tasks.create_task(each)
 
     @contextlib.contextmanager
     def browser(self) -> Iterator[asyncio.Queue[bytes]]:
-        """Add a browser for this context, and give the queue of its events, each encoded as `event` does it."""
+        """Add a browser for this context, and give the queue of its events."""
         events: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
         if self._kept:
             events.put_nowait(event("frame", self._frame(self._kept)))
@@ -65,7 +64,7 @@ class Live:
             self.browsers.discard(events)
 
     async def _listen(self) -> None:
-        """Keep each snapshot, and when it came, without end; after one that cannot be decoded listen anew."""
+        """Keep each snapshot; after one that cannot be decoded listen anew."""
         while True:
             try:
                 async for snapshot in self._client.telemetry():
@@ -76,7 +75,6 @@ class Live:
                 self._why_silent = f"what comes is not understood: {printable(str(error))}"
 
     async def _tell(self) -> None:
-        """Publish new snapshots every FRAME_S as `frame`, without end."""
         while True:
             await asyncio.sleep(FRAME_S)
             silent_s = time.monotonic() - self._heard_s
@@ -87,8 +85,6 @@ class Live:
                 self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
 
     async def _ask(self) -> None:
-        """Ask for the status every STATUS_S, and each PORTRAIT_EVERY-th time for the portrait, and publish them,
-        without end."""
         for number in itertools.count(1):
             await asyncio.sleep(STATUS_S)
             if time.monotonic() - self._heard_s < SILENT_S:
@@ -101,7 +97,6 @@ class Live:
                         self._publish("portrait", self._portrait)
 
     def _publish(self, name: str, value: object) -> None:
-        """Queue an event for every browser, encoded once; a full queue loses its oldest."""
         data = event(name, value)
         for events in self.browsers:
             if events.full():
@@ -116,7 +111,6 @@ class Live:
         return {"status": self._status, "explained": self._explained}
 
     def _frame(self, snapshots: Sequence[Telemetry]) -> Frame:
-        """Make a frame with curves of `snapshots`, and limits and latenesses of all that are kept."""
         newest, kept = snapshots[-1], self._kept
         times = Counter(code for each in kept for code in each.limits)
         return Frame(
@@ -136,5 +130,5 @@ class Live:
 
 
 def event(name: str, value: object) -> bytes:
-    """Return a server-sent event called `name`, which is not escaped, with `value` as JSON; NaN becomes null."""
+    """Return a server-sent event with `value` as JSON; NaN becomes null."""
     return b"event: %s\ndata: %s\n\n" % (name.encode(), msgspec.json.encode(value))

@@ -16,9 +16,9 @@ from tormagd.safety.codes import FAULTS, LIMITS
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
 
 STEP_S = 0.02
-"Time between two points of a curve, as in a live page."
+"As in a live page."
 AHEAD_NS = 10_000_000_000
-"How much more is read than one frame shows: the next frame is near."
+"This much more is read than one frame shows, because the next frame is near."
 CURVES = {
     "asked_N": "setpoint_cf",
     "governed_N": "governed_cf",
@@ -27,11 +27,11 @@ CURVES = {
     "gap_wanted_mm": "gap_setpoint_mm",
     "field_mT": "field_mT",
 }
-"By a curve's name on the page, the quantity in a recording."
+"The recorded quantity of each curve."
 
 
 class Believed(msgspec.Struct, frozen=True):
-    """A BeliefReport as recorded: fields that were not known are absent, and None here."""
+    """A BeliefReport as recorded; fields that were not known are None."""
 
     value: float | None = None
     sd: float | None = None
@@ -40,13 +40,13 @@ class Believed(msgspec.Struct, frozen=True):
 
 
 class Moment(Glance, total=False):
-    """The fields that a frame reads from a message: an overview's, and the belief, which only snapshots tell."""
+    """What a frame reads from a message: an overview's fields, and the belief."""
 
     belief: dict[str, Believed]
 
 
 class Moments:
-    """Ticks or snapshots of a recording: times in seconds since its start, shape (n,), and quantities, shape (n, 8)."""
+    """Ticks or snapshots of a recording: times since its start (n), and quantities (n, 8)."""
 
     def __init__(self, seen: Sequence[Seen], start_ns: int) -> None:
         self.messages = [each.message for each in seen]
@@ -55,13 +55,12 @@ class Moments:
         self._values = known if seen else np.empty((0, len(QUANTITIES)))
 
     def newest(self, times_s: Floats) -> list[int]:
-        """Return for each time, s, the index of the newest message; -1 where it is over BREAK_S old, or none came
-        before."""
+        """Return for each time the index of the newest message; -1 where it is over BREAK_S old."""
         at = np.searchsorted(self.t_s, times_s, side="right") - 1
         return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= BREAK_S, at, -1).tolist()
 
     def curve(self, name: str, times_s: Floats) -> list[float | None] | None:
-        """Return the newest value of the quantity `name` at each time, None where too old or not known."""
+        """Return the newest value of `name` at each time, None where too old."""
         values = self._values[:, QUANTITIES.index(name)]
         if not np.isfinite(values).any():
             return None
@@ -69,16 +68,14 @@ class Moments:
         return [float(value) if math.isfinite(value) else None for value in found]
 
     def within(self, from_s: float, to_s: float) -> range:
-        """Return the indices of the messages from `from_s` up to, but not at, `to_s`."""
         first, last = np.searchsorted(self.t_s, (from_s, to_s))
         return range(int(first), int(last))
 
 
 class Recorded:
-    """A recording with messages, for the page; times given to it are seconds since its first message."""
+    """A recording for the page; its times are seconds since the first message."""
 
     def __init__(self, file: RecordingFile) -> None:
-        """Raise ValueError where the recording has no message."""
         overview = file.overview
         overview.require_messages()
         self._file, self._overview, self._start_ns = file, overview, overview.start_ns
@@ -87,7 +84,6 @@ class Recorded:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Return what the page begins with, as data for JSON."""
         file = self._file
         return {
             "kind": "recording",
@@ -99,7 +95,7 @@ class Recorded:
             "scene": (file.described("scene", dict[str, Any]) or {}).get("name", ""),
             "portrait": file.described("portrait", PortraitReport),
             "overview": self._glance(),
-            # a fault and a limit of one name are two things
+            # a fault and a limit may have the same name
             "explained": {
                 kind: {code: Explained(code, known.cause, known.remedy) for code, known in of.items()}
                 for kind, of in (("limits", LIMITS), ("faults", FAULTS))
@@ -107,12 +103,11 @@ class Recorded:
         }
 
     def frame(self, at_s: float) -> Frame:
-        """Return the frame of the SHOWN_S that end at `at_s`, which is clamped to the recording; its curves have a
-        point every STEP_S."""
+        """Return the frame of the SHOWN_S that end at `at_s`, which is limited to the recording."""
         at_s = min(max(at_s, 0.0), self.duration_s)
         from_s = max(at_s - SHOWN_S, 0.0)
         at_ns = self._start_ns + round(at_s * 1e9)
-        # what was there at a moment stands in the message before it, and ends with the one after
+        # what held at a moment is in the message before it, and ends with the one after
         ticks, snapshots = self._between(at_ns - round((SHOWN_S + BREAK_S) * 1e9), at_ns + BREAK_NS)
         shown = ticks if ticks.messages else snapshots
         times_s = np.append(np.arange(from_s, at_s, STEP_S), at_s)
@@ -142,14 +137,14 @@ class Recorded:
         )
 
     def _between(self, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-        """Return ticks and snapshots of at least this time, ns since 1970, and often of more."""
+        """Return ticks and snapshots of at least this time, and often of more."""
         if self._read is None or not self._read[0] <= from_ns < to_ns <= self._read[1]:
             span = from_ns - AHEAD_NS, to_ns + AHEAD_NS
             self._read = (*span, *moments(self._file, *span))
         return self._read[2:]
 
     def _glance(self) -> dict[str, Any]:
-        """Return the measured force over the whole length (else the asked one), and what came meanwhile; times in s."""
+        """Return the measured force over the whole length (else the asked one), and what came meanwhile."""
         overview = self._overview
         known = overview.series("measured_cf") or overview.series("setpoint_cf")
         spans: dict[str, Any] = {
@@ -165,14 +160,14 @@ class Recorded:
 
 
 def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Moments]:
-    """Read the ticks and the snapshots from `from_ns` to `to_ns`, ns since 1970, both included; either may be empty."""
+    """Read the ticks and the snapshots from `from_ns` to `to_ns`."""
     seen, start_ns = file.between(from_ns, to_ns, Moment), file.overview.start_ns
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
     return Moments(ticks, start_ns), Moments(snapshots, start_ns)
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
-    """Return the belief in the newest snapshot up to `at_s`, s since the start, by quantity, without unknown values."""
+    """Return the belief in the newest snapshot up to `at_s`, by quantity."""
     place = (snapshots.newest(np.array([at_s])) or [-1])[0]
     told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
     return {
@@ -183,7 +178,6 @@ def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
 
 
 def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
-    """Return the limits present from `from_s` up to `at_s`, s since the start, the largest share of that time first."""
     held_s: defaultdict[str, float] = defaultdict(float)
     steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
     for place in shown.within(from_s, at_s):

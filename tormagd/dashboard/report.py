@@ -1,5 +1,4 @@
-"""A recording, or several side by side, as one HTML page to keep, send and print: no script, nothing loaded from
-elsewhere."""
+"""One recording, or several side by side, as one HTML page."""
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
@@ -19,11 +18,11 @@ from tormagd.recording.reader import RecordingFile
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation
 
 MAX_TOLD = 20
-"How many moments of one fault are listed."
+"Moments of one fault that are listed."
 
 
 def report(of: Sequence[RecordingFile]) -> str:
-    """Return one HTML page on these recordings, side by side, in their order; pictures are within it."""
+    """Return one HTML page on these recordings, with its pictures within."""
     names = [each.path.name for each in of]
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
@@ -75,7 +74,6 @@ def _figures(of: Sequence[RecordingFile]) -> list[list[str]]:
 
 
 def _range(of: RecordingFile, name: str) -> str:
-    """Say the range of a quantity over the recording, N."""
     known = of.overview.series(name)
     if known is None:
         return "not recorded"
@@ -91,7 +89,7 @@ def _picture(of: RecordingFile) -> str:
 def _codes(
     of: Sequence[RecordingFile], kind: str, explained: Mapping[Any, Explanation], told: Callable[[Codes, float], str]
 ) -> str:
-    """Return an HTML table of the codes of a kind, "limits" or "faults", that any of the recordings has."""
+    """Return an HTML table of the limits or faults that any of the recordings has."""
     names = dict.fromkeys(code for each in of for code in each.overview.codes[kind])
     texts = {str(code): known for code, known in explained.items()}
     rows = []
@@ -122,7 +120,6 @@ def _marks(of: Sequence[RecordingFile]) -> list[list[str]]:
 
 
 def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each quantity that was believed and acted at any recording's end: its name, and a text for each."""
     found = []
     for each in of:
         end_ns = each.overview.end_ns
@@ -139,7 +136,6 @@ def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
 
 
 def _lateness(of: Sequence[RecordingFile]) -> list[list[str]]:
-    """Return a row for each bar of the lateness histogram."""
     bars = [f"under {LATE_US[0]:g}", *(f"{a:g} to {b:g}" for a, b in pairwise(LATE_US))]
     counts = [each.overview.late_counts for each in of]
     return [[bar, *(f"{of_one[i]:,}" for of_one in counts)] for i, bar in enumerate([*bars, f"over {LATE_US[-1]:g}"])]

@@ -19,7 +19,7 @@ from tormagd.recording.reader import RecordingError
 
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
-"Host names that are served. By another name for this address, a foreign page could read the answers."
+"By another name for this address, a foreign page could read the answers."
 MAX_BROWSERS = 32
 PAGE = Path(__file__).parent / "page"
 HEADERS = {
@@ -30,7 +30,6 @@ HEADERS = {
 
 
 def application(shown: Live | Recorded) -> web.Application:
-    """Return the web application for a live daemon or a recording."""
 
     async def page(request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / "index.html")
@@ -67,7 +66,7 @@ def application(shown: Live | Recorded) -> web.Application:
 
 
 async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None]) -> None:
-    """Serve the page on LOOPBACK until SIGINT or SIGTERM, then close what is open; `port` 0 takes a free one."""
+    """Serve the page on LOOPBACK until SIGINT or SIGTERM; `port` 0 takes a free one."""
     over = asyncio.Event()
     runner = web.AppRunner(application(shown), access_log=None, shutdown_timeout=0.5)
     await runner.setup()
@@ -83,7 +82,7 @@ async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None])
 
 @web.middleware
 async def _only_this_machine(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Raise HTTPForbidden for a host name other than NAMES: a foreign page could reach the server by its own name."""
+    """Raise HTTPForbidden for a host name other than NAMES."""
     if request.url.host not in NAMES:
         raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
     return await handler(request)
@@ -98,7 +97,6 @@ def _json(value: object) -> web.Response:
 
 
 def _seconds(text: str) -> float:
-    """Parse the query's `at_s`, s."""
     try:
         seconds = float(text)
     except ValueError:

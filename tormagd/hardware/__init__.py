@@ -1,1 +1,1 @@
-"""Hardware: what carries messages to the firmware, and what the firmware last said."""
+"""Carries messages to the firmware, and holds what the firmware last said."""

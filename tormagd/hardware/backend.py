@@ -1,6 +1,6 @@
 """The interface of a backend, and the choice of one among the installed plugins.
 
-A backend carries typed messages over one kind of wire. It does not pace, retry or interpret: `link.DeviceLink` does.
+A backend carries typed messages over one kind of wire. `link.DeviceLink` paces, repeats and interprets them.
 """
 
 import logging
@@ -18,19 +18,18 @@ from tormagd.named_file import did_you_mean
 from tormagd_client.endpoints import ConfigError, Strict
 
 ENTRY_POINTS = "tormagd.backends"
-"""The group of entry points under which plugins register; each names a `Driver`."""
 OptionsT = TypeVar("OptionsT", bound=Strict)
 
 PLUGIN_ERRORS = (
     ImportError, AttributeError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError, SyntaxError,
 )  # fmt: skip
-"""What the module of a foreign plugin may raise while it is imported."""
+"A foreign plugin's module may raise any of these while it is imported."
 
 log = logging.getLogger(__name__)
 
 
 class BackendError(OSError):
-    """The device is gone, or cannot be opened. The text says what happened."""
+    """The device is gone or cannot be opened."""
 
     def __init__(self, cause: str, remedy: str = "") -> None:
         super().__init__(cause)
@@ -45,66 +44,64 @@ class LinkStatistics(Protocol):
     corrupt: int
     lost: int
     repeated: int
-    """Frames that the backend itself took for repetitions. Repeated States that it hands on are counted by the link."""
+    "Frames that the backend itself took for repetitions; the link counts repeated States."
     resynchronisations: int
     unsent: int
-    """Messages that the wire did not take at once."""
     refused: dict[str, str]
     """Why the newest refused message was refused, by its name, or by "frame" for bytes that were no message yet."""
 
 
 Stream: TypeAlias = FrameStream | CanStream
-"What turns a backend's messages into the wire's bytes, and bytes into messages."
 Received: TypeAlias = bytes | list[tuple[int, bytes]]
-"What one read gave: a serial port's bytes, or a bus's frames, identifier and data each."
+"What one read returned: serial bytes, or the identifier and data of each CAN frame."
 Sent: TypeAlias = bytes | tuple[int, bytes]
-"What one message became on the wire: a serial frame's bytes, or a CAN frame's identifier and data."
+"One message on the wire, serial or CAN."
 
 
 class Backend(Protocol):
-    """An open connection to one device. If it also has a `stream: Stream`, the black box keeps its frames."""
+    """An open connection to one device. If it has a `stream: Stream`, the black box records its frames."""
 
     @property
     def statistics(self) -> LinkStatistics:
         """Counters since the connection was opened."""
 
     def receive(self) -> Sequence[Message]:
-        """Return the valid messages that have arrived; never block. Raises BackendError when the device is gone."""
+        """Return the valid messages that have arrived, without blocking. Raises BackendError if the device is gone."""
 
     def send(self, message: Message) -> None:
-        """Hand one message to the wire; never block. Raises BackendError when the device is gone."""
+        """Hand one message to the wire, without blocking. Raises BackendError if the device is gone."""
 
     def close(self) -> None:
         """Close the connection, so that others may open the device. Never raises."""
 
 
 def _accept(device: Device, options: Strict, rates: Rates) -> None:
-    """Accept all settings: a driver without a check of its own."""
+    """Accept all settings."""
 
 
 @dataclass(frozen=True)
 class Driver(Generic[OptionsT]):
-    """One kind of backend, as its entry point gives it."""
+    """One kind of backend: the object that an entry point names."""
 
     options: type[OptionsT]
-    "What `[device.options]` may say; it is decoded before anything is opened."
     open: Callable[[Device, OptionsT], Backend]
-    "Opens the device. Raises BackendError saying why not."
+    "Raises BackendError."
     check: Callable[[Device, OptionsT, Rates], None] = _accept
-    "Refuses settings that cannot work, without any hardware. Raises ConfigError."
+    "Checks settings without any hardware. Raises ConfigError."
 
 
 class Chosen(NamedTuple):
-    """The backend that a configuration asks for, with all of its options."""
+    """The backend that a configuration asks for, with its options bound."""
 
     options: Strict
     open: Callable[[], Backend]
-    "Opens the device. Raises BackendError saying why not."
+    "Raises BackendError."
 
 
 def installed() -> dict[str, str]:
-    """Load every installed backend plugin; return by its name, sorted, why it does not load, "" where it does. Raises
-    what a module raises besides PLUGIN_ERRORS, such as SystemExit."""
+    """Load every installed backend plugin; return why each does not load, or "", by name. Other exceptions than
+    PLUGIN_ERRORS, such as SystemExit, pass through.
+    """
     found = {}
     for entry in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         found[entry.name] = ""
@@ -117,9 +114,10 @@ def installed() -> dict[str, str]:
 
 
 def choose(device: Device, rates: Rates) -> Chosen:
-    """Import the backend plugin that `device.backend` names, check the settings, and return it ready to be opened.
-    Raises ConfigError where no such plugin is installed, where it does not load, and where it refuses `device.options`
-    or `rates`."""
+    """Import the plugin that `device.backend` names, check its settings, and return it ready to be opened.
+
+    Raises ConfigError if it is not installed, does not load, or refuses `device.options` or `rates`.
+    """
     found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if device.backend not in found:
         installed_are = f"installed are {', '.join(sorted(found)) or 'none'}"
@@ -136,7 +134,6 @@ def choose(device: Device, rates: Rates) -> Chosen:
 
 
 def _load(entry: metadata.EntryPoint) -> Driver[Any]:
-    """Import the driver of an entry point."""
     loaded = entry.load()
     if not isinstance(loaded, Driver):
         raise TypeError(f"{entry.value} is {loaded!r:.80}: allowed is a {Driver.__module__}.{Driver.__name__}")

@@ -1,7 +1,7 @@
 """The CAN backend: python-can opens the bus, and each `receive` drains it.
 
-Any python-can interface will do whose bus has a file descriptor. Known are `socketcan` in the field, `slcan` and
-`udp_multicast` on the bench, and `tormagsim` for the simulated device.
+Any python-can interface will do whose bus has a file descriptor: `socketcan` in the field, `slcan` and `udp_multicast`
+on the bench, `tormagsim` for the simulated device.
 """
 
 import contextlib
@@ -26,20 +26,19 @@ from tormagd.named_file import did_you_mean
 from tormagd_client.endpoints import ConfigError, Strict
 
 FRAMES_AT_ONCE = 256
-"""Most frames taken in one `receive`: a bus that never falls silent must not keep the loop."""
+"""Limit of one `receive`: a bus that never falls silent must not hold up the loop."""
 UNSENT_FRAMES = 50
-"""Frames in a row that the bus may leave untaken; at 1 kHz, the device's own command timeout."""
+"""50 ms at 1 kHz, the device's own command timeout."""
 EXCHANGE_BITS = 395
-"""Bits of one Drive, State and Sense with the most stuffing: firmware_protocol/README.md."""
+"""One Drive, State and Sense with the most bit stuffing: firmware_protocol/README.md."""
 MAX_LOAD = 0.7
-"""Share of the bit rate that these three may take; the rest is for Status, commands and the bus's other nodes."""
+"""The rest is for Status, commands and other nodes."""
 BUS_OFF = 0x40
-"""Error class in the identifier of an error frame: linux/can/error.h, CAN_ERR_BUSOFF."""
+"""CAN_ERR_BUSOFF of linux/can/error.h."""
 ABSENT = {
     errno.ENODEV: ("there is no such interface", "plug the adapter in"),
     errno.EAFNOSUPPORT: ("the kernel knows no CAN", "sudo modprobe can_raw"),
 }
-"""Why the kernel opens no `socketcan` interface, and what to do before the interface is brought up."""
 
 
 class CanOptions(Strict, frozen=True):
@@ -56,13 +55,9 @@ class CanOptions(Strict, frozen=True):
 
 
 class CanBackend:
-    """An open CAN bus and the conversation with one node on it: a `Backend`. Nothing here waits.
-
-    It counts the frames in a row that the bus did not take; `stream` counts all else.
-    """
+    """An open CAN bus and the conversation with one node on it: a `Backend`."""
 
     def __init__(self, port: str, options: CanOptions, bus: can.BusABC, held: int | None = None) -> None:
-        """Take over the open `bus`; `close` shuts it down."""
         self._port, self._options, self._bus, self._held = port, options, bus, held
         self._fd: int = bus.fileno()
         self.stream = CanStream(options.node)
@@ -76,7 +71,7 @@ class CanBackend:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the node's messages among the frames that have arrived, in their order; none where none has."""
+        """Return the node's messages among the frames that have arrived, in order."""
         self.stream.received = []
         messages: list[Message] = []
         for _ in range(FRAMES_AT_ONCE):
@@ -85,14 +80,14 @@ class CanBackend:
             except (can.CanError, OSError) as error:
                 if not (isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError)):
                     raise self._gone("receiving failed", error) from error
-                self._bus.flush()  # python-can would keep a line that is no text for ever
+                self._bus.flush()  # python-can would keep a line that is not text for ever
                 self.stream.count_unreadable()
                 continue
-            except (ValueError, IndexError):  # how slcan says that a line of the adapter's is damaged
+            except (ValueError, IndexError):  # slcan's answer to a damaged line from the adapter
                 self.stream.count_unreadable()
                 continue
             if frame is None:
-                # an adapter's own chatter is no frame, and more may stand behind it
+                # the adapter's own chatter is not a frame, and frames may follow it
                 if not self._readable.poll(0):
                     break
             elif (message := self._unpack(frame)) is not None:
@@ -100,7 +95,6 @@ class CanBackend:
         return messages
 
     def send(self, message: Message) -> None:
-        """Hand one frame to the bus, and keep it in `stream.sent`, also where the bus does not take it."""
         identifier, data = self.stream.pack(message)
         frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
         if self._writable.poll(0):
@@ -120,10 +114,9 @@ class CanBackend:
             )
 
     def close(self) -> None:
-        """Shut the bus down and drop the adapter's lock; it may be called again."""
         with contextlib.suppress(can.CanError, OSError):
             self._bus.shutdown()
-        if isinstance(self._bus, slcanBus):  # its shutdown talks to the adapter first, and if that fails keeps the port
+        if isinstance(self._bus, slcanBus):  # if this fails, the port stays open
             self._bus.serialPortOrig.close()
         if self._held is not None:
             os.close(self._held)
@@ -138,7 +131,7 @@ class CanBackend:
         return f"check the device's supply, wiring, termination and bit rate ({self._options.bitrate})"
 
     def _unpack(self, frame: can.Message) -> Message | None:
-        """Return the message in a frame; None for one that is foreign, damaged or not from the device."""
+        """Return the message in a frame, or None if it is foreign, damaged or not from the device."""
         if frame.is_error_frame:
             if frame.arbitration_id & BUS_OFF or self._bus.state is can.BusState.ERROR:
                 raise BackendError(
@@ -148,7 +141,7 @@ class CanBackend:
             self.stream.count_unreadable()
             return None
         if frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
-            return None  # somebody else's conversation on the same bus
+            return None  # another conversation on the same bus
         try:
             return self.stream.unpack(frame.arbitration_id, bytes(frame.data))
         except SecondHostError as error:
@@ -158,7 +151,6 @@ class CanBackend:
             ) from error
 
     def _gone(self, what: str, error: can.CanError | OSError) -> BackendError:
-        """Return the error that says `what` failed and why, with a remedy where the interface is down."""
         number = _errno(error)
         if number == errno.ENETDOWN:
             return BackendError(f"{self._name}: the interface is down", remedy=_bring_up(self._port, self._options))
@@ -166,7 +158,7 @@ class CanBackend:
 
 
 def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
-    """Refuse an interface that is not installed, fails to load or has no descriptor, and a bit rate that is too low."""
+    """Refuse an interface that is unknown, does not load or has no descriptor, and a bit rate that is too low."""
     interface = options.interface
     if interface not in BACKENDS:
         raise ConfigError(
@@ -194,7 +186,7 @@ def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
 
 
 def open_can(device: Device, options: CanOptions) -> CanBackend:
-    """Open `device.port` through `options.interface`; a slcan adapter is locked first, so that one program holds it."""
+    """Open `device.port` through `options.interface`; lock a slcan adapter first, for one program only."""
     name = f"{options.interface} {device.port}"
     held = None
     try:
@@ -204,7 +196,7 @@ def open_can(device: Device, options: CanOptions) -> CanBackend:
             interface=options.interface,
             channel=device.port,
             bitrate=options.bitrate,
-            ignore_config=True,  # what applies stands in our configuration, not in a file of python-can's
+            ignore_config=True,  # python-can's own configuration file must not apply
             **_of_the_interface(options),
         )
     except (can.CanError, OSError, ValueError) as error:
@@ -222,16 +214,15 @@ def open_can(device: Device, options: CanOptions) -> CanBackend:
 
 
 DRIVER = Driver(CanOptions, open_can, check_can)
-"""The entry point `can`."""
 
 
 def _of_the_interface(options: CanOptions) -> dict[str, Any]:
     fitting: dict[str, dict[str, Any]] = {
         # other nodes' frames need not wake the daemon
         "socketcan": {"can_filters": [{"can_id": options.node, "can_mask": 0xF, "extended": False}]},
-        # by default it sleeps for 2 s when it opens, and for 1 ms whenever it finds nothing to read
+        # the defaults sleep for 2 s on opening, and for 1 ms whenever there is nothing to read
         "slcan": {"tty_baudrate": options.baud, "sleep_after_open": 0.0, "timeout": 0.0},
-        # stays on this machine
+        # packets stay on this machine
         "udp_multicast": {"hop_limit": 0, "fd": False},
     }
     return fitting.get(options.interface, {})
@@ -242,7 +233,7 @@ def _bring_up(port: str, options: CanOptions) -> str:
 
 
 def _hold(path: str) -> int:
-    """Open `path` and return a descriptor that holds the lock of pyserial's exclusive ports; python-can takes none."""
+    """Open `path` with the lock of pyserial's exclusive ports, which python-can does not take."""
     descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -253,10 +244,9 @@ def _hold(path: str) -> int:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """Return the errno of the system's error behind one of python-can's; None where there is none."""
     while error is not None:
         number = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
-        if number is not None and number > 0:  # a resolver's errors have numbers of their own, under 0
+        if number is not None and number > 0:  # a resolver's errors have numbers below 0
             return number
         error = error.__cause__
     return None

@@ -1,4 +1,4 @@
-"""Messages to CAN frames and back: the part of the CAN backend that works without a bus."""
+"""Converts messages to CAN frames and back, without a bus."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -21,9 +21,9 @@ from firmware_protocol.framing import FramingStatistics, Succession
 
 FROM_DEVICE = (State, Sense, Status, Identity)
 UNREADABLE = (0x2000_0000, b"")
-"""What stands for an error frame, and for bytes that were no frame at all: linux/can.h, CAN_ERR_FLAG."""
+"""Stands for an error frame and for bytes that were no frame: CAN_ERR_FLAG of linux/can.h."""
 ECHOES = 32
-"""Sent Drives that are kept, to know their echo by, on a bus that returns what is sent (UDP multicast)."""
+"""Sent Drives that are kept, to recognise their echo on a bus that returns what is sent (UDP multicast)."""
 
 
 class SecondHostError(Exception):
@@ -31,12 +31,11 @@ class SecondHostError(Exception):
 
 
 class CanStream:
-    """Both directions of one conversation with one node. A frame that does not decode is counted, never raised."""
+    """Both directions of the conversation with one node. A frame that does not decode is counted, never raised."""
 
     __match_args__: ClassVar = ("node", "statistics", "_states", "_drives", "_synchronised")
 
     def __init__(self, node: int) -> None:
-        """Begin a conversation with `node`."""
         self.node = node
         self.statistics = FramingStatistics()
         self._identifiers = {message: can_identifier(function, node) for message, function in FUNCTION.items()}
@@ -44,12 +43,10 @@ class CanStream:
         self._drives: deque[bytes] = deque(maxlen=ECHOES)
         self._synchronised = True
         self.received: list[tuple[int, bytes]] = []
-        """The node's frames since the reader of the bus last emptied the list, UNREADABLE among them."""
+        """Frames since the bus was last read, UNREADABLE among them."""
         self.sent = UNREADABLE
-        """The newest outgoing frame."""
 
     def pack(self, message: Message) -> tuple[int, bytes]:
-        """Return a message's CAN identifier and data, and keep both in `sent` until the next call."""
         data = encode(message)
         if isinstance(message, Drive):
             self._drives.append(data)
@@ -57,8 +54,6 @@ class CanStream:
         return self.sent
 
     def unpack_all(self, frames: Iterable[tuple[int, bytes]]) -> list[Message]:
-        """Return the messages in frames (identifier, data), in their order, as `unpack` of each; UNREADABLE counts as
-        corrupt."""
         messages: list[Message] = []
         for identifier, data in frames:
             if identifier == UNREADABLE[0]:
@@ -68,7 +63,7 @@ class CanStream:
         return messages
 
     def unpack(self, identifier: int, data: bytes) -> Message | None:
-        """Return the message in a frame; None for a frame of another node, of a host, or one that does not decode."""
+        """Return the message in a frame, or None for another node's, a host's, or one that does not decode."""
         if identifier & 0xF != self.node:
             return None
         self.received.append((identifier, data))
@@ -92,7 +87,6 @@ class CanStream:
         return message
 
     def count_unreadable(self) -> None:
-        """Count an error frame, or bytes that were no frame, as corrupt, and note UNREADABLE in `received`."""
         self.received.append(UNREADABLE)
         self._count_corrupt()
 

@@ -38,16 +38,16 @@ log = logging.getLogger(__name__)
 
 
 class Traffic(Protocol):
-    """A listener to all that passes between daemon and device, byte for byte: the black box's journal."""
+    """Hears all that passes between daemon and device: the black box's journal."""
 
     def read(self, now_s: float, raw: Received) -> None:
-        """Take the bytes or frames that were read from the device at `now_s`."""
+        """Take what was read from the device."""
 
     def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        """Take the frames of one period. `unsent` messages in all were not taken by the wire at once."""
+        """Take the frames of one period; `unsent` counts all messages that the wire has not taken at once."""
 
     def connected(self, memory: Any) -> None:
-        """Take the memory of a conversation that begins, as `Connection.memory` gives it; None: it is over."""
+        """Take the memory of a conversation that begins, or None when it ends."""
 
 
 class Connection:
@@ -60,7 +60,6 @@ class Connection:
         on_loss: Callable[[], None],
         host: Callable[[float], str] = lambda now_s: "",
     ) -> None:
-        """Begin closed."""
         self._device, self._open_backend, self._on_loss, self._host = device, open_backend, on_loss, host
         self._backend: Backend | None = None
         self._stream: Stream | None = None
@@ -75,7 +74,6 @@ class Connection:
         self.losses = 0
         self._last_loss = ""
         self.traffic: Traffic | None = None
-        """Who hears of all traffic; None: nobody."""
 
     @property
     def state(self) -> LinkState:
@@ -83,7 +81,7 @@ class Connection:
 
     @property
     def cause(self) -> str:
-        """Why the device does not run, or what a measurement still lacks; empty when it runs and is measured."""
+        """Why the device does not run, or what a measurement still lacks."""
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return self._cause
@@ -100,14 +98,12 @@ class Connection:
 
     @property
     def remedy(self) -> str:
-        """What a person can do about the cause; empty where there is no cause or no advice."""
         if self.state is LinkState.RUNNING:
             return "look at what the firmware sends, and at its CRC-8" if self.cause else ""
         return self._remedy or _REMEDIES.get(self.state, "")
 
     @property
     def serial_number(self) -> int | None:
-        """The device's serial number; None without an open port, and until the device has said it."""
         identity = None if self._link is None else self._link.identity
         return None if identity is None else identity.serial_number
 
@@ -120,11 +116,11 @@ class Connection:
         return self._unfinished if self._link is None else self._link.pending
 
     def open(self, now_s: float) -> None:
-        """Open the port and begin a conversation, in which an unfinished RETRACT is sent again; tell `traffic` so."""
+        """Open the port and begin a conversation, which repeats an unfinished RETRACT."""
         try:
             self._backend = self._open_backend()
         except BackendError as error:
-            # the first failure is news, the same one again is not
+            # only the first failure is news
             log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
             self._wait(now_s, LinkState.BACK_OFF, str(error), error.remedy)
             self._notice()
@@ -142,7 +138,7 @@ class Connection:
         self._notice()
 
     def receive(self, now_s: float) -> None:
-        """Read what has come from the device, and hand it to `traffic` and the conversation; never wait."""
+        """Read what the device has sent, and hand it to `traffic` and the conversation."""
         backend, link = self._backend, self._link
         if backend is None or link is None:
             return
@@ -160,7 +156,7 @@ class Connection:
     def exchange(
         self, now_s: float, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
     ) -> None:
-        """Send this period's Drive to a running device, then the Hello or command that is due; tell `traffic`."""
+        """Send this period's Drive to a running device, then the Hello or command that is due."""
         if self._link is None and self._waiting is not LinkState.CLOSED and now_s >= self._reopen_s:
             self.open(now_s)
         link, backend = self._link, self._backend
@@ -168,7 +164,7 @@ class Connection:
             return
         if number != self._requested:
             self._requested = number
-            # opening the gap waits for a device; nothing else may move one that has come since it was asked for
+            # opening the gap waits for a device; no other request may move one that has come since
             if request is DeviceRequest.RETRACT or link.state is LinkState.RUNNING:
                 link.request(now_s, request)
         sent: list[Sent] = []
@@ -191,7 +187,6 @@ class Connection:
             self._notice()
 
     def close(self) -> None:
-        """Close the port; it stays closed until `open`."""
         self._release()
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
         self._seen = LinkState.CLOSED
@@ -203,20 +198,18 @@ class Connection:
         return {"requested": self._requested, "link": plain(self._link), "stream": plain(self._stream)}
 
     def remember(self, memory: Any, known: Kinds) -> None:
-        """Continue a conversation from `memory`, which `memory()` returned, on this connection's open port."""
         self._requested = memory["requested"]
         restore(self._link, memory["link"], known)
         restore(self._stream, memory["stream"], known)
         self._seen = self.state
 
     def report(self) -> LinkReport:
-        """Return the link's report for `status`; None in it for what is not known yet or needs an open port."""
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
         round_trip = None if link is None else link.round_trip.report()
         counted = {name: None if backend is None else getattr(backend.statistics, name) for name in COUNTERS}
         if link is not None and counted["repeated"] is not None:
-            counted["repeated"] += link.repeated  # each repetition is counted by whoever drops it
+            counted["repeated"] += link.repeated  # a repetition is counted by whoever drops it
         return LinkReport(
             state=str(self.state),
             cause=self.cause,
@@ -241,13 +234,12 @@ class Connection:
         )
 
     def _send(self, backend: Backend, message: Message, sent: list[Sent]) -> None:
-        """Send a message, and add its frame to `sent` where the backend has a stream."""
         backend.send(message)
         if self._stream is not None:
             sent.append(self._stream.sent)
 
     def _lose(self, now_s: float, cause: str, remedy: str) -> None:
-        """End the conversation as lost for `cause`, close the port, and wait in LOST until it is opened again."""
+        """End the conversation for `cause`, close the port, and wait in LOST until it is opened again."""
         assert self._link is not None, "only an open port can be lost"
         self._link.lose(cause)
         self._remedy = remedy
@@ -257,7 +249,6 @@ class Connection:
         self._wait(now_s, LinkState.LOST, cause, remedy)
 
     def _release(self) -> None:
-        """Close the backend and tell `traffic`; forget link and stream, with what the link has pending."""
         if self._backend is not None:
             self._backend.close()
             if self.traffic is not None:
@@ -265,13 +256,12 @@ class Connection:
         self._backend = self._link = self._stream = None
 
     def _wait(self, now_s: float, state: LinkState, cause: str, remedy: str) -> None:
-        """Wait in `state` before the port is opened again, twice as long each time, to LONGEST_BACK_OFF_S."""
+        """Wait in `state` before opening the port again, twice as long each time, up to LONGEST_BACK_OFF_S."""
         self._waiting, self._cause, self._remedy = state, cause, remedy
         self._reopen_s = now_s + self._back_off_s
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
 
     def _notice(self) -> None:
-        """Act on a change of state since the last call, if there was one."""
         before, state = self._seen, self.state
         if state is before:
             return
@@ -289,7 +279,6 @@ class Connection:
 
 
 def clock_report(fit: ClockReport | None, way_s: float = 0.0) -> ClockReport | None:
-    """Return a clock's fit, rounded for `status`; None for None."""
     if fit is None:
         return None
     return ClockReport(

@@ -1,4 +1,4 @@
-"""Messages to serial bytes and back: the part of the serial backend that works without a port."""
+"""Converts messages to serial bytes and back, without a port."""
 
 from typing import ClassVar, final
 
@@ -16,23 +16,20 @@ class FrameStream:
         self._decoder = FrameDecoder()
         self._sequence = 0
         self.received = b""
-        """The bytes that `unpack` was last given."""
         self.sent = b""
-        """The newest outgoing frame."""
 
     @property
     def statistics(self) -> FramingStatistics:
         return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
-        """Return a message's frame, with the next sequence number, 0..255, and keep it in `sent` until the next call."""
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         self.sent = frame
         return frame
 
     def unpack(self, data: bytes) -> list[Message]:
-        """Return the valid messages that `data` completes, in their order, and keep `data` in `received`."""
+        """Return the valid messages that `data` completes, in order, and keep `data` in `received`."""
         self.received = data
         messages: list[Message] = []
         for frame in self._decoder.feed(data):

@@ -1,6 +1,6 @@
 """The conversation with one firmware: handshake, commands that are repeated until acknowledged, measurements.
 
-No I/O and no clock: the daemon and the virtual-time simulation carry the same messages to and from it.
+It has no I/O and no clock: the daemon and the virtual-time simulation carry its messages.
 """
 
 from collections.abc import Mapping
@@ -31,19 +31,19 @@ from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 
 REPEAT_S: Final = 0.05
-"A Hello or a command without its acknowledgement is sent again after this time."
+"After this time without an acknowledgement a Hello or a command is sent again."
 GIVE_UP_S: Final = 1.0
-"A Home or Clear that is not acknowledged after this time is given up: later it would be a surprise."
+"A Home or Clear that is not acknowledged by then is given up: a late one would be a surprise."
 HELLO_S: Final = 1.0
-"A Hello is sent this often: a device that was reset takes no Drive before one."
+"A device that was reset takes no Drive before a Hello."
 SILENT_S: Final = 0.08
-"Without any message for this long the link is lost; by then the firmware's own 50 ms have passed."
+"By then the firmware's own 50 ms have passed."
 UNANSWERED_S: Final = 1.0
-"A device that has sent no Identity for this long gets a Hello only every HELLO_S: it may be another make's."
+"A device without an Identity for this long may be of another make; it gets a Hello only every HELLO_S."
 FIRST_NONCE: Final = 255
-"""The nonce of a Hello until a command is acknowledged. Commands count from 1 to 254, so that theirs always differs."""
+"Commands count from 1 to 254, so a Hello's nonce always differs."
 OVERTAKEN: Final = 16
-"A State whose counter is behind by less than this repeats an earlier one, or was overtaken; it is no measurement."
+"A State whose counter is behind by less is a repetition or was overtaken."
 
 POSITION_SPAN_MM: Final = period(State, "left_position_mm")
 DEVICE_TIME_SPAN_S: Final = period(State, "device_time_s")
@@ -58,7 +58,7 @@ _COMMANDS: Final[dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]]] 
 
 
 class LinkState(StrEnum):
-    """Where a connection stands. In CLOSED, BACK_OFF and LOST the port is not open."""
+    """The state of a connection. In CLOSED, BACK_OFF and LOST the port is not open."""
 
     CLOSED = "CLOSED"
     BACK_OFF = "BACK_OFF"
@@ -69,7 +69,7 @@ class LinkState(StrEnum):
     LOST = "LOST"
 
 
-# a member's look-up in its class takes longer than what else is done with a message
+# looking a member up in its class takes longer than the rest of the work on a message
 _IDENTIFYING: Final = LinkState.IDENTIFYING
 _UNANSWERED: Final = LinkState.UNANSWERED
 _RUNNING: Final = LinkState.RUNNING
@@ -78,7 +78,7 @@ _NO_REQUEST: Final = DeviceRequest.NONE
 
 @final
 class DeviceLink:
-    """One conversation with a device, from the opening of the port to its loss. A new opening needs a new link."""
+    """One conversation with a device."""
 
     __match_args__: ClassVar = (
         "_acknowledged", "_asked_s", "_broken", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
@@ -90,15 +90,13 @@ class DeviceLink:
 
     def __init__(self, now_s: float) -> None:
         self.repeated = 0
-        """States that were dropped: they repeat an earlier one, or were overtaken on their way."""
         self._drives = self._states = 0
         self._request = DeviceRequest.NONE
         self._request_due_s = self._requested_s = now_s
         self._begin(now_s, "waiting for the device to say who it is")
 
     def _begin(self, now_s: float, cause: str) -> None:
-        """Begin to identify the device, at first and after a reset or a replacement, and forget all that was known of
-        it."""
+        """Begin to identify the device, and forget all that was known of it."""
         self.state = _IDENTIFYING
         self.cause = cause
         self.identity: Identity | None = None
@@ -110,7 +108,7 @@ class DeviceLink:
         self._broken = ""
         self._delay_s = 0.0
         self._nonce = 0
-        # a Hello sets what the device calls the last accepted nonce, so it repeats that one and acknowledges nothing
+        # the device takes a Hello's nonce for the last accepted one, and so acknowledges nothing
         self._acknowledged = FIRST_NONCE
         self._state: State | None = None
         self._sense: Sense | None = None
@@ -132,7 +130,7 @@ class DeviceLink:
 
     @property
     def measurement(self) -> Measurement | None:
-        """The newest State, with the newest Sense and Status; None until a State follows the first of both."""
+        """The newest State, Sense and Status; None until a State follows the first of both others."""
         if self._measurement is None and self._is_measured:
             self._measurement = self._measured()
         return self._measurement
@@ -142,7 +140,6 @@ class DeviceLink:
         return self._request
 
     def receive(self, now_s: float, message: Message) -> None:
-        """Take one message that came from the device at `now_s`: State, Sense, Status or Identity."""
         self._heard_s = now_s
         if self.state is _UNANSWERED:
             self.state = _IDENTIFYING
@@ -157,7 +154,7 @@ class DeviceLink:
             self._take_identity(message)
 
     def due(self, now_s: float) -> list[Message]:
-        """Return the Hello or the command to send at `now_s`, after the period's Drive; often none."""
+        """Return the Hello or the command to send after this period's Drive."""
         self.round_trip.drive(self._drives % 256, now_s)
         self._change_state(now_s)
         is_waiting = False
@@ -177,7 +174,6 @@ class DeviceLink:
         return messages
 
     def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
-        """Return the next Drive, with the next counter, 0..255; it counts as sent."""
         self._drives += 1
         return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._drives % 256)
 
@@ -188,7 +184,6 @@ class DeviceLink:
         self._request_due_s = self._requested_s = now_s
 
     def missing(self, refused: Mapping[str, str]) -> str:
-        """Return what a measurement of a running device still lacks, as in "no Sense yet, State refused: CRC-8"."""
         if self.state is not _RUNNING or self._is_measured:
             return ""
         lacking: list[str] = []
@@ -198,20 +193,19 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Renew `quality`, which the measurement carries from then on, from the backend's counters, where that is due."""
+        """Renew `quality` from the backend's counters, when that is due."""
         if self._quality_watch.is_due(now_s):
             counts = Counts(self._drives, self._states, frames, damaged, unsent)
             self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
             self._measurement = None
 
     def lose(self, cause: str) -> None:
-        """End the conversation in LOST, from any state: the port failed, for `cause`."""
         self.state = LinkState.LOST
         self.cause = cause
 
     def _change_state(self, now_s: float) -> None:
-        """Identify a device anew that was reset or replaced; else enter LOST or UNANSWERED, and say why in `cause`."""
-        # the break was heard a tick ago: so the core has seen the measurement that shows it, and names it better
+        """Identify a device anew after a reset or a replacement, or enter LOST or UNANSWERED."""
+        # one tick later, so that the core has seen the measurement that shows the break, and names it better
         if self._broken:
             self._begin(now_s, self._broken)
         elif self.state is _RUNNING and now_s - self._heard_s > SILENT_S:
@@ -222,7 +216,6 @@ class DeviceLink:
             self.cause = f"the device has not said who it is for {UNANSWERED_S:g} s"
 
     def _take_identity(self, identity: Identity) -> None:
-        """Keep an Identity: enter RUNNING, or REFUSED for another protocol schema, from any state."""
         self.round_trip.identity()
         known, self.identity = self.identity, identity
         if known is not None and known.serial_number != identity.serial_number:
@@ -240,11 +233,11 @@ class DeviceLink:
     def _take_status(self, now_s: float, status: Status) -> None:
         """Keep a Status: end an acknowledged request, and note a reset or how late the device obeys."""
         if self._status is None:
-            # an earlier host has counted this far; its last number again would be taken for a repetition
+            # an earlier host has counted this far; its last number would be taken for a repetition
             self._nonce = _next_nonce(status.command_nonce)
         elif self._status.command_nonce != 0 and status.command_nonce == 0:
             self._broken = "the device was reset"
-        # a device that has just homed has a new origin; the newest State here is still of the old one
+        # a device that has just homed has a new origin, and the newest State is still of the old one
         has_new_origin = self._status is not None and _is_homed(status) and not _is_homed(self._status)
         self._status = status
         if not has_new_origin:
@@ -255,9 +248,9 @@ class DeviceLink:
             self._request = DeviceRequest.NONE
             self._acknowledged = self._nonce
         elif self._request is DeviceRequest.RETRACT and status.mode is DeviceMode.LATCHED:
-            # a latched device has opened already, or cannot, and will not try again before a Clear
+            # a latched device has opened, or cannot, and tries again only after a Clear
             self._request = DeviceRequest.NONE
-        # only a running device says which Drive it obeys; one late Status alone is a stall, not the wire's doing
+        # one late Status alone is a stall
         last_s = self._delay_s
         self._delay_s = 0.0
         if status.mode is DeviceMode.RUN:
@@ -267,8 +260,7 @@ class DeviceLink:
             self._measurement = None
 
     def _take_sense(self, now_s: float, sense: Sense) -> None:
-        """Keep a Sense and the time at which it came; once there are measurements, add the handle's travel to them."""
-        # Sense follows the State of the same instant; the measurement takes the newest of both
+        # Sense follows the State of the same instant
         self._sensed_s = now_s
         previous = self._sense
         if self._is_measured and previous is not None:
@@ -277,7 +269,7 @@ class DeviceLink:
         self._sense = sense
 
     def _take_state(self, now_s: float, state: State) -> None:
-        """Take a State into the measurement, its positions and time unwrapped, and feed round trips and clock."""
+        """Unwrap a State's positions and time into the measurement, and feed round trips and clock."""
         previous = self._state
         if previous is not None and (previous.counter - state.counter) % 256 < OVERTAKEN:
             self.repeated += 1
@@ -291,15 +283,14 @@ class DeviceLink:
         self._number += 1
         self._received_s = now_s
         self._device_time_s += (state.device_time_s - previous.device_time_s) % DEVICE_TIME_SPAN_S
-        # before homing the position's origin is arbitrary; homing sets it to 0, so a wrap and a re-zero look alike:
-        # taking the shortest way each time is right for the first and harmless for the second
+        # homing sets an arbitrary origin to 0, so a wrap and a re-zero look alike: taking the shortest way is right for
+        # a wrap and harmless for a re-zero
         self._left_mm += _unwrapped(previous.left_position_mm, state.left_position_mm, POSITION_SPAN_MM)
         self._right_mm += _unwrapped(previous.right_position_mm, state.right_position_mm, POSITION_SPAN_MM)
         self._measurement = None
         self.clock.add(now_s, self._device_time_s)
 
     def _begin_measuring(self, now_s: float, state: State) -> None:
-        """Begin measurements with this State, as number 0 and with its positions and time as they are."""
         if self._status is None or self._sense is None:
             return
         self._is_measured = True
@@ -310,7 +301,6 @@ class DeviceLink:
         self._right_mm = state.right_position_mm
 
     def _measured(self) -> Measurement:
-        """Return a Measurement of the newest State and Sense, and of the newest Status that counts for this State."""
         sense, status = self._sense, self._told
         assert sense is not None, "measuring begins with a Sense"
         assert status is not None, "measuring begins with a Status"

@@ -1,6 +1,6 @@
-"""How well the wire carries messages, in figures of the last second: they warn before a slow loop swings.
+"""How well the wire has carried messages in the last second: figures that warn before a slow loop swings.
 
-Every measurement carries a `LinkQuality`, so that a step decides on its inputs alone, and a replay decides the same.
+Every measurement carries a `LinkQuality`: so a step decides on its inputs alone, and a replay decides the same.
 """
 
 from collections import deque
@@ -9,19 +9,15 @@ from typing import ClassVar, Final, final
 from firmware_protocol.value import Value
 
 LOOKED_S: Final = 0.1
-"The figures are renewed this often: a look."
 LOOKS: Final = 10
-"Looks that the figures span: a second."
 SETTLING_LOOKS: Final = 3
-"Looks left out at first in a conversation: the answers to the last Drives are still on their way."
+"The first looks of a conversation do not count: the answers to the last Drives are still on their way."
 LOSES: Final = 0.02
 "A wire that loses or damages a greater share is lossy: a sound serial cable or CAN bus loses none."
 
 
 @final
 class LinkQuality(Value):
-    """How well the wire carried in the last second."""
-
     def __init__(
         self,
         unanswered: float = 0.0,
@@ -52,8 +48,6 @@ UNKNOWN_QUALITY: Final = LinkQuality()
 
 @final
 class Counts(Value):
-    """Counters of one conversation, which only grow."""
-
     def __init__(self, drives: int = 0, states: int = 0, frames: int = 0, damaged: int = 0, unsent: int = 0) -> None:
         self.drives: Final = drives
         self.states: Final = states
@@ -64,8 +58,6 @@ class Counts(Value):
 
 @final
 class LinkWatch:
-    """The figures of one conversation, renewed every LOOKED_S from its counters."""
-
     __match_args__: ClassVar = ("_counts", "_due_s", "_round_trip_s")
 
     def __init__(self, now_s: float) -> None:
@@ -74,11 +66,10 @@ class LinkWatch:
         self._round_trip_s = 0.0
 
     def is_due(self, now_s: float) -> bool:
-        """Tell whether the next `look` is due."""
         return now_s >= self._due_s
 
     def look(self, now_s: float, counts: Counts, round_trip_s: float, clock_drift: float) -> LinkQuality:
-        """Return the quality over the last LOOKS looks, or all so far; the next look is due LOOKED_S after `now_s`."""
+        """Return the quality over the last LOOKS looks, and set when the next is due."""
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)
         before = self._counts[0]

@@ -1,7 +1,7 @@
 """How long the wire takes, and how the device's clock runs against the host's.
 
-The conversation feeds both with every Drive and State; both keep a bounded number of figures. What costs more than a
-comparison is computed when it is asked for, not when it is fed.
+The conversation feeds both with every Drive and State, and both keep a bounded number of figures. What costs more than
+a comparison is computed when it is asked for.
 """
 
 import math
@@ -13,34 +13,33 @@ from typing import ClassVar, Final, TypeAlias, final
 from tormagd_client.messages import ClockReport
 
 ROUND_TRIPS = 256
-"Round trips that percentiles are taken from: a quarter of a second of control."
+"Percentiles are taken from these: a quarter of a second of control."
 USUAL_OF: Final = 101
-"Round trips that the median is taken from: over twice the 50 late ones after a device stood still, at 1 kHz."
+"The median is taken from these: over twice the 50 late ones after a device stood still, at 1 kHz."
 WINDOW_S = 0.5
-"The least delayed State of a window of this time stands for all of the window: queues on the way only ever add."
+"The least delayed State of a window stands for all of it: queues on the way only ever add."
 WINDOWS = 60
 MIN_WINDOWS = 6
 OUTLIER = 4.0
-"Standard deviations, by the median of the absolute deviations, beyond which a window does not count."
+"A window further off than so many standard deviations (by the median absolute deviation) does not count."
 MAX_RESIDUAL_US = 2_000.0
-"A line with a larger standard deviation around it does not fit."
 NEWEST_WINDOWS = 3
-"Where none of so many newest windows lies on the line, the clock has left the line."
+"When this many newest windows all lie off the line, the clock has left it."
 DRIFT_WINDOWS: Final = 8
-"Windows that the drift is taken from: a clock that runs wrong is known after four seconds."
+"The drift is taken from these: a clock that runs wrong is known after four seconds."
 STANDING: Final = 20
-"After more States in a row with one time the clock stands: a millisecond is a hundred steps of the device's clock."
+"After more States in a row with one time the clock stands."
 CLOCK_STEP_S = 1e-5
-"The resolution of State.device_time_s. A window one step off the line, with its jitter, is no outlier."
+"Resolution of State.device_time_s; a window one step off the line is no outlier."
 
 
 Windows: TypeAlias = Sequence[tuple[float, float]]
-"Of each window, the host's time less the device's, and the host's time, s."
+"For each window, the host's time less the device's, and the host's time, s."
 
 
 @final
 class RoundTrip:
-    """Times from a Drive that is handed to the wire until its State has been read, s."""
+    """Times from handing a Drive to the wire until its State has been read, s."""
 
     __match_args__: ClassVar = (
         "_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure",
@@ -57,28 +56,24 @@ class RoundTrip:
         self._recent: deque[float] = deque(maxlen=ROUND_TRIPS)
 
     def drive(self, counter: int, now_s: float) -> None:
-        """Note that the Drive with this counter, 0..255, goes out at `now_s`; the time of that counter's last Drive is
-        forgotten."""
         self._newest = counter
         self._sent_s[counter] = now_s
 
     def since_next_s(self, counter: int, now_s: float) -> float:
-        """Return the time since the Drive after the one with this counter, 0..255, went out, s."""
+        """Return the time since the Drive after the one with this counter went out."""
         return 0.0 if counter == self._newest else max(0.0, now_s - self._sent_s[(counter + 1) % 256])
 
     def hello(self) -> None:
-        """Note that a Hello goes out after the newest Drive."""
         self._before_hello = self._newest
 
     def identity(self) -> None:
-        """Note that the Identity for the newest Hello came: it fixes how far Drive and State counters are apart."""
+        """Note the Identity for the newest Hello: it fixes the offset between Drive and State counters."""
         if self._before_hello is not None and self._state is not None:
             self._lead = self._before_hello - self._state
         self._before_hello = None
 
     def state(self, counter: int, now_s: float) -> None:
-        """Note that the State with this counter, 0..255, came at `now_s`; its round trip counts once a Status confirms
-        it."""
+        """Note a State; its round trip counts once a Status confirms it."""
         self._state, self._newest_s = counter, now_s
         lead = self._lead
         if lead is None:
@@ -90,7 +85,7 @@ class RoundTrip:
             self._lead = None
 
     def status(self, drive_counter: int) -> None:
-        """Take the counter of the last Drive that the device accepted: count the round trips since the last Status."""
+        """Take the last Drive that the device accepted, and count the round trips since the last Status."""
         state, lead = self._state, self._lead
         if state is None:
             return
@@ -111,7 +106,6 @@ class RoundTrip:
 
     @property
     def usual_s(self) -> float:
-        """The median of the newest USUAL_OF round trips, or of fewer while there are fewer, s; 0 while none is known."""
         ordered_s = sorted(list(self._recent)[-USUAL_OF:])
         return ordered_s[len(ordered_s) // 2] if ordered_s else 0.0
 
@@ -120,7 +114,6 @@ class RoundTrip:
         return min(self._recent, default=0.0)
 
     def report(self) -> dict[str, float] | None:
-        """Return `least`, `p50` (median) and `p99` of the recent round trips, us to 0.1; None while none is known."""
         ordered_s = sorted(self._recent)
         if not ordered_s:
             return None
@@ -130,7 +123,7 @@ class RoundTrip:
 
 @final
 class DeviceClock:
-    """The device's clock against the host's, by regression over the least delayed State of each half second."""
+    """The device's clock against the host's, by regression over the least delayed State of each window."""
 
     __match_args__: ClassVar = ("_ends_s", "_least", "_newest_s", "_standing", "_windows", "drift")
 
@@ -143,10 +136,10 @@ class DeviceClock:
         self._newest_s = -math.inf
         self._standing = 0
         self.drift = 0.0
-        """By which share the clock runs fast, over DRIFT_WINDOWS; 0 while unknown, -1 for a clock that stands."""
+        "The share by which the clock runs fast; 0 while unknown, -1 for a clock that stands."
 
     def add(self, host_s: float, device_s: float) -> None:
-        """Take a State that was latched at `device_s` on the device's clock, unwrapped, and read at `host_s`, s."""
+        """Take a State latched at `device_s` on the device's clock and read at `host_s`."""
         if device_s != self._newest_s:
             self._newest_s, self._standing = device_s, 0
         else:
@@ -160,14 +153,14 @@ class DeviceClock:
             self._least = (offset_s, host_s)
 
     def fit(self) -> ClockReport | None:
-        """Return the line of the host's time less the device's; None where no line fits yet."""
+        """Return the line of the host's time less the device's."""
         if not self._is_fitted:
             self._fit = _newest_line(list(self._windows))
             self._is_fitted = True
         return self._fit
 
     def _turn(self, host_s: float) -> None:
-        """End the window and begin the next at `host_s`: keep the least delayed State, if one came, and renew `drift`."""
+        """Begin the next window, and renew `drift`."""
         if self._least[0] < math.inf:
             self._windows.append(self._least)
             self._is_fitted = False
@@ -179,8 +172,8 @@ class DeviceClock:
 
 
 def _newest_line(windows: Windows) -> ClockReport | None:
-    """Return the line through the newest of `windows`, which are in the order of time; None where no line fits."""
-    # no line fits across a clock that was set, or stood still for a while: the older half is dropped until one does
+    """Return the line through the newest of `windows`, which are in order of time."""
+    # no line fits across a clock that was set or stood still, so the older half goes until one does
     while len(windows) >= MIN_WINDOWS:
         fit, is_left = _robust_line(windows)
         if fit.residual_us < MAX_RESIDUAL_US and not is_left:
@@ -190,7 +183,7 @@ def _newest_line(windows: Windows) -> ClockReport | None:
 
 
 def _robust_line(windows: Windows) -> tuple[ClockReport, bool]:
-    """Return the line through the windows, in the order of time, and whether all of the NEWEST_WINDOWS lie off it."""
+    """Return the line through the windows, and whether all of the NEWEST_WINDOWS lie off it."""
     newest_s = windows[-1][1]
     half = len(windows) // 2
     slope = _median([(b[0] - a[0]) / (b[1] - a[1]) for a, b in zip(windows, windows[-half:], strict=False)])

@@ -6,14 +6,14 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from firmware_protocol.value import Value
 from tormagd.hardware.link_quality import UNKNOWN_QUALITY, LinkQuality
 
-# an operation on flags makes a new one, in a microsecond; a shift does not, and the core asks a thousand times a second
+# an operation on flags makes a new one, in a microsecond; a shift does not
 _HOMED: Final = Switches.HOMED.bit_length() - 1
 _LEFT_OPEN: Final = Switches.LEFT_OPEN.bit_length() - 1
 _RIGHT_OPEN: Final = Switches.RIGHT_OPEN.bit_length() - 1
 _LATCHED: Final = DeviceMode.LATCHED
 _BUSY: Final = (DeviceMode.HOMING, DeviceMode.RETRACTING)
 _LARGEST: Final = 1e10
-"Bound on any number, 300 years of a clock's seconds: what is computed from larger ones may overflow."
+"300 years in seconds; what is computed from larger numbers may overflow."
 
 
 def _is_set(bits: int, place: int) -> bool:
@@ -22,7 +22,7 @@ def _is_set(bits: int, place: int) -> bool:
 
 @final
 class Measurement(Value):
-    """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s."""
+    """One device state. Carriage positions are mm from the home switches (closing is negative)."""
 
     def __init__(
         self,
@@ -66,10 +66,9 @@ class Measurement(Value):
 
     @property
     def is_finite(self) -> bool:
-        """Tell whether the numbers are finite and small enough to compute with: the root of their squares' sum is at
-        most 1e10."""
+        """Whether the root of the sum of the numbers' squares is at most 1e10."""
         link = self.link
-        # one comparison, as it stands in every tick: a sum of squares with NaN is not less, and nothing cancels
+        # one comparison in every tick: a sum of squares with NaN is not less, and nothing cancels
         squares = (
             self.received_s * self.received_s
             + self.device_time_s * self.device_time_s
@@ -107,6 +106,5 @@ class Measurement(Value):
 
     @property
     def is_latched(self) -> bool:
-        """Tell whether the device holds a fault, which only a Clear takes away."""
         faults: int = self.faults
         return self.mode is _LATCHED or faults != 0

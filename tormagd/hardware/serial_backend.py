@@ -1,4 +1,4 @@
-"""The serial backend: pyserial opens and configures the port, whose descriptor is then read and written directly."""
+"""The serial backend: pyserial opens the port, whose descriptor is then read and written directly."""
 
 import errno
 import os
@@ -14,7 +14,7 @@ from tormagd.hardware.serial_port import SerialPort
 from tormagd.hardware.usb_latency import make_prompt
 from tormagd_client.endpoints import Strict
 
-# why a port does not open, where the kernel's own words leave open what to do
+# remedies for errors that do not suggest one
 _HELD = ("another process holds it", "tormagctl ports says who; end it, and it is tried again")
 _REFUSALS = {
     errno.EAGAIN: _HELD,  # from flock
@@ -32,7 +32,7 @@ class SerialOptions(Strict, frozen=True):
 
 
 def open_serial(device: Device, options: SerialOptions) -> SerialPort:
-    """Open `device.port` exclusively at `options.baud`, with its driver's latency timer at 1 ms where that can be set."""
+    """Open `device.port` exclusively, with the driver's latency timer at 1 ms where it can be set."""
     try:
         port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()
@@ -42,18 +42,17 @@ def open_serial(device: Device, options: SerialOptions) -> SerialPort:
         reason = os.strerror(error.errno) if error.errno else str(error)
         reason, remedy = _REFUSALS.get(error.errno or 0, (reason, ""))
         raise BackendError(f"{device.port}: cannot be opened: {reason}", remedy) from error
-    except (termios.error, ValueError) as error:  # unplugged while it was set up, or no rate of this driver
+    except (termios.error, ValueError) as error:  # unplugged during set-up, or a rate that the driver lacks
         raise BackendError(f"{device.port}: cannot be opened: {error.args[-1]}") from error
     return SerialPort(port)
 
 
 def _tell_nothing_from_gone(fd: int) -> None:
-    """Set VMIN to 1: a read without data then raises BlockingIOError, and returns no bytes only from a lost device."""
-    # with pyserial's VMIN = 0 a read returns no bytes both when none have come and when the device is unplugged
+    """Set VMIN to 1: a read without data then raises BlockingIOError."""
+    # with pyserial's VMIN = 0 a read returns no bytes both without data and from an unplugged device
     attributes = termios.tcgetattr(fd)
     attributes[6][termios.VMIN] = 1
     termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
 
 DRIVER = Driver(SerialOptions, open_serial)
-"""The entry point `serial`."""

@@ -1,4 +1,4 @@
-"""An open serial port: frames are written to its descriptor and read from it, never waiting."""
+"""An open serial port, whose descriptor is written and read without waiting."""
 
 import contextlib
 import os
@@ -13,12 +13,12 @@ from tormagd.hardware.frame_stream import FrameStream
 
 READ_BYTES: Final = 4_096
 UNSENT_BYTES: Final = 512
-"Some frames may wait for the driver; more bytes than this mean that nobody reads at the other end."
+"Some frames may wait for the driver; more bytes mean that nobody reads at the other end."
 
 
 @final
 class SerialPort:
-    """An open, exclusively held serial port and the conversation on it: a `Backend`. Nothing here waits."""
+    """An exclusively held serial port and the conversation on it: a `Backend`."""
 
     def __init__(self, port: serial.Serial) -> None:
         self._port = port
@@ -31,7 +31,6 @@ class SerialPort:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Return the valid messages in the next READ_BYTES bytes that have arrived; none where none has."""
         try:
             # `read` on an empty terminal waits for a kernel worker (flush_to_ldisc), up to 100 ms on a busy machine
             if not self._port.in_waiting:
@@ -42,7 +41,7 @@ class SerialPort:
         return self.stream.unpack(data)
 
     def send(self, message: Message) -> None:
-        """Write one frame behind what the driver had not taken yet; bytes that it does not take now are kept."""
+        """Write one frame after what the driver has not taken yet, and keep what it does not take now."""
         data = self._unsent + self.stream.pack(message)
         try:
             written = os.write(self._fd, data)
@@ -57,7 +56,6 @@ class SerialPort:
             raise BackendError(f"{self._port.port}: nobody reads at the other end")
 
     def close(self) -> None:
-        """Close the port and drop its lock; unsent bytes are discarded."""
         # closing would wait for unsent bytes, up to half a minute
         with contextlib.suppress(OSError, termios.error):
             self._port.reset_output_buffer()

@@ -1,6 +1,6 @@
-"""The latency timer of USB serial chips, which keep received bytes back, for 16 ms as a rule, unless told otherwise.
+"""The latency timer of USB serial chips, which hold received bytes back, by default for 16 ms.
 
-The chip's driver shows the timer in sysfs. A port without one (a device's own USB, a pty) keeps nothing back.
+The chip's driver shows the timer in sysfs. A device's own USB or a pty has none, and holds nothing back.
 """
 
 import logging
@@ -15,7 +15,6 @@ log = logging.getLogger(__name__)
 
 
 def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
-    """Return the latency timer of the port with the path `port`, or of the port that a link leads to, ms."""
     try:
         return int((sysfs / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii"))
     except (OSError, ValueError):
@@ -23,7 +22,7 @@ def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
 
 
 def make_prompt(port: serial.Serial, sysfs: Path = SYSFS) -> None:
-    """Set the latency timer of an open port to 1 ms, where it has one that is longer."""
+    """Set an open port's latency timer to 1 ms, where it has a longer one."""
     found_ms = latency_ms(port.port, sysfs)
     if found_ms is None or found_ms <= PROMPT_MS:
         return

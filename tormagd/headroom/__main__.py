@@ -1,7 +1,7 @@
 """`python -m tormagd.headroom [--config FILE]`: what this machine holds, as one JSON object.
 
-`tormagctl doctor --measure` judges it. A process of its own, because what it measures must not share an interpreter
-with who asks.
+`tormagctl doctor --measure` judges it. It is a process of its own, because what it measures must not share an
+interpreter with the one who asks.
 """
 
 import argparse
@@ -25,12 +25,11 @@ from tormagd_client.printable import printable
 
 TIMER_S = 2.0
 CORE_S = 0.7
-"Virtual time of the loop whose calls are timed; repeating them takes as long again in real time."
+"In virtual time; repeating the calls takes as long again in real time."
 SHARES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure this machine for a configuration, print the result as one JSON object, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tormagd.headroom", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's configuration")
     options = parser.parse_args(arguments)
@@ -43,7 +42,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
-    """Measure this machine for `config`: the reference loop, the core's calls, and a bare timer for `timer_s`."""
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority
     late, cost = uvloop.run(_in_real_time(config, timer_s, steps, plans))
@@ -69,14 +67,12 @@ async def _in_real_time(
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Return `mean`, `p50`, `p99`, `p999` and `max` of `values`, in their unit, rounded to 0.1, in this order."""
     return {"mean": round(float(np.mean(values)), 1)} | {
         name: round(float(np.percentile(values, share)), 1) for name, share in SHARES.items()
     }
 
 
 def build() -> str:
-    """Return which build of the core this interpreter runs: `compiled` or `interpreted`."""
     return "compiled" if settle().is_compiled else "interpreted"
 
 

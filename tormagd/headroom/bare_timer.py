@@ -1,7 +1,6 @@
-"""A bare timer: what this machine gives a thread that asks for nothing but to be woken in every control period.
+"""A bare timer: what this machine gives a thread that only asks to be woken in every control period.
 
-It has the daemon's heartbeat, event loop and scheduling, but no controller and no device. What it misses, the daemon
-would have missed too.
+It has the daemon's heartbeat, event loop and scheduling, but no controller and no device.
 """
 
 import asyncio
@@ -17,11 +16,11 @@ NS = 1_000_000_000
 WARM_UP_BEATS = 20
 
 OnBeat = Callable[[Heartbeat, int, int], None]
-"""Called with the heartbeat, the beats that this one stands for, and the time on CLOCK_MONOTONIC, ns."""
+"Called with the heartbeat, the beats that this one stands for, and CLOCK_MONOTONIC in ns."
 
 
 class Lateness(NamedTuple):
-    """How late each beat was, us, how many beats were missed besides, and what scheduling the kernel refused."""
+    """How late each beat was, how many were missed, and what the kernel refused."""
 
     beats_us: list[float]
     missed: int
@@ -29,7 +28,7 @@ class Lateness(NamedTuple):
 
 
 async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
-    """Call `on_beat` in every period until `ended` is set; missed beats are told in its arguments."""
+    """Call `on_beat` in every period until `ended` is set."""
     heartbeat = Heartbeat(period_ns)
 
     def woken() -> None:
@@ -46,7 +45,6 @@ async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
 
 
 async def lateness(realtime: RealTime, rate_hz: int, seconds: float) -> Lateness:
-    """Measure for `seconds` how late a bare timer of `rate_hz` beats: return each beat's lateness, us."""
     not_granted = prepare(realtime)
     late_us: list[float] = []
     missed = -WARM_UP_BEATS

@@ -1,8 +1,8 @@
 """What `plan` and `step` cost on this machine: the scene in virtual time, then both once more, each call timed.
 
-Both are deterministic, so they can be called again with what they were given in the closed loop, without plant and
-protocol. They are called in the control period's own pace. A processor that sleeps between two ticks finds colder
-caches, and a step takes two or three times as long. Figures are processor time; the bare timer says what others take.
+Both are deterministic, so they can be called again with what they were given in the closed loop. They are called at the
+control period's own pace: a processor that sleeps between two ticks finds colder caches, and a step takes two or three
+times as long. Figures are processor time.
 """
 
 import asyncio
@@ -24,22 +24,20 @@ from tormagd.simulation.parameters import load_plant
 
 PLANT = "sample_1"
 SWING_SHARE, PULSE_HZ = 0.2, 1.2
-"The asked force: the middle of the scene's range, and a share of the middle up and down, as often as a heart beats."
+"A share of the middle of the scene's range, as often as a heart beats."
 
 Call = Callable[[], object]
 
 
 class CoreCost(NamedTuple):
-    """Processor time of each call of `step` and of `plan`, us."""
-
     step_us: list[float]
     plan_us: list[float]
 
 
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
-    """Run `core` for `seconds` of virtual time on a pulse; return the calls of `step` and of `plan`, one each a tick."""
+    """Run `core` in virtual time on a pulse, and return its calls of `step` and `plan`."""
     period_s = 1.0 / config.rates.control_hz
-    # stages change in place, so the calls are repeated on those of another loop, which has come as far
+    # stages change in place: the calls are repeated on another loop's, which have come as far
     loop, again = _armed(config, core), _armed(config, core)
     stepper, planner = again.stepper, again.planner
     assert planner is not None, "this loop plans"
@@ -50,7 +48,7 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
     for _ in range(round(seconds / period_s)):
         now_s = loop.now_s + period_s
         force_N = middle_N * (1.0 + SWING_SHARE * math.sin(math.tau * PULSE_HZ * now_s))
-        setpoint = TimedSetpoint(force_N, now_s, 0.1)  # a new one for every tick, so that every tick plans
+        setpoint = TimedSetpoint(force_N, now_s, 0.1)  # new for every tick, so that every tick plans
         measured = loop.stepper.measured
         sample = loop.tick(setpoint)
         steps.append(partial(stepper.step, sample.time_s, sample.measurement, sample.plan))
@@ -59,14 +57,12 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
 
 
 def _armed(config: Config, core: Core) -> ClosedLoop:
-    """Return a new loop of `core` on the simulated PLANT, armed: homed and enabled, without a setpoint."""
     loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
     loop.arm()
     return loop
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
-    """Repeat one plan and one step a beat until all are done, and return the processor time of each, us."""
     found = CoreCost([], [])
     ended = asyncio.Event()
 

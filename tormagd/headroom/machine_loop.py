@@ -1,9 +1,8 @@
 """A fixed piece of pure Python: how long it takes says what interpreter and processor are worth right now.
 
-Two carriages under a PID, and the CRC of what they would send. So it has the float arithmetic, attributes, calls,
-tuples and whole numbers of a control tick. It has nothing of ours, of NumPy or of the kernel. It stands beside every
-figure, so that figures of two machines, or of two hours on a shared one, can be told apart. It is never compiled. A
-change would make every earlier figure incomparable: a test holds its result.
+Two carriages under a PID, and the CRC of what they would send: the operations of a control tick, never compiled. Its
+time stands beside every figure, to tell two machines, or two hours on a shared one, apart. A change would make every
+earlier figure incomparable: a test holds its result.
 """
 
 import statistics
@@ -14,23 +13,19 @@ REPETITIONS = 25
 
 
 class _Carriage:
-    """A carriage with the integral of its PID: a speed that follows the duty, and the place that it comes to."""
-
     __slots__ = ("integral", "position_mm", "speed_mm_s")
 
     def __init__(self) -> None:
         self.position_mm = self.speed_mm_s = self.integral = 0.0
 
     def drive(self, duty: float) -> tuple[float, float]:
-        """Move for a millisecond with this duty, and return the new place, mm, and speed, mm/s."""
         self.speed_mm_s += (38.0 * duty - self.speed_mm_s) * 0.06
         self.position_mm += self.speed_mm_s * 0.001
         return self.position_mm, self.speed_mm_s
 
 
 def work() -> tuple[float, float, int]:
-    """Run one round and return both carriages' last places, mm, and the CRC-16 of their way: the same on every
-    machine."""
+    """Run one round, and return both carriages' last places, mm, and the CRC-16 of their way."""
     left, right, crc = _Carriage(), _Carriage(), 0xFFFF
     for tick in range(TICKS):
         wanted_mm = 0.01 * tick
@@ -48,7 +43,6 @@ def work() -> tuple[float, float, int]:
 
 
 def machine_us(repetitions: int = REPETITIONS) -> float:
-    """Return the median processor time of one round of `work`, us, of this thread, after one that does not count."""
     work()
     taken_ns = []
     for _ in range(repetitions):

@@ -10,7 +10,7 @@ from tormagd.physics.errors import DomainError, require_that
 
 
 class Choice(NamedTuple):
-    """A search with its settings, and why it was taken, for the log. A setting that the search lacks is 0."""
+    """A search with its settings, and why it was taken."""
 
     solver: str
     step_mT: float
@@ -19,19 +19,19 @@ class Choice(NamedTuple):
 
 
 _USUAL = {"newton": (0.0, 0), "nearest": (2.0, 4), "torch": (1.0, 4), "thesis": (1.0, 0)}
-"By the name of a search, the usual step of its grid, mT, and its number of neighbours; 0 where it has none."
+"The usual step of the grid, mT, and number of neighbours."
 
 RUNTIME_SOLVERS = tuple(_USUAL)
 OF_TORCH = ("torch", "thesis")
-"Searches that ask the network itself in torch, which is loaded for them only; the others ask the curve."
+"Searches for which torch is loaded."
 BESIDE_PLANS = ("thesis",)
-"Searches that take longer than a plan has, and run in a process of their own."
+"They take longer than a plan has, and run in a process of their own."
 
 
 def named(
     solver: str, step_mT: float | None = None, neighbours: int | None = None, reason: str = "named by the scene"
 ) -> Choice:
-    """Return the choice of a search by its name; None stands for its usual grid step, mT, or number of neighbours."""
+    """Return the choice of a search by its name; None stands for a usual setting."""
     require_that(solver in _USUAL, "solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
     settings = []
     for key, given, usual in zip(("step_mT", "neighbours"), (step_mT, neighbours), _USUAL[solver], strict=True):
@@ -41,7 +41,6 @@ def named(
 
 
 def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel, *, rises: bool) -> FieldSolver:
-    """Build the chosen search over a range of fields, mT, and return it."""
     if choice.solver == "newton":
         require_that(rises, "solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")
         return RisingSearch(field_range_mT)
@@ -59,7 +58,6 @@ def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel
 
 
 def mean_error_N(model: ForceModel) -> float:
-    """Return the mean absolute error of the model's force in its training's validation, N."""
     name, metrics = "validation_mae_N", model.metadata.metrics
     require_that(name in metrics, name, "missing in the model's metrics", "a model that states its mean error")
     return metrics[name]

@@ -13,11 +13,10 @@ from tormagd.physics.errors import require_that
 MAX_GRID_POINTS = 100_000
 
 Batch = Callable[[ForceCurve], Floats]
-"Returns the force, N, at every field of a grid, for the state of the handle that a curve is for."
 
 
 def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[np.float64]:
-    """Return fields from least to greatest, mT, evenly spaced by `step_mT` or a little less, both ends included."""
+    """Return evenly spaced fields with both ends included, at most `step_mT` apart."""
     low, high = field_range_mT
     require_number("field_range_mT", low)
     require_number("field_range_mT", high)
@@ -42,7 +41,6 @@ class NearestFieldSearch:
         self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`; of several the one nearest `last_field_mT`, or the least where that is None."""
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
         forces_N = curve.forces_N(self._fields_mT) if self._batch is None else self._batch(curve)
         candidates, reach = self._candidates(forces_N - force_N, near, tie_N(curve))
@@ -50,7 +48,7 @@ class NearestFieldSearch:
         return answer(curve, field_mT, force_N, curve.force_N(field_mT), 2, reach)
 
     def _candidates(self, excess_N: Floats, near_mT: float, same_N: float) -> tuple[NDArray[np.float64], Reach]:
-        """Return the fields that fit equally well, mT, and whether the force asked is in reach."""
+        """Return the fields that fit equally well, and whether the force is in reach."""
         fields = self._fields_mT
         below = excess_N < 0
         crosses = below[1:] != below[:-1]
@@ -60,7 +58,7 @@ class NearestFieldSearch:
         left = beside[crosses[beside]]
         best_N = 0.0 if left.size else float(error_N[nearest].min())
         candidates = fields[nearest[error_N[nearest] <= best_N + same_N]]
-        # on a plateau of more points than `neighbours` chance decides which are candidates
+        # on a plateau chance decides which points are candidates
         here = min(max(round((near_mT - fields[0]) * self._per_mT), 0), len(fields) - 1)
         if error_N[here] <= best_N + same_N:
             candidates = np.append(candidates, fields[here])

@@ -8,18 +8,18 @@ from tormagd.model.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
 
 ACCURACY_MT: Final = 1e-3
-"""Largest error of the root: a twentieth of the largest change of field over one encoder count (1/560 mm)."""
+"A twentieth of the largest change of field over one encoder count (1/560 mm)."
 
 LOOKED_AT_MT: Final = 0.25 * ACCURACY_MT
-"""A step that should end this near the root is taken for the last: at its end only the force is evaluated, no slope."""
+"A step that should end this near the root is the last, and needs no slope."
 
 MAX_EVALUATIONS: Final = 60
-"""Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; three times as many allow for steps between bisections."""
+"Bisection alone needs 20 from 1000 mT; three times as many allow for steps between bisections."
 
 
 @final
 class RisingSearch:
-    """Newton's method from the last field, or else from the least, in a bracket that begins as the whole range."""
+    """Newton's method from the last field, in a bracket that begins as the whole range."""
 
     def __init__(self, field_range_mT: tuple[float, float]) -> None:
         low_mT, high_mT = field_range_mT
@@ -31,14 +31,13 @@ class RisingSearch:
         self._high_mT = high_mT
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`."""
         low, high = self._low_mT, self._high_mT
         span = high - low
         field = checked_near_mT(force_N, last_field_mT, low)
         field = low if field < low else high if field > high else field
         same_N = tie_N(curve)
         left, right, left_seen, right_seen = low, high, False, False
-        # a step ends at about its square times this from the root: a parabola's at first, then as the last steps show
+        # a step ends at about its square times this from the root: a parabola's at first
         bend_per_mT, before = 1.0 / span, 2.0 * span
         predicted_N, evaluations = 0.0, 0
         while True:
@@ -55,7 +54,7 @@ class RisingSearch:
                 if field <= low:
                     return answer(curve, field, force_N, predicted_N, evaluations, Reach.BELOW)
                 right, right_seen = field, True
-            # an end of the range that was not evaluated does not close the bracket: the force may be out of reach
+            # an end that was not evaluated does not close the bracket: the force may be out of reach
             if (left_seen and right_seen and right - left <= ACCURACY_MT) or evaluations >= MAX_EVALUATIONS:
                 break
             # a slope that rounding made flat gives no direction, but the force rises
@@ -73,7 +72,7 @@ class RisingSearch:
                 if bend_per_mT * step * step <= LOOKED_AT_MT:
                     there_N = curve.force_N(following)
                     evaluations += 1
-                    # with a tenth of the excess left the slope is known to a third, and tells how near the root is
+                    # with a tenth of the excess left the slope is known to a third
                     allowed_N = min(0.5 * ACCURACY_MT * slope, 0.1 * abs(excess_N))
                     if abs(there_N - force_N) <= max(allowed_N, same_N):
                         return answer(curve, following, force_N, there_N, evaluations, Reach.INSIDE)

@@ -13,11 +13,11 @@ from tormagd.model.model_file import ForceModel
 from tormagd.model.network import to_network
 from tormagd.physics.errors import require_that
 
-torch.set_num_threads(1)  # a second thread costs more than it saves at these sizes, and waits for a busy processor
+torch.set_num_threads(1)  # a second thread costs more than it saves at these sizes
 
 
 def batch(model: ForceModel, fields_mT: Floats) -> Batch:
-    """Return a function from a curve to the forces of `model`, N, at all `fields_mT` (n), in one pass in torch."""
+    """Return a function from a curve to the model's forces at all `fields_mT`, in one pass."""
     network, rows = to_network(model), torch.zeros((len(fields_mT), len(FEATURES)), dtype=torch.float64)
     rows[:, FIELD] = torch.from_numpy(fields_mT)
     others = torch.tensor([column for column in range(len(FEATURES)) if column != FIELD])
@@ -33,7 +33,6 @@ def batch(model: ForceModel, fields_mT: Floats) -> Batch:
 
 
 def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
-    """Return a function from a curve and one field, mT, to the force of `model`, N: a pass in torch for one row."""
     network = to_network(model)
 
     def force_N(curve: ForceCurve, field_mT: float) -> float:
@@ -45,7 +44,7 @@ def row(model: ForceModel) -> Callable[[ForceCurve, float], float]:
 
 
 class RowByRow:
-    """The thesis's search: one field of a grid after the other from the least, until |F - NN| <= epsilon."""
+    """The thesis's search: one field of a grid after the other, until |F - NN| <= epsilon."""
 
     def __init__(self, fields_mT: Floats, epsilon_N: float, predict_N: Callable[[ForceCurve, float], float]) -> None:
         require_number("epsilon_N", epsilon_N)
@@ -54,7 +53,6 @@ class RowByRow:
         self._epsilon_N, self._predict_N = epsilon_N, predict_N
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the first field whose force is within epsilon of `force_N`, else the one that comes nearest."""
         checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
         best_mT, best_N, above, below, rows = self._fields_mT[0], math.inf, False, False, 0
         for field_mT in self._fields_mT:

@@ -12,8 +12,8 @@ class Reach(StrEnum):
     """Whether the fields in range can give the force that was asked."""
 
     INSIDE = "inside"
-    BELOW = "below"  # less force was asked than the least that any field gives
-    ABOVE = "above"  # more force was asked than the greatest that any field gives
+    BELOW = "below"  # less than any field gives
+    ABOVE = "above"  # more than any field gives
 
 
 @final
@@ -32,7 +32,7 @@ class FieldSolution(Value):
 
 @final
 class Question(Value):
-    """A question to a search in a process of its own: at which field does the brake give `force_N`?"""
+    """A question to a search in its own process: which field gives `force_N`?"""
 
     def __init__(
         self, time_s: float, displacement_mm: float, rate_mm_s: float, force_N: float, last_field_mT: float
@@ -46,26 +46,22 @@ class Question(Value):
 
 @final
 class Answer(Value):
-    """The answer of a search in a process of its own to the `Question` of `time_s`."""
-
     def __init__(self, time_s: float, solution: FieldSolution) -> None:
         self.time_s: Final = time_s
         self.solution: Final = solution
 
 
 TIE: Final = 16.0 * 2.0**-52
-"Share of a sum's magnitude within which two forces are equal: a network's sum is off by a few units of rounding."
+"Forces that differ by less than this share of a sum's magnitude are equal up to rounding."
 
 
 class FieldSolver(Protocol):
-    """A search for the field at which the brake gives `force_N`."""
-
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`; of several, the one nearest `last_field_mT`, or the least where that is None."""
+        """Return the field for `force_N`; of several, the one nearest `last_field_mT` (None: the least)."""
 
 
 def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float) -> float:
-    """Check the arguments of a search; return the field that its answer should be near, mT."""
+    """Check a search's arguments, and return the field to be near."""
     near_mT = least_mT if last_field_mT is None else last_field_mT
     if not (-LARGEST <= near_mT <= LARGEST and -LARGEST <= force_N <= LARGEST):
         require_number("last_field_mT", near_mT)
@@ -74,13 +70,11 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
 
 
 def tie_N(curve: ForceCurve) -> float:
-    """Return the difference of force, N, up to which two forces of `curve` count as equal: its rounding error."""
     return TIE * curve.magnitude_N
 
 
 def answer(
     curve: ForceCurve, field_mT: float, force_N: float, predicted_N: float, iterations: int, reach: Reach
 ) -> FieldSolution:
-    """Return the solution for `force_N` at a field where `curve` predicts `predicted_N`, with its confidence."""
     trust = curve.confidence(field_mT, force_N - predicted_N)
     return FieldSolution(field_mT, predicted_N, trust, iterations, reach)

@@ -5,16 +5,16 @@ from typing import Final, final
 from firmware_protocol.value import Value
 
 TURN_MM: Final = 0.05
-"A handle that goes back by more than this has turned: 6 counts of its encoder."
+"A handle that goes back by more (6 counts of its encoder) has turned."
 MOBILISED_MM: Final = 2.0
-"Displacement saturates here: friction is fully mobilised, whatever the insert."
+"Friction is fully mobilised from here on, whatever the insert."
 MOVING_MM_S: Final = 5.0
-"A slower handle teaches no model and no trim, and no force is planned for it: its friction may be static."
+"A slower handle teaches nothing, and no force is planned for it: its friction may be static."
 
 
 @final
 class Turn(Value):
-    """Where a handle last turned, mm, the way it has gone since, 1 or -1, and the furthest it has been, mm."""
+    """Where a handle last turned, which way it has gone since (1 or -1), and how far it has been."""
 
     def __init__(self, direction: float, turned_mm: float, furthest_mm: float) -> None:
         self.direction: Final = direction
@@ -22,7 +22,6 @@ class Turn(Value):
         self.furthest_mm: Final = furthest_mm
 
     def moved_to(self, position_mm: float) -> "Turn":
-        """Return the state after the handle moved to `position_mm`; this one stays."""
         beyond_mm = position_mm - self.furthest_mm
         if beyond_mm * self.direction >= 0.0:
             return self if beyond_mm == 0.0 else Turn(self.direction, self.turned_mm, position_mm)
@@ -31,5 +30,4 @@ class Turn(Value):
         return self
 
     def displacement_mm(self, position_mm: float) -> float:
-        """Return the distance from the turn to `position_mm`, 0 to MOBILISED_MM, whichever way; NaN for NaN."""
         return min(abs(position_mm - self.turned_mm), MOBILISED_MM)

@@ -16,18 +16,18 @@ FIELD: Final = FEATURES.index("field_mT")
 CIP: Final = FEATURES.index("cip_percent")
 
 LARGEST: Final = 1e9
-"""Bound on every input and weight: no device comes near it, and the product of two does not overflow float32."""
+"No device comes near this, and the product of two does not overflow float32."
 
 
 class Element(StrEnum):
-    """The element that the features were measured on: brake or tactile pad. A model serves one of them only."""
+    """A model serves one element only."""
 
     TORQUE = "torque"
     TACTILE = "tactile"
 
 
 class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Affine map between physical values and the network's -1..1: scaled = (value - offset) * gain."""
+    """Affine map to the network's -1..1: scaled = (value - offset) * gain."""
 
     input_offset: tuple[float, float, float, float]
     input_gain: tuple[float, float, float, float]
@@ -35,20 +35,18 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     output_gain: float
 
     def scaled(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return `features` (n x 4) on the network's scale (n x 4): from -1 to 1 within the ranges of training."""
         scaled: NDArray[np.float64] = (features - np.array(self.input_offset)) * np.array(self.input_gain)
         return scaled
 
 
 def require_number(name: str, value: float) -> None:
-    """Raise `DomainError` when `value` is NaN, infinite or beyond `LARGEST`."""
-    # asked several times in every plan: what is allowed is put into words only where it does not hold
+    # asked several times in every plan: the text is made only where it is needed
     if not -LARGEST <= value <= LARGEST:
         raise DomainError(name, value, f"a finite number within +-{LARGEST:g}")
 
 
 def feature_rows(features: ArrayLike) -> NDArray[np.float64]:
-    """Return `features` as an array of float64 (n x 4, in the order of `FEATURES`); no rows at all (0 x 4) are as good."""
+    """Return `features` as float64, n x 4 in the order of `FEATURES`. Raises `DomainError`."""
     rows = np.asarray(features, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != len(FEATURES):
         raise DomainError("features", f"an array of shape {rows.shape}", f"n x 4 in the order {', '.join(FEATURES)}")

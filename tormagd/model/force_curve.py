@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from tormagd.model.features import FEATURES, FIELD, LARGEST, require_number
 
 EXTRAPOLATION_RATE: Final = 4.0
-"""Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."""
+"Falls to 1/e a quarter of the training range outside it, features summed."
 
 RESIDUAL_RATE: Final = 20.0
-"""Confidence falls to 1/e when 5% of the training force span remains between force asked and force predicted."""
+"Falls to 1/e with 5% of the training force span between force asked and force predicted."
 
 LARGEST_EXPONENT: Final = 700.0
-"exp() of a little more overflows. A sigmoid unit this far from its step adds nothing to the last digit of a force."
+"exp() of a little more overflows; so far from its step a unit adds nothing."
 
 # compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST
@@ -26,63 +26,59 @@ Floats: TypeAlias = NDArray[np.floating]
 
 
 class ForceCurve(Protocol):
-    """Force over field at a fixed displacement and rate of the handle and share of iron. Fields are finite, in mT."""
+    """The force over the field at one state of the handle and share of iron."""
 
     @property
     def displacement_mm(self) -> float:
-        """The handle's displacement that the curve holds for."""
+        """The handle's displacement."""
 
     @property
     def rate_mm_s(self) -> float:
-        """The handle's rate that the curve holds for."""
+        """The handle's rate."""
 
     @property
     def cip_percent(self) -> float:
-        """The elastomer's share of carbonyl iron, percent by volume."""
+        """The share of carbonyl iron, by volume."""
 
     @property
     def magnitude_N(self) -> float:
-        """The sum of the magnitudes of a force's terms: its rounding error is a share of this."""
+        """The sum of the magnitudes of a force's terms, which bounds its rounding error."""
 
     def force_N(self, field_mT: float) -> float:
         """Return the force at one field."""
 
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """Return the force, N, and its slope dF/dB, N/mT, at one field."""
+        """Return the force, N, and its slope dF/dB, N/mT."""
 
     def forces_N(self, fields_mT: Floats) -> Floats:
-        """Return the force at each field (n), in the precision of the fields."""
+        """Return the force at each field (n), in the fields' precision."""
 
     def confidence(self, field_mT: float, error_N: float) -> float:
-        """Return the trust, 0..1, in a field whose predicted force misses the force asked by `error_N`."""
+        """Return the trust, 0..1, in a field whose force misses the force asked by `error_N`."""
 
 
 def within(value: float, ends: tuple[float, float]) -> float:
-    """Return `value`, held within the two `ends`, the least first: so a model is asked only where it was trained."""
     return min(max(value, ends[0]), ends[1])
 
 
 @final
 class Known:
-    """What a model was trained on: the least and the greatest of each feature, and the span of the forces, N."""
+    """The ranges of features and forces that a model was trained on."""
 
     def __init__(self, ranges: tuple[tuple[float, float], ...], span_N: float) -> None:
         self.lows: Final = [low for low, _ in ranges]
         self.highs: Final = [high for _, high in ranges]
-        # a feature that never varied counts as a share of its magnitude, at least 1 unit
         self.scales: Final = [(high - low) or max(abs(low), 1.0) for low, high in ranges]
         self.span_N: Final = span_N
 
     def excess(self, place: int, value: float) -> float:
-        """Return how far feature number `place` of `FEATURES`, from 0, lies outside its range, as a share of it; 0
-        inside, and for NaN."""
         outside = max(self.lows[place] - value, value - self.highs[place])
         return outside / self.scales[place] if outside > 0.0 else 0.0
 
 
 @final
 class Network:
-    """The 4-h-1 sigmoid network in physical units, as lists: F = constant + output . sigmoid(weight x + bias)."""
+    """The 4-h-1 sigmoid network in physical units: F = constant + output . sigmoid(weight x + bias)."""
 
     def __init__(
         self,
@@ -92,7 +88,7 @@ class Network:
         constant_N: float,
         known: Known,
     ) -> None:
-        # sigmoid(z) = 1 / (1 + exp(-z)): the weights are kept with the minus sign
+        # 1 / (1 + exp(-z)): the weights are kept with the minus sign
         columns: list[list[float]] = [(-weight[:, FEATURES.index(name)]).tolist() for name in FEATURES]
         self.displacement: Final = columns[0]
         self.rate: Final = columns[1]
@@ -103,7 +99,7 @@ class Network:
         outputs: list[float] = output.tolist()
         self.output: Final = outputs
         self.constant_N: Final = constant_N
-        # (1 + tanh(z / 2)) / 2 is the same sigmoid: NumPy's tanh takes arrays, and cannot overflow
+        # the same sigmoid by tanh, which takes arrays and cannot overflow
         self.field_half: Final = weight[:, FIELD] / 2
         self.output_half: Final = output / 2
         self.middle_N: Final = constant_N + math.fsum(outputs) / 2
@@ -111,8 +107,7 @@ class Network:
         self.known: Final = known
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
-        """Return the force curve at a state of the handle, in mm, mm/s and percent of iron by volume. Raises
-        `DomainError` naming a number that is not finite, or beyond `LARGEST`."""
+        """Return the force curve at a state of the handle. Raises `DomainError` beyond `LARGEST`."""
         # written out because it stands before every prediction of the control loop
         if not (
             -_LARGEST <= displacement_mm <= _LARGEST
@@ -130,8 +125,6 @@ class Network:
 
 @final
 class NetworkCurve:
-    """The `ForceCurve` of a network at one state of the handle, made by `Network.curve`."""
-
     def __init__(
         self, network: Network, shift: list[float], displacement_mm: float, rate_mm_s: float, cip_percent: float
     ) -> None:
@@ -143,11 +136,9 @@ class NetworkCurve:
 
     @property
     def magnitude_N(self) -> float:
-        """The sum of the magnitudes of a force's terms: its rounding error is a share of this."""
         return self._network.magnitude_N
 
     def force_N(self, field_mT: float) -> float:
-        """Return the force, N, at one field, mT."""
         network, total_N = self._network, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -156,7 +147,6 @@ class NetworkCurve:
         return total_N + network.constant_N
 
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """Return the force, N, and its slope dF/dB, N/mT, at one field, mT."""
         network, total_N, slope = self._network, 0.0, 0.0
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
@@ -169,8 +159,6 @@ class NetworkCurve:
         return total_N + network.constant_N, slope
 
     def forces_N(self, fields_mT: Floats) -> Floats:
-        """Return the force, N, at each field (n), mT, in the precision of the fields, float32 or float64; NaN gives
-        NaN."""
         network, kind = self._network, fields_mT.dtype
         hidden = np.multiply.outer(fields_mT, network.field_half.astype(kind, copy=False))
         hidden -= np.array(self._shift, dtype=kind) / 2
@@ -179,7 +167,6 @@ class NetworkCurve:
         return forces
 
     def confidence(self, field_mT: float, error_N: float) -> float:
-        """Return the trust exp(-4 e - 20 r), 0..1, in a field whose force misses the force asked by `error_N`."""
         known = self._network.known
         excess = (
             known.excess(0, self.displacement_mm)

@@ -2,8 +2,8 @@
 
     F = F0(B - h) less what has relaxed of it      h follows the field's changes towards +-h_max
 
-F0 is the force without memory, which the network knows. The part of F0 without field, and the part that the field adds,
-each relax by a Prony series (`tormagd.physics.relaxation`). A brake has one series for both, a pad may have two.
+F0 is the force without memory. Its part without field and the part that the field adds each relax by a Prony series
+(`tormagd.physics.relaxation`). A brake has one series for both, a pad may have two.
 """
 
 from itertools import pairwise
@@ -18,8 +18,6 @@ LONGEST_S = 1e5
 
 
 class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Relaxation and field lag of one element; the defaults are an element that remembers nothing."""
-
     fractions: tuple[float, ...] = ()
     times_s: tuple[float, ...] = ()
     field_fractions: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET
@@ -47,7 +45,6 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def added(self) -> PronySeries:
-        """The relaxation of the force that the field adds."""
         own = self.field_fractions
         return PronySeries(self.fractions if isinstance(own, msgspec.UnsetType) else own, self.times_s)
 

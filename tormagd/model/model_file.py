@@ -1,7 +1,7 @@
 """The force model as data: a frozen network with its provenance, and the file that carries it.
 
-A model file is safetensors, which holds numbers and text and cannot carry code. Its header says what the numbers mean,
-and a SHA-256 over header and tensors makes every changed bit a refusal instead of a different force.
+A model file is safetensors, which cannot carry code. Its header says what the numbers mean, and a SHA-256 over header
+and tensors makes every changed bit a refusal instead of a different force.
 """
 
 import datetime
@@ -38,24 +38,22 @@ from tormagd.physics.errors import DomainError, require_that
 
 Array: TypeAlias = NDArray[np.float64]
 Ranges: TypeAlias = dict[str, tuple[float, float]]
-"By name, the least and the greatest value of each feature and of `force_N`."
+"The range of each feature and of `force_N`, by name."
 
 FORMAT = "tormagd-force-model-1"
 MAX_HIDDEN = 4096
 MAX_FILE_BYTES = 1 << 20
-"""Room for the largest admissible network, and little enough that a wrong file is refused before it costs memory."""
+"A wrong file is refused before it costs memory."
 
 TEXT_FIELDS = frozenset({"element", "insert", "training_data_sha256", "created"})
-"""Header fields written as they are; the others are JSON."""
+"Written as they are; the others are JSON."
 
 
 class ModelFileError(ValueError):
-    """A model file that is missing, damaged, or meant for another element or insert; the text says which."""
+    """A model file that is missing, damaged, or meant for another element or insert."""
 
 
 class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a force model is and where it came from."""
-
     element: Element
     insert: str
     hidden: int
@@ -98,7 +96,6 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 def _require_ranges(key: str, ranges: Ranges) -> None:
-    """Raise `DomainError` naming `key` unless each feature and `force_N` has a finite range."""
     require_that(set(ranges) == set(UNITS), key, sorted(ranges), f"one range for each of {', '.join(UNITS)}")
     for name, (low, high) in ranges.items():
         is_range = -LARGEST <= low <= high <= LARGEST
@@ -112,7 +109,7 @@ def _require_ranges(key: str, ranges: Ranges) -> None:
 
 
 class PhysicalLayers(NamedTuple):
-    """The network in physical units: F = output_bias + output_weight . sigmoid(hidden_weight x + hidden_bias)."""
+    """The weights with the scaling folded in."""
 
     hidden_weight: Array
     hidden_bias: Array
@@ -122,8 +119,6 @@ class PhysicalLayers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """Force of an insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network."""
-
     metadata: ModelMetadata
     hidden_weight: Array
     hidden_bias: Array
@@ -131,7 +126,7 @@ class ForceModel:
     output_bias: float
     physical: PhysicalLayers = field(init=False, repr=False)
     network: Network = field(init=False, repr=False)
-    "The network once more, on lists of floats: its curves are what plans ask."
+    "On lists of floats: its curves are what plans ask."
 
     def __post_init__(self) -> None:
         hidden = self.metadata.hidden
@@ -143,7 +138,6 @@ class ForceModel:
         object.__setattr__(self, "network", Network(*self.physical, known))
 
     def _fold(self) -> PhysicalLayers:
-        """Return the network with the scaling folded in."""
         scaling = self.metadata.scaling
         gain, offset = np.array(scaling.input_gain), np.array(scaling.input_offset)
         weight = self.hidden_weight * gain
@@ -166,7 +160,6 @@ class ForceModel:
 
     @property
     def force_span_N(self) -> float:
-        """Greatest less least force seen in training, N."""
         low, high = self.metadata.ranges["force_N"]
         return high - low
 
@@ -175,7 +168,7 @@ class ForceModel:
         return _checksum(_header(self.metadata), _tensors(self))
 
     def of(self, insert: str) -> "ForceModel":
-        """Return the model of one of its several inserts: the ranges are that insert's alone; the weights are the same."""
+        """Return the model of one of its inserts, with that insert's ranges."""
         whole, memory = self.metadata, self.metadata.memory
         ranges = (whole.boxes or {}).get(insert)
         if ranges is None:
@@ -186,27 +179,26 @@ class ForceModel:
         return replace(self, metadata=own)
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
-        """Return the force over the field at one state of the handle, as `Network.curve`."""
         return self.network.curve(displacement_mm, rate_mm_s, cip_percent)
 
     def predict(self, features: ArrayLike) -> Array:
-        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`); a single point is 1 x 4."""
+        """Return the force, N (n), at `features` (n x 4, order of `FEATURES`)."""
         rows = feature_rows(features)
         weight, bias, output, constant = self.physical
-        # sigmoid(z) = (1 + tanh(z/2)) / 2: one operation fewer than exp, and it cannot overflow
+        # (1 + tanh(z/2)) / 2 is the sigmoid, and cannot overflow
         forces_N = np.tanh((rows @ weight.T + bias) / 2) @ (output / 2) + (constant + float(output.sum()) / 2)
         return np.asarray(forces_N, dtype=np.float64)
 
     def predict_one(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Return the force, N, at one point, by the curve that plans use."""
+        """Return the force at one point, by the curve that plans use."""
         require_number("field_mT", field_mT)
         return self.curve(displacement_mm, rate_mm_s, cip_percent).force_N(field_mT)
 
     def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
-        """Return the slope of the force over the field, dF/dB, N/mT (n), at `features` (n x 4, order of `FEATURES`)."""
+        """Return dF/dB (n) at `features` (n x 4)."""
         rows = feature_rows(features)
         weight, bias, output, _ = self.physical
-        # the sigmoid's slope without 1 - tanh^2, which is 0 by rounding where a unit is saturated
+        # without 1 - tanh^2, which is 0 by rounding where a unit is saturated
         falls = np.exp(-np.abs(rows @ weight.T + bias))
         return np.asarray(falls / (1.0 + falls) ** 2 @ (output * weight[:, FIELD]), dtype=np.float64)
 
@@ -221,7 +213,7 @@ def save_model(path: Path | str, model: ForceModel) -> None:
 
 
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
-    """Read a model file for `element` and `insert`; None accepts any insert."""
+    """Read a model file for `element` and `insert`; None accepts any insert. Raises ModelFileError."""
     source = Path(path)
     try:
         model = _decode(read_bounded(source, MAX_FILE_BYTES)).of(insert or "")
@@ -242,8 +234,7 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
 
 
 def _decode(data: bytes) -> ForceModel:
-    """Return the model in a file's bytes."""
-    # the library proves that the header is whole and that the tensors lie inside the file
+    # the library proves that header and tensors are whole
     tensors = {name: _tensor(name, content) for name, content in safetensors.deserialize(data)}  # type: ignore[no-untyped-call]
     header = _json_header(data).get("__metadata__", {})
     if header.get("format") != FORMAT:
@@ -266,14 +257,12 @@ def _decode(data: bytes) -> ForceModel:
 
 
 def _tensor(name: str, content: dict[str, Any]) -> Array:
-    """Return a tensor as an array."""
     if content["dtype"] not in ("F64", "float64"):
         raise ModelFileError(f"tensor {name} is {content['dtype']}; needed is F64")
     return np.frombuffer(content["data"], dtype="<f8").reshape(content["shape"])
 
 
 def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return `value` as a read-only float64 copy of `shape`; `name` is what an error calls it."""
     source = np.asarray(value)
     require_that(source.dtype.kind == "f", name, source.dtype, "floating-point numbers")
     array = source.astype(np.float64)
@@ -301,7 +290,6 @@ def _header(metadata: ModelMetadata) -> dict[str, str]:
 
 
 def _checksum(header: dict[str, str], tensors: dict[str, Array]) -> str:
-    """Return the SHA-256 of header and tensors, as hexadecimal digits; their order does not matter."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -316,7 +304,7 @@ def _json_header(data: bytes) -> dict[str, dict[str, Any]]:
 
 
 def _canonical(data: bytes) -> bytes:
-    """Return safetensors bytes with the header's keys sorted: the library writes them in random order."""
+    """Sort the header's keys, which the library writes in random order."""
     (length,) = struct.unpack_from("<Q", data)
     header = json.dumps(_json_header(data), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)

@@ -11,7 +11,7 @@ from tormagd.physics.errors import require_that
 
 
 class ForceNetwork(nn.Module):
-    """4-h-1 network from physical features (n x 4, order of `FEATURES`) to force in N (n)."""
+    """From physical features (n x 4, order of `FEATURES`) to force in N (n)."""
 
     input_offset: Tensor
     input_gain: Tensor
@@ -28,8 +28,7 @@ class ForceNetwork(nn.Module):
         def uniform(*shape: int) -> Tensor:
             return 2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1
 
-        # A feature with gain 0 never reaches the hidden units: its weights stay 0, and it is no dimension to cover.
-        # The 2 turns the rule, made for tanh, into one for the sigmoid.
+        # A feature with gain 0 is no dimension to cover. The 2 turns the rule, made for tanh, into one for the sigmoid.
         varying = (self.input_gain != 0).to(torch.float64)
         reach = 2 * 0.7 * hidden ** (1 / max(int(varying.sum()), 1))
         direction = uniform(hidden, len(FEATURES)) * varying
@@ -40,26 +39,21 @@ class ForceNetwork(nn.Module):
         self.output_bias = nn.Parameter(torch.zeros((), dtype=torch.float64))
 
     def scale_inputs(self, features: Tensor) -> Tensor:
-        """Map features (n x 4) to the network's -1..1, or beyond where they are outside the range of training; not
-        checked."""
         return (features - self.input_offset) * self.input_gain
 
     def scale_output(self, force_N: Tensor) -> Tensor:
-        """Map force in N to the network's -1..1."""
         return (force_N - self.output_offset) * self.output_gain
 
     def forward_scaled(self, inputs: Tensor) -> Tensor:
-        """Return the scaled force (n) for scaled features (n x 4)."""
         hidden = torch.sigmoid(torch.addmm(self.hidden_bias, inputs, self.hidden_weight.T))
         return hidden @ self.output_weight + self.output_bias
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return force in N (n) for features (n x 4), which are not checked: NaN gives NaN."""
         return self.forward_scaled(self.scale_inputs(features)) / self.output_gain + self.output_offset
 
 
 def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
-    """Copy the weights of `network` into a model, to be saved and used; its scaling has to be that of `metadata`."""
+    """Copy the weights into a model; the scaling has to be that of `metadata`."""
     return ForceModel(
         metadata=metadata,
         hidden_weight=network.hidden_weight.detach().double().numpy(),
@@ -70,7 +64,6 @@ def to_model(network: ForceNetwork, metadata: ModelMetadata) -> ForceModel:
 
 
 def to_network(model: ForceModel) -> ForceNetwork:
-    """Return a float64 network with the weights of `model`, for further training or as a reference."""
     network = ForceNetwork(model.metadata.scaling, model.metadata.hidden)
     with torch.no_grad():
         network.hidden_weight.copy_(torch.tensor(model.hidden_weight))

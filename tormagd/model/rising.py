@@ -9,7 +9,7 @@ from tormagd.model.model_file import ForceModel
 def falling_at(
     model: ForceModel, fields_mT: tuple[float, float], displacement_mm: float, points: int = 33
 ) -> float | None:
-    """Return the least rate of the handle, mm/s, at which the model's force somewhere does not rise with the field."""
+    """Return the least rate of the handle at which the force does not rise everywhere with the field."""
     _, (slowest, fastest), _, (cip_percent, _) = model.feature_ranges
     fields = np.linspace(*fields_mT, points)
     for rate_mm_s in np.linspace(slowest, fastest, points).tolist():

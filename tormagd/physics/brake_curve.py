@@ -1,13 +1,11 @@
-"""The dimensionless brake curve: force and stretch over the magnetic load, without cancellation.
-
-Divided by its scales, the thesis's force law (Eq. 29..34) depends on one load and two constants. With
+"""The dimensionless brake curve: force and stretch over the magnetic load (Eq. 29 to 34), without cancellation.
 
     w = (R_o - R_i) / R_i     tau = t (mu_r - 1)     A = 1 - w tau / 2     B = w (1 + 3 tau / 2)
-    y     magnetic over elastic stress, the load
-    eps   1 - lambda1, the radial compression at the shaft
-    phi   force over 2 pi t R_i^2 mu_d G0 / R_w
+    eps = r - p,  p = 1 - A y,  r = sqrt(p^2 + 2 B y)             radial compression 1 - lambda1
+    phi = (lambda1^-4 - 1) / lambda1 + 4 (1 + w) y / lambda1^3    force over 2 pi t R_i^2 mu_d G0 / R_w
 
-it reads
+The load y is magnetic over elastic stress; in tau, t is a bare number of metres, as in the thesis. Nothing cancels at
+small loads: both terms of phi are positive, and r - p is taken as 2 B y / (r + p) where p > 0.
 """
 
 import math
@@ -19,7 +17,7 @@ import numpy as np
 from tormagd.physics.errors import Real
 
 MAX_COMPRESSION = 0.95
-"""Largest compression the model is used at (lambda1 = 0.05): the force goes to infinity as lambda1 goes to 0."""
+"lambda1 = 0.05: the force goes to infinity as lambda1 goes to 0."
 
 _SCALAR = SimpleNamespace(
     sqrt=math.sqrt,
@@ -32,38 +30,34 @@ _SCALAR = SimpleNamespace(
 
 
 def functions(value: Any) -> SimpleNamespace | ModuleType:
-    """Return the elementary functions for a value: those of `math` for a float or int, numpy's for anything else."""
     return _SCALAR if isinstance(value, float | int) else np
 
 
 class BrakeCurve(NamedTuple):
-    """The brake curve of one wall ratio and body-force weight: w (`wall`), A (`a`) and B (`b`) of Eq. 29 to 34."""
-
     wall: float
     a: float
     b: float
 
     @classmethod
     def of(cls, wall: float, body_force: float) -> "BrakeCurve":
-        """Return the curve for w = (R_o - R_i) / R_i > 0 and tau = t (mu_r - 1) >= 0."""
         return cls(wall, 1.0 - 0.5 * wall * body_force, wall * (1.0 + 1.5 * body_force))
 
     def compression(self, load: Real) -> Real:
-        """Return the compression eps = 1 - lambda1 at the load y >= 0 (Eq."""
+        """Return eps at the load y >= 0 (Eq. 29)."""
         fn = functions(load)
         p = 1.0 - self.a * load
         larger = fn.sqrt(p * p + 2.0 * self.b * load) + abs(p)
-        # a thin wall under a high load has p < 0, where the plain difference r - p does not cancel
+        # a thin wall under a high load has p < 0, where r - p does not cancel
         compression: Real = fn.where(p < 0.0, larger, 2.0 * self.b * load / larger)
         return compression
 
     def load(self, compression: Real) -> Real:
-        """Return the load y that compresses by eps, 0 to MAX_COMPRESSION: the inverse of `compression`."""
+        """Return the load y that compresses by eps."""
         load: Real = 0.5 * compression * (2.0 + compression) / (self.b + self.a * compression)
         return load
 
     def force(self, compression: Real, load: Real) -> Real:
-        """Return the force phi (Eq."""
+        """Return the force phi (Eq. 33 and 34)."""
         fn = functions(load)
         stretch = 1.0 - compression
         elastic: Real = fn.expm1(-4.0 * fn.log1p(-compression))

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.floating[Any]]
 Real = TypeVar("Real", float, FloatArray)
-"""A Python float, or an array of float32 or float64 whose type the result keeps."""
+"A Python float, or an array of float32 or float64 whose type the result keeps."
 
 
 class DomainError(ValueError):
-    """A value outside the range in which a model holds. The text names the variable, the value and what is allowed."""
+    """A value outside the range in which a model holds."""
 
     def __init__(self, variable: str, value: object, allowed: str) -> None:
         super().__init__(f"{variable} = {value} is not allowed: {allowed}")
@@ -20,18 +20,17 @@ class DomainError(ValueError):
         self.allowed = allowed
 
     def __reduce__(self) -> tuple[type["DomainError"], tuple[str, object, str]]:
-        # exceptions are rebuilt from their text by default: one raised in a process pool's worker would break the pool
+        # an error rebuilt from its text would break a process pool
         return type(self), (self.variable, self.value, self.allowed)
 
 
 def require_that(condition: bool, variable: str, value: object, allowed: str) -> None:
-    """Raise `DomainError` for `variable` unless `condition` is true."""
     if not condition:
         raise DomainError(variable, value, allowed)
 
 
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:
-    """Raise `DomainError`, naming `variable`, unless `value` or every element of it is in [low, high]; NaN never is."""
+    """Raise `DomainError` unless every element of `value` is in [low, high]."""
     if isinstance(value, float | int):
         if low <= value <= high:
             return

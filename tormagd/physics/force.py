@@ -1,13 +1,10 @@
 """The magnetoelastic brake force: from the radial moment of the field to the friction force at the roller.
 
-This is the thesis's chain (Eq. 29..34, with Gamma_1 and Gamma_2 as its appendix has them) with units. The dimensionless
-curve under it, and why it is written so, is in `tormagd.physics.brake_curve`:
+The thesis's chain (Eq. 29..34, with Gamma_1 and Gamma_2 as in its appendix), with units, over the dimensionless curve
+of `tormagd.physics.brake_curve`:
 
     y = (mu_r a / 4)^2 / (4 mu0 mu_r G0 R_o R_i)                   magnetic over elastic stress
-    F = 2 pi t R_i^2 mu_d G0 / R_w * curve(y)                      Eq. 33 and 34
-
-The radial moment a (`radial_moment_Tm`) is that of `tormagd.physics.field`, without mu_r / 4. F rises strictly with a,
-so the inverse is unique; `tormagd.lab.design.force_law` has it. The model is used for a stretch lambda1 >= 0.05 only.
+    F = 2 pi t R_i^2 mu_d G0 / R_w * curve(y)                      rises strictly with the moment a
 """
 
 import math
@@ -24,8 +21,6 @@ MU0_H_M = 4e-7 * math.pi
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Elastomer cylinder around its shaft, and the roller, all in m."""
-
     inner_radius_m: float
     outer_radius_m: float
     thickness_m: float
@@ -43,13 +38,10 @@ class Geometry:
 
 
 TORMAG = Geometry(inner_radius_m=0.004, outer_radius_m=0.011, thickness_m=0.020, roller_radius_m=0.020)
-"""The thesis's device (table 2.2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Elastomer:
-    """Shear modulus G0 (Pa), relative permeability mu_r and kinetic friction coefficient mu_d of one insert."""
-
     shear_modulus_Pa: float
     relative_permeability: float
     friction_coefficient: float
@@ -61,39 +53,34 @@ class Elastomer:
 
 
 def max_radial_moment_Tm(elastomer: Elastomer, geometry: Geometry) -> float:
-    """Return the largest admissible radial moment, T m: it compresses the elastomer to lambda1 = 0.05."""
+    """Return the moment that compresses the elastomer to lambda1 = 0.05."""
     return reduced(elastomer, geometry).max_moment_Tm
 
 
 def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the kinetic friction force at the roller, N, >= 0 (Eq."""
+    """Return the kinetic friction force at the roller. Raises `DomainError` for a moment out of range."""
     law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return law.force(radial_moment_Tm)
 
 
 class Reduced(NamedTuple):
-    """The force law of one elastomer in one geometry: the dimensionless curve and the two scales that give it units."""
-
     curve: BrakeCurve
     load_root_per_Tm: float
     force_scale_N: float
     max_moment_Tm: float
 
     def load(self, moment_Tm: Real) -> Real:
-        """Return the dimensionless load y at a radial moment, T m; nothing is checked."""
         root = self.load_root_per_Tm * moment_Tm
         return root * root
 
     def force(self, moment_Tm: Real) -> Real:
-        """Return the friction force at the roller, N, at a radial moment of 0 to `max_moment_Tm`, T m."""
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
 
 
 @lru_cache(maxsize=64)
 def reduced(elastomer: Elastomer, geometry: Geometry) -> Reduced:
-    """Return the force law of one elastomer in one geometry."""
     g0, mu_r = elastomer.shear_modulus_Pa, elastomer.relative_permeability
     inner, outer, thickness = geometry.inner_radius_m, geometry.outer_radius_m, geometry.thickness_m
     curve = BrakeCurve.of(wall=(outer - inner) / inner, body_force=thickness * (mu_r - 1.0))

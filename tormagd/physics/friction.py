@@ -17,8 +17,6 @@ from firmware_protocol.value import Value
 
 @final
 class Friction(Value):
-    """Friction at the roller, apart from its kinetic level, which the field sets. Nothing is checked here."""
-
     def __init__(
         self,
         presliding_stiffness_N_mm: float,
@@ -32,12 +30,11 @@ class Friction(Value):
         self.stribeck_speed_mm_s: Final = stribeck_speed_mm_s
 
     def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
-        """Return the steady level g(v) of the dry part at a speed, N; the speed's sign does not matter."""
         ratio = speed_mm_s / self.stribeck_speed_mm_s
         return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))
 
     def advance(self, deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> tuple[float, float]:
-        """Return force, N, and deflection, mm, at the end of a step of `dt_s` at constant speed and kinetic level."""
+        """Return force, N, and deflection, mm, after a step at constant speed."""
         viscous_N = self.viscous_N_s_mm * speed_mm_s
         reach_mm = self.level_N(speed_mm_s, kinetic_N) / self.presliding_stiffness_N_mm
         if reach_mm == 0.0:

@@ -25,13 +25,13 @@ _Force = Annotated[float, Meta(ge=0.0, le=1e3)]
 
 
 def relative_permeability(cip_fraction: float) -> float:
-    """Return the relative permeability mu_r at a CIP volume fraction (Eq."""
+    """Return mu_r at a volume fraction of iron (Eq. 5)."""
     require("cip_fraction", cip_fraction, 0.10, 0.40)
     return 2.0 + 2.0 * (cip_fraction - 0.10) / 0.30
 
 
 class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
-    """The force at a gap of 45 mm less that at 95 mm, N: mean and deviation as measured, and the thesis's estimate."""
+    """The force at a gap of 45 mm less that at 95 mm."""
 
     measured_N: Annotated[float, Meta(ge=1e-6, le=1e3)]
     deviation_N: _Force
@@ -39,15 +39,12 @@ class MeasuredForceRange(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def thesis_estimate_N(self) -> float:
-        """The thesis's estimate of the force range, N."""
         if self.estimate_N is None:
             raise DomainError("estimate_N", None, "stated for the thesis's inserts only")
         return self.estimate_N
 
 
 class Matrix(Struct, frozen=True, forbid_unknown_fields=True):
-    """The silicone that inserts of one Shore hardness are made of."""
-
     product: Annotated[str, Meta(min_length=1, max_length=100)]
     shore_hardness: _Hardness
     density_g_cc: Annotated[float, Meta(ge=0.1, le=25.0)]
@@ -55,8 +52,6 @@ class Matrix(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Insert(Struct, frozen=True, forbid_unknown_fields=True):
-    """One fabricated insert. Fractions are of volume; the shear modulus is without field."""
-
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
     shore_hardness: _Hardness
     cip_fraction: _Fraction
@@ -69,7 +64,6 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def elastomer(self) -> Elastomer:
-        """Shear modulus, permeability and friction of the insert, for `brake_force_N`."""
         mu_r, friction = self.relative_permeability, self.friction_coefficient
         return Elastomer(
             self.shear_modulus_Pa,
@@ -79,7 +73,6 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def matrix(self) -> Matrix:
-        """The silicone of the insert's hardness."""
         known = ", ".join(map(str, MATRICES))
         allowed = f"one of a [[matrix]], {known}; or state friction_coefficient"
         require_that(self.shore_hardness in MATRICES, f"{self.name}: shore_hardness", self.shore_hardness, allowed)
@@ -91,14 +84,12 @@ class Insert(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def force_range(self) -> MeasuredForceRange:
-        """The measured force range."""
         if self.measured is None:
             raise DomainError("insert", repr(self.name), "one whose force range has been measured")
         return self.measured
 
     @property
     def masses_g(self) -> dict[str, float]:
-        """Mass of each content in 100 cc, g: `matrix`, `cip`, `slacker`, `thinner`."""
         matrix_fraction = 1.0 - self.cip_fraction - self.slacker_fraction - self.thinner_fraction
         return {
             "matrix": 100.0 * matrix_fraction * self.matrix.density_g_cc,
@@ -119,6 +110,5 @@ INSERTS = {item.name: item for item in _FILE.insert}
 
 
 def insert(name: str) -> Insert:
-    """Return an insert of the registry by its name, such as "MRE-50-40"; capitals count."""
     require_that(name in INSERTS, "insert", repr(name), "one of " + ", ".join(INSERTS))
     return INSERTS[name]

@@ -1,11 +1,8 @@
 """Attraction between the two magnets: the axial load that the lead screws have to hold.
 
-Closed form for two parallel, uniformly magnetised cuboids (G. Akoun and J.-P. Yonnet, "3D analytical calculation of the
-forces exerted between two cuboidal magnets", IEEE Trans. Magn. 20 (1984) 1962-1964), for identical, coaxial blocks. On
-the axis the 64 corner terms fold to 12. The logarithms ln(r - U) become inverse hyperbolic sines: their even part
-cancels over the pair of corners at U and -U. What is left has no difference of nearly equal numbers.
-
-Free space is assumed: the iron shaft and the elastomer between the magnets are left out.
+Closed form for two identical, coaxial, uniformly magnetised cuboids in free space (Akoun and Yonnet, IEEE Trans. Magn.
+20 (1984) 1962-1964). On the axis the 64 corner terms fold to 12. Inverse hyperbolic sines in place of the logarithms
+leave no difference of nearly equal numbers.
 """
 
 import math
@@ -19,12 +16,12 @@ from tormagd.physics.errors import Real, require
 MU0_H_M = 4e-7 * math.pi
 MIN_GAP_MM = 0.01
 MAX_GAP_PER_EDGE = 50.0
-"""Largest gap over the magnet's shortest edge; beyond it the corner terms cancel too far, and a dipole would do."""
+"The corner terms cancel too far beyond this many shortest edges."
 
 
 @dataclass(frozen=True, slots=True)
 class CuboidMagnet:
-    """One block, magnetised along its thickness (the axis that joins the two): edges in m, remanence in T."""
+    """One block, magnetised along its thickness, the axis that joins the two."""
 
     width_m: float
     depth_m: float
@@ -38,12 +35,11 @@ class CuboidMagnet:
 
 
 def attraction_N(gap_mm: Real, magnet: CuboidMagnet) -> Real:
-    """Return the attraction between two identical coaxial blocks at a face-to-face gap, N, >= 0."""
     edges_m = (magnet.width_m, magnet.depth_m, magnet.thickness_m)
     require("gap_mm", gap_mm, MIN_GAP_MM, MAX_GAP_PER_EDGE * min(edges_m) * 1e3)
     gap_m = np.asarray(gap_mm, dtype=np.float64) * 1e-3
     thickness_m = magnet.thickness_m
-    # distances between the magnets' four charged faces, each with its sign, and the two lateral corner offsets
+    # distances between charged faces, each with its sign, and the lateral offsets
     axial = ((gap_m, 1.0), (gap_m + thickness_m, -2.0), (gap_m + 2.0 * thickness_m, 1.0))
     across = ((0.0, 1.0), (magnet.width_m, -1.0))
     along = ((0.0, 1.0), (magnet.depth_m, -1.0))

@@ -2,9 +2,8 @@
 
     F = (1 - sum g_i) F0 + sum g_i h_i           dh_i/dt = dF0/dt - h_i / tau_i
 
-F0 is the force the elastomer would give without memory. After a step F0 the force starts at F0 and relaxes to
-(1 - sum g_i) F0. After a long rest at a high F0, a fall to a low F0 undershoots and can leave F below zero. Contact is
-then lost: the caller has to bound a brake's level at zero.
+F0 is the force without memory. A fall after a long rest at a high F0 can leave F below zero, where contact is lost: the
+caller has to bound a brake's level at zero.
 """
 
 import math
@@ -14,7 +13,7 @@ from firmware_protocol.value import Value
 from tormagd.physics.errors import DomainError, require, require_that
 
 PronyState: TypeAlias = tuple[float, ...]
-"""The last driving force, N, then one branch force h_i, N, for each time constant."""
+"The last driving force, then the h_i."
 
 MAX_FORCE_N: Final = 1e9
 MAX_STEP_S: Final = 1e9
@@ -22,12 +21,12 @@ MAX_STEP_S: Final = 1e9
 
 @final
 class PronyStep(Value):
-    """The exact update of a `PronySeries` over one length of step, for a driving force that is linear in the step."""
+    """The exact update over one step, for a driving force that is linear in it."""
 
     __match_args__ = ("fractions", "decays", "gains")
 
     def __init__(self, fractions: tuple[float, ...], decays: tuple[float, ...], gains: tuple[float, ...]) -> None:
-        relaxing = 0.0  # summed here: `sum` is a call, and a plan makes two of these
+        relaxing = 0.0  # `sum` is a call, and a plan makes two of these
         for fraction in fractions:
             relaxing += fraction
         self.equilibrium_fraction: Final = 1.0 - relaxing
@@ -36,7 +35,6 @@ class PronyStep(Value):
         self.gains: Final = gains
 
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
-        """Return the force, N, and the state at the end of a step, from the state at its beginning."""
         if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
             require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         if len(state) != len(self.fractions) + 1:
@@ -51,13 +49,12 @@ class PronyStep(Value):
         return force_N, tuple(following)
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
-        """Return the step, of equal length, of a series with equal times and other fractions; this one stays."""
         return PronyStep(fractions, self.decays, self.gains)
 
 
 @final
 class PronySeries(Value):
-    """Relaxing fractions g_i (0..1, sum < 1), each with its time constant tau_i, 1e-6..1e9 s."""
+    """Fractions g_i (0..1, sum < 1), each with its time constant tau_i, 1e-6..1e9 s."""
 
     def __init__(self, fractions: tuple[float, ...], times_s: tuple[float, ...]) -> None:
         paired = f"one time for each of the {len(fractions)} fractions"
@@ -71,18 +68,17 @@ class PronySeries(Value):
         self.times_s: Final = times_s
 
     def relaxed(self, driving_N: float) -> PronyState:
-        """Return the state after an endless rest at a driving force: that force, and 0 N in every branch."""
         require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
         return (driving_N, *[0.0 for _ in self.fractions])
 
     def discretise(self, dt_s: float) -> PronyStep:
         """Return the update for steps of `dt_s`; 0 is a jump of the driving force."""
-        if not 0.0 <= dt_s <= MAX_STEP_S:  # spares every plan the call of `require`
+        if not 0.0 <= dt_s <= MAX_STEP_S:
             require("dt_s", dt_s, 0.0, MAX_STEP_S)
         ratios = [dt_s / time_s for time_s in self.times_s]
         return PronyStep(
             fractions=self.fractions,
             decays=tuple([math.exp(-ratio) for ratio in ratios]),
-            # mean of the decay over the step: what is left of a ramp that rose by one over it
+            # what is left of a ramp that rose by one over the step
             gains=tuple([-math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0 for ratio in ratios]),
         )

@@ -162,7 +162,8 @@ class _Reading:
             self.header.update(record.metadata)
 
     def message(self, sent: Message) -> None:
-        """Keep the entries in a message of `/core`, or compare one of `/ticks` or `/frames` with them, or pass it over."""
+        """Keep the entries in a message of `/core`, or compare one of `/ticks` or `/frames` with them, or
+        pass it over."""
         if not self.header:
             raise RecordingError(f"{self._path}: {NO_BLACK_BOX}")  # before all of a long recording has been read
         topic = self._topics.get(sent.channel_id, "")

@@ -100,7 +100,8 @@ class RecordingFolder:
         return size >= self.budget.segment_bytes or lasted_s >= self.budget.segment_s
 
     def room(self, needed_bytes: int) -> str:
-        """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty where there is."""
+        """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty
+        where there is."""
         if shutil.disk_usage(self.path).free >= self.budget.free_bytes + needed_bytes:
             return ""
         return self.make_room(needed_bytes)
@@ -112,7 +113,8 @@ class RecordingFolder:
         return f"No space left on device: {over}, and nothing unmarked is left to take away" if over else ""
 
     def prune(self, coming_bytes: int = 0) -> list[Segment]:
-        """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return those deleted."""
+        """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return
+        those deleted."""
         left, gone = self.segments(), []
         for segment in list(left):
             is_old = segment.began_s is not None and self._clock() - segment.began_s > self.budget.most_s

@@ -141,7 +141,8 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
-        """Return, by code of this kind, the spans in which the code was present: from and to, seconds since the start."""
+        """Return, by code of this kind, the spans in which the code was present: from and to, seconds since
+        the start."""
         known = self.codes.get(kind, {})
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
@@ -248,7 +249,8 @@ def _number(value: object) -> float | None:
 
 
 def codes_in(told: object) -> tuple[str, ...]:
-    """Return the codes in a field's value, a text, or a list or tuple of texts; empty for anything else, such as None."""
+    """Return the codes in a field's value, a text, or a list or tuple of texts; empty for anything
+    else, such as None."""
     words = (told,) if isinstance(told, str) else told if isinstance(told, tuple | list) else ()
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 

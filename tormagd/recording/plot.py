@@ -132,7 +132,8 @@ def _headline(overview: Overview, title: str, notes: Sequence[str]) -> str:
 
 
 def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:
-    """Draw a quantity as one line from each stretch's least value to its greatest and on to the next; nothing for None."""
+    """Draw a quantity as one line from each stretch's least value to its greatest and on to the next;
+    nothing for None."""
     if data is None:
         return
     # from the least to the greatest of each stretch, and on to the next

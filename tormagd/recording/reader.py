@@ -229,7 +229,8 @@ class Contents:
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
     def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Message], None]:
-        """Return a function of one message, which hands each tick and snapshot to `each`, decoded as the type `wanted`."""
+        """Return a function of one message, which hands each tick and snapshot to `each`, decoded as the
+        type `wanted`."""
         decoder = msgspec.json.Decoder(wanted)
 
         def message(sent: Message) -> None:
@@ -255,7 +256,8 @@ class Contents:
 
 
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Read the recording in an open `file` at byte 0, which errors call `name`: each tick and snapshot goes to `each`."""
+    """Read the recording in an open `file` at byte 0, which errors call `name`: each tick and snapshot
+    goes to `each`."""
     found = Contents()
     is_whole = scan(file, name, found.take, found.reading(wanted, each))
     found.require(name)

@@ -45,7 +45,8 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
 def listening(
     context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
 ) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket to `address`, for telemetry or ticks whose messages begin with `topic`, and return it."""
+    """Connect a new SUB socket to `address`, for telemetry or ticks whose messages begin with `topic`,
+    and return it."""
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)

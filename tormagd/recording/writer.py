@@ -47,7 +47,8 @@ INDEX_SHARE = 64
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
-    """Say in a sentence why the disk of `path` has no room for `needed_bytes` and MIN_FREE_BYTES; empty where it has."""
+    """Say in a sentence why the disk of `path` has no room for `needed_bytes` and MIN_FREE_BYTES; empty
+    where it has."""
     free, least = shutil.disk_usage(path.parent).free, MIN_FREE_BYTES + needed_bytes
     if free >= least:
         return ""

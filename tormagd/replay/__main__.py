@@ -22,7 +22,6 @@ from tormagd_client.endpoints import ConfigError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Replay the file that the arguments name, print one JSON object, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tormagd.replay", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("file", type=Path)
     parser.add_argument("--from", dest="from_s", type=float, default=0.0)
@@ -61,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
-    """Rehearse the black box on the simulator with the recorded configuration, and again where settings change it."""
+    """Rehearse the black box with the recorded configuration, and again where settings change it."""
     todo = script(known.columns, box.entries)
     config = changed(known.config, options.settings)
     simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
@@ -79,5 +78,5 @@ def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) 
 
 
 if __name__ == "__main__":
-    logging.disable()  # a connection that is run again has no news
+    logging.disable()  # a replayed connection has no news
     sys.exit(main())

@@ -1,4 +1,4 @@
-"""The conversation with the device run again: the same `Connection`, fed what was read at the times recorded."""
+"""The conversation with the device run again: the same `Connection`, fed what was read at the recorded times."""
 
 from collections.abc import Sequence
 from itertools import zip_longest
@@ -24,11 +24,10 @@ KNOWN = kinds(
     *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
     *(LinkQuality, Counts, Frame, FramingStatistics),
 )
-"The types in a connection's memory."
 
 
 class Found(NamedTuple):
-    """The first difference: its field, the recorded and the replayed value, and the frame it belongs to."""
+    """The first difference: its field, both values, and the frame that it belongs to."""
 
     field: str
     recorded: Any
@@ -37,26 +36,21 @@ class Found(NamedTuple):
 
 
 def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
-    """Return the first difference between two plain values, its field behind `where` and a point; None where they agree
-    to the bit."""
+    """Return the first difference between two plain values, its field prefixed with `where`."""
     found = first_difference(recorded, replayed)
     return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
 
 
 class Conversation:
-    """The recorded conversation with the device run again: a `Connection`, and the backend that gives it what was read."""
-
     def __init__(self, frame: int) -> None:
         self._connection: Connection | None = None
         self.stream: Stream = FrameStream()
         self._unread: Sequence[Any] = ()
         self._written: list[Sent] = []
         self.frame = frame
-        "Number of the newest frame in the file, from 1; set by the caller."
         self.frames = 0
 
     def begin(self, memory: Any) -> None:
-        """Replace the connection by one with this `memory`, as `Connection.memory` gives it; by none for None."""
         self._connection = None
         if memory is not None:
             told = memory["stream"]
@@ -68,17 +62,16 @@ class Conversation:
             self._connection = connection
 
     def compare_memory(self, recorded: Any) -> Found | None:
-        """Return where the connection's memory differs from the `recorded` one, with the newest frame's number."""
+        """Return where the connection's memory differs from the `recorded` one."""
         own = self._connection
         return None if own is None else differing("state.connection", recorded, own.memory(), self.frame)
 
     def compare(self, recorded: Measurement | None) -> Found | None:
-        """Return where the connection's newest measurement differs from the one that the recorded step was given."""
+        """Return where the newest measurement differs from the recorded step's."""
         own = self._connection
         return None if own is None else differing("measurement", plain(recorded), plain(own.measurement), self.frame)
 
     def read(self, entry: Any) -> None:
-        """Feed the connection a READ entry, and add its frames to `frames`."""
         if self._connection is not None:
             _, now_s, raw = entry
             self._unread = pieces = raw if isinstance(raw, list) else [raw]
@@ -86,7 +79,7 @@ class Conversation:
             self.frames += len(pieces)
 
     def wrote(self, entry: Any, output: Duty) -> Found | None:
-        """Send a step's `output` again, and return the first frame that differs from those of the WROTE entry."""
+        """Send a step's `output` again, and return the first frame that differs from the WROTE entry's."""
         if self._connection is None:
             return None
         _, now_s, recorded, unsent = entry
@@ -105,7 +98,7 @@ class Conversation:
         return self.stream.statistics
 
     def receive(self) -> list[Message]:
-        """Decode what `read` was given last, and return the messages; empty where that was done before."""
+        """Decode what `read` was last given; empty when called again."""
         pieces, self._unread = self._unread, ()
         if isinstance(self.stream, FrameStream):
             return [message for piece in pieces for message in self.stream.unpack(piece)]
@@ -115,7 +108,6 @@ class Conversation:
             raise BackendError("another host drives the node") from error
 
     def send(self, message: Message) -> None:
-        """Encode a message, and keep its bytes or frame."""
         self._written.append(self.stream.pack(message))
 
     def close(self) -> None:
@@ -123,7 +115,7 @@ class Conversation:
 
 
 def _shown(frame: Any) -> str:
-    """Return a frame as text: bytes in hexadecimal, behind the identifier and "#" on a bus; "nothing" for None."""
+    """Return a frame as hexadecimal text, behind the identifier and "#" on a bus."""
     if frame is None:
         return "nothing"
     if isinstance(frame, bytes):

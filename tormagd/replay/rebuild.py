@@ -24,12 +24,10 @@ SHOWN = 12
 
 
 class ReplayError(ValueError):
-    """A black box that cannot be run again here, and why, in one sentence."""
+    """A black box that cannot be run again here."""
 
 
 class Recorded(NamedTuple):
-    """The checked contents of a black box's header."""
-
     config: Config
     scene: Scene
     model: str
@@ -39,7 +37,7 @@ class Recorded(NamedTuple):
 
 
 def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
-    """Check a black box's header and return its contents; its model will be looked for where it was, then in `beside`."""
+    """Check a black box's header and return its contents; the model may also lie in `beside`."""
     header = box.header
     missing = [name for name in NEEDED if name not in header]
     if missing:
@@ -55,7 +53,7 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
         raise ReplayError(f"its ticks have no column {lacking[0]!r}: tormagd {header['version'][:20]!r} wrote it")
     config = _intact(header, "config")
     if isinstance(kept := config.get("recordings"), dict):
-        kept.pop("key", None)  # of seals, which earlier versions made
+        kept.pop("key", None)  # earlier versions sealed recordings with it
     try:
         return Recorded(
             checked(config, Config),
@@ -70,7 +68,6 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
 
 
 def rebuilt(known: Recorded, config: Config | None = None) -> Core:
-    """Build the recorded core, with `config` in place of the recorded configuration unless that is None."""
     found = ""
     for folder in known.model_folders:
         try:
@@ -85,8 +82,7 @@ def rebuilt(known: Recorded, config: Config | None = None) -> Core:
 
 
 def differences(known: Recorded, configured: Config | None) -> list[str]:
-    """List what differs from when the file was written, a line each, in this order: build, platform, scene,
-    configuration."""
+    """List what differs since the file was written: build, platform, scene, configuration."""
     found = []
     here, there = sources_hash(), known.header["sources_sha256"]
     if here != there:
@@ -108,14 +104,12 @@ def differences(known: Recorded, configured: Config | None) -> list[str]:
 
 
 def _compare(found: list[str], what: str, there: str, data: bytes) -> None:
-    """Add a sentence to `found` where the hash of `data` is not `there`."""
     here = hashlib.sha256(data).hexdigest()
     if here != there:
         found.append(f"{what}: {there[:SHOWN]} was recorded and is used, here is {here[:SHOWN]}")
 
 
 def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
-    """Return the header's value `name`, a JSON object, once its hash is compared with the value `NAME_sha256`."""
     told = hashlib.sha256(header[name].encode()).hexdigest()
     if told != header[f"{name}_sha256"]:
         raise ReplayError(f"{name}: its hash is {told[:SHOWN]}, beside it stands {header[f'{name}_sha256'][:SHOWN]!r}")
@@ -124,7 +118,6 @@ def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
 
 
 def _json(header: dict[str, str], name: str, kind: Any) -> Any:
-    """Decode a header's JSON value as `kind`."""
     try:
         return msgspec.json.decode(header[name], type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:

@@ -1,7 +1,7 @@
 """What would have happened instead: the simulated device in place of the real one, in virtual time.
 
 Setpoints, commands and the handle's motion are a black box's; the configuration may be another. The simulator is not
-the recorded device. So it runs with the recorded configuration too, to compare with.
+the recorded device, so it runs with the recorded configuration too, to compare with.
 """
 
 import tomllib
@@ -28,22 +28,21 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import TickRecord
 
 HOMED_S, CONNECTED_S = 8.0, 0.5
-"""When the file's first tick is, in virtual time."""
+"""Times before the file's first tick, in virtual time."""
 PATIENCE_S = 0.5
-"How long a refused command is given again: the simulated device may come to rest later than the real one."
+"How long a refused command is repeated: the simulated device may come to rest later than the real one."
 SEED = 1
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
 
 
 class Happened(msgspec.Struct, frozen=True):
-    """What a run met: faults by when each was first latched, limits by how long each held."""
+    """What a run met: when each fault was first latched, and how long each limit held."""
 
     faults: dict[str, float]
     limits: dict[str, float]
     refused: list[str]
 
     def note(self, at_s: float, faults: Iterable[str], held: Iterable[str], for_s: float) -> None:
-        """Add one tick at `at_s`: its faults, and the limits in `held` for another `for_s` seconds."""
         for fault in faults:
             self.faults.setdefault(str(fault), round(at_s, 3))
         for limit in dict.fromkeys(map(str, held)):
@@ -51,7 +50,7 @@ class Happened(msgspec.Struct, frozen=True):
 
 
 class Script(NamedTuple):
-    """What a black box's core was asked to do; times are in seconds from its first tick."""
+    """What a black box's core was asked to do; times are seconds from its first tick."""
 
     lasts_s: float
     is_homed: bool
@@ -59,7 +58,6 @@ class Script(NamedTuple):
     hand: RecordedHand
     setpoints: list[tuple[float, TimedSetpoint | None]]
     commands: list[tuple[float, str]]
-    "Commands that the core took, with their times."
     recorded: Happened
 
     @property
@@ -93,7 +91,7 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
 
 
 def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
-    """Return what is to be done again: the setpoints, taken commands and handle positions of a black box's entries."""
+    """Return the setpoints, taken commands and handle positions of a black box's entries."""
     records = ticks_of(columns, entries)
     ticks = list(records.values())
     first_s = ticks[0].monotonic_s
@@ -124,7 +122,6 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
 
 
 def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Sequence[str]) -> Happened:
-    """Run the script in the closed loop against the simulated device, and return what it met."""
     try:
         delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in map(parse_fault, faults)]
         hand = RecordedHand(tuple(time_s + todo.begins_s for time_s in todo.hand.times_s), todo.hand.positions_mm)
@@ -149,7 +146,6 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
 
 
 def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
-    """Run `loop`, which stands at the script's begin, to the script's end, and return what was met."""
     happened = Happened({}, {}, [])
     setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))
     newest: TimedSetpoint | None = None
@@ -174,7 +170,6 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
 
 
 def _recorded(ticks: list[TickRecord]) -> Happened:
-    """Return the faults and limits that the recorded ticks show; `refused` is empty."""
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
     for before, tick in pairwise([ticks[0], *ticks]):
         happened.note(tick.monotonic_s - first_s, tick.faults, tick.limits, tick.monotonic_s - before.monotonic_s)
@@ -186,8 +181,6 @@ def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:
 
 
 def _hand(ticks: list[TickRecord]) -> RecordedHand:
-    """Return the handle's positions, mm, as its encoder measured them, at the times of the Sense, s from the first
-    tick."""
     places: dict[float, float] = {}
     for tick in ticks:
         if tick.sensed_s is not None and tick.device_handle_mm is not None:

@@ -31,13 +31,13 @@ from tormagd_client.messages import TickRecord
 UNTAKEN = (
     TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
 )  # fmt: skip
-"What the core may raise for values that it never makes itself."
+"The core may raise these for values that it never makes itself."
 SETPOINT = tuple[
     float, float, float, float | None, float | None, tuple[float, ...], float, int, tuple[Limit, ...], float | None,
     Any,
 ]  # fmt: skip
 NOT_THE_CORES = 1
-"Number of leading columns that the core does not make: `t_ns`, from the clock."
+"Leading columns that the core does not make: `t_ns`, from the clock."
 MEASURED = {
     "received_s": "received_s",
     "device_time_s": "device_time_s",
@@ -55,11 +55,10 @@ MEASURED = {
 }
 "By field of a measurement, the column that holds it."
 QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s", "device_clock_drift")
-"The columns of a measurement's LinkQuality, in field order."
 
 
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
-    """Return when a plan of a black box began, s on the monotonic clock, and its setpoint; None for a plan without one."""
+    """Return when a recorded plan began, and its setpoint."""
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
     return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
 
@@ -76,7 +75,7 @@ class Difference(msgspec.Struct, frozen=True):
 
 
 class Rerun(msgspec.Struct, frozen=True):
-    """What a replay gave: `ticks` that agree to the bit, from `from_s` to `to_s` after the file's first tick."""
+    """What a replay gave: `ticks` that agree to the bit, from `from_s` to `to_s`."""
 
     ticks: int
     from_s: float
@@ -88,7 +87,6 @@ class Rerun(msgspec.Struct, frozen=True):
 
 
 def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
-    """Return the tick records of a black box by the index of their entry, from 0, in the file's order."""
     own = TickRecord.__struct_fields__
     order = None if columns == own else [columns.index(name) for name in own]
     records: dict[int, TickRecord] = {}
@@ -107,7 +105,7 @@ def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickReco
 
 
 def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: float = 0.0) -> Rerun:
-    """Run `core` over the entries, up to the first difference or the last tick, and return what came of it."""
+    """Run `core` over the entries, up to the first difference or the last tick."""
     records = ticks_of(columns, entries)
     places = list(records)
     first_s = records[places[0]].monotonic_s
@@ -123,7 +121,7 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
     from_s, ticks, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
     difference: Difference | None = None
     for place in range(start, places[-1] + 1):
-        # a step's inputs stand in the record of its period, which comes after whatever else happened in that
+        # a step's inputs are in the record of its period, which comes after the period's other entries
         record = records[places[number]]
         time_s = record.monotonic_s - first_s
         try:
@@ -144,7 +142,7 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
 
 
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
-    """Return the index of the newest snapshot whose next tick is not after `until_s`, else of the first with a tick."""
+    """Return the index of the newest snapshot that a tick follows by `until_s`, else of the first."""
     found: int | None = None
     waiting: int | None = None
     for place, entry in enumerate(entries):
@@ -160,8 +158,6 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 
 
 class _Running:
-    """Core and conversation while they are replayed, entry by entry."""
-
     def __init__(self, core: Core, frame: int) -> None:
         self.conversation = Conversation(frame)
         self._of_frames: Found | None = None
@@ -171,11 +167,10 @@ class _Running:
         self._output: Duty | None = None
         self._measurement: Measurement | None = None
         self.is_known = False
-        "Whether the states are those of the recorded core."
         self.snapshots = self.gaps = 0
 
     def take(self, entry: Any, record: TickRecord) -> Found | None:
-        """Take one entry that is no tick, and return the first thing that differs; None where nothing does."""
+        """Take one entry that is no tick, and return the first difference."""
         name = name_of(entry)
         self.conversation.frame += len(frames_in(entry))
         if name == journal.STATE:
@@ -193,7 +188,7 @@ class _Running:
         return None
 
     def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
-        """Do what one entry tells: step, plan, learning, command or fault; return a difference only for a command."""
+        """Do what one entry tells: step, plan, learning, command or fault."""
         match name:
             case journal.STEP:
                 self._measurement = measurement_of(record)
@@ -258,8 +253,7 @@ class _Running:
         return next(Found(*row) for row in rows if packed(row[1]) != packed(row[2]))
 
     def _begin(self, entry: Any) -> Found | None:
-        """Compare the states with a snapshot where they are known, then take the snapshot's; return the first
-        difference."""
+        """Compare the states with a snapshot's, if they are known, and then take them."""
         differs, connection = None, entry[3]
         if self.is_known:
             self.snapshots += 1
@@ -274,7 +268,6 @@ class _Running:
 
 
 def measurement_of(record: TickRecord) -> Measurement | None:
-    """Return the measurement that a tick's step was given; None where the record's `measurement`, its number, is None."""
     if record.measurement is None:
         return None
     numbers = {name: getattr(record, column) for name, column in MEASURED.items()}
@@ -292,7 +285,7 @@ def measurement_of(record: TickRecord) -> Measurement | None:
 
 
 def name_of(entry: Any) -> str:
-    """Return a black box entry's name, a word by itself or at the head of a list; empty for a tick and anything else."""
+    """Return an entry's name, a word by itself or at the head of a list; empty for a tick."""
     if isinstance(entry, str):
         return entry
     if isinstance(entry, list) and entry and isinstance(entry[0], str):

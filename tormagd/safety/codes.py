@@ -7,8 +7,6 @@ from firmware_protocol.codec import DeviceFault
 
 
 class Reaction(StrEnum):
-    """The safe reaction to a fault or limit."""
-
     OPENING = "opening"
     "The gap opens at a bounded speed, and the drives go off there."
     LIMITED = "limited"
@@ -18,25 +16,20 @@ class Reaction(StrEnum):
 
 
 class Position(StrEnum):
-    """What is known of the carriages' positions after a fault."""
-
     KEPT = "kept"
     LOST_HERE = "lost"
-    "An encoder's counts are wrong."
     LOST_THERE = "given up by the device"
     "A device that has latched, or was reset, does not call itself homed."
 
 
 class Explanation(NamedTuple):
-    """What a person needs to know about a fault or limit, and how soon the safe reaction begins."""
-
     cause: str
     remedy: str
     reaction: Reaction = Reaction.HELD
     safe_ms: float = 100.0
-    "The longest time from when the cause shows to when the reaction begins."
+    "From when the cause shows to when the reaction begins."
     shows: str = "at once"
-    "When the cause shows: many faults hide from a device at rest."
+    "Many faults hide from a device at rest."
     position: Position = Position.KEPT
 
     @property
@@ -583,6 +576,6 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
-    """Return the faults for the firmware's fault bits, in the order of the bits; empty for none."""
+    """Return the faults for the firmware's fault bits."""
     names = _BY_DEVICE_FAULT | ({DeviceFault.COMMAND_TIMEOUT: Fault.HOST_STALL} if is_host_stall else {})
     return tuple(fault for bit, fault in names.items() if bit in bits)

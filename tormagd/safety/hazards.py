@@ -23,7 +23,7 @@ FAULTS_OF: Final[dict[Hazard, str]] = {
     "SENSE_STALE STATUS_STALE CLOCK SENSOR",
     Hazard.WORN: "DEVICE_TEMPERATURE DEVICE_OVERCURRENT DEVICE_END_STOP DEVICE_SKEW SKEW",
 }
-"The faults that control it, by their names: one that went is missed."
+"The faults that control it, by name."
 LIMITS_OF: Final[dict[Hazard, str]] = {
     Hazard.CLOSES: "OTHER_SOURCE RANGE CEILING OVER_FORCE",
     Hazard.OPENS: "STALE TAKEOVER HOST_STALL DEVICE_SILENT ENCODER",
@@ -31,9 +31,8 @@ LIMITS_OF: Final[dict[Hazard, str]] = {
     "DEVICE_OR_SENSOR SENSOR_ZERO OFFSET_UNKNOWN HANDLE_LOST SENSE_STALE LINK_DEGRADED CLOCK",
     Hazard.WORN: "SKEW",
 }
-"The limits that do."
 HARMLESS: Final = "NO_SETPOINT STANDBY F_MIN F_MAX RATE SATURATED"
-"Limits that tell what the device can do, and control no hazard."
+"They tell what the device can do, and control no hazard."
 
 
 class Cause(NamedTuple):
@@ -43,11 +42,11 @@ class Cause(NamedTuple):
     hazard: Hazard
     cause: str
     control: str = ""
-    "What is done about it; empty: nothing can be."
+    "Empty where nothing can be done."
     test: str = ""
-    "A test of it, as FILE::FUNCTION within tests; empty: none."
+    "As FILE::FUNCTION within tests."
     cell: str = ""
-    "A row of the fault matrix that shows it; empty: none."
+    "A row of the fault matrix."
 
 
 CAUSES: Final = (
@@ -119,4 +118,3 @@ CAUSES: Final = (
         "firmware_protocol/test_conformance.py::test_the_c_sources_pass",
     ),
 )
-"Every cause known that is not a code's."

@@ -16,16 +16,13 @@ from tormagd.safety.codes import FAULTS, Fault, Position
 CLEARING_S = 0.5
 "How long the device may take to report that a cleared fault is gone."
 LOST_POSITION = frozenset({fault for fault, row in FAULTS.items() if row.position is Position.LOST_HERE})
-"""Faults after which an encoder's counts are not believed any more, though the device goes on calling itself homed."""
+"The device goes on calling itself homed, but an encoder's counts are not believed any more."
 
 
 class OperatingState(StrEnum):
-    """CRTK operating states."""
-
     DISABLED = "DISABLED"
     "The gap is open or on its way there, and nothing is driven from here."
     ENABLED = "ENABLED"
-    "The force follows the setpoint."
     PAUSED = "PAUSED"
     "The gap is held where it is; a force over the ceiling opens it."
     FAULT = "FAULT"
@@ -33,8 +30,6 @@ class OperatingState(StrEnum):
 
 
 class Event(StrEnum):
-    """What may change the operating state: an operator's command, or faults that show."""
-
     ENABLE = "enable"
     DISABLE = "disable"
     PAUSE = "pause"
@@ -56,7 +51,7 @@ class DeviceRequest(StrEnum):
 
 
 class RefusedError(Exception):
-    """A command that is refused; nothing has changed. `code` names the reason, `message` says it, `hint` what to do."""
+    """A command that is refused: `code` names the reason, `message` says it, `hint` what to do."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(message)
@@ -65,8 +60,6 @@ class RefusedError(Exception):
 
 @final
 class Conditions(Value):
-    """The conditions on which a command is taken or refused."""
-
     def __init__(
         self,
         connected: bool,
@@ -91,7 +84,7 @@ class Conditions(Value):
         self.device_latched: Final = device_latched
         self.sensor_doubted: Final = sensor_doubted
         self.cause: Final = cause
-        "What keeps the device from being connected or its measurements from being fresh; empty where nothing does."
+        "Why the device is not connected, or its measurements not fresh."
         self.remedy: Final = remedy
         self.round_trip_s: Final = round_trip_s
         self.clock_drift: Final = clock_drift
@@ -126,17 +119,16 @@ class SafetyState(Value):
         return self.operating_state is OperatingState.ENABLED or self.operating_state is OperatingState.PAUSED
 
     def ask(self, request: DeviceRequest) -> "SafetyState":
-        """Return this state with a new request to the device, under the next request number; NONE would be numbered,
-        too."""
+        """Return this state with a new request to the device, under the next number."""
         return self.replaced(request=request, request_number=self.request_number + 1)
 
 
 Refuses = Callable[[SafetyState, Conditions], str]
-"""The check of a guard. It returns what is wrong, in a sentence with the figures; empty where nothing is."""
+"Returns what is wrong, with the figures; empty where nothing is."
 
 
 class Guard(NamedTuple):
-    """A condition of a transition. Where it does not hold, the event is refused with `code`, and nothing changes."""
+    """A condition of a transition. Where it does not hold, the event is refused with `code`."""
 
     code: str
     wants: str
@@ -146,22 +138,17 @@ class Guard(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One row of the table: where `event` leads from `source`."""
-
     event: Event
     source: OperatingState
     target: OperatingState
     reason: str
-    "What the transition means, for the log."
+    "What the log says."
     guards: tuple[Guard, ...] = ()
-    "In the order in which they are asked; the first that does not hold is told."
+    "The first that does not hold is told."
     request: DeviceRequest = DeviceRequest.NONE
-    "What the device is asked for."
 
 
 class Refusal(NamedTuple):
-    """A row of the table for an `event` that is refused in `source`, with `code`."""
-
     event: Event
     source: OperatingState
     code: str
@@ -203,7 +190,6 @@ def _apart(state: SafetyState, present: Conditions) -> str:
 
 
 def _slow(state: SafetyState, present: Conditions) -> str:
-    """Return what is wrong with the round trip to the device, in ms; empty where it is at most `most_round_trip_s`."""
     if present.round_trip_s <= present.most_round_trip_s:
         return ""
     return (
@@ -260,7 +246,7 @@ READY: tuple[Guard, ...] = (
         "check the firmware's timer and its clock source",
     ),
 )
-"The guards of `enable`: what must hold before anything is driven."
+"What must hold before anything is driven."
 
 DISABLED: Final = OperatingState.DISABLED
 ENABLED: Final = OperatingState.ENABLED
@@ -302,7 +288,7 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Refusal(Event.HOME, FAULTED, "fault", CLEAR),
     # stop is never refused, and needs no device: a device that comes back finds a fault that somebody has to clear
     *[Transition(Event.STOP, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
-    # the daemon has latched nothing here; a device may hold what it latched while nobody was there to see it
+    # the daemon has latched nothing here; a device may hold what it latched while nobody was there
     Transition(Event.CLEAR_FAULT, DISABLED, DISABLED, _UNLATCHED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
     # a fault that the device latches meanwhile is news, and must not be cleared unseen
     Transition(Event.CLEAR_FAULT, ENABLED, ENABLED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
@@ -315,14 +301,14 @@ ROWS: tuple[Transition | Refusal, ...] = (
     *[Transition(Event.FAULT, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
-"""All transitions and refusals, by event and state. A fault that is latched already is no event."""
+"A fault that is latched already is no event."
 COMMANDS: tuple[str, ...] = tuple([str(event) for event in Event if event is not Event.FAULT])
 _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
 
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
-    """Return `state` in FAULT with `faults` latched and the device asked to open; `state` itself where none is new."""
-    if not faults:  # as nearly always, a thousand times a second
+    """Return `state` in FAULT with the new `faults` latched and the device asked to open."""
+    if not faults:
         return state
     new = [fault for fault in faults if fault not in state.faults]
     if not new:
@@ -338,18 +324,18 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
 
 
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
-    """Return `state` after the device said whether it is homed: a device that is not homed ends `needs_homing`."""
+    """Return `state` without `needs_homing` once the device has said that it is not homed."""
     return state if is_homed or not state.needs_homing else state.replaced(needs_homing=False)
 
 
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
-    """Return the state after the operator's command `name` at the host's time `now_s`; `state` itself stays as it was."""
+    """Return the state after the operator's command `name`. Raises RefusedError."""
     if name not in COMMANDS:
         raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
     event = Event(name)
     row = TRANSITIONS[event, state.operating_state]
     if isinstance(row, Refusal):
-        if not conditions.connected:  # a missing device is told first, whatever else is in the way
+        if not conditions.connected:
             require(CONNECTED, state, conditions)
         raise RefusedError(row.code, _refused(row, state), row.remedy)
     for guard in row.guards:
@@ -369,7 +355,6 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 
 
 def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
-    """Raise RefusedError where `guard` does not hold in `state` under `conditions`; else do nothing."""
     message = guard.refuses(state, conditions)
     if message:
         is_told_better = guard is CONNECTED and conditions.remedy
@@ -377,7 +362,6 @@ def require(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
 
 
 def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
-    """Return the commands that lead from `state` to ENABLED, in their order; none in ENABLED, `resume` in PAUSED."""
     if state.operating_state is ENABLED:
         return ()
     if state.operating_state is PAUSED:
@@ -390,7 +374,7 @@ def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
 
 
 def reason(name: str, source: OperatingState) -> str:
-    """Return the log's line for a command that was taken in the state `source`, as in "FAULT to DISABLED: why"."""
+    """Return the log's line for a command, as in "FAULT to DISABLED: why"."""
     row = TRANSITIONS[Event(name), source]
     return f"{source} to {row.target}: {row.reason}" if isinstance(row, Transition) else ""
 
@@ -401,7 +385,6 @@ def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -
 
 
 def _refused(row: Refusal, state: SafetyState) -> str:
-    """Return the message of a refusal: in FAULT the latched faults, for `enable` "already" and the state."""
     if row.source is FAULTED:
         return f"cannot {row.event} in {row.source}: {', '.join(state.faults)}"
     already = f"already {row.source}"

@@ -7,8 +7,6 @@ from msgspec import Struct
 
 
 class OperatingPoint(Struct, frozen=True):
-    """One way to serve a scene: rates of control and of plans, Hz, and the search for the field."""
-
     control_hz: int
     inference_hz: int
     search: str
@@ -18,7 +16,7 @@ class OperatingPoint(Struct, frozen=True):
 
 
 class Share(Struct, frozen=True):
-    """The processor time of a daemon that serves a scene in one way, live on the simulated device."""
+    """The processor time of a daemon that serves a scene in one way on the simulated device."""
 
     way: OperatingPoint
     daemon: float
@@ -31,8 +29,6 @@ class Share(Struct, frozen=True):
 
 
 class Tried(Struct, frozen=True):
-    """The RMS error of the force, N, of a scene's own signal served in one way, on each of the three samples."""
-
     way: OperatingPoint
     rms_N: tuple[float, ...]
 
@@ -42,8 +38,6 @@ class Tried(Struct, frozen=True):
 
 
 class WorstDevice(Struct, frozen=True):
-    """The worst device of a group in one situation."""
-
     group: str
     device: str
     signal: str
@@ -53,8 +47,6 @@ class WorstDevice(Struct, frozen=True):
 
 
 class MeasuredScene(Struct, frozen=True):
-    """What was measured of one scene."""
-
     name: str
     fingerprint: str
     tolerance_N: float
@@ -71,7 +63,6 @@ class MeasuredScene(Struct, frozen=True):
         return self.usual.worst_N <= self.tolerance_N
 
     def of(self, way: OperatingPoint) -> Tried:
-        """Return what was found of `way`: the same rates and the same search."""
         return next(each for each in self.tried if each.way == way)
 
 
@@ -80,36 +71,33 @@ class Measurements(Struct, frozen=True):
 
     command: str
     machine_us: float
-    "Of the machine that the shares are of: see `tormagd.headroom.machine_loop`."
+    "See `tormagd.headroom.machine_loop`."
     pairs: int
     "Runs of each way that a share is the median of."
     draws: int
-    "Devices drawn from the plant card that decided; twice as many judged."
+    "Devices from the plant card that decided; twice as many judged."
     shares: tuple[Share, ...]
     scenes: tuple[MeasuredScene, ...]
 
     def share(self, way: OperatingPoint) -> Share | None:
-        """Return what serving in this `way` costs; None where it was not measured."""
         return next((each for each in self.shares if each.way == way), None)
 
     def scene(self, fingerprint: str) -> MeasuredScene | None:
-        """Return what was measured of the scene with this `fingerprint`; None where none was."""
         return next((each for each in self.scenes if each.fingerprint == fingerprint), None)
 
 
 FILE = "measured.json"
 TOLERATED = 0.8
-"Share of a scene's tolerance: an error within it may be chosen."
+"An error within this share of the tolerance may be chosen."
 WORSE = 0.2
-"Share of a scene's tolerance: an error that is so much over the usual way's may be chosen."
+"An error that exceeds the usual way's by this share of the tolerance may be chosen."
 
 
 def measured() -> Measurements:
-    """Read the file of measurements that comes with the package, anew at each call, and return it."""
     return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measurements)
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
-    """Return the greatest error, N, of a way that may be chosen in place of the usual one with the error `usual_N`."""
+    """Return the greatest error of a way that may replace the usual one."""
     most_N = max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)
     return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N

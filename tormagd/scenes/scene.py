@@ -20,29 +20,27 @@ AUTO = "auto"
 MIN_SETPOINT_HZ = 12.0
 "Setpoints a tenth of a second apart are no stream any more."
 MIN_CONTROL_HZ = 500
-"What is watched for safety is watched in every control tick: slower than this is none that a scene is run at."
+"Safety is watched in every control tick."
 AND_UNMET = "; and "
-"Between what a device does not give of a scene, where it is refused."
+"Between what a device does not give of a scene."
 ENDING = ".toml"
 _SHIPPED = resources.files(__package__)
 
 
 class Force(Strict, frozen=True):
-    """The forces the task asks for, N, and how closely they must be rendered."""
-
     least_N: Annotated[float, Meta(ge=0.0, le=1_000.0)]
-    "What the task would like as its lowest force; below the device's F_min it gets F_min, and the limit F_MIN shows."
+    "Below the device's F_min the task gets F_min."
     most_N: Annotated[float, Meta(gt=0.0, le=1_000.0)]
     resolution_N: Annotated[float, Meta(gt=0.0, le=100.0)]
-    "The smallest difference of force that matters."
+    "The smallest difference that matters."
     tolerance_rms_N: Annotated[float, Meta(gt=0.0, le=100.0)]
     least_variance_accounted_for: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     release_N_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.0
-    "How fast the force is let go when its publisher is gone, and how fast it goes to another publisher's."
+    "How fast the force is let go, or passes to another publisher's."
     most_release_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 20.0
-    "How fast it may be lost at most, whatever fails."
+    "The limit whatever fails."
     standby_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
-    """Where the brake waits while less is asked: nearer to the forces that come, and felt as drag."""
+    "Where the brake waits while less is asked: nearer to the forces that come, and felt as drag."
 
     @property
     def waiting_N(self) -> float:
@@ -50,7 +48,7 @@ class Force(Strict, frozen=True):
 
 
 class Bandwidth(Strict, frozen=True):
-    """The rates below which the task is not served, Hz."""
+    """The rates below which the task is not served."""
 
     control_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 1_000
     inference_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = MIN_INFERENCE_HZ
@@ -60,17 +58,17 @@ class Signal(Strict, frozen=True):
     """The force that the task asks for over time: a recording, or `force`'s range up and down."""
 
     file: str = ""
-    "A CSV with the columns t_s,force_N, relative to the scene file; forces between its rows are on a smooth curve."
+    "A CSV with the columns t_s,force_N, relative to the scene file; the force follows a smooth curve through its rows."
     bandwidth_hz: Annotated[float, Meta(gt=0.0, le=100.0)] | UnsetType = UNSET
     "Each rise and each fall is half a period of a cosine of this frequency."
     step_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
-    "Of each rise and fall; the whole range where it is not given."
+    "The height of each rise and fall; by default the whole range."
     hold_s: Annotated[float, Meta(ge=0.0, le=86_400.0)] | UnsetType = UNSET
-    "After each rise and each fall; 0 where it is not given."
+    "The rest after each rise and fall."
     is_known_ahead: bool = False
-    "Whether the publisher knows what comes, and sends it as a preview."
+    "The publisher sends what comes as a preview."
     setpoint_hz: Annotated[float, Meta(ge=MIN_SETPOINT_HZ, le=1_000.0)] | UnsetType = UNSET
-    "How often the publisher sends; as often as plans are made where it is not given."
+    "By default as often as plans are made."
 
     def __post_init__(self) -> None:
         shaped = {key: getattr(self, key) for key in ("bandwidth_hz", "step_N", "hold_s")}
@@ -83,30 +81,27 @@ class Signal(Strict, frozen=True):
 
 
 class Handle(Strict, frozen=True):
-    """How fast the brake's handle slides, mm/s at the roller's surface. A model that does not know such handles is
-    refused."""
+    """How fast the brake's handle slides. The model must have been trained on it."""
 
     least_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
     most_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
-    "By default the thesis's 20 rpm."
+    "The thesis's 20 rpm."
 
 
 class Finger(Strict, frozen=True):
-    """How a finger presses into the pad. A model that does not know so deep a pad, or one so fast, is refused."""
+    """How a finger presses into the pad. The model must have been trained on it."""
 
     depth_mm: Annotated[float, Meta(gt=0.0, le=20.0)]
-    "In which the forces are asked for; a finger that is less deep gets the gap of this depth."
+    "The forces are asked for at this depth; a finger that is less deep gets its gap."
     most_mm_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 1.0
-    "Pressing in and drawing back; by default the thesis's."
 
 
 class Budget(Strict, frozen=True):
-    """What the control of the scene may cost; `tormagctl scene check` says whether it does."""
+    """What the control of the scene may cost, as `tormagctl scene check` says."""
 
     core_share: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
-    "Of one processor's time, for steps and plans."
     delay_ms: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
-    """How old setpoints may be when they are followed (`SOURCE_LATE`), and the budget of the whole way."""
+    "How old setpoints may be when they are followed (`SOURCE_LATE`): the budget of the whole way."
 
 
 class Terms(Strict, frozen=True):
@@ -120,14 +115,14 @@ class Terms(Strict, frozen=True):
     forecast: bool = True
     motor: bool = True
     learning: bool = True
-    "No part of the model, but whether `creep`, `scale`, `offset` and the carriages' lag go on being learned."
+    "Whether `creep`, `scale`, `offset` and the carriages' lag go on being learned."
 
     @property
     def left_out(self) -> tuple[str, ...]:
         return tuple(name for name in TERMS if not getattr(self, name))
 
     def without(self, *names: str) -> "Terms":
-        """Return these terms with `names` left out, too; without names the same."""
+        """Return these terms with `names` left out. Raises ValueError for an unknown name."""
         for name in names:
             if name not in TERMS:
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
@@ -139,11 +134,11 @@ EVERY_TERM = Terms()
 
 
 class Insert(Strict, frozen=True):
-    """Which elastomer is fitted, which device it is in, and the model learned from the two."""
+    """Which elastomer is fitted, in which device, and the model learned from the two."""
 
     name: str
     model: str
-    """A safetensors file (relative to the scene file), or the name of a shipped model."""
+    "A safetensors file (relative to the scene file), or the name of a shipped model."
     gap_closed_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 45.0
     gap_open_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 95.0
     inner_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 4.0
@@ -151,17 +146,17 @@ class Insert(Strict, frozen=True):
     thickness_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
     roller_radius_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] | UnsetType = UNSET
-    "The fastest that the task lets the gap move, where that is less than the configuration's."
+    "The fastest that the task lets the gap move."
 
 
 class Solver(Strict, frozen=True):
-    """The field search. "auto": none where the rate is no term, else Newton's method, the cheapest and most exact."""
+    """The field search. "auto" is none where the rate is no term, else Newton's method, the cheapest and most exact."""
 
     name: str = AUTO
     step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET
-    "Of the grid over the field."
+    "The step of the grid over the field."
     neighbours: Annotated[int, Meta(ge=1, le=64)] | UnsetType = UNSET
-    'Points of the grid that compete for the answer of the search "nearest".'
+    "Points of the grid that compete for the answer."
 
     def __post_init__(self) -> None:
         for key in ("step_mT", "neighbours"):
@@ -171,22 +166,21 @@ class Solver(Strict, frozen=True):
 
 
 class Scene(Strict, frozen=True):
-    """One task. Raises ValueError where its statements contradict each other; `load_scene` makes it a ConfigError."""
+    """One task. Raises ValueError where its statements contradict each other."""
 
     name: str
     description: str
     force: Force
     insert: Insert
     element: Literal["torque", "tactile"] = "torque"
-    "What the force is made with: the brake on the handle's shaft, or a pad under a finger."
+    "The brake on the handle's shaft, or a pad under a finger."
     signal: Signal | None = None
-    "Without one nothing is known of how the force changes, and nothing is refused for it."
+    "Without one nothing is refused for how fast the force changes."
     handle: Handle = msgspec.field(default_factory=Handle)
     finger: Finger | UnsetType = UNSET
-    "What presses into a pad; a tactile scene has it, and no other."
+    "Only in tactile scenes."
     budget: Budget = msgspec.field(default_factory=Budget)
     terms: Terms = EVERY_TERM
-    "Which parts of the controller's model run."
     bandwidth: Bandwidth = msgspec.field(default_factory=Bandwidth)
     solver: Solver = msgspec.field(default_factory=Solver)
 
@@ -216,7 +210,6 @@ class Scene(Strict, frozen=True):
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
 
     def _require_no_brake(self) -> None:
-        """Raise ValueError where a tactile scene states what only a brake has."""
         usual = Insert(self.insert.name, self.insert.model)
         for key in ("inner_radius_mm", "outer_radius_mm", "thickness_mm", "roller_radius_mm"):
             value = getattr(self.insert, key)
@@ -233,7 +226,7 @@ class Scene(Strict, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """The hash, 16 hex digits, of what the scene asks for; equal scenes have equal ones in every process."""
+        """A hash, 16 hex digits, of what the scene asks for."""
         signal, insert = self.signal, self.insert
         task = msgspec.structs.replace(
             self,
@@ -250,15 +243,13 @@ class Scene(Strict, frozen=True):
 
 
 def shipped_scenes() -> tuple[str, ...]:
-    """Return the names of the scenes that come with the package, sorted."""
     return shipped(_SHIPPED, ENDING)
 
 
 def scene_path(name_or_path: str) -> Path:
-    """Return the path of the shipped scene with this name, or of the file at this path, from the working directory on."""
     return named("scene", name_or_path, _SHIPPED, ENDING)
 
 
 def load_scene(name_or_path: str) -> Scene:
-    """Read and check a shipped scene, by its name, or the scene in a file; a shipped name goes first."""
+    """Read and check a shipped scene by its name, or the scene in a file. Raises ConfigError."""
     return convert(scene_path(name_or_path), Scene)

@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 
 
 def recorded(path: Path) -> tuple[Array, Array]:
-    """Read a file of forces, and return its times from the first row on, s, and forces, N (n each, 2 at least)."""
+    """Read a file of forces, and return times from the first row on, s, and forces, N. Raises ConfigError."""
     try:
         table = read_forces(path)
     except ForceFileError as error:
@@ -27,7 +27,7 @@ def recorded(path: Path) -> tuple[Array, Array]:
 def asked(
     signal: Signal, beside: Path, range_N: tuple[float, float], longest_s: float, rate_hz: int
 ) -> tuple[Array, Array]:
-    """Return times, s from 0 on, and forces, N (n each), that `signal` asks for."""
+    """Return times from 0 on, s, and forces, N (n each), that `signal` asks for."""
     low_N, high_N = range_N
     if signal.file:
         known_s, known_N = recorded(beside / signal.file)
@@ -48,7 +48,7 @@ def asked(
 
 
 def _through(time_s: Array, known_s: Array, known_N: Array) -> Array:
-    """Return the forces (n) at `time_s` on cubic Hermite curves through the rows `known_s`, `known_N`."""
+    """Return the forces at `time_s` on cubic Hermite curves through the known rows."""
     slope = np.gradient(known_N, known_s)
     after = np.clip(np.searchsorted(known_s, time_s, side="right"), 1, len(known_s) - 1)
     start = after - 1

@@ -3,7 +3,7 @@
 import signal
 
 if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    # what follows takes half a second to load: until `main` sees to it, Ctrl-C may simply end the process
+    # the imports take half a second: until `main` takes over, Ctrl-C may end the process
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import argparse
@@ -33,17 +33,17 @@ from tormagd.simulation.slcan_door import SlcanDoor
 from tormagd.slices import ask_for_slices
 from tormagd_client.printable import printable
 
-# The C sources are what a microcontroller runs, qemu one; the Python twin, held equal by tests, needs no compiler.
+# The C sources are what a microcontroller runs, in qemu or natively; the Python twin needs no compiler.
 FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware, "qemu": EmulatedFirmware}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the device until SIGTERM or SIGINT and return the exit code; the first line on stdout says where hosts come."""
+    """Run the device until SIGTERM or SIGINT; the first line on stdout names its port or channel."""
     command = parser()
     options = command.parse_args(arguments)
     ask_for_slices()  # a real device has a processor of its own
     with contextlib.ExitStack() as resources:
-        # before anything is opened: all of it is closed again
+        # before anything is opened, so that all of it is closed again
         is_stopped = resources.enter_context(interrupted_by(signal.SIGTERM, signal.SIGINT))
         try:
             device, door = _opened(options, resources)
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
-    """Build the device that the options ask for, open its door, and return both; `resources` closes the door."""
+    """Build the device that the options ask for, and open its door."""
     boot = FIRMWARES[options.firmware]
     plant = load_plant(options.plant)
     hand = parse_hand(options.hand or ("steady" if plant.pad is None else "pressing"))
@@ -89,7 +89,6 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the argument parser of `python -m tormagd.simulation`; the reference of commands is made from it, too."""
     made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
     doors = made.add_mutually_exclusive_group(required=True)
     doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal, its path printed first")
@@ -134,7 +133,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _rate(least: int, most: int, text: str) -> int:
-    """Return the command-line word `text` as a whole number."""
     rate = int(text)
     if not least <= rate <= most:
         raise argparse.ArgumentTypeError(f"{rate}: allowed are {least} to {most}")

@@ -16,7 +16,7 @@ from typing import Final, final
 from tormagd.simulation.parameters import PlantError, PlantParameters
 
 MAX_STEP_SHARE: Final = 0.25
-"""Largest share of a substep in the time constants it has to resolve; the samples stay under 0.07."""
+"The samples stay under 0.07."
 
 
 @final
@@ -30,7 +30,7 @@ class Axis:
         self._dt_s = dt_s
         self._resistance_Ohm = motor.resistance_Ohm
         self._coupling_Nm_A = gear.ratio * motor.back_emf_V_s_rad
-        # the current is exact for the mean speed of the step: L/R is under a millisecond
+        # exact for the mean speed of the step: L/R is under a millisecond
         self._electrical_time_s = motor.inductance_mH * 1e-3 / motor.resistance_Ohm
         self._decay = math.exp(-dt_s / self._electrical_time_s)
         self._remaining = (1.0 - self._decay) * self._electrical_time_s / dt_s
@@ -59,7 +59,7 @@ class Axis:
         self.speed_rad_s = 0.0
         self.current_A = 0.0
         self.position_m = start_mm * 1e-3
-        # at power-on the nut carries the whole attraction and the guide nothing
+        # at power-on the nut carries the whole attraction
         self.contact_N = attraction_N
         flank_m = self.backlash_m if attraction_N > 0.0 else -self.backlash_m
         self._nut_zero_m = self.position_m + (flank_m + attraction_N / self._stiffness_N_m)
@@ -69,8 +69,7 @@ class Axis:
         return self._coupling_Nm_A * self.speed_rad_s
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
-        """Advance the drive and its carriage by one time step, `dt_s`."""
-        # four times a simulated millisecond: hence local names
+        # runs four times per simulated millisecond: hence local names
         coupling_Nm_A = self._coupling_Nm_A
         before_rad_s, contact_N = self.speed_rad_s, self.contact_N
         if voltage_V is None:
@@ -100,7 +99,7 @@ class Axis:
             against_rad_s = -grip_rad_s if before_rad_s > 0.0 else grip_rad_s
             speed_rad_s = before_rad_s + push_rad_s + against_rad_s
             if (speed_rad_s > 0.0) != (before_rad_s > 0.0):
-                # it stops within the step, and only what pushes harder than friction holds turns it back from there
+                # only what pushes harder than friction holds turns it back from there
                 back_rad_s = push_rad_s - against_rad_s
                 rest = speed_rad_s / (speed_rad_s - before_rad_s)
                 speed_rad_s = back_rad_s * rest if (back_rad_s > 0.0) != (before_rad_s > 0.0) else 0.0
@@ -120,7 +119,7 @@ class Axis:
             end_A = settled_A + (start_A - settled_A) * self._decay
             self.current_A = -limit_A if end_A < -limit_A else limit_A if end_A > limit_A else end_A
 
-        # the carriage follows the nut: it stands while the guide's drag holds it, else slides to the limit
+        # the carriage stands while the guide's drag holds it, else slides to the limit
         nut_m = self._nut_zero_m + angle_rad * lead_m_rad
         position_m, drag_N = self.position_m, self.drag_N
         backlash_m, stiffness_N_m = self.backlash_m, self._stiffness_N_m
@@ -147,7 +146,7 @@ class Axis:
             self.contact_N = 0.0
 
     def shaft_after(self, age_s: float, voltage_V: float | None) -> tuple[float, float]:
-        """Return the screw's (angle_rad, current_A) at `age_s` after the last step, without changing the state."""
+        """Return the screw's (angle_rad, current_A) at `age_s` after the last step."""
         speed_rad_s = self.speed_rad_s
         angle_rad = self.angle_rad + age_s * speed_rad_s
         if voltage_V is None:

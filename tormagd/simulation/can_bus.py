@@ -1,6 +1,6 @@
 """The python-can interface `tormagsim`: how a host comes to the simulated device's CAN bus.
 
-`can.Bus(interface="tormagsim", channel=PATH)` with the path that `python -m tormagd.simulation --can` prints. Several
+`can.Bus(interface="tormagsim", channel=PATH)` takes the path that `python -m tormagd.simulation --can` prints. Several
 hosts may be on the bus; each hears the others and the device, and itself with `receive_own_messages`.
 """
 
@@ -27,16 +27,15 @@ from tormagd.simulation.can_frame import (
 )
 
 SEND_BUFFER_BYTES = 4_608
-"""The kernel's least, a handful of frames: a host has to notice soon that nobody takes its frames."""
+"""The kernel's least, a handful of frames: a host must soon notice that nobody takes its frames."""
 
 
 class SimulatorBus(can.BusABC):
-    """A host's CAN controller on the simulated bus. Classical frames with 11-bit identifiers only."""
+    """A host's CAN controller on the simulated bus, for classical frames with 11-bit identifiers."""
 
     def __init__(
         self, channel: str, can_filters: Any = None, receive_own_messages: bool = False, **settings: object
     ) -> None:
-        """Connect to the simulator that serves `channel`."""
         self.channel_info = f"tormagsim {channel}"
         self._name = "".join(Path(channel).name.split())
         self._hears_itself = receive_own_messages
@@ -52,18 +51,17 @@ class SimulatorBus(can.BusABC):
 
     @staticmethod
     def _detect_available_configs() -> list[AutoDetectedConfig]:
-        """Return the channels of running simulators that were given no path of their own, sorted; python-can asks for
-        them."""
+        """Return the channels of running simulators, for python-can."""
         listening = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace").split()
         found = sorted(str(path) for path in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/can"))
         return [{"interface": "tormagsim", "channel": path} for path in found if path in listening]
 
     def fileno(self) -> int:
-        """Return the socket's descriptor, -1 once the bus is shut down."""
+        """Return the socket's descriptor, or -1 after shutdown."""
         return self._socket.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a classical data frame, waiting up to `timeout` seconds for room; None waits for ever, 0 not at all."""
+        """Send a classical data frame, waiting up to `timeout` seconds for room; None waits for ever."""
         is_classical = not (msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd)
         if not (is_classical and 0 <= msg.arbitration_id <= MAX_IDENTIFIER and len(msg.data) <= MAX_DATA):
             raise can.CanOperationError(f"{msg}: allowed are classical data frames of 11-bit identifiers")
@@ -104,6 +102,5 @@ class SimulatorBus(can.BusABC):
         return message, False
 
     def shutdown(self) -> None:
-        """Leave the bus."""
         super().shutdown()
         self._socket.close()

@@ -1,7 +1,7 @@
 """The simulated device on a CAN bus: frames in, frames out.
 
-A frame of n bytes takes 47 + 8 n bits, those of ISO 11898-1 without stuffed ones, its pause of 3 included. Whoever has
-something to send waits until the bus is free, then the lowest identifier goes first.
+A frame of n bytes takes 47 + 8 n bits: those of ISO 11898-1 without stuffed ones, with the pause of 3. A sender waits
+until the bus is free, then the lowest identifier goes first.
 """
 
 import math
@@ -16,9 +16,9 @@ from tormagd.simulation.plant import Truth
 DEFAULT_BITRATE = 1_000_000
 DEFAULT_NODE = 1
 MAX_WAITING = 32
-"""Frames that the controllers on the bus hold together; what comes on top is lost, as in a full transmit queue."""
+"""As in a full transmit queue, frames above this are lost."""
 DEVICE = 0
-"""The device as a sender; hosts have any other number."""
+"""The device as a sender; hosts have other numbers."""
 
 
 class Delivery(NamedTuple):
@@ -27,11 +27,11 @@ class Delivery(NamedTuple):
     sender: int
     frame: CanFrame
     time_s: float
-    """When its last bit went by, from power-on."""
+    """When its last bit passed, from power-on."""
 
 
 class CanLine(Protocol):
-    """What a host has of a device on a bus: a `CanDevice`, or what lies in front of one."""
+    """A host's view of a device on a bus: a `CanDevice`, or what lies in front of one."""
 
     @property
     def messages(self) -> MessageDevice:
@@ -42,18 +42,17 @@ class CanLine(Protocol):
         """The plant's true state at the time of the last call."""
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
-        """Take the frame that the host hands to its controller at `now_s`."""
+        """Take the frame that the host hands to its controller."""
 
     def transmit(self, now_s: float) -> list[Delivery]:
-        """Let time pass until `now_s` and return the frames that have gone by since the last call."""
+        """Advance to `now_s` and return the frames that have passed since the last call."""
 
 
 class CanDevice:
-    """One device and the bus it is on: the frames that wait, the one under way, and those that are not fetched yet."""
+    """One device and its bus, with the waiting, current and unfetched frames."""
 
     def __init__(self, messages: MessageDevice, bitrate: int = DEFAULT_BITRATE, node: int = DEFAULT_NODE) -> None:
         self.messages = messages
-        """The device itself."""
         self._bit_s = 1.0 / bitrate
         self._node = node
         self._order = count()
@@ -71,20 +70,19 @@ class CanDevice:
         return min(self.messages.next_event_s, math.inf if self._flight is None else self._flight.time_s)
 
     def receive(self, now_s: float, frame: CanFrame, host: int = 1) -> None:
-        """Let time pass until `now_s` and queue the frame that `host` sends then; in a full queue it is lost."""
+        """Advance to `now_s` and queue the frame of `host`; a full queue loses it."""
         self.advance(now_s)
         self._queue(host, frame)
         self._start_frame()
 
     def transmit(self, now_s: float) -> list[Delivery]:
-        """Let time pass until `now_s` and return the frames whose last bit has gone by since the last call, in that
-        order."""
+        """Advance to `now_s` and return the frames that have passed since the last call, in order."""
         self.advance(now_s)
         delivered, self._delivered = self._delivered, []
         return delivered
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`: frames end and start on the bus."""
+        """Advance to `now_s`: frames end and start on the bus."""
         if not self._now_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._now_s} on")
         while (event_s := self.next_event_s) <= now_s:
@@ -92,7 +90,7 @@ class CanDevice:
         self._pass_time(now_s)
 
     def _pass_time(self, time_s: float) -> None:
-        """Advance the device to `time_s`, take what it sends out of its `outbox`, and end and start frames."""
+        """Advance the device, take what it sends, and end and start frames."""
         self.messages.advance(time_s)
         self._now_s = time_s
         outbox = self.messages.outbox
@@ -112,7 +110,6 @@ class CanDevice:
             heappush(self._waiting, (frame.identifier, next(self._order), sender, frame))
 
     def _start_frame(self) -> None:
-        """Put the waiting frame of the lowest identifier on the bus, if the bus is free and one waits."""
         if self._flight is None and self._waiting:
             _, _, sender, frame = heappop(self._waiting)
             self._flight = Delivery(sender, frame, self._now_s + (47 + 8 * len(frame.data)) * self._bit_s)

@@ -12,11 +12,11 @@ from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, from_socket, 
 MAX_HOSTS = 8
 FRAMES_AT_ONCE = 16
 FOLDER_PREFIX = "tormagsim-"
-"Begins the name of the folder for a channel that was given no path."
+"Names the folder of a channel without a given path."
 
 
 class CanDoor:
-    """Simulated CAN bus with a device and up to MAX_HOSTS hosts, which come and go as they like."""
+    """A simulated CAN bus with a device and up to MAX_HOSTS hosts, which come and go."""
 
     def __init__(self, device: CanDevice, path: Path) -> None:
         """Serve at `path`, replacing what a killed simulator left there."""
@@ -36,13 +36,11 @@ class CanDoor:
         self.address = str(path)
 
     def descriptors(self) -> Sequence[int]:
-        """Return the descriptors of the listening socket and of every host."""
         return (self._listener.fileno(), *self._hosts)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Admit hosts, take their frames, and hand on every frame that has gone by until `now_s`, seconds from
-        power-on."""
-        # later where the device's time stood still, and never earlier: so no frame is stamped before the last
+        """Admit hosts, take their frames, and hand on every frame that has passed until `now_s`."""
+        # later when the device's time stood still, never earlier, so that frame stamps only rise
         self._power_on_s = max(self._power_on_s, time.time() - now_s)
         for descriptor in readable:
             if descriptor in self._hosts:
@@ -55,14 +53,13 @@ class CanDoor:
                     self._hand(descriptor, to_socket(frame, descriptor == -sender, self._power_on_s + time_s))
 
     def close(self) -> None:
-        """Disconnect all hosts and remove the socket from its folder."""
         for descriptor in list(self._hosts):
             self._dismiss(descriptor)
         self._listener.close()
         self._path.unlink(missing_ok=True)
 
     def _welcome(self) -> None:
-        """Admit the host that connects; one above MAX_HOSTS is disconnected at once."""
+        """Admit the host that connects, or disconnect one above MAX_HOSTS."""
         with contextlib.suppress(BlockingIOError):  # a host that came has gone again
             host, _ = self._listener.accept()
             if len(self._hosts) >= MAX_HOSTS:
@@ -75,8 +72,7 @@ class CanDoor:
         self._hosts.pop(descriptor).close()
 
     def _take(self, now_s: float, descriptor: int) -> None:
-        """Hand the device at most FRAMES_AT_ONCE frames of the host at `descriptor`, with the time `now_s`; the rest
-        waits."""
+        """Hand the device at most FRAMES_AT_ONCE of a host's frames; the rest waits."""
         for _ in range(FRAMES_AT_ONCE):
             try:
                 packet = self._hosts[descriptor].recv(SOCKET_FRAME.size + 1)
@@ -85,24 +81,23 @@ class CanDoor:
             except OSError:
                 packet = b""
             said = from_socket(packet)
-            if said is None or said.frame.identifier & ERROR_FLAG:  # end of file, or no host of ours
+            if said is None or said.frame.identifier & ERROR_FLAG:  # end of file, or not one of our hosts
                 self._dismiss(descriptor)
                 return
             # a sender that hears itself has the negative number
             self._device.receive(now_s, said.frame, -descriptor if said.is_own else descriptor)
 
     def _hand(self, descriptor: int, packet: bytes) -> None:
-        """Send a packet to the host at `descriptor`."""
         try:
             self._hosts[descriptor].send(packet)
         except BlockingIOError:
-            return  # a host that does not read: its controller overruns
+            return  # the controller of a host that does not read overruns
         except OSError:
             self._dismiss(descriptor)
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove the socket at `path` if nobody listens there; leave it where somebody does, and do nothing without one."""
+    """Remove the socket at `path` if nobody listens there."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
         try:
             probe.connect(str(path))

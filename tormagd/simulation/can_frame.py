@@ -7,13 +7,13 @@ from typing import NamedTuple
 MAX_IDENTIFIER = 0x7FF
 MAX_DATA = 8
 ERROR_FLAG = 0x2000_0000
-"""In the identifier of an error frame, which is a report of the controller (linux/can.h)."""
+"""Marks an error frame, a report of the controller (linux/can.h)."""
 SOCKET_FRAME = struct.Struct("=IB?2x8sd")
-"""Linux's `struct can_frame`, with a flag in a spare byte, and a time behind it."""
+"""Linux's `struct can_frame`, with a flag in a spare byte, and a time after it."""
 
 
 class CanFrame(NamedTuple):
-    """Identifier and 0 to 8 bytes of data. With ERROR_FLAG in the identifier: a controller's report of an error."""
+    """Identifier and 0 to 8 bytes of data, or with ERROR_FLAG a controller's report of an error."""
 
     identifier: int
     data: bytes
@@ -24,18 +24,17 @@ class SocketFrame(NamedTuple):
 
     frame: CanFrame
     is_own: bool
-    """To a host: it has sent the frame itself."""
+    """The receiving host has sent the frame itself."""
     time_s: float
-    """When the frame's last bit went by, s since 1970; a host sends 0."""
+    """When the frame's last bit passed, s since 1970; 0 from a host."""
 
 
 def to_socket(frame: CanFrame, is_own: bool = False, time_s: float = 0.0) -> bytes:
-    """Return the frame as one packet of the simulator's socket."""
     return SOCKET_FRAME.pack(frame.identifier, len(frame.data), is_own, frame.data, time_s)
 
 
 def from_socket(packet: bytes) -> SocketFrame | None:
-    """Return the frame in a packet of the simulator's socket, None where the packet holds no valid one."""
+    """Return the frame in a packet, or None if it is not valid."""
     if len(packet) != SOCKET_FRAME.size:
         return None
     identifier, length, is_own, data, time_s = SOCKET_FRAME.unpack(packet)

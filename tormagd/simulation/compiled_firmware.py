@@ -1,7 +1,7 @@
 """The firmware's C sources, compiled for this machine, behind the interface of the Python firmware.
 
-What a microcontroller would run runs here. Every message goes in and comes out as payload bytes through the C codec,
-and the state is the C struct. Tests hold this firmware and the Python one equal step by step.
+What a microcontroller would run runs here: every message goes through the C codec as payload bytes, and the state is
+the C struct. Tests hold this firmware and the Python one equal step by step.
 """
 
 import ctypes
@@ -34,7 +34,7 @@ ANSWERS = (Answer.NONE, Answer.IDENTITY, Answer.MEASUREMENT)
 
 
 class CParameters(ctypes.Structure):
-    """struct tormag_device_parameters."""
+    """struct tormag_device_parameters"""
 
     _fields_ = [
         ("lead_mm", ctypes.c_double),
@@ -48,7 +48,7 @@ class CParameters(ctypes.Structure):
 
 
 class CSensors(ctypes.Structure):
-    """struct tormag_sensors, in the order of `Sensors`; like the firmware's, the counters run over at 32 bits."""
+    """struct tormag_sensors, in the order of `Sensors`"""
 
     _fields_ = [
         ("left_counts", ctypes.c_int32),
@@ -64,7 +64,7 @@ class CSensors(ctypes.Structure):
 
 
 class View(ctypes.Structure):
-    """struct tormag_bridge_view."""
+    """struct tormag_bridge_view"""
 
     _fields_ = [
         ("mode", ctypes.c_uint8),
@@ -78,7 +78,6 @@ class View(ctypes.Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    """Return the library, loaded once for this process, with its functions' types declared."""
     library = load_library()
     pointer, time_s, payload = ctypes.c_void_p, ctypes.c_double, ctypes.c_char_p
     sensors = ctypes.POINTER(CSensors)
@@ -100,25 +99,23 @@ def _library() -> ctypes.CDLL:
 
 
 def _sizes(library: ctypes.CDLL) -> list[int]:
-    """Return the bytes of the C device, and of the structures for parameters, sensors and view."""
     sizes = (ctypes.c_size_t * 4)()
     library.tormag_bridge_sizes(sizes)
     return list(sizes)
 
 
 class CompiledFirmware:
-    """One device's firmware in C from its boot on, as `Firmware`: the same calls, times and results."""
+    """One device's firmware in C from its boot on, with the interface of `Firmware`."""
 
     def __init__(self, plant: PlantParameters) -> None:
         library = _library()
-        # The C struct lives in an array of doubles, for their alignment.
+        # for alignment
         self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
         library.tormag_device_init(self._device, ctypes.byref(parameters_of(plant)))
         self._output: Output = OFF
         self._known: View | None = None
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host at `time_s`, s since boot, and return what to answer, as `Firmware.receive`."""
         payload, self._known = encode(message), None
         answer: int = _library().tormag_bridge_receive(
             self._device, time_s, FUNCTION[type(message)], payload, len(payload), seen(sensors)
@@ -128,27 +125,23 @@ class CompiledFirmware:
         return ANSWERS[answer]
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick at `time_s`, as `Firmware.tick`: return a Status every twentieth time, None otherwise."""
         payload, self._known = ctypes.create_string_buffer(MAX_PAYLOAD), None
         length: int = _library().tormag_bridge_tick(self._device, time_s, seen(sensors), payload)
         _require_sent(length, sensors)
         return _decoded(Status, payload.raw) if length else None
 
     def status(self, sensors: Sensors) -> Status:
-        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any)."""
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
         _require_sent(_library().tormag_bridge_status(self._device, seen(sensors), payload), sensors)
         return _decoded(Status, payload.raw)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return State and Sense of that moment, as `Firmware.measurement`: each call counts State's counter up."""
         payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
         result: int = _library().tormag_bridge_measurement(self._device, time_s, seen(sensors), payloads)
         _require_sent(result, sensors)
         return _decoded(State, payloads.raw[:MAX_PAYLOAD]), _decoded(Sense, payloads.raw[MAX_PAYLOAD:])
 
     def identity(self) -> Identity:
-        """Return the schema hash, firmware version and serial number."""
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
         _library().tormag_bridge_identity(self._device, payload)
         return _decoded(Identity, payload.raw)
@@ -167,7 +160,7 @@ class CompiledFirmware:
 
     @property
     def output(self) -> Output:
-        """The state of both bridges now: the same object until it changes, so `is` tells whether it has."""
+        """The same object until it changes, so `is` tells whether it has."""
         view = self._view()
         output = Output(view.left_duty, view.right_duty, view.enabled)
         if output != self._output:
@@ -182,7 +175,6 @@ class CompiledFirmware:
 
 
 def parameters_of(plant: PlantParameters) -> CParameters:
-    """Return what the firmware of a plant's device is given at its boot, as the C structure."""
     return CParameters(
         lead_mm=plant.screw.lead_mm,
         stall_A=plant.assumed.overcurrent_A,
@@ -195,7 +187,6 @@ def parameters_of(plant: PlantParameters) -> CParameters:
 
 
 def seen(sensors: Sensors) -> CSensors:
-    """Return `sensors` as the firmware's structure."""
     return CSensors(
         sensors.left_counts,
         sensors.right_counts,
@@ -215,7 +206,6 @@ def _require_sent(result: int, sensors: Sensors) -> None:
 
 
 def _decoded(kind: type[M], payload: bytes) -> M:
-    """Return the message in a payload of the C codec; every message of a device has 8 bytes."""
     message = decode(FUNCTION[kind], payload)
     assert isinstance(message, kind), f"function {FUNCTION[kind]} decodes to {kind}"
     return message

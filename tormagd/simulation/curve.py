@@ -1,11 +1,11 @@
-"""A function of one variable as a table: what a tick reads where computing it anew would take too long."""
+"""A function of one variable as a table, where a tick has no time to compute it."""
 
 from typing import final
 
 
 @final
 class Curve:
-    """A function as a table: its values at equal distances from `start` to `end`, linear between them."""
+    """A function's values at equal distances from `start` to `end`, linear between them."""
 
     def __init__(self, values: list[float], start: float, end: float) -> None:
         self._start = start
@@ -14,7 +14,7 @@ class Curve:
         self._values = values
 
     def at(self, x: float) -> float:
-        """Return the value at `x`; beyond both ends the outermost pieces go on in their direction."""
+        """Return the value at `x`; beyond both ends the outermost pieces go on."""
         place = (x - self._start) * self._per_unit
         index = int(place)
         if index < 0:

@@ -38,19 +38,18 @@ from tormagd.simulation.plant import Plant, Truth
 BITS_PER_BYTE: Final = 10  # start, eight data bits, stop
 DEFAULT_BAUD: Final = 1_000_000
 FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware | EmulatedFirmware]
-"""Makes what boots: `Firmware`, the C sources of the same rules, or these on their processor."""
+"What boots: `Firmware`, its rules in C, or these on their processor."
 BYTES: Final = 0
-"The function of what arrives as bytes of a serial line, for a firmware that reads frames itself."
+"The function of bytes on a serial line."
 WEAR: Final = 4.0
 JUMP_MM: Final = 4.0
-"By how much an encoder leaps."
 WATCHDOG_S: Final = 0.1
 "A firmware that hangs is reset after this time."
 HOT_C: Final = 70.0
 JAMMED_N: Final = 1e5
 "More drag than any motor overcomes."
 MAX_BACKLOG_BYTES: Final = 65_536
-"""What the serial buffers of both ends and the adapter between them hold; more is lost, as on a real port."""
+"What the buffers hold; more is lost, as on a real port."
 STANDING: Final = frozenset(
     {
         *("worn_gearbox", "motor_dead_left", "motor_reversed_left", "duties_reversed", "overheated"),
@@ -58,22 +57,21 @@ STANDING: Final = frozenset(
         *("other_schema", "commands_vanish", "answers_half", "state_crc", "no_state", "no_sense", "no_status"),
     }
 )
-"""Faults without a size or state of their own, asked for by name where they show."""
+"Faults that are looked up where they show."
 OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed", "opening"})
 SILENCES: Final = {FUNCTION[State]: "no_state", FUNCTION[Sense]: "no_sense", FUNCTION[Status]: "no_status"}
-"By function, the fault that keeps its messages from being sent."
 DRIVE: Final = bytes((FUNCTION[Drive],))
 LEFT_OPEN: Final = 1
 RIGHT_OPEN: Final = 2
 LEFT_CLOSED: Final = 4
 RIGHT_CLOSED: Final = 8
 END_SWITCHES: Final = [Switches(bits) for bits in range(16)]
-"""By their bits, sums of the four above: flags are made here, not in a tick."""
+"Flags are made here, not in a tick."
 
 
 @final
 class Packet(Value):
-    """One message's payload, and when the link delivers it or the device hands it to the link."""
+    """One message's payload, and when the link delivers or takes it."""
 
     def __init__(self, time_s: float, function: int, payload: bytes) -> None:
         self.time_s: Final = time_s
@@ -83,7 +81,7 @@ class Packet(Value):
 
 @final
 class MessageDevice:
-    """The simulated device at the level of messages: payloads in, payloads out, whatever carries them."""
+    """The simulated device at the level of messages, whatever carries them."""
 
     def __init__(
         self,
@@ -98,7 +96,7 @@ class MessageDevice:
         self._boot = boot
         self.outbox: deque[Packet] = deque()
         self.undecodable = 0
-        """Payloads that arrived and were no message."""
+        "Payloads that were no message."
         self._faults: deque[Fault] = deque(sorted(faults, key=attrgetter("at_s")))
         self._jitter = random.Random(f"reply jitter {seed}")
         self._jitter_s = parameters.firmware.reply_jitter_us * 1e-6
@@ -128,7 +126,7 @@ class MessageDevice:
         return self.plant.truth
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
-        """Queue a payload that arrives at `time_s`; the device hears it when `advance` gets there."""
+        """Queue a payload that arrives at `time_s`."""
         latest_s = self._inbox[-1].time_s if self._inbox else self._time_s
         if not latest_s <= time_s < math.inf:
             raise ValueError(f"time_s = {time_s}: allowed is from {latest_s} on")
@@ -153,7 +151,6 @@ class MessageDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next, s from power-on: a message arrives, an answer leaves, or the firmware ticks."""
         event_s = self._tick_due_s
         if self._inbox:
             event_s = min(event_s, self._inbox[0].time_s)
@@ -167,7 +164,7 @@ class MessageDevice:
             self._time_s = time_s
 
     def _drive_bridges(self) -> None:
-        """Put the firmware's present output at the motors, in steps of the PWM, as supply and faults let it."""
+        """Put the firmware's output at the motors, as supply and faults let it."""
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
@@ -188,7 +185,7 @@ class MessageDevice:
         return (time_s - self._boot_s) * self._rate
 
     def _tick(self, time_s: float) -> None:
-        """Begin the faults that are due, then let the firmware tick, and send its Status if one is due."""
+        """Begin the faults that are due, let the firmware tick, and send its Status."""
         self._ticks += 1
         while self._faults and self._faults[0].at_s <= time_s:
             self._strike(time_s, self._faults.popleft())
@@ -203,7 +200,7 @@ class MessageDevice:
             self._send(time_s, status)
 
     def _deliver(self, time_s: float, packet: Packet) -> None:
-        """Give the firmware a `packet` that arrives at `time_s`, and queue its answer with the device's jitter."""
+        """Give the firmware a packet, and queue its answer with jitter."""
         if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
         if "answers_half" in self._struck and _is_drive(packet):
@@ -218,7 +215,6 @@ class MessageDevice:
             self._answers.append((answer_s, answer))
 
     def _hear(self, device_s: float, packet: Packet) -> Answer:
-        """Give the firmware a packet's bytes or message, and return what it answers, at `device_s` of its own clock."""
         if packet.function == BYTES and isinstance(self.firmware, EmulatedFirmware):
             return self.firmware.hear(device_s, packet.payload, self._sensors())
         try:
@@ -229,7 +225,6 @@ class MessageDevice:
         return self.firmware.receive(device_s, message, self._sensors())
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
-        """Send what `answer` stands for into `outbox`: Identity, or State and Sense as they are at `time_s`."""
         if answer is IDENTITY:
             known = self.firmware.identity()
             if "other_schema" in self._struck:
@@ -241,8 +236,7 @@ class MessageDevice:
         self._send(time_s, sense)
 
     def _send(self, time_s: float, message: Message) -> None:
-        """Put a message into `outbox` at `time_s`, unless a fault silences its kind; a fault may spoil the CRC of a
-        State."""
+        """Put a message into `outbox`, unless a fault silences or spoils it."""
         function, payload = FUNCTION[type(message)], encode(message)
         if SILENCES.get(function) in self._struck:
             return
@@ -281,7 +275,7 @@ class MessageDevice:
         return math.floor(self.plant.handle_mm * self._handle_counts_per_mm)
 
     def _reset(self, time_s: float) -> None:
-        """Boot the firmware, again or for the first time: mode, zero, clock and pending answers are lost."""
+        """Boot the firmware: mode, zero, clock and pending answers are lost."""
         self.firmware: Firmware | CompiledFirmware | EmulatedFirmware = self._boot(self.parameters)
         self._answers: deque[tuple[float, Answer]] = deque()
         (left_rad, _), (right_rad, _) = self.plant.shafts
@@ -291,7 +285,6 @@ class MessageDevice:
         self._tick_due_s = time_s + TICK_S / self._rate
 
     def _encoders(self, left_rad: float, right_rad: float) -> tuple[int, int]:
-        """Return left and right counts since power-on at these screw angles, faults of the encoders included."""
         stuck = self._stuck_left
         left_counts = math.floor(left_rad * self._counts_per_rad) if stuck is None else stuck
         return (
@@ -307,7 +300,7 @@ class MessageDevice:
         self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
 
     def mend(self) -> None:
-        """End all faults that act on the device now, at the time of the last `advance`."""
+        """End all faults that act on the device now."""
         plant, parameters, time_s = self.plant, self.parameters, self._time_s
         if "worn_gearbox" in self._struck:
             plant.wear(1.0 / WEAR)
@@ -324,7 +317,6 @@ class MessageDevice:
         self._drive_bridges()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
-        """Begin `fault` at `time_s`: what it does is in `faults.KNOWN`, its size in percent, if it has one, in `fault`."""
         if fault.name in STANDING:
             self._struck.add(fault.name)
         match fault.name:
@@ -369,15 +361,14 @@ class MessageDevice:
             self._drive_bridges()
 
     def _run_clock_at(self, time_s: float, rate: float) -> None:
-        """Let the firmware's clock run at `rate` device seconds a second, from its present time on; its next tick moves
-        with it."""
+        """Let the firmware's clock run at `rate` from now on."""
         self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
         self._rate = rate
         self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
 
 
 class SerialDevice(Protocol):
-    """What a host has of a device behind a serial line: a `VirtualDevice`, or what listens or lies in front of one."""
+    """A `VirtualDevice`, or something in front of one."""
 
     @property
     def messages(self) -> MessageDevice:
@@ -388,10 +379,10 @@ class SerialDevice(Protocol):
         """The plant's true state at the time of the last call."""
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """Take the bytes `data` that the host writes at `now_s`."""
+        """Take the bytes that the host writes at `now_s`."""
 
     def transmit(self, now_s: float) -> bytes:
-        """Let time pass until `now_s` and return the bytes that have left the line since the last call."""
+        """Return the bytes that have left the line by `now_s` since the last call."""
 
 
 @final
@@ -425,7 +416,6 @@ class VirtualDevice:
         return self._decoder.statistics
 
     def receive(self, now_s: float, data: bytes) -> None:
-        """Let time pass until `now_s` and take the bytes `data` that the host writes then; they arrive one by one."""
         self.messages.advance(now_s)
         start_s = max(now_s, self._receiver_free_s)
         room = MAX_BACKLOG_BYTES - math.ceil((start_s - now_s) / self._byte_s)
@@ -441,8 +431,7 @@ class VirtualDevice:
         self._receiver_free_s = start_s + taken * self._byte_s
 
     def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`, and queue what the device sends on the line, in frames with the next sequence
-        numbers."""
+        """Queue what the device has sent by `now_s` as frames on the line."""
         self.messages.advance(now_s)
         outbox = self.messages.outbox
         while outbox:
@@ -454,14 +443,12 @@ class VirtualDevice:
             self._line.append((start_s, frame))
 
     def transmit(self, now_s: float) -> bytes:
-        """Let time pass until `now_s` and return the bytes that have left the line since the last call; a frame may
-        come in parts."""
         self.advance(now_s)
         out: list[bytes] = []
         line, byte_s = self._line, self._byte_s
         while line:
             start_s, data = line[0]
-            # a millionth of a byte of tolerance: sums of times are not exact
+            # sums of times are not exact
             done = int((now_s - start_s) / byte_s + 1e-6)
             if done < len(data):
                 if done > 0:
@@ -474,7 +461,6 @@ class VirtualDevice:
 
     @property
     def next_event_s(self) -> float:
-        """When something happens next, s from power-on: a frame of the device ends on the line, or an event inside it."""
         event_s = self.messages.next_event_s
         if self._line:
             start_s, data = self._line[0]
@@ -488,7 +474,6 @@ def _is_drive(packet: Packet) -> bool:
 
 
 def _stretches(data: bytes) -> list[bytes]:
-    """Return `data` cut behind each delimiter: a frame has arrived when its delimiter has."""
     if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
         return [data]
     *ended, rest = data.split(DELIMITER)

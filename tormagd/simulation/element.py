@@ -16,7 +16,7 @@ from tormagd.simulation.warmth import Warmth
 
 @final
 class TorqueElement:
-    """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristle deflection, temperature."""
+    """Friction of insert and shaft, with its state: magnetic branch, relaxation, bristles, temperature."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         self._dt_s = dt_s
@@ -35,7 +35,7 @@ class TorqueElement:
         series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
         self._relax = series.discretise(dt_s)
 
-        # the device has been standing at this gap for long before the power came
+        # the device has been at this gap for long before the power came
         self._memory = series.relaxed(self._force.at(self._field.moment_Tm))
         self._deflection_mm = 0.0
         self.force_N = 0.0
@@ -46,14 +46,11 @@ class TorqueElement:
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
-        """Advance by one step that ends at `time_s` and at gap `gap_mm`, with the handle at the mean speed
-        `speed_mm_s`."""
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
-        """Begin a step that ends at `time_s`, s from power-on, and at `gap_mm`: advance all but the bristles, and set
-        `kinetic_N`."""
+        """Begin a step that ends at `time_s` and `gap_mm`: advance all but the bristles."""
         moment_Tm = self._field.advance(gap_mm)
         driving_N = self._force.at(moment_Tm) * self._warmth.advance(time_s)
         relaxed_N, self._memory = self._relax.advance(self._memory, driving_N)
@@ -61,13 +58,10 @@ class TorqueElement:
         self.kinetic_N = max(relaxed_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """Return the friction, N, that the step begun by `prepare` would end with at the mean handle speed
-        `speed_mm_s`."""
+        """Return the friction with which the step would end at this speed."""
         return self._friction.advance(self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
-        """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`: set `force_N` and the
-        bristles."""
         self.force_N, self._deflection_mm = self._friction.advance(
             self._deflection_mm, speed_mm_s, self.kinetic_N, self._dt_s
         )

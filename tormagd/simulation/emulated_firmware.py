@@ -33,7 +33,7 @@ from tormagd.simulation.firmware import OFF, Answer, Output, Sensors
 from tormagd.simulation.parameters import PlantParameters
 
 CYCLES_PER_S: Final = 25e6
-"Of the timers that the firmware has its time from."
+"The rate of the firmware's timers."
 MACHINE: Final = (
     *("-M", "mps2-an386", "-display", "none", "-nodefaults"),
     # an instruction takes a nanosecond of the machine's time, a sleep none of the computer's
@@ -41,7 +41,7 @@ MACHINE: Final = (
 )
 INSTRUCTIONS_PER_CYCLE: Final = 40
 MAX_BYTES: Final = 64
-"Of the link, at one wake."
+"The link carries no more at one wake."
 END_S: Final = 5.0
 
 
@@ -50,19 +50,19 @@ class EmulationError(OSError):
 
 
 class _PinsIn(ctypes.Structure):
-    """struct pins_in."""
+    """struct pins_in"""
 
     _fields_ = [("sensors", CSensors), ("cycles", ctypes.c_uint32), ("bytes", ctypes.c_uint32)]
 
 
 class _PinsOut(ctypes.Structure):
-    """struct pins_out."""
+    """struct pins_out"""
 
     _fields_ = [("view", View), ("sent", ctypes.c_uint32), ("busy", ctypes.c_uint32)]
 
 
 class EmulatedFirmware:
-    """One device's firmware on its processor from its boot on, as `Firmware`, with times in seconds since that boot."""
+    """One device's firmware on its processor, with the interface of `Firmware`."""
 
     def __init__(self, plant: PlantParameters) -> None:
         program, emulator = build(Target.MPS2), debian_tool("qemu-system-arm")
@@ -80,7 +80,7 @@ class EmulatedFirmware:
                 process_group=0,  # Ctrl-C is for this process, which ends the emulator
             )
         self.close = weakref.finalize(self, _end, self._process, self._link, self._errors)
-        """Ends the emulation; returns how many bytes of the stack were ever used, None where it had ended already."""
+        "Ends the emulation, and returns how many bytes of the stack were ever used."
         self._decoder = FrameDecoder()
         self._sequence = 0
         self._cycles = 0
@@ -91,15 +91,12 @@ class EmulatedFirmware:
         self._pins = self._told(bytes(parameters_of(plant)))
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Let a message of the host arrive at `time_s`, in a frame of its own with the next sequence number; return
-        what was answered."""
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
         return self.hear(time_s, frame, sensors)
 
     def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
-        """Let bytes of the link arrive at `time_s` of its clock, one whole frame at most, and return what was answered
-        to them."""
+        """Let at most one whole frame arrive, and return what was answered."""
         answer = Answer.NONE
         for start in range(0, len(data), MAX_BYTES):
             messages = self._wake(time_s, sensors, data[start : start + MAX_BYTES])
@@ -108,18 +105,16 @@ class EmulatedFirmware:
         return answer
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Let it sleep until its tick at `time_s`, as `Firmware.tick`, and return a Status every twentieth time, None
-        otherwise."""
         self._answer(self._wake(time_s, sensors))
         status, self._status = self._status, None
         return status
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return the oldest State and Sense that it has sent and nobody has taken, and forget them."""
+        """Return and forget the oldest State and Sense."""
         return self._measured.popleft()
 
     def identity(self) -> Identity:
-        """Return what it has answered to the last Hello, again and again."""
+        """Return the answer to the last Hello."""
         if self._identity is None:
             raise RuntimeError("the firmware has sent no Identity yet: allowed is to ask after a Hello")
         return self._identity
@@ -145,8 +140,7 @@ class EmulatedFirmware:
         return INSTRUCTIONS_PER_CYCLE * int(self._pins.busy)
 
     def _answer(self, messages: list[Message]) -> Answer:
-        """Keep what the firmware has sent in one wake for `measurement`, `identity` and `tick`, and return what answer
-        it is."""
+        """Keep what the firmware has sent, and return what answer it is."""
         answer = Answer.NONE
         match messages:
             case [State() as state, Sense() as sense, *rest]:
@@ -162,8 +156,7 @@ class EmulatedFirmware:
         return answer
 
     def _wake(self, time_s: float, sensors: Sensors, data: bytes = b"") -> list[Message]:
-        """Let it sleep until `time_s` on its clock, then act on its sensors and on at most MAX_BYTES of the link's
-        `data`."""
+        """Let the firmware sleep until `time_s`, then act on its sensors and `data`."""
         cycles = round(time_s * CYCLES_PER_S)
         record = _PinsIn(seen(sensors), cycles - self._cycles, len(data))
         self._pins = pins = self._told(bytes(record), data)
@@ -176,7 +169,7 @@ class EmulatedFirmware:
         return [decode(frame.function, frame.payload) for frame in frames]
 
     def _told(self, record: bytes, data: bytes = b"") -> _PinsOut:
-        """Put `data` on the link, tell the firmware a record of its pins, and return what it says when it waits again."""
+        """Tell the firmware its pins, and return what it says when it waits again."""
         to, of = _pipes(self._process)
         said = b""
         with contextlib.suppress(OSError):
@@ -192,14 +185,13 @@ class EmulatedFirmware:
 
 
 def _pipes(process: "subprocess.Popen[bytes]") -> tuple[IO[bytes], IO[bytes]]:
-    """Return the pipes to and from the emulator."""
     assert process.stdin, "it was opened"
     assert process.stdout, "it was opened"
     return process.stdin, process.stdout
 
 
 def _end(process: "subprocess.Popen[bytes]", link: socket.socket, errors: IO[bytes]) -> int | None:
-    """End the emulation, as `EmulatedFirmware.close`: without its pins the firmware counts its stack and stops."""
+    """End the emulation: without its pins the firmware counts its stack and stops."""
     to, of = _pipes(process)
     to.close()
     used = of.read(4)

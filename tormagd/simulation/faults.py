@@ -42,20 +42,17 @@ _FORM = re.compile(r"(?P<name>\w+)(?:=(?P<percent>[+-]?[\d.]+)%)?(?:@(?P<at_s>[\
 
 
 class FaultError(ValueError):
-    """Fault specification that is in no known form or names no known fault; the message says what is allowed."""
+    """A fault specification that is not allowed; the message says what is."""
 
 
 class Fault(NamedTuple):
-    """One fault, when it begins in seconds since power-on, and the change in percent for those that have a size."""
-
     name: str
     at_s: float = 0.0
     percent: float = 0.0
 
 
 def parse_fault(spec: str) -> Fault:
-    """Return the fault that the command-line word `spec` stands for: `NAME[=PERCENT%][@SECONDS]`; without a time from 0
-    s on."""
+    """Return the fault that the command-line word `NAME[=PERCENT%][@SECONDS]` stands for."""
     match = _FORM.fullmatch(spec)
     name = match["name"] if match else spec
     if match is None or name not in KNOWN:

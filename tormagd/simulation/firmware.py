@@ -47,8 +47,8 @@ MAX_TEMPERATURE_C: Final = 60.0
 VERSION: Final = (1, 0)
 SERIAL_NUMBER: Final = 1
 
-# An operation on flags makes new ones, and a member of an enumeration is looked up in its class by Python code, at a
-# microsecond and a fifth of one: what is needed in every tick is made and named here
+# looking up an enumeration's member takes a fifth of a microsecond, an operation on flags a whole one: what every tick
+# needs is made here
 HOMED_SWITCHES: Final = [Switches(bits) | Switches.HOMED for bits in range(16)]
 CLOSED_SWITCHES: Final = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
 NO_FAULT: Final = DeviceFault(0)
@@ -63,7 +63,7 @@ DRIVES_OFF: Final = DriveMode.OFF
 
 @final
 class Sensors(Value):
-    """What the electronics measure at one time. Encoder counts are since boot, positive opening."""
+    """What the electronics measure. Encoder counts are since boot, positive opening."""
 
     def __init__(
         self,
@@ -102,8 +102,6 @@ OFF: Final = Output(0.0, 0.0, enabled=False)
 
 
 class Answer(Enum):
-    """What the firmware answers to a received message: nothing, its Identity, or State and Sense."""
-
     NONE = auto()
     IDENTITY = auto()
     MEASUREMENT = auto()
@@ -116,8 +114,7 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 
 @final
 class Firmware:
-    """One device's firmware from its boot on. All times are device time, seconds since boot, and never fall; this is
-    not checked."""
+    """One device's firmware from its boot on. Times are device time, seconds since boot, and never fall."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm
@@ -146,14 +143,12 @@ class Firmware:
         self._ticks = 0
         self._state_counter = 0
 
-    # -- messages ------------------------------------------------------------------------------------------------
-
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        """Act on one message of the host at `time_s` and return what to answer; a message of a device is ignored."""
+        """Act on one message of the host, and return what to answer."""
         if isinstance(message, Drive):
             return self._drive(time_s, message, sensors)
         if isinstance(message, Hello):
-            # accepted whatever it was before, so that a new host starts from a known nonce
+            # a new host starts from a known nonce
             self._nonce = message.nonce
             self._compatible = message.schema_hash == SCHEMA_HASH and message.protocol_version == PROTOCOL_VERSION
             if not self._compatible:
@@ -166,7 +161,7 @@ class Firmware:
         return NO_ANSWER
 
     def _drive(self, time_s: float, drive: Drive, sensors: Sensors) -> Answer:
-        """Act on a Drive; one with a new counter is answered in every mode, so that a host can always measure."""
+        """Act on a Drive; a new one is answered in every mode, so that a host can always measure."""
         if drive.counter == self._drive_counter:
             return NO_ANSWER
         self._drive_counter = drive.counter
@@ -185,7 +180,7 @@ class Firmware:
         return MEASUREMENT
 
     def _obey(self, time_s: float, command: Retract | Home | Clear, sensors: Sensors) -> bool:
-        """Carry out `command` unless the mode forbids it, and return whether it was accepted."""
+        """Carry out `command` unless the mode forbids it, and return whether it did."""
         if isinstance(command, Retract):
             if self.mode is LATCHED:
                 return False
@@ -214,10 +209,8 @@ class Firmware:
         self._rest(time_s, IDLE)
         return True
 
-    # -- time ----------------------------------------------------------------------------------------------------
-
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        """Run one 1 kHz tick at `time_s`, s since boot: the motion under way and the watches, which may latch faults."""
+        """Run one 1 kHz tick: the motion under way and the watches."""
         if self.mode is RUN:
             self._tick_run(time_s, sensors)
         elif self._motors_on:
@@ -228,7 +221,6 @@ class Firmware:
         return None if self._ticks % STATUS_TICKS else self.status(sensors)
 
     def _tick_run(self, time_s: float, sensors: Sensors) -> None:
-        """Watch a run: any fault is latched, ends it and opens the gap."""
         left_mm, right_mm = self._positions_mm(sensors)
         fault = self._causes(time_s, sensors)
         if time_s - self._drive_s > COMMAND_TIMEOUT_S:
@@ -243,7 +235,6 @@ class Firmware:
         self.output = self._bounded(self.output, sensors)
 
     def _tick_motion(self, time_s: float, sensors: Sensors) -> None:
-        """Advance homing or retraction by one tick, and set `output`; at its end take the zeros over and rest."""
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
         homing = isinstance(motion, HomingMotion)
@@ -260,7 +251,7 @@ class Firmware:
         if outcome is Outcome.MOVING:
             return
         if outcome is Outcome.REVERSED:
-            # to open is just what cannot be: friction holds the gap where it is
+            # friction holds the gap where it is
             self.faults |= DeviceFault.HOMING_FAILED
             self._rest(time_s, LATCHED)
             return
@@ -277,7 +268,6 @@ class Firmware:
         self._rest(time_s, LATCHED if self.faults else IDLE)
 
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
-        """Watch the resting device, and latch what shows: UNCOMMANDED_MOTION, or SUPPLY and TEMPERATURE where new."""
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)
             return
@@ -287,8 +277,7 @@ class Firmware:
 
     @staticmethod
     def _bounded(output: Output, sensors: Sensors) -> Output:
-        """Return `output` without an opening duty for a carriage at its open switch, which must not run on into the
-        stop."""
+        """Keep a carriage at its open switch from running into the stop."""
         if not sensors.switches:
             return output
         return Output(
@@ -297,10 +286,8 @@ class Firmware:
             output.enabled,
         )
 
-    # -- transitions ---------------------------------------------------------------------------------------------
-
     def _fail(self, time_s: float, fault: DeviceFault, sensors: Sensors) -> None:
-        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move by themselves."""
+        """Latch `fault` and open the gap; drives that are off stay off, unless the carriages move."""
         self.faults |= fault
         if not self._motors_on and DeviceFault.UNCOMMANDED_MOTION not in fault:
             self._rest(time_s, LATCHED)
@@ -308,7 +295,6 @@ class Firmware:
             self._retract(time_s, sensors)
 
     def _retract(self, time_s: float, sensors: Sensors) -> None:
-        """Begin to open the gap."""
         if self.mode is RUN:
             self._may_run = False
         self.mode = RETRACTING
@@ -324,7 +310,7 @@ class Firmware:
         )
 
     def _rest(self, time_s: float, mode: DeviceMode) -> None:
-        """Open the bridges, end the motion, and enter `mode`; LATCHED also makes the device unhomed."""
+        """Open the bridges and enter `mode`; LATCHED also makes the device unhomed."""
         self.mode = mode
         self.output = OFF
         self._motion = None
@@ -337,10 +323,7 @@ class Firmware:
     def _motors_on(self) -> bool:
         return self.mode is not IDLE and self.mode is not LATCHED
 
-    # -- watches -------------------------------------------------------------------------------------------------
-
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
-        """Return the faults whose cause is there now, whatever the device does: SUPPLY and TEMPERATURE."""
         causes = NO_FAULT
         if not MIN_SUPPLY_V <= sensors.supply_V <= MAX_SUPPLY_V:
             causes |= DeviceFault.SUPPLY
@@ -349,8 +332,7 @@ class Firmware:
         return causes
 
     def _causes(self, time_s: float, sensors: Sensors) -> DeviceFault:
-        """Return the lasting causes, and OVERCURRENT once a motor's current has been at its level for over
-        OVERCURRENT_S."""
+        """Return the lasting causes, and OVERCURRENT after too long a high current."""
         if abs(sensors.left_current_A) < self._overcurrent_A:
             self._left_calm_s = time_s
         if abs(sensors.right_current_A) < self._overcurrent_A:
@@ -364,7 +346,7 @@ class Firmware:
         self._right_calm_s = time_s
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
-        """Return how far a carriage, the further of the two, has moved from where it rested, mm, whichever way."""
+        """Return how far a carriage has moved from where it rested."""
         if time_s - self._watch_since_s < COASTING_S:
             return 0.0
         left, right = sensors.left_counts, sensors.right_counts
@@ -390,14 +372,10 @@ class Firmware:
             Carriage(right_mm, Switches.RIGHT_OPEN in sensors.switches, sensors.right_current_A),
         )
 
-    # -- reports -------------------------------------------------------------------------------------------------
-
     def identity(self) -> Identity:
-        """Return the schema hash, firmware version and serial number; they are the same for every device and plant."""
         return Identity(SCHEMA_HASH, VERSION[0], VERSION[1], SERIAL_NUMBER)
 
     def status(self, sensors: Sensors) -> Status:
-        """Return mode, switches, faults, temperature, supply, and the last counter and nonce accepted (0 before any)."""
         ends: int = sensors.switches
         return Status(
             mode=self.mode,
@@ -410,7 +388,7 @@ class Firmware:
         )
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        """Return State and Sense of that moment; each call counts State's counter up, from 1 on and modulo 256."""
+        """Return State and Sense, and advance State's counter."""
         left_mm, right_mm = self._positions_mm(sensors)
         self._state_counter = (self._state_counter + 1) % 256
         return (

@@ -11,11 +11,11 @@ SMALLEST_GAP_MM: Final = 45.0
 
 @final
 class GapField:
-    """Radial moment of a plant's magnets, T m, with rate-independent hysteresis of at most `branch_Tm` either way."""
+    """Radial moment of a plant's magnets, with rate-independent hysteresis of at most `branch_Tm` either way."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float) -> None:
         self.static: Final = moment_over_gap(plant)
-        "The moment over the gap without hysteresis."
+        "Without hysteresis."
         largest_Tm = self.static.at(SMALLEST_GAP_MM)
         self.branch_Tm: Final = plant.field.hysteresis_percent / 100.0 * largest_Tm
         self._turn_Tm: Final = plant.assumed.hysteresis_scale * largest_Tm
@@ -27,7 +27,6 @@ class GapField:
         return self._moment_Tm + self._lag_Tm
 
     def advance(self, gap_mm: float) -> float:
-        """Move the gap to `gap_mm` and return the radial moment there, with hysteresis, T m."""
         moment_Tm = self.static.at(gap_mm)
         change_Tm = moment_Tm - self._moment_Tm
         if change_Tm != 0.0:

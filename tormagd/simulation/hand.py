@@ -18,7 +18,7 @@ PRESSES_AT_S: Final = 10.0
 PRESSING_MM_S: Final = 1.0
 EXACT_N: Final = 1e-9
 ROUNDS: Final = 100
-"A step of a hand that feels is solved to within EXACT_N, in ROUNDS rounds at most."
+"How exactly, and in how many rounds at most, a felt step is solved."
 RECORDED = {"t_s": TIME, "position_mm": (-1e6, 1e6, "mm")}
 KNOWN = (
     "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], felt[=KEY=VALUE,...], "
@@ -27,38 +27,35 @@ KNOWN = (
 
 
 class HandError(ValueError):
-    """Hand specification or recording that cannot be used; the message says what is allowed."""
+    """A hand specification or recording that cannot be used."""
 
 
 class Hand(Protocol):
     """Prescribed motion of the roller's surface, or of a finger into a pad."""
 
     def position_mm(self, time_s: float) -> float:
-        """Return the travel of the roller's surface since time 0, or the finger's depth in the pad, mm."""
+        """Return the travel of the roller's surface, or the finger's depth."""
 
 
 @final
 class SteadyHand(Value):
-    """Hand that turns at a constant speed: 42 mm/s at the 20 rpm of the thesis's measurements."""
+    """A hand that turns at a constant speed, by default the thesis's 20 rpm."""
 
     def __init__(self, rpm: float = DEFAULT_RPM) -> None:
         self.rpm: Final = rpm
 
     def position_mm(self, time_s: float) -> float:
-        """Return the travel of the roller's surface since time 0, mm, at `time_s`."""
         return time_s * self.rpm / 60.0 * math.tau * ROLLER_RADIUS_MM
 
 
 @final
 class ReversingHand(Value):
-    """Hand that goes forth, rests, goes back, rests: smooth strokes of 30 mm (0.35 of the period each), full stops
-    (0.15 each)."""
+    """A hand that goes forth, rests, goes back and rests, in smooth strokes."""
 
     def __init__(self, period_s: float = DEFAULT_PERIOD_S) -> None:
         self.period_s: Final = period_s
 
     def position_mm(self, time_s: float) -> float:
-        """Return the place of the roller's surface at `time_s`, 0 to REVERSING_TRAVEL_MM, mm."""
         phase = math.fmod(time_s, self.period_s) / self.period_s
         half, back = (phase, False) if phase < 0.5 else (phase - 0.5, True)
         share = min(half / 0.35, 1.0)
@@ -68,26 +65,24 @@ class ReversingHand(Value):
 
 @final
 class PressingHand(Value):
-    """The dummy finger of the thesis's pulse experiment: it presses `depth_mm` into the pad at 1 mm/s, and stays."""
+    """The finger of the thesis's pulse experiment, which presses into the pad at 1 mm/s."""
 
     def __init__(self, depth_mm: float = DEFAULT_DEPTH_MM) -> None:
         self.depth_mm: Final = depth_mm
 
     def position_mm(self, time_s: float) -> float:
-        """Return the finger's depth in the pad at `time_s`, mm."""
         return min(max(PRESSING_MM_S * (time_s - PRESSES_AT_S), 0.0), self.depth_mm)
 
 
 @final
 class RecordedHand(Value):
-    """Recorded motion: linear between its points, standing before the first and after the last. Times rise."""
+    """Recorded motion, linear between its points, standing before and after them."""
 
     def __init__(self, times_s: tuple[float, ...], positions_mm: tuple[float, ...]) -> None:
         self.times_s: Final = times_s
         self.positions_mm: Final = positions_mm
 
     def position_mm(self, time_s: float) -> float:
-        """Return the recorded place at `time_s`, mm, linear between the points; the first or the last beyond them."""
         after = bisect.bisect_right(self.times_s, time_s)
         if after == 0:
             return self.positions_mm[0]
@@ -100,8 +95,7 @@ class RecordedHand(Value):
 
 @final
 class StrokingHand(Value):
-    """Hand that rests for 10 s, until the device is homed. Then it pushes to `reach_mm`, rests, withdraws, rests, and
-    so on."""
+    """A hand that rests until the device is homed, then pushes, rests, withdraws, rests, and so on."""
 
     def __init__(self, push_mm_s: float, reach_mm: float, rest_s: float) -> None:
         self.push_mm_s: Final = push_mm_s
@@ -109,7 +103,6 @@ class StrokingHand(Value):
         self.rest_s: Final = rest_s
 
     def position_mm(self, time_s: float) -> float:
-        """Return the intended place at `time_s`, 0 to `reach_mm`, mm."""
         half_s = self.reach_mm / self.push_mm_s + self.rest_s
         phase_s = math.fmod(max(time_s - PRESSES_AT_S, 0.0), 2.0 * half_s)
         pushed_mm, withdrawn_mm = self.push_mm_s * phase_s, max(self.push_mm_s * (phase_s - half_s), 0.0)
@@ -118,8 +111,7 @@ class StrokingHand(Value):
 
 @final
 class Impedance(Value):
-    """Mechanical impedance of a hand at the handle: the mass that moves with it, and spring and damper behind that
-    mass."""
+    """The mass that moves with the handle, and the hand's spring and damper behind it."""
 
     def __init__(self, mass_kg: float, stiffness_N_mm: float, damping_N_s_mm: float) -> None:
         self.mass_kg: Final = mass_kg
@@ -129,7 +121,7 @@ class Impedance(Value):
 
 @final
 class FeltHand:
-    """Hand that feels: spring and damper draw its mass x towards an intended motion x_i, while the friction f resists."""
+    """A hand that feels: spring and damper draw its mass towards an intended motion, while friction resists."""
 
     def __init__(self, intended: Hand, impedance: Impedance, lets_go_s: float = math.inf) -> None:
         self._intended = intended
@@ -138,16 +130,15 @@ class FeltHand:
         self._time_s = 0.0
         self._place_mm = intended.position_mm(0.0)
         self.speed_mm_s = 0.0
-        "At the end of the last step."
         self.force_N = 0.0
-        "Mean force of spring and damper on the mass in the last step."
+        "Mean force of spring and damper in the last step."
 
     def position_mm(self, time_s: float) -> float:
-        """Return the intended place at `time_s`, mm; `moved_mm` gives the real one."""
+        """Return the intended place; `moved_mm` gives the real one."""
         return self._intended.position_mm(time_s)
 
     def moved_mm(self, time_s: float, resisting_N: Callable[[float], float]) -> float:
-        """Advance the hand to `time_s` and return its place then, mm."""
+        """Advance the hand to `time_s`, and return its place then."""
         dt_s, speed_mm_s, impedance = time_s - self._time_s, self.speed_mm_s, self._impedance
         if dt_s <= 0.0:
             raise ValueError(f"time_s = {time_s}: allowed is after {self._time_s}, where the hand has been")
@@ -173,7 +164,7 @@ class FeltHand:
 
 
 def _root(function: Callable[[float], float], start: float, slope: float) -> float:
-    """Return a zero of a function that rises far out, to within EXACT_N or as near as ROUNDS rounds come."""
+    """Return a zero of a function that rises far out."""
     near, at_near = start, function(start)
     step = -at_near / slope
     far = near + step
@@ -200,7 +191,7 @@ _SIZED: dict[str, tuple[Callable[..., Hand], float, float]] = {
     "reversing": (ReversingHand, 0.1, 1000.0),
     "pressing": (PressingHand, 0.1, 6.0),
 }
-"By name, a hand with one size: its class, and the least and greatest size."
+"Its class, and the least and greatest size."
 _FELT: dict[str, tuple[float, float, float]] = {
     "mass_kg": (0.1, 0.001, 20.0),
     "stiffness_N_mm": (0.4, 0.0, 100.0),
@@ -209,11 +200,11 @@ _FELT: dict[str, tuple[float, float, float]] = {
     "reach_mm": (20.0, 0.1, 1000.0),
     "rest_s": (1.0, 0.0, 1000.0),
 }
-"By name, a size of a hand that feels: its default, least and greatest."
+"Default, least and greatest size."
 
 
 def parse_hand(spec: str) -> Hand:
-    """Return the hand that the command-line word `spec`, one of KNOWN, stands for; a size not given takes its default."""
+    """Return the hand that the command-line word `spec` stands for. Raises HandError."""
     name, _, value = spec.partition("=")
     if name in _SIZED:
         hand, low, high = _SIZED[name]
@@ -226,7 +217,6 @@ def parse_hand(spec: str) -> Hand:
 
 
 def _felt(spec: str, text: str) -> FeltHand:
-    """Return the hand of the word `spec`, felt=KEY=VALUE,..., whose part behind `felt=` is `text`."""
     sizes = {key: usual for key, (usual, _, _) in _FELT.items()}
     for word in filter(None, text.split(",")):
         key, _, value = word.partition("=")
@@ -239,7 +229,6 @@ def _felt(spec: str, text: str) -> FeltHand:
 
 
 def _number(spec: str, text: str, low: float, high: float) -> float:
-    """Return `text`, a part of the word `spec`, as a number from `low` to `high`."""
     try:
         number = float(text)
     except ValueError:
@@ -250,7 +239,7 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
 
 
 def read_recording(path: Path) -> RecordedHand:
-    """Read a hand's motion from the CSV file at `path`: columns t_s, s, and position_mm, mm, within +-1e6."""
+    """Read a hand's motion from a CSV file. Raises HandError."""
     try:
         table = read_table(path, RECORDED)
     except ForceFileError as error:

@@ -24,7 +24,7 @@ PATIENCE_S: Final = 0.3
 DEAD_CURRENT_A: Final = 0.02  # a connected motor draws ten times this at the duty that stands for no progress
 WRONG_WAY_MM: Final = 1.0  # back, while homing drives the carriage open: its motor or its encoder is reversed
 TIME_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
-SEARCH_SHARE: Final = 0.5  # of the speed of opening, about that of homing, from which it brakes at a switch
+SEARCH_SHARE: Final = 0.5  # of the speed of opening: about that of homing, from which it brakes at a switch
 STROKE_MM: Final = 25.5  # of a carriage, between its stops
 MIN_SHARE: Final = 0.6  # of the speed of opening: what the weakest motors reach on the lowest supply
 LATE_S: Final = 0.5  # to turn round, to taper, to settle at the switch
@@ -32,8 +32,6 @@ LATE_S: Final = 0.5  # to turn round, to taper, to settle at the switch
 
 @final
 class Carriage(Value):
-    """What the firmware knows of one carriage: encoder position, state of its open switch, motor current."""
-
     def __init__(self, position_mm: float, at_open_end: bool, current_A: float) -> None:
         self.position_mm: Final = position_mm
         self.at_open_end: Final = at_open_end
@@ -41,8 +39,6 @@ class Carriage(Value):
 
 
 class Outcome(Enum):
-    """Whether a motion goes on, is done, has failed, or found a reversed motor or encoder."""
-
     MOVING = auto()
     DONE = auto()
     FAILED = auto()
@@ -51,14 +47,13 @@ class Outcome(Enum):
 
 @final
 class Ramp:
-    """Position ramp that leads one carriage at a bounded speed, and the duty that follows the ramp."""
+    """A position ramp that leads one carriage, and the duty that follows it."""
 
     def __init__(self, position_mm: float, lead_mm_rev: float) -> None:
         self._reference_mm = position_mm
         self._full_speed_mm_s = NO_LOAD_REV_S * lead_mm_rev
 
     def duty(self, position_mm: float, speed_mm_s: float, dt_s: float) -> float:
-        """Advance the ramp by `dt_s` at the signed `speed_mm_s` and return the duty for the carriage at `position_mm`."""
         reference_mm = self._reference_mm + speed_mm_s * dt_s
         self._reference_mm = min(max(reference_mm, position_mm - RAMP_LEAD_MM), position_mm + RAMP_LEAD_MM)
         duty = speed_mm_s / self._full_speed_mm_s + RAMP_GAIN_PER_MM * (self._reference_mm - position_mm)
@@ -67,7 +62,7 @@ class Ramp:
 
 @final
 class CarriageOpening:
-    """Motion that brings one carriage to its open switch and brakes it there."""
+    """Brings one carriage to its open switch and brakes it there."""
 
     def __init__(self, time_s: float, carriage: Carriage, lead_mm_rev: float, stall_A: float) -> None:
         self._ramp = Ramp(carriage.position_mm, lead_mm_rev)
@@ -79,7 +74,6 @@ class CarriageOpening:
         self.outcome = Outcome.MOVING
 
     def step(self, time_s: float, dt_s: float, carriage: Carriage, speed_mm_s: float) -> None:
-        """Advance by one tick, `dt_s` long and ending at `time_s`, and set `duty` and `outcome`."""
         if self.outcome is Outcome.FAILED:
             return
         if carriage.at_open_end:
@@ -98,13 +92,13 @@ class CarriageOpening:
             self.outcome = Outcome.FAILED
 
     def went_back(self, carriage: Carriage) -> bool:
-        """Return whether the carriage went more than WRONG_WAY_MM towards closed while it was driven open."""
+        """Tell whether the carriage moved towards closed while it was driven open."""
         return carriage.position_mm < self._progress_mm - WRONG_WAY_MM
 
 
 @final
 class Retraction:
-    """Motion that opens the gap: both carriages to their open switches, each as far as it comes."""
+    """Brings both carriages to their open switches, each as far as it comes."""
 
     def __init__(
         self,
@@ -124,7 +118,6 @@ class Retraction:
 
     @property
     def duties(self) -> tuple[float, float]:
-        """Left and right duty, in -1..1."""
         left, right = self._openings
         return left.duty, right.duty
 
@@ -133,17 +126,13 @@ class Retraction:
         return Outcome.FAILED in [opening.outcome for opening in self._openings]
 
     def is_late(self, time_s: float) -> bool:
-        """Return whether the motion has taken longer, at `time_s`, than the whole stroke takes a device that can
-        open."""
+        """Tell whether the motion takes longer than the whole stroke takes a device that can open."""
         return time_s > self._late_s
 
     def is_reversed(self, carriages: tuple[Carriage, Carriage]) -> bool:
-        """Return whether a carriage has gone back towards closed while it was driven open."""
         return True in [opening.went_back(each) for opening, each in zip(self._openings, carriages, strict=True)]
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Advance both carriages by one tick, `dt_s` long and ending at `time_s`, and return the outcome; updates
-        `duties`."""
         for opening, carriage in zip(self._openings, carriages, strict=True):
             opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))
         outcomes = [opening.outcome for opening in self._openings]
@@ -152,17 +141,16 @@ class Retraction:
         return Outcome.DONE if outcomes == [Outcome.DONE, Outcome.DONE] else Outcome.FAILED
 
     def _bounded_mm_s(self, carriage: Carriage) -> float:
-        """Return the speed, mm/s, at which this carriage is to open now; above 0."""
         if not self._tapered:
             return self._speed_mm_s
-        # beyond where its switch should have been the zero is wrong, as after an encoder's leap: it searches there
+        # beyond where its switch should have been the zero is wrong: it searches there
         most_mm_s = self._speed_mm_s if carriage.position_mm < 0.0 else SEARCH_SHARE * self._speed_mm_s
         return min(most_mm_s, CREEP_MM_S + TAPER_PER_S * abs(carriage.position_mm))
 
 
 @final
 class HomingMotion:
-    """Motion that finds both open switches twice: at speed, then creeping after a back-off, so that the zero repeats."""
+    """Finds both open switches twice: at speed, then creeping after a back-off, so that the zero repeats."""
 
     def __init__(
         self,
@@ -185,12 +173,11 @@ class HomingMotion:
 
     @property
     def zeros_mm(self) -> tuple[float, float]:
-        """Encoder positions at which the left and right open switch closed; 0 for one that was not found."""
+        """Where the open switches closed; 0 for one that was not found."""
         left_mm, right_mm = self._edges_mm
         return left_mm or 0.0, right_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Advance by one tick, `dt_s` long and ending at `time_s`; set `duties` and return the outcome."""
         if time_s >= self._deadline_s:
             return Outcome.FAILED
         if self._search is None:
@@ -213,14 +200,12 @@ class HomingMotion:
         return Outcome.MOVING
 
     def _begin_back_off(self, time_s: float, carriages: tuple[Carriage, Carriage]) -> None:
-        """Note where and when a back-off begins; `_back_off` then drives it."""
         self._back_off_since_s = time_s
         self._starts_mm = [carriage.position_mm for carriage in carriages]
         self._ramps = [Ramp(carriage.position_mm, self._lead_mm_rev) for carriage in carriages]
 
     def _back_off(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """Drive both carriages off their open switches for one tick, `dt_s` long and ending at `time_s`, and set
-        `duties`."""
+        """Drive both carriages off their open switches for one tick."""
         if time_s - self._back_off_since_s > BACK_OFF_LIMIT_S:
             return Outcome.FAILED
         sides = zip(carriages, self._ramps, self._starts_mm, strict=True)

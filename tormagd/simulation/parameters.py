@@ -14,18 +14,18 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import require
 
 PLANTS_INSERT = "MRE-50-40"
-"Insert of the committed samples."
+"The committed samples have it."
 _PLANTS = resources.files(__package__) / "plants"
 
 PlantError = ConfigError
-"A plant file that cannot be used: the message names the file, the key path, the value and what is allowed."
+"A plant file that cannot be used: the message names key, value and what is allowed."
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Share = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
 class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
-    """The MRE insert around the shaft, as in tables 2.3 and 2.4 of the thesis."""
+    """The MRE insert, as in tables 2.3 and 2.4 of the thesis."""
 
     shear_modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
     relative_permeability: Annotated[float, Meta(ge=1.0, le=10.0)]
@@ -33,9 +33,6 @@ class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Friction(Struct, frozen=True, forbid_unknown_fields=True):
-    """Contact of insert and shaft: static over kinetic friction, Stribeck speed, pre-sliding stiffness and
-    viscosity."""
-
     static_to_kinetic: Annotated[float, Meta(ge=1.0, le=3.0)]
     stribeck_speed_mm_s: Positive
     presliding_stiffness_N_mm: Positive
@@ -43,7 +40,7 @@ class Friction(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Field(Struct, frozen=True, forbid_unknown_fields=True):
-    """Radial moment of the magnets over their gap, with hysteresis in percent of its value at a gap of 45 mm."""
+    """Radial moment of the magnets over their gap; hysteresis is a share of its value at 45 mm."""
 
     law: Literal["power", "thesis"]
     coefficient: Annotated[float, Meta(gt=0.0, le=10.0)]
@@ -52,7 +49,7 @@ class Field(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
-    """Prony terms of an elastomer: each share of a force step dies away with its time constant."""
+    """Prony terms: each share of a force step dies away with its time constant."""
 
     fractions: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
     times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
@@ -68,8 +65,9 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """A tactile pad between plates, in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked
-    pad at small strain."""
+    """A tactile pad in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked pad at small
+    strain.
+    """
 
     cip_percent: Annotated[float, Meta(ge=0.0, le=60.0)]
     modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
@@ -91,7 +89,7 @@ class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """The element of the second plant, in the place of the insert; `SecondElement` states the laws of these constants."""
+    """The element of the second plant: see `SecondElement`."""
 
     concentration: Annotated[float, Meta(ge=1.0, le=3.0)]
     without_field_N: NotNegative
@@ -120,7 +118,7 @@ class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
-    """Temperature of the insert: its effect on the force, and how fast the insert begins to warm."""
+    """How temperature affects the force, and how fast the insert begins to warm."""
 
     force_percent_K: Annotated[float, Meta(ge=-5.0, le=5.0)]
     drift_K_h: Annotated[float, Meta(ge=0.0, le=20.0)]
@@ -143,8 +141,7 @@ class Motor(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Gear(Struct, frozen=True, forbid_unknown_fields=True):
-    """One gearbox. The mesh loses 1 - `efficiency` of the torque above `output_friction_Nm`, which the no-load current
-    shows."""
+    """The mesh loses 1 - `efficiency` of the torque above `output_friction_Nm`, which the no-load current shows."""
 
     ratio: Annotated[float, Meta(ge=1.0)]
     efficiency: Annotated[float, Meta(gt=0.0, le=1.0)]
@@ -152,8 +149,6 @@ class Gear(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Screw(Struct, frozen=True, forbid_unknown_fields=True):
-    """Lead screw, nut and guide of each carriage."""
-
     lead_mm: Annotated[float, Meta(gt=0.0, le=50.0)]
     friction_coefficient: Annotated[float, Meta(ge=0.0, le=1.0)]
     drag_left_N: NotNegative
@@ -163,7 +158,7 @@ class Screw(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
-    """Drive stage and encoders; an encoder's counts are per turn of the gearbox output."""
+    """Encoder counts are per turn of the gearbox output."""
 
     encoder_counts_per_rev: Annotated[int, Meta(ge=16, le=1_000_000)]
     supply_V: Annotated[float, Meta(gt=0.0, le=25.0)]
@@ -172,8 +167,7 @@ class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True):
-    """The force sensor: noise is one sample's standard deviation. The offset drifts steadily, up or down by the
-    seed."""
+    """The noise is one sample's standard deviation. The offset drifts steadily, up or down by the seed."""
 
     noise_mN: Annotated[float, Meta(ge=0.0, le=1000.0)]
     drift_mN_min: Annotated[float, Meta(ge=0.0, le=1000.0)]
@@ -182,7 +176,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FirmwareTiming(Struct, frozen=True, forbid_unknown_fields=True):
-    """How far the device's clock is off the host's, and the width of the uniform random delay before a reply."""
+    """How far the device's clock is off the host's, and the width of the random delay before a reply."""
 
     clock_ppm: Annotated[float, Meta(ge=-1000.0, le=1000.0)]
     reply_jitter_us: Annotated[float, Meta(ge=0.0, le=5000.0)]
@@ -198,7 +192,7 @@ class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
     home_mm: Positive = 47.5  # open switch: half of the largest gap, 95 mm
     closed_mm: Positive = 22.25  # closed switch: a quarter millimetre inside half of the smallest gap, 45 mm
     stop_beyond_mm: Positive = 0.25  # hard stop behind the closed switch; twice that behind the open one
-    start_left_mm: Positive = 40.0  # where the carriages stand at power-on: somewhere, and not equal
+    start_left_mm: Positive = 40.0  # where the carriages are at power-on: somewhere, and not equal
     start_right_mm: Positive = 39.0
     attraction_factor: Annotated[float, Meta(ge=0.5, le=5.0)] = 2.0  # iron shaft: 30 N at 45 mm in air, card 50..80 N
     hysteresis_scale: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1  # field change, of the largest, that turns a branch
@@ -238,9 +232,9 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     firmware: FirmwareTiming
     assumed: Assumed = Assumed()
     pad: PadParameters | None = None
-    "In the place of insert and shaft; `elastomer`, `friction` and `relaxation` are then unused."
+    "In the place of insert and shaft, whose tables are then unused."
     second: SecondParameters | None = None
-    "In the place of the insert; `elastomer`, `friction`, `relaxation` and `field` are then unused."
+    "In the place of the insert, whose tables and `field` are then unused."
 
     def __post_init__(self) -> None:
         limit_A = self.electronics.current_limit_A
@@ -261,7 +255,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Between(Struct, frozen=True, forbid_unknown_fields=True):
-    """A plant file with a pad or the second plant's element. `carriages` names the plant with all the other parts."""
+    """A plant file with another element. `carriages` names the plant with all the other parts."""
 
     carriages: str
     pad: PadParameters | None = None
@@ -281,12 +275,11 @@ def _kind(tables: dict[str, Any]) -> type[PlantParameters | _Between]:
 
 
 def plant_names() -> tuple[str, ...]:
-    """Return the names of the plants that come with the package, sorted."""
     return shipped(_PLANTS, ".toml")
 
 
 def load_plant(path_or_name: str | Path) -> PlantParameters:
-    """Read a plant by the name of a packaged one (`sample_1`), or from a TOML file; a packaged name goes first."""
+    """Read a packaged plant by its name, such as `sample_1`, or a TOML file. Raises PlantError."""
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
     read = convert_as(path, _kind)
     if isinstance(read, PlantParameters):
@@ -296,7 +289,7 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
-    """Return the plant with the insert called `name` in the place of its own; the plant itself for PLANTS_INSERT."""
+    """Return the plant with another insert."""
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
     own = plant.elastomer
     fitted = Elastomer(

@@ -23,13 +23,13 @@ T = TypeVar("T")
 PERIOD_S: Final = 2e-3
 VALID_MS: Final = 100.0
 FORCE, WAY, LAW = MODES = ("force", "way", "law")
-"What a setpoint says: the tip's force; the force of each way; or the law by which the force follows the handle."
+"The tip's force, the force of each way, or the law by which the force follows the handle."
 VESSEL: Final = Friction(presliding_stiffness_N_mm=2.0, viscous_N_s_mm=0.0, static_ratio=1.2, stribeck_speed_mm_s=2.0)
 "An assumption: the tip sticks, and slips at less force."
 
 
 class Felt(NamedTuple):
-    """Forces at the tip at one time. `force_N` resists the way in, `friction_N` is the vessel's while the tip slides."""
+    """Forces at the tip. `force_N` resists the way in, `friction_N` is the vessel's while the tip slides."""
 
     tip_mm: float
     force_N: float
@@ -40,7 +40,7 @@ class Felt(NamedTuple):
 
 
 class Patient:
-    """Robot's tip that follows the handle with a first-order lag, in a vessel with an elastic wall, which may beat."""
+    """A robot's tip that follows the handle late, in a vessel with an elastic wall, which may beat."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class Patient:
         self._contact_mm: float | None = None
 
     def update(self, time_s: float, handle_mm: float) -> Felt:
-        """Advance to `time_s`, with the handle at `handle_mm` since the last update, and return what the tip feels."""
+        """Advance to `time_s`, and return what the tip feels."""
         if math.isnan(self._time_s):
             self._time_s, self._start_mm, self._robot_mm, self._tip_mm = time_s, handle_mm, handle_mm, handle_mm
         dt_s, self._time_s = time_s - self._time_s, time_s
@@ -89,7 +89,7 @@ class Patient:
 
 
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
-    """Return the fields of a setpoint that says what the tip feels, `felt`, in the way of `mode`, one of MODES."""
+    """Return the fields of a setpoint that says what the tip feels."""
     if mode == FORCE:
         return {"servo_cf": abs(felt.force_N)}
     fields: dict[str, Any] = {"servo_cf": felt.wall_N + felt.friction_N}
@@ -105,7 +105,7 @@ def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
 
 
 class NetworkDelay(Generic[T]):
-    """One direction of a network: a delay, uniform jitter on top, losses in bursts, and one outage from .. to, seconds."""
+    """One direction of a network: a delay, jitter on top, losses in bursts, and one outage."""
 
     def __init__(
         self,
@@ -129,7 +129,6 @@ class NetworkDelay(Generic[T]):
         self._under_way: list[tuple[float, int, float, T]] = []
 
     def send(self, time_s: float, value: T) -> None:
-        """Send `value` at `time_s`: it arrives after the delay and its jitter."""
         chance, arrives_s = self._draw.random(), time_s + self._delay_s + self._jitter_s * self._draw.random()
         self._is_losing = chance < (self._goes_on if self._is_losing else self._begins)
         self._sent += 1
@@ -137,8 +136,7 @@ class NetworkDelay(Generic[T]):
             heapq.heappush(self._under_way, (arrives_s, self._sent, time_s, value))
 
     def arrived(self, time_s: float) -> list[tuple[float, T]]:
-        """Return (time it was sent, value) of all that has arrived by `time_s` since the last call, in order of
-        arrival."""
+        """Return the time of sending and the value of all that has arrived since the last call."""
         found = []
         while self._under_way and self._under_way[0][0] <= time_s:
             found.append(heapq.heappop(self._under_way)[2:])
@@ -155,7 +153,7 @@ def run(
     clock_s: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints in `mode` `back`."""
+    """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints `back`."""
     began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
     newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0
     while not is_over(now_s := clock_s()):
@@ -174,7 +172,6 @@ def run(
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the argument parser of `python -m tormagd.simulation.patient`."""
     made = argparse.ArgumentParser(
         prog="python -m tormagd.simulation.patient", description="A simulated patient, the source of setpoints."
     )
@@ -191,7 +188,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the simulated patient from the command line and return the exit code."""
     command = parser()
     options = command.parse_args(arguments)
     try:

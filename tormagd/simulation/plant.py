@@ -15,18 +15,18 @@ from tormagd.simulation.second_element import SecondElement
 from tormagd.simulation.static_laws import pull_over_gap
 
 SUBSTEP_S: Final = 5e-4
-"""Step of motors and screws, at most the motors' electrical time constant; see `Axis` for what it leaves out."""
+"At most the motors' electrical time constant."
 
 ELEMENT_STEP_S: Final = 1e-3
-"""Step of the element and the hand; the element's updates are exact over it."""
+"The element's updates are exact over it."
 
 _ROUNDING: Final = 1e-6
-"""Share of a substep by which sums of time steps may be off before a step is held back."""
+"Share of a substep by which sums of time steps may be off."
 
 
 @final
 class Truth(Value):
-    """The plant's true state at one time. `force_N` has the sign of the motion that it resists."""
+    """The plant's true state. `force_N` has the sign of the motion that it resists."""
 
     def __init__(
         self,
@@ -56,11 +56,11 @@ class Truth(Value):
 
 
 class Sensor(Protocol):
-    """What shows the rendered force: a `SimulatedSensor`, or a test's own in its place."""
+    """What shows the rendered force: a `SimulatedSensor`, or a test's own."""
 
     @property
     def reading_N(self) -> float:
-        """Reading now, N."""
+        """The reading now, N."""
 
     def advance(self, time_s: float, force_N: float) -> None:
         """Bring the sensor to `time_s`, at which the rendered force is `force_N`."""
@@ -68,7 +68,7 @@ class Sensor(Protocol):
 
 @final
 class Plant:
-    """The device without its electronics, in fixed substeps of its own time; `Axis` and `TorqueElement` state the laws."""
+    """The device without its electronics, in fixed substeps. `Axis` and `TorqueElement` state the laws."""
 
     def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
         assumed = parameters.assumed
@@ -97,7 +97,7 @@ class Plant:
         self._target_s = 0.0
         self._left_V: float | None = None
         self._right_V: float | None = None
-        # what the voltages before the present ones add to the mean over the substep that has begun
+        # what earlier voltages add to the mean over the substep that has begun
         self._left_early_V = 0.0
         self._right_early_V = 0.0
         self._substeps = 0
@@ -112,8 +112,7 @@ class Plant:
 
     @property
     def shafts(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The left and the right screw now, which may be within a substep: of each angle, rad since power-on, and
-        current, A."""
+        """Angle, rad since power-on, and current, A, of each screw now."""
         left, right, left_V, right_V = self.left, self.right, self._left_V, self._right_V
         age_s = self._target_s - self.time_s
         if age_s < _ROUNDING * self._substep_s:
@@ -126,8 +125,7 @@ class Plant:
 
     @property
     def truth(self) -> Truth:
-        """The true state at `time_s`, the last whole substep; force and handle are those of the last whole
-        millisecond."""
+        """The true state at the last whole substep; force and handle at the last whole millisecond."""
         left, right, element = self.left, self.right, self.element
         return Truth(
             self.time_s,
@@ -144,14 +142,14 @@ class Plant:
         )
 
     def drive(self, left_V: float | None, right_V: float | None) -> None:
-        """Put `left_V` and `right_V` at the motors from now on, positive to open; None opens that motor's bridge."""
+        """Put these voltages at the motors; None opens a motor's bridge."""
         share = self._target_s / self._substep_s - self._substeps
         self._left_early_V += _early_V(self.left, share, self._left_V, left_V)
         self._right_early_V += _early_V(self.right, share, self._right_V, right_V)
         self._left_V, self._right_V = left_V, right_V
 
     def advance(self, dt_s: float) -> None:
-        """Let `dt_s` pass: run every substep that has become due, with element, hand and force sensor each millisecond."""
+        """Let `dt_s` pass: run every substep that has become due."""
         self._target_s = target_s = self._target_s + dt_s
         due = int(target_s / self._substep_s + _ROUNDING)
         if due == self._substeps:
@@ -172,7 +170,6 @@ class Plant:
         self._substeps = due
 
     def _advance_element(self, time_s: float) -> None:
-        """Move the hand to `time_s`, then advance the element and the force sensor by their step."""
         hand, element, before_mm = self._hand, self.element, self.handle_mm
         if isinstance(element, PressedPad):
             self.handle_mm = hand.position_mm(time_s)
@@ -189,7 +186,6 @@ class Plant:
         self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:
-        """Divide the friction of both gearboxes and screws by `divisor`, each time it is called."""
         for axis in (self.left, self.right):
             axis.gear_friction_Nm /= divisor
             axis.screw_friction_m /= divisor
@@ -210,7 +206,7 @@ def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None
 
 @final
 class SimulatedSensor:
-    """The force sensor: samples at its own rate, adds noise and a drifting offset, saturates, and shows samples late."""
+    """Samples at its own rate, adds noise and a drifting offset, saturates, and shows samples late."""
 
     def __init__(self, plant: PlantParameters, noise: random.Random) -> None:
         sensor = plant.force_sensor
@@ -227,9 +223,7 @@ class SimulatedSensor:
         self.reading_N = 0.0
 
     def advance(self, time_s: float, force_N: float) -> None:
-        """Bring the sensor to `time_s`, at which the rendered force is `force_N`: sample when due, show what has
-        arrived."""
-        # half an element step of tolerance: a sample falls on the nearest step
+        # a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
             self._samples += 1
             sample_N = force_N + self._drift_N_s * time_s + self._spread_N * self._normal()
@@ -239,7 +233,7 @@ class SimulatedSensor:
             self.reading_N = self._in_flight.popleft()[1]
 
     def _normal(self) -> float:
-        """Return the next standard normal number; two are made at a time and the second is kept (Box and Muller, 1958)."""
+        """Return a standard normal number; two are made at a time (Box and Muller, 1958)."""
         if self._has_spare:
             self._has_spare = False
             return self._spare

@@ -1,8 +1,7 @@
 """The tactile element: from the magnets' gap and the finger's depth in the pad to the force that the finger feels.
 
-The same magnets, screws and field as the brake's, with a `TactilePad` between them. Richer than any model the
-controller uses: field with hysteresis, Gent law, saturation, Payne effect, rate, eight relaxing branches, conditioning,
-warmth.
+The same magnets, screws and field as the brake's, with a `TactilePad` between them, which is richer than any model the
+controller uses.
 """
 
 from typing import Final, final
@@ -18,8 +17,7 @@ MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
 
 @final
 class PressedPad:
-    """The pad between the magnets, with its state: magnetic branch, conditioned pad, temperature. It starts worked and
-    rested."""
+    """The worked, rested pad between the magnets, with its state."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         if plant.pad is None:
@@ -39,8 +37,7 @@ class PressedPad:
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
-        """Advance by one step that ends at `time_s`, s, and at `gap_mm`, with the finger `depth_mm` deep and pressing
-        at `speed_mm_s`."""
+        """Advance by one step that ends at `time_s` and `gap_mm`."""
         field_mT = MT_PER_TM * self._field.advance(gap_mm)
         depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)
         speed_mm_s = min(max(speed_mm_s, -FASTEST_MM_S), FASTEST_MM_S)

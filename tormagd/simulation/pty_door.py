@@ -1,7 +1,4 @@
-"""The serial door: the device behind a pseudo-terminal.
-
-A pty carries bytes at once whatever the baud rate; the pacing is the device's.
-"""
+"""The serial door: the device behind a pseudo-terminal, which carries bytes at once at any baud rate."""
 
 import fcntl
 import os
@@ -17,7 +14,7 @@ MAX_UNREAD_BYTES = 4096
 
 
 class Pty:
-    """Pseudo-terminal in raw mode that hosts may open and close as they like."""
+    """A pseudo-terminal in raw mode that hosts may open and close at any time."""
 
     def __init__(self) -> None:
         self._ours, self._theirs = os.openpty()
@@ -26,16 +23,15 @@ class Pty:
         self.address = os.ttyname(self._theirs)
 
     def close(self) -> None:
-        """Close both ends of the line, once: a second call raises OSError."""
+        """Close both ends of the line, once."""
         os.close(self._ours)
         os.close(self._theirs)
 
     def descriptors(self) -> Sequence[int]:
-        """Return the descriptor of the device's end."""
         return (self._ours,)
 
     def read(self) -> bytes:
-        """Return what the host has written, READ_BYTES at most; the rest waits."""
+        """Return at most READ_BYTES of what the host has written."""
         return os.read(self._ours, READ_BYTES)
 
     def write(self, data: bytes) -> None:
@@ -50,15 +46,12 @@ class Pty:
 
 
 class PtyDoor(Pty):
-    """The serial device behind a pseudo-terminal."""
-
     def __init__(self, device: VirtualDevice) -> None:
         super().__init__()
         self._device = device
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device the host's bytes, if `readable` is not empty, and the host what the device has sent by
-        `now_s`."""
+        """Exchange bytes between host and device until `now_s`."""
         if readable:
             self._device.receive(now_s, self.read())
         if out := self._device.transmit(now_s):

@@ -13,16 +13,15 @@ from typing import NamedTuple, Protocol, TextIO
 from tormagd.simulation.plant import Truth
 
 LATE_S = 2e-3
-"""From this lateness on, a wake-up counts as falling behind: two firmware ticks."""
+"From here on a wake-up is late: two firmware ticks."
 SLIP_S = 5e-3
-"""From this lateness on, the device's time stands still instead, because the process did not run, as no microcontroller
-would."""
+"From here on the device's time stands still instead, because the process did not run."
 TRUTH_PERIOD_S = 1e-3
 TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C,kinetic_N\n"
 
 
 class PacedDevice(Protocol):
-    """A device with its wire, run by calls; times are seconds from power-on and never fall."""
+    """A device with its wire; times are seconds from power-on and never fall."""
 
     @property
     def truth(self) -> Truth:
@@ -30,7 +29,7 @@ class PacedDevice(Protocol):
 
     @property
     def next_event_s(self) -> float:
-        """When the device has something to do next, s from power-on; it may be past, and is never infinite."""
+        """When the device has something to do next; it may be past."""
 
     def advance(self, now_s: float) -> None:
         """Let time pass until `now_s`."""
@@ -44,27 +43,24 @@ class Door(Protocol):
         """What a host opens."""
 
     def descriptors(self) -> Sequence[int]:
-        """Return the file descriptors to wait for until something comes from a host."""
+        """Return the file descriptors to wait on for hosts."""
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device what has come on the `readable` descriptors, and hosts what the device has sent by
-        `now_s`."""
+        """Hand the device what has come, and hosts what the device has sent by `now_s`."""
 
     def close(self) -> None:
         """Close everything that the door opened."""
 
 
 class Punctuality(NamedTuple):
-    """How well real time was kept: late wake-ups, the worst lateness, and how long the device's time stood still."""
-
     late: int
     worst_s: float
     slipped_s: float
 
 
 def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: TextIO | None = None) -> Punctuality:
-    """Run `device` behind `door` in real time until `stopped()`, and return how well real time was kept."""
-    # nothing made so far will die: keep the collector from walking it while the device runs
+    """Run `device` behind `door` in real time until `stopped()`, and return how well that was kept."""
+    # keeps the collector from walking what will not die while the device runs
     gc.freeze()
     power_on_s = time.monotonic()
     realtime_ns = time.time_ns()

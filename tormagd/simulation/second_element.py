@@ -1,7 +1,7 @@
-"""The element of the second plant: each law is of another form than those of `TorqueElement` and of the controller.
+"""The element of the second plant: each law has another form than those of `TorqueElement` and of the controller.
 
-It only judges: no model is trained on it, and no constant of a controller was chosen by it. Sizes are assumptions, of
-the order that the literature gives; they stand in `plants/second.toml`, with their sources.
+It only judges: no model is trained on it, and no constant of a controller was chosen by it. Sizes are assumptions of
+the order that the literature gives; they are in `plants/second.toml`, with their sources.
 
     field        b = 2 c B(gap / 2)                     two blocks, on their axis (Furlani 2001); c of the iron shaft
     memory       m = (1 - sum w_i) b + sum w_i play_i   play of half width r_i (Krasnoselskii and Pokrovskii 1989)
@@ -19,12 +19,11 @@ from tormagd.simulation.parameters import PlantParameters, SecondParameters
 from tormagd.simulation.warmth import Warmth
 
 RESTED_S: Final = 1000.0
-"How long the handle has been standing when the power comes."
+"How long the handle has stood when the power comes."
 
 
 def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) -> float:
-    """Return the flux density at the shaft, mT: a block's on its axis, half a gap away, times 2 and times
-    `concentration`."""
+    """Return the flux density at the shaft: twice a block's on its axis, times `concentration`."""
     width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
 
     def angle(from_mm: float) -> float:
@@ -36,14 +35,13 @@ def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) 
 
 
 def fresh_N(field_mT: float, second: SecondParameters) -> float:
-    """Return the kinetic friction, N, of the fresh, cool element in the field `field_mT`, sliding at the reference
-    speed."""
+    """Return the fresh, cool element's kinetic friction at the reference speed."""
     saturation = math.tanh(field_mT / second.saturating_mT)
     return second.without_field_N + second.saturated_N * saturation * saturation
 
 
 def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> float:
-    """Return the friction at `speed_mm_s` and contact age `age_s` over that of steady sliding at the reference speed."""
+    """Return the friction over that of steady sliding at the reference speed."""
     reference_mm_s, slow_mm_s = second.reference_mm_s, second.slow_mm_s
     reference_age = second.renewed_mm / reference_mm_s / second.ageing_s
     faster = math.log((slow_mm_s + abs(speed_mm_s)) / (slow_mm_s + reference_mm_s))
@@ -53,7 +51,7 @@ def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> fl
 
 @final
 class SecondElement:
-    """The second plant's element, behind the interface of `TorqueElement`; advances in equal steps of `dt_s`."""
+    """The second plant's element, behind the interface of `TorqueElement`."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         if plant.second is None:
@@ -77,14 +75,11 @@ class SecondElement:
         return self._warmth.temperature_C
 
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
-        """Advance by one step that ends at `time_s` and at gap `gap_mm`, with the handle at the mean speed
-        `speed_mm_s`."""
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
 
     def prepare(self, time_s: float, gap_mm: float) -> None:
-        """Begin a step that ends at `time_s`, s from power-on, and at `gap_mm`: advance plays, creep, temperature and
-        `kinetic_N`."""
+        """Begin a step that ends at `time_s` and `gap_mm`: advance plays, creep and temperature."""
         second = self._second
         driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self._warmth.advance(time_s)
         self._creeping_N = self._crept_N(self._creeping_N + second.creeping_share * (driving_N - self._fresh_N))
@@ -92,17 +87,14 @@ class SecondElement:
         self.kinetic_N = max((1.0 - second.creeping_share) * driving_N + self._creeping_N, 0.0)
 
     def resisting_N(self, speed_mm_s: float) -> float:
-        """Return the friction, N, that the step begun by `prepare` would end with at the mean handle speed
-        `speed_mm_s`."""
+        """Return the friction with which the step would end at this speed."""
         return self._slid(speed_mm_s)[0]
 
     def slide(self, speed_mm_s: float) -> None:
-        """End the step that `prepare` began, with the handle at the mean speed `speed_mm_s`."""
         self.force_N, self._age_s, self._stretched_mm = self._slid(speed_mm_s)
 
     def _slid(self, speed_mm_s: float) -> tuple[float, float, list[float]]:
-        """Return force, N, contact age, s, and each spring's length, mm, at the end of a step at the mean speed
-        `speed_mm_s`."""
+        """Return force, N, contact age, s, and each spring's length, mm, at the end of a step."""
         second, dt_s = self._second, self._dt_s
         # exact for a constant speed: what is left of the age, and what the step adds to it
         renewed = abs(speed_mm_s) * dt_s / second.renewed_mm
@@ -119,7 +111,7 @@ class SecondElement:
         return force_N, age_s, springs_mm
 
     def _magnetised_mT(self, gap_mm: float) -> float:
-        """Move the plays to the field at `gap_mm`, and return that field with their hysteresis, mT."""
+        """Move the plays, and return the field with their hysteresis."""
         second = self._second
         field_mT = shaft_field_mT(gap_mm, self._plant, second.concentration)
         found_mT = field_mT
@@ -130,7 +122,6 @@ class SecondElement:
         return found_mT
 
     def _crept_N(self, creeping_N: float) -> float:
-        """Return what is left of the creeping force, N, after `dt_s`."""
         scale_N = self._second.creep_scale_N
         large = math.exp(-abs(creeping_N) / scale_N)
         kept, lost = self._kept, self._lost

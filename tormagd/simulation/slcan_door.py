@@ -1,7 +1,7 @@
-"""The door of a CAN adapter on a serial line: the Lawicel ASCII protocol ("slcan") on a pseudo-terminal.
+"""A CAN adapter on a serial line: the Lawicel ASCII protocol ("slcan") on a pseudo-terminal.
 
-What a CANable or a Lawicel CAN232 does between a host's serial port and the bus (Lawicel CAN232 manual, version 3).
-Commands end with CR and are answered with CR, or with BEL when they are refused.
+It does what a CANable or a Lawicel CAN232 does between a host's serial port and the bus (Lawicel CAN232 manual, version
+3). Commands end with CR and are answered with CR, or with BEL when they are refused.
 """
 
 import re
@@ -16,14 +16,13 @@ OK = b"\r"
 REFUSED = b"\a"
 SENT = b"z\r"
 LONGEST_COMMAND = 32
-"""The longest there is, a 29-bit frame of 8 bytes, has 26 characters."""
+"""The longest command, a 29-bit frame of 8 bytes, has 26 characters."""
 TOLD = {b"V": b"V1013\r", b"N": b"NSIM1\r", b"F": b"F00\r"}
-"""Version, serial number and status flags."""
 _FRAME = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
 class SlcanAdapter:
-    """Translator between the serial characters of the Lawicel protocol and CAN frames; no I/O and no clock."""
+    """Translates between the Lawicel protocol and CAN frames, without I/O or clock."""
 
     def __init__(self) -> None:
         self.is_open = False
@@ -31,10 +30,9 @@ class SlcanAdapter:
         self._pending = b""
 
     def feed(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
-        """Take the host's characters; return the characters to answer, and the frames that the host sends, both in
-        their order."""
+        """Take the host's characters; return the answer, and the frames that the host sends."""
         *commands, rest = (self._pending + data).split(END)
-        # too long a command is refused when its end comes: no more of it is kept than shows its length
+        # too long a command is refused at its end, so only enough to show its length is kept
         self._pending = rest[: LONGEST_COMMAND + 1]
         answers, frames = b"", []
         for command in commands:
@@ -47,11 +45,10 @@ class SlcanAdapter:
         return answers, frames
 
     def line(self, frame: CanFrame) -> bytes:
-        """Return a received frame as characters for the host, CR included, whether the channel is open or not."""
+        """Return a received frame as characters for the host."""
         return b"t%03X%d%s\r" % (frame.identifier, len(frame.data), frame.data.hex().upper().encode())
 
     def _answer(self, command: bytes) -> bytes:
-        """Carry out a command that is no frame, given without its CR, and return its answer."""
         match command[:1]:
             case b"":  # hosts send empty lines to end whatever was there before
                 return OK
@@ -62,7 +59,7 @@ class SlcanAdapter:
                 self.is_open = False
                 return OK
             case b"S" if not self.is_open and command[1:] in {b"%d" % number for number in range(9)}:
-                return OK  # accepted and without effect: the simulated bus has its own bit rate
+                return OK  # without effect: the simulated bus has its own bit rate
         return TOLD.get(command[:1], REFUSED)
 
 
@@ -75,7 +72,7 @@ class SlcanDoor(Pty):
         self._adapter = SlcanAdapter()
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device the host's frames, and the host the adapter's answers and the device's frames until `now_s`."""
+        """Exchange frames and answers between host and device until `now_s`."""
         out = b""
         if readable:
             out, frames = self._adapter.feed(self.read())

@@ -1,6 +1,6 @@
 """The plant's laws that know no time, from the gap to the field, the magnets' pull and the force of a fresh element.
 
-They are formulas over arrays, asked once, when a device is made; what a tick needs of them it gets as a `Curve`.
+They are formulas over arrays, evaluated once when a device is made; a tick reads them as a `Curve`.
 """
 
 import math
@@ -18,17 +18,17 @@ from tormagd.simulation.parameters import PlantParameters
 GRID_MM = 2e-3
 MOMENT_POINTS = 20_000
 JOIN_MM = 10.0
-"""Width over which Eq. 7 goes over into the power law beyond a gap of 95 mm."""
+"Over this width Eq. 7 goes over into the power law beyond 95 mm."
 
 
 def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
-    """Return the radial moment at each gap (n, mm) by the plant's field law, T m (n), without hysteresis."""
+    """Return the radial moment at each gap (n), without hysteresis."""
     power = PowerFieldLaw(plant.field.coefficient, plant.field.exponent).radial_moment_Tm(gap_mm)
     if plant.field.law == "power":
         return power
     thesis = ThesisFieldLaw()
     low_mm, high_mm = thesis.gap_range_mm
-    # under 45 mm, in the half millimetre before the stops, Eq. 7 is continued along its tangent
+    # in the half millimetre before the stops Eq. 7 is continued along its tangent
     inside_mm = np.clip(gap_mm, low_mm, high_mm)
     tangent = thesis.d_radial_moment_d_gap(low_mm) * np.minimum(gap_mm - low_mm, 0.0)
     share = np.clip((gap_mm - high_mm) / JOIN_MM, 0.0, 1.0)
@@ -38,25 +38,22 @@ def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
 
 
 def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
-    """Return the attraction between the magnets at a gap, N, >= 0: the closed form in air times the factor for the iron
-    shaft."""
+    """Return the attraction between the magnets: that in air times the factor for the iron shaft."""
     return plant.assumed.attraction_factor * attraction_N(gap_mm, _magnet(plant))
 
 
 def moment_over_gap(plant: PlantParameters) -> Curve:
-    """Return `radial_moment_Tm` as a table over every gap that the device can reach, mm to T m."""
     ends_mm = _reached_mm(plant)
     return Curve(radial_moment_Tm(_gaps_mm(*ends_mm), plant).tolist(), *ends_mm)
 
 
 def pull_over_gap(plant: PlantParameters) -> Curve:
-    """Return `pull_of_magnets_N` as a table over every gap that the device can reach, mm to N."""
     ends_mm = _reached_mm(plant)
     return Curve((plant.assumed.attraction_factor * _attraction_N(_magnet(plant), *ends_mm)).tolist(), *ends_mm)
 
 
 def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: float) -> Curve:
-    """Return the fresh, cool insert's kinetic friction as a table over the radial moment, T m to N."""
+    """Return the fresh, cool insert's kinetic friction over the radial moment."""
     elastomer = Elastomer(
         shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
         relative_permeability=plant.elastomer.relative_permeability,
@@ -78,7 +75,7 @@ def _gaps_mm(start_mm: float, end_mm: float) -> FloatArray:
     return np.linspace(start_mm, end_mm, math.ceil((end_mm - start_mm) / GRID_MM) + 1)
 
 
-# these two take longer than all else of a device; many devices are mostly made of the same parts
+# these two take most of the time to make a device, and many devices share them
 @lru_cache(maxsize=8)
 def _attraction_N(magnet: CuboidMagnet, start_mm: float, end_mm: float) -> FloatArray:
     return attraction_N(_gaps_mm(start_mm, end_mm), magnet)

@@ -25,16 +25,16 @@ FASTEST_MM_S: Final = 100.0
 STRONGEST_MT: Final = 500.0
 
 TOUCHING_MM = 0.2
-"""Depth at which cycles turn at their open end: plates that leave the pad would measure air."""
+"Plates that leave the pad would measure air."
 RATES_MM_S = (1.0, 0.5, 4.0, 2.0)
-"""Not in order, so that a drift over the record is not mistaken for an effect of the rate."""
+"Not in order, so that a drift is not mistaken for an effect of the rate."
 CYCLES_PER_RATE = 3
 SAMPLES_PER_CYCLE = 175
 
 
 @final
 class TactilePad:
-    """One pad with its past: conditioning by strain (Mullins effect) and relaxing stress. A new pad is unworked."""
+    """One pad with its past: conditioning by strain (Mullins effect) and relaxing stress."""
 
     def __init__(self, parameters: PadParameters) -> None:
         self._parameters = parameters
@@ -51,13 +51,12 @@ class TactilePad:
         self._field_memory: PronyState = self._field_series.relaxed(0.0)
 
     def rest(self) -> None:
-        """Take the load off until all stress has relaxed: depth is 0 mm then; conditioning stays, and no time is
-        counted."""
+        """Take the load off until all stress has relaxed; conditioning stays."""
         self._displacement_mm = 0.0
         self._memory, self._field_memory = self._series.relaxed(0.0), self._field_series.relaxed(0.0)
 
     def elastic_parts_N(self, displacement_mm: float, rate_mm_s: float, field_mT: float) -> tuple[float, float]:
-        """Return two forces before relaxation, N: the elastomer's as conditioned now, and what the field adds."""
+        """Return the forces before relaxation of the elastomer, and of the field."""
         require("displacement_mm", displacement_mm, 0.0, DEEPEST_MM)
         require("rate_mm_s", rate_mm_s, -FASTEST_MM_S, FASTEST_MM_S)
         require("field_mT", field_mT, 0.0, STRONGEST_MT)
@@ -79,7 +78,6 @@ class TactilePad:
         return matrix_N, added_kPa * area * gent * (1.0 + pad.field_rate_gain * speed)
 
     def advance(self, dt_s: float, displacement_mm: float, rate_mm_s: float, field_mT: float) -> float:
-        """Advance by `dt_s` and return the force at the step's end, N, never negative."""
         if dt_s != self._dt_s:
             self._step, self._field_step = self._series.discretise(dt_s), self._field_series.discretise(dt_s)
             self._dt_s = dt_s
@@ -95,15 +93,14 @@ class TactilePad:
         return max(relaxed_N + field_N, 0.0)
 
     def run(self, time_s: Array, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
-        """Advance through a program of n samples and return the force at each, N (n)."""
+        """Return the force at each of n samples of a program."""
         steps = np.round(np.diff(time_s, prepend=0.0 if time_s[0] == 0.0 else 2 * time_s[0] - time_s[1]), 9)
         columns = zip(steps.tolist(), displacement_mm.tolist(), rate_mm_s.tolist(), field_mT.tolist(), strict=True)
         return np.array([self.advance(*row) for row in columns])
 
 
 def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Return time, displacement, rate and cycle number of one pass of the test rig, each (4 rates * 3 cycles *
-    samples)."""
+    """Return time, displacement, rate and cycle number of one pass of the test rig."""
     times, displacements, rates, cycles, start_s = [], [], [], [], 0.0
     stroke_mm = FULL_INDENTATION_MM - TOUCHING_MM
     share = np.arange(1, samples_per_cycle + 1) / samples_per_cycle
@@ -118,8 +115,7 @@ def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, 
 
 
 def worked_pad(parameters: PadParameters) -> TactilePad:
-    """Return a new pad that has been pressed through one pass of `cycling_program`, twelve cycles without field, and
-    has rested."""
+    """Return a pad after twelve cycles without field and a rest."""
     pad = TactilePad(parameters)
     time_s, displacement_mm, rate_mm_s, _ = cycling_program(50)
     pad.run(time_s, displacement_mm, rate_mm_s, np.zeros_like(time_s))

@@ -8,7 +8,7 @@ from tormagd.simulation.parameters import PlantParameters
 
 @final
 class Warmth:
-    """Temperature of the elastomer: it rises from the ambient temperature towards the warmest, exponentially."""
+    """Temperature of the elastomer, which rises exponentially from the ambient to the warmest."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self._force_per_K: Final = plant.thermal.force_percent_K / 100.0
@@ -18,7 +18,7 @@ class Warmth:
         self.temperature_C = self._ambient_C
 
     def advance(self, time_s: float) -> float:
-        """Set `temperature_C` to that of `time_s`, s since power-on; return the factor on a cool elastomer's force."""
+        """Set `temperature_C` at `time_s`, and return the factor on a cool elastomer's force."""
         if self._warming_K > 0.0:
             self.temperature_C = self._ambient_C - self._warming_K * math.expm1(
                 -self._drift_K_s * time_s / self._warming_K

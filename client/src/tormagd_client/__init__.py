@@ -1,4 +1,4 @@
-"""What a program of your own speaks to the daemon with; `tormagctl` does, too. For asyncio: `tormagd_client.aio`."""
+"""The client library of the daemon, which `tormagctl` uses too. For asyncio: `tormagd_client.aio`."""
 
 from typing import TYPE_CHECKING, Any
 

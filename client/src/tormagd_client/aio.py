@@ -39,7 +39,7 @@ from tormagd_client.wire import (
 
 
 class AsyncClient(Connections[zmq.asyncio.Socket]):
-    """Asyncio client of the daemon at `endpoints`: arguments, results and errors of `blocking.Client`."""
+    """Asyncio client of the daemon at `endpoints`, with the calls and errors of `blocking.Client`."""
 
     _made = zmq.asyncio.Context
 
@@ -55,8 +55,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         return await self._result(command, args, self._wait_s)
 
     async def status(self, wait_s: float = math.inf) -> Status:
-        """Return what the daemon is doing, waiting at most `wait_s`, and no longer than for any answer. Raises as
-        `request`."""
+        """Return what the daemon is doing, waiting at most `wait_s`. Raises as `request`."""
         return understood(await self._result("status", {}, min(wait_s, self._wait_s)), Status)
 
     async def describe(self) -> Description:
@@ -66,8 +65,9 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
     async def arm(
         self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None
     ) -> tuple[str, ...]:
-        """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know.
-        Raises as `request`, and RefusedError where arming failed."""
+        """Have the daemon clear, home and enable, as far as needed, and return the commands given. Warn whoever holds
+        the handle before. Raises as `request`, and RefusedError if arming failed.
+        """
         until_s, report = asyncio.get_running_loop().time() + timeout_s, ArmReport(given=(), is_over=False)
         await self.request("arm")
         try:
@@ -87,7 +87,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
     async def publish(
         self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any
     ) -> None:
-        """Ask for a force at the roller, with arguments and errors of `blocking.Client.publish`."""
+        """Ask for a force at the roller, as `blocking.Client.publish` does."""
         setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
         while await setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
             self._is_taken = (await setpoints.recv()).startswith(SUBSCRIBED)
@@ -96,8 +96,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         await setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def telemetry(self) -> AsyncIterator[Telemetry]:
-        """Yield every telemetry message from now on, without an end. Raises MessageError for a message that is not
-        valid."""
+        """Yield every telemetry message from now on. Raises MessageError for an invalid one."""
         return self._heard(TELEMETRY_TOPIC, Telemetry)
 
     def motions(self) -> AsyncIterator[Motion]:
@@ -109,7 +108,6 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         return self._heard(VERDICT_TOPIC, Verdict)
 
     async def _heard(self, topic: bytes, kind: type[Told]) -> AsyncIterator[Told]:
-        """Subscribe to `topic` and yield its messages without an end."""
         socket = self._socket(zmq.SUB, self._endpoints.telemetry, topic)
         while True:
             yield decode((await socket.recv_multipart())[-1], kind)
@@ -123,7 +121,6 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         self.close()
 
     async def _result(self, command: str, args: dict[str, Any], wait_s: float) -> dict[str, Any]:
-        """Send a command and return its result, one command at a time."""
         async with self._turn:
             control, pending = self._socket(zmq.DEALER, self._endpoints.control), Pending(next(self._ids), command)
             try:

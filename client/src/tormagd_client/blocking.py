@@ -52,14 +52,15 @@ class Client(Connections["zmq.Socket[bytes]"]):
     def ask(self, command: str, **args: Any) -> Pending:
         """Send `command` without waiting, and return what `answer` takes."""
         pending = Pending(next(self._ids), command)
-        # a daemon that refused the key is no peer of the socket: sending would block for ever
+        # a daemon that refused the key is no peer of the socket, and sending would block for ever
         with contextlib.suppress(zmq.Again):
             self._socket(zmq.DEALER, self._endpoints.control).send(asked(pending, args), zmq.NOBLOCK)
         return pending
 
     def answer(self, pending: Pending, wait_s: float = 0.0) -> dict[str, Any] | None:
-        """Return the result of an asked command; None where no answer comes within `wait_s`. Raises RefusedError,
-        InFaultError, and UnreachableError for an answer that is not understood."""
+        """Return the result of an asked command, or None without an answer within `wait_s`. Raises RefusedError,
+        InFaultError, and UnreachableError for an answer that is not understood.
+        """
         deadline_s = time.monotonic() + wait_s
         left_s = wait_s
         control = self._socket(zmq.DEALER, self._endpoints.control)
@@ -67,12 +68,11 @@ class Client(Connections["zmq.Socket[bytes]"]):
             result = answered(control.recv_multipart()[-1], pending)
             if result is not None:
                 return result
-            left_s = deadline_s - time.monotonic()  # the late answer to a request that was given up
+            left_s = deadline_s - time.monotonic()  # a late answer to a request that was given up
         return None
 
     def status(self, wait_s: float = math.inf) -> Status:
-        """Return what the daemon is doing, waiting at most `wait_s`, and no longer than for any answer. Raises as
-        `request`."""
+        """Return what the daemon is doing, waiting at most `wait_s`. Raises as `request`."""
         return understood(self._result(self.ask("status"), min(wait_s, self._wait_s)), Status)
 
     def describe(self) -> Description:
@@ -80,8 +80,9 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return understood(self.request("describe"), Description)
 
     def arm(self, timeout_s: float = 30.0, told: Callable[[str], object] = lambda command: None) -> tuple[str, ...]:
-        """Have the daemon clear, home and enable, as far as that is needed: whoever holds the handle has to know.
-        Raises as `request`, and RefusedError where arming failed."""
+        """Have the daemon clear, home and enable, as far as needed, and return the commands given. Warn whoever holds
+        the handle before. Raises as `request`, and RefusedError if arming failed.
+        """
         until_s, report = time.monotonic() + timeout_s, ArmReport(given=(), is_over=False)
         self.request("arm")
         try:
@@ -99,14 +100,16 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return armed(report)
 
     def publish(self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any) -> None:
-        """Ask for a force at the roller, N, meant at `stamp_ns`, CLOCK_REALTIME; None means now. Raises ValueError
-        naming what is not allowed, TypeError for an unknown field, and UnreachableError where nobody takes setpoints
-        within `wait_s`."""
+        """Ask for a force at the roller, N, meant at `stamp_ns`, CLOCK_REALTIME (None: now), and valid for
+        `valid_for_ms`.
+
+        Raises ValueError for a value that is not allowed, TypeError for an unknown field, and UnreachableError if
+        nobody takes setpoints within `wait_s`.
+        """
         self.require_taken().send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def require_taken(self) -> "zmq.Socket[bytes]":
-        """Wait until the daemon takes setpoints, and return the socket for them. Raises UnreachableError as
-        `publish`."""
+        """Wait until the daemon takes setpoints, and return the socket for them. Raises UnreachableError."""
         # XPUB speaks to SUB as PUB does, and hears of the subscription: before it, setpoints would be lost
         setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
         while setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
@@ -116,21 +119,20 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return setpoints
 
     def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
-        """Return the telemetry that has arrived since the last call, oldest first; wait up to `wait_s` for the first
-        message. Raises MessageError for a message that is not valid."""
+        """Return the telemetry since the last call, oldest first; wait up to `wait_s` for the first message. Raises
+        MessageError for an invalid one.
+        """
         return self._arrived(TELEMETRY_TOPIC, Telemetry, wait_s)
 
     def motions(self, wait_s: float = 0.0) -> list[Motion]:
-        """Return the handle's motions since the last call, `rates.motion_hz` a second. Waits and raises as
-        `telemetry`."""
+        """Return the handle's motions since the last call, `rates.motion_hz` a second; as `telemetry`."""
         return self._arrived(MOTION_TOPIC, Motion, wait_s)
 
     def verdicts(self, wait_s: float = 0.0) -> list[Verdict]:
-        """Return what became of setpoints since the last call, whoever sent them. Waits and raises as `telemetry`."""
+        """Return what became of setpoints since the last call, whoever sent them; as `telemetry`."""
         return self._arrived(VERDICT_TOPIC, Verdict, wait_s)
 
     def _arrived(self, topic: bytes, kind: type[Told], wait_s: float) -> list[Told]:
-        """Return all messages of `topic` that have arrived, waiting up to `wait_s` for the first."""
         socket = self._socket(zmq.SUB, self._endpoints.telemetry, topic)
         arrived: list[Told] = []
         while socket.poll(0 if arrived else round(wait_s * 1e3)):
@@ -146,7 +148,6 @@ class Client(Connections["zmq.Socket[bytes]"]):
         self.close()
 
     def _result(self, pending: Pending, wait_s: float) -> dict[str, Any]:
-        """Return the answer to `pending`."""
         result = self.answer(pending, wait_s)
         if result is None:
             raise self._unanswered(wait_s)

@@ -2,7 +2,7 @@
 
     F = f + k max(x - x0, 0)     x tip's place on the handle's way, mm; F force, N; f friction, k stiffness, x0 the wall
 
-A line through the points of the way in, by recursive least squares that forget. The variances are the residuals'.
+A line is fitted to the points of the way in by recursive least squares with forgetting; variances are the residuals'.
 """
 
 import math
@@ -10,33 +10,31 @@ import math
 from tormagd_client.messages import MAX_PLACE_MM, MAX_STIFFNESS_N_MM, Contact
 
 SETTLES = 20
-"Samples in the running mean of a point, which takes the noise off place and force."
+"Samples in the running mean of a point, which averages out the noise."
 STEP_MM = 0.2
-"Way from point to point: a tip that rests teaches nothing, and makes nothing forgotten."
+"Distance from point to point: a tip at rest adds nothing and forgets nothing."
 KEPT, LEAST = 0.98, 6
 "Weight that earlier points keep at each new one; fewest points of a line."
 TOUCHES_N = 0.1
-"A force above friction by this much is a wall's."
 OFF, STRIKES = 5.0, 3
-"Deviations from the line, and points in a row beyond them, after which the wall is another one."
+"After STRIKES points in a row, OFF deviations from the line, the wall is another one."
 MAX_SHARE, MAX_MM = 0.2, 0.5
 "Largest standard deviations of a known wall: of stiffness, as a share, and of place."
 
 
 class ContactEstimator:
-    """Estimator of one wall, for samples with 20 mN and 0.2 mm of noise, some hundred a second."""
+    """Estimates one wall from samples with 20 mN and 0.2 mm of noise, some hundred a second."""
 
     def __init__(self) -> None:
         self._mean_mm = self._mean_N = 0.0
         self._samples = self._strikes = self._free = 0
         self._point_mm = math.inf
         self.friction_N = 0.0
-        "Friction on the way in, before the wall."
         self._begin()
 
     @property
     def contact(self) -> Contact | None:
-        """Return the wall; None while it is not known well enough: then send forces."""
+        """The wall, or None while it is not known well enough: then send forces."""
         slope_N_mm, place_mm, slope_sd, place_sd_mm, _ = self._line()
         is_known = slope_sd <= MAX_SHARE * slope_N_mm and place_sd_mm <= MAX_MM
         if not (is_known and abs(place_mm) <= MAX_PLACE_MM):
@@ -45,8 +43,9 @@ class ContactEstimator:
         return Contact(handle_mm=place_mm, stiffness_N_mm=stiffness_N_mm, friction_N=max(self.friction_N, 0.0))
 
     def update(self, tip_mm: float, force_N: float, way: float) -> None:
-        """Take one sample. `tip_mm` counts as the handle's place does, and `force_N` resists the way in. Raises
-        ValueError for a number that is not finite."""
+        """Take one sample. `tip_mm` counts as the handle's place does; `force_N` resists the way in. Raises ValueError
+        for a number that is not finite.
+        """
         for name, value in (("tip_mm", tip_mm), ("force_N", force_N), ("way", way)):
             if not math.isfinite(value):
                 raise ValueError(f"{name} = {value}: allowed are finite numbers")
@@ -61,13 +60,10 @@ class ContactEstimator:
             self._take(self._mean_mm, self._mean_N)
 
     def _begin(self) -> None:
-        """Forget the line of the wall; friction stays."""
         self._weight = self._at_mm = self._at_N = 0.0
         self._mm2 = self._mm_N = self._N2 = 0.0
 
     def _take(self, place_mm: float, force_N: float) -> None:
-        """Learn from one mean point: friction from the first LEAST and all before the wall, the line from those behind
-        it."""
         if self._is_off(place_mm, force_N):
             return
         if self._free < LEAST or force_N - self.friction_N < TOUCHES_N:
@@ -85,8 +81,7 @@ class ContactEstimator:
         self._N2 += off_N * (force_N - self._at_N)
 
     def _is_off(self, place_mm: float, force_N: float) -> bool:
-        """Return whether a point does not belong to the wall's line; after STRIKES of them in a row, forget the
-        wall."""
+        """Whether a point is off the wall's line; after STRIKES of them in a row, forget the wall."""
         slope_N_mm, wall_mm, _, _, sd_N = self._line()
         is_off = False
         if slope_N_mm > 0.0:
@@ -102,7 +97,6 @@ class ContactEstimator:
         return is_off
 
     def _line(self) -> tuple[float, float, float, float, float]:
-        """Return slope and wall's place, the standard deviations of both, and a point's deviation from the line, N."""
         if self._weight < LEAST * KEPT**LEAST or self._mm_N <= 0.0:
             return 0.0, 0.0, math.inf, math.inf, math.inf
         slope_N_mm = self._mm_N / self._mm2

@@ -1,4 +1,4 @@
-"""Where a daemon is: ZeroMQ addresses, and the key files of who connects from elsewhere."""
+"""Where a daemon is: ZeroMQ addresses, and key files for connections from elsewhere."""
 
 import ipaddress
 import os
@@ -17,7 +17,7 @@ _TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
 
 
 class ConfigError(ValueError):
-    """Configuration that was refused: the message names the key, the value and what is allowed."""
+    """A configuration that was refused: the message names the key, the value and what is allowed."""
 
 
 class Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -61,7 +61,7 @@ class Endpoints(Strict, frozen=True):
     "Keys, for who connects from elsewhere."
 
     def is_guarded(self, name: str) -> bool:
-        """Return whether the endpoint `name` accepts only clients whose key is listed."""
+        """Whether the endpoint `name` accepts only clients whose key is listed."""
         matched = _TCP.fullmatch(getattr(self, name))
         is_local = matched is None or _is_loopback(matched[1])
         return not is_local or (self.curve is not None and self.curve.also_local)
@@ -91,8 +91,9 @@ def require_usable(endpoints: Endpoints) -> None:
 
 
 def in_folder(folder: str) -> Endpoints:
-    """Return the endpoints of a daemon whose sockets are in `folder`. Raises ConfigError for a path that is none or too
-    long."""
+    """Return the endpoints of a daemon whose sockets are in `folder`. Raises ConfigError for an unusable or too long
+    path.
+    """
     try:
         placed = msgspec.convert({name: f"ipc://{folder}/{name}" for name in ENDPOINTS}, Endpoints)
         require_usable(placed)
@@ -102,7 +103,6 @@ def in_folder(folder: str) -> Endpoints:
 
 
 def _ipc_place(name: str, address: str) -> str:
-    """Return the socket path that an `ipc://` address comes to, links resolved."""
     path = address.removeprefix("ipc://")
     require(
         path not in ("", "@", "*")
@@ -117,7 +117,7 @@ def _ipc_place(name: str, address: str) -> str:
 
 
 def _tcp_place(name: str, address: str, has_keys: bool) -> str:
-    """Return host and port of a `tcp://` address; without keys only loopback."""
+    """Return host and port of a `tcp://` address; without keys only loopback is allowed."""
     matched = _TCP.fullmatch(address)
     host, port = matched.groups() if matched else ("", "0")
     require(

@@ -8,7 +8,7 @@ from tormagd_client.printable import printable
 
 
 class ClientError(Exception):
-    """A call that was not carried out: a stable code, what happened, and what to do next."""
+    """A call that failed: a stable code, what happened, and what to do next."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(printable(f"{message}; {hint}" if hint else message))
@@ -16,8 +16,6 @@ class ClientError(Exception):
 
 
 class RefusedError(ClientError):
-    """The daemon refused a command."""
-
     def __init__(self, command: str, code: str, message: str, hint: str) -> None:
         super().__init__(code, message, hint)
         self.command = command
@@ -35,11 +33,10 @@ class UnreachableError(ClientError):
 
 
 class SettingError(ClientError):
-    """An address or a key file that cannot be used."""
+    """An address or a key file cannot be used."""
 
 
 def not_understood(what: str, why: Exception) -> UnreachableError:
-    """Return the error for a message of another version or another program; `what` names the message."""
     return UnreachableError(
         "unintelligible",
         f"the {what} that came is not what tormagctl {__version__} knows: {why}",
@@ -48,7 +45,7 @@ def not_understood(what: str, why: Exception) -> UnreachableError:
 
 
 def unreachable(address: str, what: str) -> UnreachableError:
-    """Return the error that nobody answers at `address`: why, where the file system shows it, and what to do."""
+    """Return the error that nobody answers at `address`, with the reason that the file system shows."""
     message, hint = f"daemon not reachable at {address}: {what}", "is it running? systemctl status tormagd"
     if address.startswith("tcp://"):
         hint += (

@@ -22,14 +22,13 @@ from tormagd_client.regular_file import require_regular
 
 PUBLIC, SECRET = ".key", ".key_secret"
 SERVER = "server"
-"Name of the daemon's own key pair."
 MAX_KEY_FILE_BYTES = 4_096
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _KEY_CHARACTERS = 40
 
 
 class KeyPair(NamedTuple):
-    """A public and a secret key, each as its 40 characters of Z85."""
+    """A public and a secret key, each as 40 characters of Z85."""
 
     public: bytes
     secret: bytes
@@ -63,13 +62,15 @@ def load_public(path: Path) -> bytes:
 
 
 def fingerprint(public: bytes | str) -> str:
-    """Return what people compare when a key has changed hands: 16 hexadecimal digits of SHA-256 over the key."""
+    """Return what people compare when a key has changed hands: 16 hexadecimal digits of its SHA-256."""
     return hashlib.sha256(z85.decode(public)).digest()[:8].hex(":", 2)
 
 
 def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
-    """Make a key pair, both files with mode 0600, and return the paths of its secret and its public file. Raises
-    ConfigError where `name` is not allowed, or a file exists or cannot be made."""
+    """Make a key pair, both files with mode 0600, and return the paths of its secret and its public file.
+
+    Raises ConfigError if `name` is not allowed, or a file exists or cannot be made.
+    """
     if not _NAME.fullmatch(name):
         raise ConfigError(
             f"name = {name[:80]!r}: allowed are 1..64 letters, digits, . _ and -, a letter or digit first"
@@ -78,7 +79,7 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
     try:
         for folder in (secret_in, public_in):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # a key is written in a hidden folder and named once it is whole; a hard link overwrites nothing
+        # a key is written in a hidden folder and named once it is whole; a hard link never overwrites
         with tempfile.TemporaryDirectory(dir=secret_in, prefix=".") as making:
             public_made, secret_made = zmq.auth.create_certificates(making, name)
             for made in (public_made, secret_made):
@@ -90,7 +91,7 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
                 secret_path.unlink()
                 raise
     except FileExistsError as error:
-        there = error.filename2 or error.filename  # a link's second path, or what stands where a folder is to be
+        there = error.filename2 or error.filename  # a link's second path, or what is in the place of a folder
         raise ConfigError(f"{there} exists: keys are never overwritten; take another name or DIR") from error
     except OSError as error:
         raise ConfigError(f"{error.filename2 or error.filename}: {error.strerror}") from error
@@ -98,8 +99,7 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
 
 
 def regular(path: Path) -> os.stat_result:
-    """Return the status of a file that may hold a key. Raises ConfigError for another kind of file, or one too
-    large."""
+    """Return the status of a file that may hold a key. Raises ConfigError for another kind of file, or a large one."""
     try:
         return require_regular(path, MAX_KEY_FILE_BYTES)
     except OSError as error:
@@ -107,7 +107,6 @@ def regular(path: Path) -> os.stat_result:
 
 
 def _certificate(path: Path) -> KeyPair | tuple[bytes, None]:
-    """Read the keys in a file, the secret one None where there is none."""
     try:
         public, secret = zmq.auth.load_certificate(path)
     except OSError as error:
@@ -127,8 +126,7 @@ def _is_key(text: bytes) -> bool:
 
 
 def main(arguments: list[str]) -> str:
-    """Make a client's key pair from NAME and FOLDER, and return what to tell the user. Raises SystemExit where none was
-    made."""
+    """Make a client's key pair from NAME and FOLDER, and return what to tell the user. Raises SystemExit on failure."""
     try:
         name, folder = arguments
         secret, public = generate(name, Path(folder), Path(folder))

@@ -3,8 +3,7 @@
 `decode` is the border: msgpack unpacks with size limits, msgspec checks names and types, each message checks its own
 values. Unknown fields are ignored, so that a newer client can talk to an older daemon.
 
-What leaves the daemon has its type here: `Telemetry`, `Status`, `Description`, `TickRecord`, `Reply`. docs/messages.md
-lists their fields, and says when `v` rises.
+docs/messages.md lists the fields of all messages, and says when `v` rises.
 """
 
 from collections.abc import Sequence
@@ -17,13 +16,13 @@ from tormagd_client.printable import require
 
 VERSION = 1
 TELEMETRY_TOPIC, MOTION_TOPIC, VERDICT_TOPIC = b"\xde", b"motion", b"verdict"
-"What to subscribe to at the telemetry socket. A snapshot is a map of over 15 fields, which msgpack begins so."
+"Topics of the telemetry socket. A snapshot is a map of over 15 fields, which begins with this byte in msgpack."
 MAX_MESSAGE_BYTES = 16_384  # a setpoint with the longest preview is under 3 kB; libzmq drops what is larger
 MAX_SOURCE_CHARACTERS = 64
 MAX_MARK_CHARACTERS = 200
 MAX_PREVIEW_SAMPLES = 256
 MIN_PREVIEW_DT_MS, MAX_PREVIEW_DT_MS = 0.1, 1_000.0  # no loop runs faster, and a closer one has a slope without measure
-MAX_FORCE_N = 1_000.0  # a value no brake of this size can mean; `ask` keeps to the scene's own range
+MAX_FORCE_N = 1_000.0  # no brake of this size can mean more; `ask` keeps to the scene's own range
 MAX_VALIDITY_MS = 60_000.0
 MAX_DISPLACEMENT_MM = 2.0  # since the handle last turned: friction is mobilised there, and more means nothing
 MAX_RATE_MM_S = 300.0  # no hand moves a handle faster
@@ -32,7 +31,7 @@ MAX_STIFFNESS_N_MM = 100.0  # bone
 
 
 class MessageError(ValueError):
-    """Message that was refused: the text names the field, its value and what is allowed."""
+    """A message that was refused: the text names the field, its value and what is allowed."""
 
 
 def _require_within(key: str, value: float | None, least: float, most: float) -> None:
@@ -41,7 +40,7 @@ def _require_within(key: str, value: float | None, least: float, most: float) ->
 
 
 class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on."""
+    """An elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on."""
 
     handle_mm: float
     stiffness_N_mm: float
@@ -54,8 +53,9 @@ class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A force to render, from one publisher. `stamp_ns` is CLOCK_REALTIME at the publisher. Raises ValueError out of
-    range."""
+    """A force to render, from one publisher. `stamp_ns` is the publisher's CLOCK_REALTIME. Raises ValueError out of
+    range.
+    """
 
     v: int
     source: str
@@ -96,8 +96,6 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Tick(msgspec.Struct, frozen=True):
-    """Timing of the newest control tick."""
-
     lateness_us: float
     exec_us: float
 
@@ -112,7 +110,7 @@ class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True):
-    """The handle's motion, on the topic `motion`: positive pushing on."""
+    """The handle's motion: positive pushing on."""
 
     v: int
     t_ns: int
@@ -134,14 +132,12 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Mark(msgspec.Struct, frozen=True, kw_only=True):
-    """An event that a person has marked with `tormagctl mark`: when, CLOCK_REALTIME, and what they said."""
-
     t_ns: int
     text: str
 
 
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
-    """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME."""
+    """What the daemon is doing, 50 times a second. `t_ns` is CLOCK_REALTIME."""
 
     v: int
     t_ns: int
@@ -173,7 +169,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Explained(msgspec.Struct, frozen=True):
-    """A fault or a limit with its cause, in the figures of that moment where they are known, and its remedy."""
+    """A fault or a limit with its cause, in figures where they are known, and its remedy."""
 
     code: str
     cause: str
@@ -181,7 +177,7 @@ class Explained(msgspec.Struct, frozen=True):
 
 
 class RoundTripReport(msgspec.Struct, frozen=True):
-    """Time from handing a Drive to the wire until its State was read: percentiles of the newest ones, us."""
+    """Percentiles of the time from handing a Drive to the wire until its State was read, us."""
 
     least: float
     p50: float
@@ -199,7 +195,7 @@ class ClockReport(msgspec.Struct, frozen=True):
 
 
 class LinkReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device at the other end of the wire, and how well the wire carries; `tormagctl firmware --json`."""
+    """The device at the other end of the wire, and how well the wire carries."""
 
     state: str
     cause: str
@@ -257,7 +253,7 @@ class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlayoutReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What holding setpoints back until `playout_ms` after their stamps does, of the setpoints that were held."""
+    """The effect of holding setpoints back until `playout_ms` after their stamps."""
 
     playout_ms: float
     held_us: ExecReport
@@ -272,7 +268,7 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
     accepted: int
     refused: int
     dropped: int
-    oversize: int
+    oversize: int = 0
     last_refusal: str | None
     newest_source: str
     sources: dict[str, int]
@@ -281,7 +277,7 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WayReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Time of a setpoint from its stamp to the force, against a budget. What is not known yet is null."""
+    """Time of a setpoint from its stamp to the force, against a budget. Null is not known yet."""
 
     to_duty_us: ExecReport
     device_us: float | None
@@ -291,7 +287,7 @@ class WayReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LatenessReport(ExecReport, frozen=True, kw_only=True):
-    """Percentiles of how late runs began over the last seconds, us; `worst` is the longest since the start."""
+    """Percentiles of how late runs began in the last seconds, us; `worst` is the longest since the start."""
 
     worst: float
 
@@ -331,7 +327,7 @@ class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device's calibration: the file in force, why none is, and the folder; each is empty where there is none."""
+    """The device's calibration: the file in force, why none is, and the folder; empty where there is none."""
 
     file: str = ""
     refusal: str = ""
@@ -339,7 +335,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BlackBoxReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Folder of the black boxes, the newest of this run, why there is none, and how many parts were lost on the way."""
+    """Folder of the black boxes, the newest of this run, why there is none, and how many parts were lost."""
 
     folder: str = ""
     newest: str = ""
@@ -348,14 +344,12 @@ class BlackBoxReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StallReport(msgspec.Struct, frozen=True):
-    """How long the control loop stood still, and what took most of that time."""
-
     ms: float
     culprit: str
 
 
 class PeerReport(msgspec.Struct, frozen=True):
-    """A peer that was refused, or whose messages were dropped: where, who, why, and how often."""
+    """A peer that was refused, or whose messages were dropped: where, who, why, and how often in a row."""
 
     endpoint: str
     address: str
@@ -365,7 +359,7 @@ class PeerReport(msgspec.Struct, frozen=True):
 
 
 class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Connections by endpoint, peers that were refused, and messages that were dropped unread."""
+    """Connections by endpoint, and since the start the peers refused and the messages dropped unread."""
 
     connections: dict[str, int] = msgspec.field(default_factory=dict)
     refused: int = 0
@@ -375,7 +369,7 @@ class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
-    """In how many control ticks each output stage has acted since the start, in the order of the stages."""
+    """Control ticks in which each output stage has acted, in the order of the stages."""
 
     rate: int = 0
     slew: int = 0
@@ -384,8 +378,9 @@ class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FollowingReport(msgspec.Struct, frozen=True, kw_only=True):
-    """How well the force was followed in the last seconds in which it could be. That is the RMS of measured less asked:
-    as it is, and with `delay_ms` taken out, the delay that explains most of it."""
+    """How well the force was followed in the last seconds in which it could be: the RMS of measured less asked, as it
+    is, and with `delay_ms` taken out, the delay that explains most of it.
+    """
 
     rms_N: float
     aligned_rms_N: float
@@ -393,24 +388,19 @@ class FollowingReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ArmReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The newest `arm`: the commands that it has given so far, whether it is over, and why the force does not follow
-    then."""
-
     given: tuple[str, ...]
     is_over: bool
     error: Explained | None = None
 
 
 class SceneReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The newest change of the scene: to which, whether it is over, and why the scene stayed as it was."""
-
     scene: str
     is_over: bool
     error: Explained | None = None
 
 
 class Status(Telemetry, frozen=True, kw_only=True):
-    """Answer to the command `status`: the newest telemetry, and all else that is told only on demand."""
+    """Answer to the command `status`: the newest telemetry, and what is told only on demand."""
 
     version: str
     build: str = ""
@@ -449,15 +439,16 @@ class Status(Telemetry, frozen=True, kw_only=True):
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Learned phase portrait of the device: forces, rising, and the fastest change of each, either way, by the gap's
-    speed."""
+    """Learned phase portrait of the device: rising forces, and the fastest change of each, either way, by the gap's
+    speed.
+    """
 
     force_N: tuple[float, ...]
     rate_N_s: tuple[float, ...]
 
 
 class Description(msgspec.Struct, frozen=True, kw_only=True):
-    """Answer to the command `describe`: what a recording is of. What is not known is null."""
+    """Answer to the command `describe`: what a recording is of. Null is not known."""
 
     version: str
     build: str
@@ -472,7 +463,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One control tick: all inputs of the step, and all outputs. Units as in `Telemetry`; times in ns and s."""
+    """One control tick: all inputs and outputs of the step. Units as in `Telemetry`; times in ns and s."""
 
     t_ns: int
     monotonic_s: float
@@ -518,7 +509,7 @@ class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     left_current_A: float | None
     right_current_A: float | None
     supply_V: float | None
-    # what is concluded
+    # the conclusions
     reference_gap_mm: float | None
     measured_cf: float | None
     left_mm: float | None
@@ -539,13 +530,12 @@ class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     lateness_us: float
     exec_us: float
     tick: int = 0
-    # the plan's, where its search runs beside the plans
+    # of a plan whose search runs beside the plans
     search_age_s: float = 0.0
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True):
-    """A command to the daemon's control endpoint. Raises ValueError for another version, or a command of another
-    length."""
+    """A command to the daemon's control endpoint. Raises ValueError for another version, or too long a command."""
 
     v: int
     id: int | str
@@ -558,8 +548,6 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ErrorReply(msgspec.Struct, frozen=True):
-    """Why a command was refused, and what to do about it."""
-
     code: str
     message: str
     hint: str
@@ -595,7 +583,6 @@ def decode(data: bytes, message_type: type[M]) -> M:
 
 
 def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -> bytes:
-    """Return `message` as msgpack."""
     return _ENCODER.encode(message)
 
 

@@ -3,11 +3,10 @@
 import json
 
 LONGEST_SHOWN = 80
-"Characters of a value that a refusal shows, so that the refusal stays readable."
 
 
 def printable(text: str) -> str:
-    r"""Return `text` on one line, with each character that is not printable as JSON escapes it: `\n`, `\u001b`."""
+    r"""Return `text` on one line, with each unprintable character as JSON escapes it: `\n`, `\u001b`."""
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else json.dumps(each)[1:-1] for each in text)

@@ -1,4 +1,4 @@
-"""Files that anybody may have made: nothing but a regular file is opened."""
+"""Files that anybody may have made: only a regular file is opened."""
 
 import errno
 import os
@@ -15,8 +15,9 @@ _KINDS = {
 
 
 def require_regular(path: Path, most_bytes: int) -> os.stat_result:
-    """Return the status of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is
-    allowed."""
+    """Return the status of a regular file of at most `most_bytes`. Raises OSError, whose `strerror` says what is
+    allowed.
+    """
     try:
         found = path.stat()
     except ValueError as error:  # a name with a zero in it

@@ -1,4 +1,4 @@
-"""What both clients, blocking and asyncio, share: addresses and keys, requests and their answers, setpoints."""
+"""What both clients share: addresses and keys, requests and their answers, setpoints."""
 
 import itertools
 import time
@@ -37,7 +37,6 @@ Told = TypeVar("Told", Telemetry, Motion, Verdict)
 SocketT = TypeVar("SocketT", bound="zmq.Socket[Any]")
 
 FAULT_CODES = ("fault", "device_latched")
-"Refusals that mean: the device is in FAULT."
 
 SUBSCRIBED = b"\x01"
 "First byte of what an XPUB socket receives when somebody subscribes; 0 when the last subscriber has gone."
@@ -53,8 +52,6 @@ class Keys(NamedTuple):
 
 
 class Pending(NamedTuple):
-    """Request whose answer may still come."""
-
     number: int
     command: str
 
@@ -62,7 +59,7 @@ class Pending(NamedTuple):
 def keys_of(curve: Curve | None) -> Keys | None:
     """Read the client's keys that a configuration names; None where it names none.
 
-    Raises SettingError for a file that is no good, or no key of the daemon.
+    Raises SettingError for an unusable file, or no key of the daemon.
     """
     if curve is None or not curve.client_secret:
         return None
@@ -83,7 +80,7 @@ def keys_of(curve: Curve | None) -> Keys | None:
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
-    """Connect `socket`, with the `keys` at `tcp://`, and at `ipc://` where they say so; None: without keys.
+    """Connect `socket`, with the `keys` at `tcp://`, and at `ipc://` if they say so.
 
     Raises SettingError for an address that ZeroMQ cannot use.
     """
@@ -101,10 +98,7 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
 
 
 def opened(socket: SocketT, address: str, keys: Keys | None, topic: bytes = b"") -> SocketT:
-    """Set the bounds of a client's new socket, connect it and return it; a subscriber listens to `topic`.
-
-    Raises SettingError as `connect` does.
-    """
+    """Set the bounds of a client's new socket, subscribe it to `topic` and connect it. Raises SettingError."""
     is_setpoints = socket.type == zmq.XPUB
     socket.setsockopt(zmq.LINGER, 200 if is_setpoints else 0)
     socket.setsockopt(zmq.IMMEDIATE, 1 if is_setpoints else 0)  # or it is not told who unsubscribes
@@ -116,12 +110,11 @@ def opened(socket: SocketT, address: str, keys: Keys | None, topic: bytes = b"")
 
 
 def asked(pending: Pending, args: dict[str, Any]) -> bytes:
-    """Return the bytes of a request to the control endpoint."""
     return encode(Request(v=VERSION, id=pending.number, command=pending.command, args=args))
 
 
 def answered(data: bytes, pending: Pending) -> dict[str, Any] | None:
-    """Return the result in an answer; None where the answer is to another request, which was given up.
+    """Return the result in an answer, or None if it answers another request.
 
     Raises RefusedError, InFaultError, or UnreachableError for what is no answer.
     """
@@ -145,9 +138,9 @@ def answered(data: bytes, pending: Pending) -> dict[str, Any] | None:
 
 
 def understood(result: dict[str, Any], kind: type[T]) -> T:
-    """Return the result of `status` or `describe` as its type, its texts made printable; unknown fields are ignored.
+    """Return the result of `status` or `describe` as its type, its texts made printable.
 
-    Raises UnreachableError, naming the daemon's version, where a field is missing or of another type.
+    Raises UnreachableError, naming the daemon's version, if a field is missing or of another type.
     """
     try:
         return msgspec.convert(_printable(result), kind)
@@ -161,7 +154,6 @@ def understood(result: dict[str, Any], kind: type[T]) -> T:
 
 
 def arm_report(status: dict[str, Any]) -> ArmReport:
-    """Return how far an `arm` has come, from an answer to `status`. Raises as `understood`."""
     told = status.get("arm")
     if told is None:
         return ArmReport(given=(), is_over=True, error=Explained("gone", "the daemon was started anew", "arm again"))
@@ -169,21 +161,18 @@ def arm_report(status: dict[str, Any]) -> ArmReport:
 
 
 def armed(report: ArmReport) -> tuple[str, ...]:
-    """Return the commands that an `arm` has given. Raises RefusedError or InFaultError where the force does not
-    follow."""
+    """Return the commands that an `arm` has given. Raises RefusedError or InFaultError if the force does not follow."""
     if (error := report.error) is not None:
         raise refused("arm", error.code, error.cause, error.remedy)
     return report.given
 
 
 def refused(command: str, code: str, message: str, hint: str) -> RefusedError:
-    """Return what a client raises for this refusal: InFaultError for FAULT_CODES, else RefusedError."""
     kind = InFaultError if code in FAULT_CODES else RefusedError
     return kind(command, code, message, hint)
 
 
 def _printable(value: Any) -> Any:
-    """Return `value` with all its texts and keys made printable."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, dict):
@@ -192,7 +181,6 @@ def _printable(value: Any) -> Any:
 
 
 def _contact(fields: Mapping[str, float]) -> Contact:
-    """Return the contact of these fields."""
     try:
         return Contact(**fields)
     except TypeError as error:
@@ -201,7 +189,7 @@ def _contact(fields: Mapping[str, float]) -> Contact:
 
 
 class Numbering:
-    """Maker of one publisher's setpoints, numbered from 0, in a session above every earlier one of its source."""
+    """Makes one publisher's setpoints, numbered from 0, in a session above every earlier one of its source."""
 
     def __init__(self, source: str) -> None:
         self.source, self.session = source, time.time_ns()
@@ -217,9 +205,9 @@ class Numbering:
         contact: Contact | Mapping[str, float] | None = None,
         **fields: Any,
     ) -> bytes:
-        """Return the next setpoint as bytes; `stamp_ns` is when the force is meant, None for now. Raises ValueError
-        naming what is not allowed; no number is used up then. Raises TypeError for a field that a setpoint does not
-        have."""
+        """Return the next setpoint as bytes; `stamp_ns` is when the force is meant, None for now. Raises ValueError for
+        a value that is not allowed, and TypeError for an unknown field; neither uses up a number.
+        """
         made = Setpoint(
             v=VERSION,
             source=self.source,
@@ -237,7 +225,7 @@ class Numbering:
 
 
 class Connections(Generic[SocketT]):
-    """Base of both clients: the daemon at `endpoints`, and the sockets to it, opened as they are needed."""
+    """Base of both clients: the daemon at `endpoints`, and the sockets to it, opened when needed."""
 
     _made: ClassVar[Callable[[], Any]]
     "Makes the ZeroMQ context of the sockets."
@@ -253,17 +241,16 @@ class Connections(Generic[SocketT]):
 
     @classmethod
     def local(cls, folder: str, wait_s: float = 1.0, source: str = "client") -> Self:
-        """Return a client of this machine's daemon whose sockets are in `folder`. Raises ConfigError as `in_folder`."""
+        """Return a client of this machine's daemon whose sockets are in `folder`. Raises ConfigError."""
         return cls(in_folder(folder), wait_s, source)
 
     def close(self) -> None:
-        """Close the connections; setpoints under way get 0.2 s."""
+        """Close the connections; pending setpoints get 0.2 s."""
         for socket in self._sockets.values():
             socket.close()
         self._context.term()
 
     def _socket(self, kind: int, address: str, topic: bytes = b"") -> SocketT:
-        """Return the socket of this kind and topic, opening it on first use."""
         if (kind, topic) not in self._sockets:
             self._sockets[kind, topic] = opened(self._context.socket(kind), address, self._keys, topic)
         return self._sockets[kind, topic]

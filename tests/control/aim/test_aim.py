@@ -29,8 +29,6 @@ RESTING = {"handle": Handle(MOBILISED_MM, 0.0, TURN, 42.0)}
 
 @pytest.fixture
 def first(core, planned):
-    """The first plan for a setpoint."""
-
     def plan(force_N: float, measured: Measured | None = None, **setpoint: object) -> Plan:
         return planned(core.planner(), force_N, measured, **setpoint)
 
@@ -62,7 +60,7 @@ def test_a_handle_that_rests_does_not_close_the_gap(first, moving, rate_mm_s: fl
     resting = moving(handle=Handle(MOBILISED_MM, rate_mm_s, TURN, 42.0))
     gap_mm = first(force_N, moving()).gap_mm
     assert first(force_N, resting).gap_mm == pytest.approx(gap_mm, abs=0.1)
-    # nothing is known of a handle that was never seen: it is planned for as one that moves slowly
+    # a handle that was never seen is planned for as one that moves slowly
     assert first(force_N).gap_mm == pytest.approx(gap_mm, abs=1.5)
 
 
@@ -160,8 +158,6 @@ def test_where_the_field_lags_and_the_force_relaxes_the_gap_makes_up_for_both(pl
 
 
 class WrongSolver:
-    """A search that answers with one field, whatever is asked."""
-
     def __init__(self, field_mT: float) -> None:
         self._field_mT = field_mT
 
@@ -238,7 +234,6 @@ def test_nan_never_travels(core, moving, history: list[tuple[float, TimedSetpoin
         now_s += elapsed_s
         plan = planner.plan(now_s, setpoint, None if changes is None else moving(number=number, **changes))
         device, lag_s = planner.believe.device, planner.believe.carriages.lag_s
-        # gap, its speed and the lag are held within bounds below, where no NaN is
         told = [plan.governed_N, plan.field_mT, plan.predicted_N or 0.0, plan.gap_acceleration_mm_s2]
         told += [plan.confidence, plan.trim, plan.min_gap_mm]
         told += [getattr(device, name) for name in DeviceFit.__match_args__]
@@ -267,14 +262,11 @@ def test_the_most_open_of_the_guards_wins(core, device: DeviceFit, unseen: Devic
     assert plan.gap_mm >= plan.min_gap_mm
 
 
-# -- the portrait: found among its points as `bisect_right` finds it, read as straight lines give it -------------------
-
-
 GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)
 
 
 def drawn_portrait(least_N: float, gains_N: list[float]) -> Portrait:
-    """A portrait whose forces rise by so much from point to point, from steep to flat as they come."""
+    """A portrait whose forces rise by these gains, from steep to flat as they come."""
     forces_N = list(accumulate(gains_N, initial=least_N))
     gaps_mm = np.linspace(40.0, 15.0, len(forces_N)).tolist()
     return Portrait(gaps_mm, forces_N, [*gains_N, 2.0 * gains_N[-1]])

@@ -34,11 +34,10 @@ Array = npt.NDArray[np.float64]
 
 AHEAD_S = np.array([0.02, 0.04, 0.06])
 STEEPEST_N_S = 3.0
-"What the governor lets a slope be, about."
 
 
 def pulse_N(times_s: Array, seed: int = 1, rate_hz: float = 1.1) -> Array:
-    """Beats of two humps, each a few percent longer or shorter and higher or lower than the one before."""
+    """Beats of two humps, each a few percent longer or shorter and higher or lower than the last."""
     random = np.random.default_rng(seed)
     forces = np.full(len(times_s), 1.4)
     starts_s = times_s[0] - 2.0 + np.cumsum(random.normal(1.0, 0.04, 4_000)[: len(times_s)]) / rate_hz
@@ -59,20 +58,17 @@ class Followed(NamedTuple):
     mixture_N: Array
 
     def rms_N(self, start_s: float, end_s: float) -> tuple[float, float]:
-        """Of the slope and of the mixture, in a part of the time."""
         inside = (self.time_s >= start_s) & (self.time_s < end_s)
         slope_N, mixture_N = (float(np.sqrt(np.mean(each[inside] ** 2))) for each in (self.slope_N, self.mixture_N))
         return slope_N, mixture_N
 
 
 def tell(forecast: Forecast, stamp_s: float, force_N: float, slope_N_s: float = 0.0) -> None:
-    """One setpoint more, and a forecast from it."""
     forecast.update(stamp_s, force_N)
     forecast.foresee(slope_N_s)
 
 
 def follow(times_s: Array, forces_N: Array) -> Followed:
-    """Each setpoint observed, and what would have been planned for beside what came."""
     forecast, rows, slope_N_s = Forecast(), [], 0.0
     for before, (time_s, force_N) in enumerate(zip(times_s[1:].tolist(), forces_N[1:].tolist(), strict=True)):
         steepness = (force_N - forces_N[before]) / (time_s - times_s[before])
@@ -88,7 +84,6 @@ def follow(times_s: Array, forces_N: Array) -> Followed:
 
 
 def beaten(seconds: float = 4.0, rate_hz: int = 200) -> Forecast:
-    """After a pulse."""
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz
     forces_N = pulse_N(times_s)
     forecast = Forecast()
@@ -101,7 +96,6 @@ LEARNED = plain(beaten())
 
 
 def read() -> Forecast:
-    """One that has learned a pulse."""
     forecast = Forecast()
     restore(forecast, LEARNED, KNOWN)
     return forecast
@@ -111,7 +105,6 @@ learned = pytest.fixture(read)
 
 
 def times_at(kind: str, seconds: float) -> Array:
-    """When setpoints come."""
     if kind == "irregular":
         return np.cumsum(np.random.default_rng(7).uniform(0.001, 0.012, round(seconds / 0.0065)))
     rate_hz = int(kind.split()[0])
@@ -195,7 +188,6 @@ def test_after_a_jump_nothing_is_forecast_and_trust_has_to_be_earned_again(learn
     assert learned.time_s > 4.02
     learned.changes_N = changes_N
     assert learned.trust < 0.03 < trust
-    # as if it had missed all that the slope met, and by no more than what the first judgement counts
     assert (LOST.score, LOST.apart) == (pytest.approx(-1.0, abs=0.03), pytest.approx(DOUBT_N**2))
 
 

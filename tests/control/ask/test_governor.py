@@ -40,26 +40,23 @@ def governor(
     gap_speed_mm_s: float = GAP_SPEED_MM_S,
     terms: Terms = EVERY_TERM,
 ) -> Governor:
-    """On the device of these tests, which was asked for this last."""
     begun = Governor(now_s, portrait, scene, gap_speed_mm_s, terms)
     begun.asked_N, begun.above_N = asked_N, asked_N - portrait.min_N
     return begun
 
 
 def decide(following: Governor, now_s: float, setpoint: TimedSetpoint | None, lag_s: float = 0.0) -> Ask:
-    """Its next decision."""
     return following.update(now_s, setpoint, DeviceFit(), lag_s)
 
 
 def path_N(ask: Ask) -> npt.NDArray[np.float64]:
-    """The force to come."""
     return np.array(ask.path_N)
 
 
 def stream_of(
     forces_N: list[float], period_s: float = 0.01, lag_s: float = 0.0, portrait: Portrait = PORTRAIT
 ) -> tuple[Governor, Ask]:
-    """After setpoints that came one per period, with the last decision."""
+    """Return a governor after setpoints that came one per period, with its last decision."""
     following = governor(portrait=portrait)
     for number, force_N in enumerate(forces_N, 1):
         now_s = number * period_s
@@ -68,7 +65,6 @@ def stream_of(
 
 
 RAMP_N = [1.0 + 0.01 * k for k in range(40)]
-"Of 1 N/s."
 
 
 @pytest.mark.parametrize(
@@ -140,7 +136,6 @@ def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(
         assert ask.limits == ((Limit.OTHER_SOURCE,) if is_there else (Limit.OTHER_SOURCE, Limit.TAKEOVER))
         reached = reached or tick * is_there
     assert reached == pytest.approx(0.8 / SCENE.release_N_s * 1e3, abs=5)
-    # and it is followed as any other from then on
     ask = decide(following, 1.001, TimedSetpoint(1.2, 1.001, VALID_S, holder=1))
     assert (ask.force_N, ask.limits) == (1.2, ())
 
@@ -276,13 +271,12 @@ def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump(now_s: float) 
 
 
 def at(force_N: Callable[[float], float], now_s: float, ahead_s: float = 0.0) -> TimedSetpoint:
-    """The setpoint of a force, which carries what follows for so long."""
     ahead_N = tuple(force_N(now_s + 0.002 * place) for place in range(1, round(500 * ahead_s) + 1))
     return TimedSetpoint(force_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=0.002)
 
 
 def told(force_N: Callable[[float], float], seconds: float, *, ahead_s: float = 0.4, lag_s: float = 0.0) -> Ask:
-    """The last decision on setpoints that carry what follows, 500 times a second from 0 s on."""
+    """The last decision on setpoints with previews, 500 times a second from 0 s on."""
     following = governor(0.0, force_N(0.0))
     for tick in range(1, round(500 * seconds) + 1):
         ask = decide(following, tick / 500, at(force_N, tick / 500, ahead_s), lag_s)
@@ -290,7 +284,6 @@ def told(force_N: Callable[[float], float], seconds: float, *, ahead_s: float = 
 
 
 def swing_N(time_s: float) -> float:
-    """As slow as the gap of these tests can follow."""
     return 1.5 + 0.05 * math.sin(2.0 * math.pi * 2.0 * time_s)
 
 
@@ -307,7 +300,6 @@ def test_a_preview_is_what_comes(seconds: float, ahead_s: float) -> None:
 
 
 def step_N(time_s: float) -> float:
-    """Too fast for any gap."""
     return 1.2 if time_s < 1.0 else 1.8
 
 
@@ -317,7 +309,7 @@ def test_what_is_too_fast_is_missed_before_and_after() -> None:
     assert (there.force_N, there.limits) == (pytest.approx(1.5, abs=0.1), (Limit.RATE,))
     long_after = told(step_N, 1.4)
     assert (path_N(long_after), long_after.limits) == (pytest.approx(1.8, abs=2e-3), ())
-    # of what is not known nobody can be ahead
+    # what is not known cannot be prepared for
     assert told(step_N, 0.88, ahead_s=0.05).force_N == pytest.approx(1.2)
 
 
@@ -350,7 +342,6 @@ def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
     following = governor(0.499, 1.0)
     soon = decide(following, 0.5, rising)
     assert np.all(np.diff(path_N(soon)) > 0.0)
-    # no further than it was known
     assert path_N(soon)[-1] < 1.02
     for tick in range(1, 100):
         late = decide(following, 0.5 + 0.01 * tick, rising)
@@ -364,13 +355,11 @@ def test_a_preview_does_not_outlive_its_validity() -> None:
 
 
 def beats_N(time_s: float) -> float:
-    """A pulse of 1.1 Hz with a notch."""
     phase = 2.0 * math.pi * 1.1 * time_s
     return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
 
 
 def beaten(seconds: float, **keywords: Any) -> Governor:
-    """A governor after so much of the pulse, 500 times a second, without a preview."""
     following = governor(**keywords)
     for tick in range(1, round(500 * seconds) + 1):
         decide(following, tick / 500, at(beats_N, tick / 500))
@@ -385,7 +374,6 @@ def learned_once() -> Any:
 
 @pytest.fixture
 def learned(learned_once: Any) -> Governor:
-    """Of ten seconds of the pulse."""
     following = governor()
     restore(following, learned_once, KNOWN)
     return following
@@ -394,7 +382,7 @@ def learned(learned_once: Any) -> Governor:
 @pytest.mark.parametrize(("lag_s", "share"), [(0.0, 0.3), (0.01, 0.75)])
 def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> None:
     worst_N = extrapolated_N = 0.0
-    swift_mm_s = 3.0 * GAP_SPEED_MM_S  # a gap that is fast enough for this pulse
+    swift_mm_s = 3.0 * GAP_SPEED_MM_S
     following = beaten(10.0, gap_speed_mm_s=swift_mm_s)
     blind = beaten(10.0, gap_speed_mm_s=swift_mm_s, terms=EVERY_TERM.without("forecast"))
     for tick in range(5_001, 5_501):
@@ -406,7 +394,7 @@ def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> 
         following.foresee()
         assert ask.foresight > 0.9
         assert ask.limits == ()
-        # what carriages that come later by the lag are sent to now is rendered then
+        # what late carriages are sent to now is rendered after the lag
         wanted_N = [beats_N(now_s + lag_s + ahead_s) for ahead_s in PATH_S]
         worst_N = max(worst_N, float(np.abs(path_N(ask) - wanted_N).max()))
         extrapolated_N = max(extrapolated_N, float(np.abs(path_N(extrapolated) - wanted_N).max()))

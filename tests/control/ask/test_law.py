@@ -22,12 +22,10 @@ SCENE = Force(least_N=0.0, most_N=2.0, resolution_N=0.1, tolerance_rms_N=0.05)
 WALL = Wall(10.0, 0.25, 0.6)
 PERIOD_S = 0.002
 PASSES = 10
-"So many plans before the wall the gap may be on its way already: 20 ms."
+"How many plans before the wall the gap may set out: 20 ms."
 
 
 class Following:
-    """A governor with a handle, one plan a call."""
-
     def __init__(self, scene: Force = SCENE) -> None:
         self.governor = Governor(0.0, PORTRAIT, scene, 38.0)
         self.now_s = 0.0
@@ -103,7 +101,7 @@ def test_a_wall_that_goes_with_the_handle_asks_for_what_it_says(following: Follo
     for place_mm in np.arange(0.0, 60.0, 0.03).tolist():
         ask = following.ask(Travel(place_mm, 15.0), wall=Wall(place_mm - 1.2, 1.0))
         assert ask.asked_N == pytest.approx(1.2)
-        # each message says that the wall stands: the gap sets out to what would come, at 1 mm of 0.036 N
+        # each message moves the wall: the gap sets out to what would come, at 1 mm of 0.036 N
         assert ask.force_N <= 1.2 + PORTRAIT.min_N + EARLY_N + 0.036
 
 
@@ -151,7 +149,6 @@ class Pushed:
         self._way, self._sign, self._turn = Way(push_sign), push_sign, Turn(1.0, 0.0, 0.0)
 
     def at(self, place_mm: float, hand_N: float, *, zero_N: float = 0.0, is_sensor_believed: bool = True) -> Travel:
-        """The handle there, while the hand gives this force, positive pushing on."""
         encoder_mm = self._sign * place_mm
         self._turn = self._turn.moved_to(encoder_mm)
         direction = self._turn.direction
@@ -163,7 +160,6 @@ class Pushed:
 
 @pytest.fixture
 def pushed() -> Pushed:
-    """One that was pushed on to 5 mm."""
     made = Pushed(1)
     made.at(5.0, 1.5)
     return made

@@ -1,4 +1,4 @@
-"""The path of a gap that misses least of what is known ahead: beside paths that are searched for all at once."""
+"""The path of a gap that misses least of what is known ahead, beside paths that are searched for exhaustively."""
 
 import itertools
 import math
@@ -16,13 +16,11 @@ MAX_MM = SPEED_MM_S * STEP_S
 
 
 def path_mm(start_mm: float, wanted_mm: list[float], weights: list[float], elapsed_s: float = STEP_S) -> list[float]:
-    """All of the path, in even steps."""
     times_s = [STEP_S * place for place in range(len(wanted_mm))]
     return nearest_path_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEED_MM_S, len(wanted_mm))
 
 
 def cost(path: list[float], wanted_mm: list[float], weights: list[float]) -> float:
-    """What a path misses."""
     return sum(weight * (at - want) ** 2 for at, want, weight in zip(path, wanted_mm, weights, strict=True))
 
 
@@ -72,7 +70,7 @@ def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: flo
 
 
 GRID = 4
-"Steps of a search over all paths on a grid: a step of the gap is so many of it."
+"A step of the gap is this many steps of a search over all paths on a grid."
 
 
 @settings(max_examples=100, deadline=None)

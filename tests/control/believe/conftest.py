@@ -12,8 +12,6 @@ PERIOD_S = 0.004
 
 @pytest.fixture
 def hear(planned: Callable[..., Plan]) -> Callable[..., Planner]:
-    """Plans for 1 N while the same is measured, but for the noise that a live sensor has."""
-
     def heard(planner: Planner, seconds: float, measured: Measured, noise_N: float = 0.003) -> Planner:
         for number in range(round(seconds / PERIOD_S)):
             off_N = noise_N * (-1) ** number

@@ -211,7 +211,7 @@ def test_what_is_known_of_the_lag_outlasts_what_the_sensor_teaches(planner, hear
 
 @pytest.fixture
 def swing(core, moving):
-    """A planner after a swing that the gap follows that much too late, and a handle that rests: it teaches nothing."""
+    """A planner after a swing that the gap follows too late, and a handle that rests and teaches nothing."""
     gap_mm_at = core.portrait.gap_mm_at
 
     def swung(late_s: float, *, is_known: bool, seconds: float = 10.0, learns: bool = True) -> Planner:
@@ -224,7 +224,6 @@ def swing(core, moving):
 
         for tick in range(1, round(seconds / PERIOD_S)):
             now_s = tick * PERIOD_S
-            # it starts as much sooner as has been learned, and is measured before the plan
             come_s = now_s - AGE_S - late_s + planner.believe.carriages.lag_s
             gap_mm = gap_mm_at(force_N(come_s))
             side_mm_s = (gap_mm - gap_mm_at(force_N(come_s - 1e-3))) / 2e-3

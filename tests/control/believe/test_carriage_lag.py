@@ -1,4 +1,4 @@
-"""How late carriages are: learned of where they are found, off no other cause."""
+"""How late carriages are: learned from where they are found, whatever else is wrong."""
 
 import math
 
@@ -14,7 +14,6 @@ def swing_mm(time_s: float) -> float:
 
 
 def swung(late_s: float, seconds: float, *, off_mm: float = 0.0) -> CarriageLag:
-    """Of carriages that follow a planned swing as much later, measured off by so much."""
     carriages = CarriageLag()
     for tick in range(round(seconds / PERIOD_S)):
         now_s = tick * PERIOD_S

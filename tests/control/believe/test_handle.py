@@ -1,4 +1,4 @@
-"""A handle whose encoder is lost: what its force shows, and what no resting hand's does."""
+"""A handle whose encoder is lost: what its force shows, and no resting hand's does."""
 
 import math
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from tormagd.exact import plain
 
 PERIOD_S = 0.002
 STIFFEST_N_MM = 12.0
-"Of a believable elastomer."
+"No believable elastomer is stiffer."
 
 
 def watched(
@@ -20,7 +20,6 @@ def watched(
     model_N: Callable[[float], float],
     watch: HandleWatch | None = None,
 ) -> HandleWatch:
-    """After so long of readings, of functions of time; time goes on from the reading before."""
     watch = watch or HandleWatch()
     from_s = watch.heard_s
     for reading in range(1, round(duration_s / PERIOD_S) + 1):
@@ -30,12 +29,10 @@ def watched(
 
 
 def still(now_s: float) -> float:
-    """A handle that stands, or says so."""
     return 3.0
 
 
 def swinging(now_s: float) -> float:
-    """A force, or what the model gives at the gap."""
     return 1.5 + 0.2 * math.sin(math.tau * now_s)
 
 

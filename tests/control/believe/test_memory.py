@@ -1,4 +1,4 @@
-"""What the element remembers, beside the laws that it follows: a Prony series, and a lag that goes along changes."""
+"""What the element remembers, beside the laws that it follows: a Prony series, and a lag of the field."""
 
 from collections.abc import Callable
 
@@ -25,14 +25,11 @@ FAR_MM, NEAR_MM = 70.0, 48.0
 
 @pytest.fixture(scope="session")
 def element() -> Element:
-    """The brake's, with the memory that was measured."""
     return build_core(Config()).element
 
 
 @pytest.fixture(scope="session")
 def follow(element: Element) -> Callable[..., ElementMemory]:
-    """What an element remembers of being found like that, every half a second."""
-
     def remembering(*measured: Measured, memory: Memory = MEMORY) -> ElementMemory:
         remembered = ElementMemory(memory, element.nominal, element.field, GAPS_MM)
         for place, each in enumerate(measured):
@@ -43,7 +40,6 @@ def follow(element: Element) -> Callable[..., ElementMemory]:
 
 
 def found(gap_mm: float, *, depth_mm: float = 0.0, is_homed: bool = True) -> Measured:
-    """A device at that gap, whose handle has not moved; or with a finger that deep in its pad."""
     handle = Handle(depth_mm, 0.0, Turn(1.0, 0.0, 0.0))
     return Measured(1, is_homed, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
 
@@ -97,7 +93,7 @@ def test_time_that_goes_back_ages_nothing(follow) -> None:
 
 def test_the_field_lags_along_its_way_and_not_in_time(follow) -> None:
     remembered = follow()
-    assert remembered.lag_at_mT(500.0) == 0.0  # nothing is known yet
+    assert remembered.lag_at_mT(500.0) == 0.0
     remembered.field_mT, remembered.lag_mT, remembered.time_s = 400.0, 3.0, 0.0
     assert (remembered.lag_at_mT(400.0), remembered.lag_at_mT(2_000.0), remembered.lag_at_mT(-2_000.0)) == (
         3.0,
@@ -116,7 +112,7 @@ def test_an_element_without_memory_or_a_past_is_as_its_gap(follow, gaps_mm: tupl
 
 
 RELAXED = 0.13
-"Of what the shipped model's element has relaxed after a long rest, about."
+"Share that the shipped model's element has relaxed after a long rest."
 
 
 def test_a_device_that_is_found_homed_has_rested_there(follow, element: Element) -> None:
@@ -131,7 +127,7 @@ def test_one_that_has_to_be_homed_has_rested_where_it_was_switched_on(
     on_its_way = [found(95.0 + opened_mm, is_homed=False) for opened_mm in (0.0, 10.0, 95.0 - rested_mm, 15.5, 0.0)]
     remembered = follow(*on_its_way, found(95.0), memory=element.memory)
     assert remembered.relaxed_N == pytest.approx(follow(found(rested_mm), memory=element.memory).relaxed_N, rel=0.02)
-    assert remembered.lag_mT < 0.0  # the field fell
+    assert remembered.lag_mT < 0.0
 
 
 def test_a_gap_that_no_device_has_is_not_believed_to_have_been_one(follow, element: Element) -> None:

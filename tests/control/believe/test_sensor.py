@@ -1,5 +1,7 @@
-"""Who is right where the readings leave the believed device. The gap follows whichever explanation has more force, and
-doubt never presses harder (synthetic)."""
+"""Who is right where the readings leave the believed device (synthetic).
+
+The gap follows whichever explanation has more force, and doubt never presses harder.
+"""
 
 from collections.abc import Callable
 
@@ -27,17 +29,14 @@ MODEL_N = 1.0871
 "What the model says at the gap of `moving`."
 NEW_WAY = {"handle": Handle(MOBILISED_MM, 42.0, Turn(-1.0, 0.0, 100.0), 42.0)}
 CLOSER = {"gap_mm": 70.0, "handle_mm": 110.0, "handle": Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, 110.0), 42.0)}
-"A closer gap, once the handle has gone on."
 
 
 def force_N(believe: Believe) -> float:
-    """What the device is believed to give at that gap."""
     return believe.device.force_N(MODEL_N)
 
 
 @pytest.fixture
 def known(planner: Planner, hear: Callable[..., Planner], moving) -> Planner:
-    """A device that has slid for two seconds, and is as the model says."""
     return hear(planner, 2.0, moving())
 
 
@@ -125,7 +124,7 @@ def test_what_has_changed_around_the_device_may_explain_a_leap(
     core, known, hear, moving, off_N: float, changes: dict[str, object], is_disputed: bool
 ) -> None:
     here_N = core.portrait.force_N_at(70.0) if changes is CLOSER else MODEL_N
-    known.believe.handle = HandleWatch()  # the handle has gone on
+    known.believe.handle = HandleWatch()
     assert hear(known, 0.3, moving(**{"force_N": here_N + off_N, **changes})).believe.sensor.is_disputed is is_disputed
 
 
@@ -146,7 +145,7 @@ def test_a_drift_is_not_hidden_by_a_force_that_steps(core, known, hear, moving) 
     drifted_N = 0.0
     while not known.believe.sensor.is_disputed and drifted_N < 1.0:
         for measured, model_N in levels:
-            known.believe.handle = HandleWatch()  # the handle has gone on
+            known.believe.handle = HandleWatch()
             for _ in range(20):
                 drifted_N += 1e-3
                 hear(known, 0.1, measured.replaced(force_N=model_N - drifted_N))
@@ -155,13 +154,13 @@ def test_a_drift_is_not_hidden_by_a_force_that_steps(core, known, hear, moving) 
 
 def test_a_step_ends_no_dispute(core, known, hear, moving) -> None:
     hear(known, 0.3, moving(force_N=MODEL_N - 0.14))
-    known.believe.handle = HandleWatch()  # the handle has gone on
+    known.believe.handle = HandleWatch()
     assert hear(known, 1.0, moving(force_N=core.portrait.force_N_at(70.0) - 0.14, **CLOSER)).believe.sensor.is_disputed
 
 
 def test_readings_that_left_slowly_have_to_agree_for_ten_seconds_and_no_longer(known, hear, moving) -> None:
     reading_N = MODEL_N
-    while not known.believe.sensor.is_disputed:  # as much as an elastomer may win back, for half a minute
+    while not known.believe.sensor.is_disputed:  # an elastomer may win back as much in half a minute
         reading_N += 0.0014
         hear(known, 0.1, moving(force_N=reading_N))
         if known.believe.sensor.leaves_s > 2.0 * DRIFTS_S:
@@ -183,5 +182,5 @@ def test_a_sensor_that_stands_still_is_wrong_only_where_it_should_not(known, hea
 
 def test_a_sensor_without_noise_may_stand_still_while_the_force_does(planner, hear, moving) -> None:
     assert Limit.SENSOR not in hear(planner, 5.0, moving(), 0.0).planned.limits
-    planner.believe.handle = HandleWatch()  # the handle has gone on
+    planner.believe.handle = HandleWatch()
     assert Limit.SENSOR in hear(planner, 0.3, moving(**CLOSER), 0.0).planned.limits

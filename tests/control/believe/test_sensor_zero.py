@@ -1,4 +1,4 @@
-"""The sensor's zero: half the sum of the signed forces at a reversal, and what is not known of it between."""
+"""The sensor's zero: half the sum of the signed forces at a reversal, and how its uncertainty grows."""
 
 import math
 from typing import Any
@@ -34,7 +34,7 @@ def strokes(
     model_N: tuple[float, float] = (1.5, 1.5),
     rate_mm_s: tuple[float, float] = (42.0, 42.0),
 ) -> tuple[SensorZero, float]:
-    """After strokes to and fro of a handle on a device whose sensor is off by that, with noise; and when."""
+    """After strokes to and fro on a device whose sensor is off by that, with noise; and when."""
     zero = zero or SensorZero()
     if not is_tared:
         zero.doubt()
@@ -61,7 +61,6 @@ def strokes(
         ),
         # one reversal is enough where the sensor is not taken for tared
         (0.3, {"number": 2, "is_tared": False}, 0.01, 0.03),
-        # the force may be another after it
         (0.1, {"number": 2, "is_tared": False, "scale": 1.2, "model_N": (0.8, 1.9)}, 0.01, 0.03),
     ],
 )

@@ -25,11 +25,9 @@ BOUNDS = device_bounds(Config().trim)
 MIN_FACTOR, MAX_FACTOR = factor_bounds(BOUNDS)
 MIN_SHARE = BOUNDS.min_scale * (1.0 - MAX_RELAXED)
 KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
-"A device of which everything is known."
 
 
 def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit = UNSEEN) -> SlowFriction:
-    """After readings of `share` times what was expected at that rate of a fit that makes the model's force."""
     slow = SlowFriction(BOUNDS)
     slow.followed_N = 1.5
     for _ in range(round(seconds / PERIOD_S)):
@@ -38,7 +36,7 @@ def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit =
 
 
 def rescaled(slow: SlowFriction, before_N: float, after_N: float, rate_mm_s: float = 42.0) -> SlowFriction:
-    """What is known of slow friction once the fit has learned at that rate."""
+    """Return what is known of slow friction once the fit has learned at that rate."""
     after = SlowFriction(BOUNDS)
     after.factor, after.learned, after.slowness = slow.factor, slow.learned, slow.slowness
     after.rescale(before_N, after_N, rate_mm_s)
@@ -82,13 +80,13 @@ def test_what_is_believed_of_a_creep_grows_by_three_deviations_of_the_fit() -> N
 def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
     slow, reach_mm = SlowFriction(BOUNDS), 2.0 / BRISTLES_N_MM
     slow.follow(2.0, 0.0)
-    assert slow.followed_N == 0.0  # nothing has been travelled
+    assert slow.followed_N == 0.0
     for step in range(1, 101):
         slow.follow(2.0, 0.01 * reach_mm * step)
     assert slow.followed_N == pytest.approx(2.0 * (1.0 - math.exp(-1.0)), rel=1e-9)
     slow.follow(0.3, reach_mm)
     assert slow.followed_N == pytest.approx(0.3)
-    slow.follow(1.0, 0.0)  # the way back bends the bristles as well
+    slow.follow(1.0, 0.0)
     assert slow.followed_N > 0.3
 
 
@@ -111,7 +109,7 @@ def test_what_a_creep_has_not_shown_is_what_the_fit_says() -> None:
     slow = crept(1.1, 3.0)
     assert rescaled(slow, 1.0, 1.0).factor == pytest.approx(slow.factor)
     assert rescaled(slow, 1.0, -0.1).factor == slow.factor
-    assert rescaled(crept(1.0, 9.0), 1.0, 0.4).factor_at(0.0) == MAX_FACTOR  # of more than twice the force
+    assert rescaled(crept(1.0, 9.0), 1.0, 0.4).factor_at(0.0) == MAX_FACTOR
     assert rescaled(SlowFriction(BOUNDS), 1.0, 0.8).factor == 1.0
 
 

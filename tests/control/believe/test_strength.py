@@ -25,7 +25,7 @@ BOUNDS = DeviceBounds(0.6, 1.6, -0.2, 0.3)
 
 
 def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = UNSEEN) -> DeviceFit:
-    """The fit after a device of that scale and offset has been held at model forces for some time each, with noise."""
+    """The fit after a device of that scale and offset was held at these model forces, with noise."""
     random = np.random.default_rng(1)
     for seconds, model_N in levels:
         for noise_N in random.normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
@@ -47,7 +47,6 @@ def test_one_force_is_right_where_it_was_shown_and_uncertain_elsewhere() -> None
     assert fit.force_N(0.7) == pytest.approx(0.91, abs=0.01)
     assert fit.deviation_N(0.7) < 0.07
     assert fit.deviation_N(2.0) > 2.0 * fit.deviation_N(0.7)
-    # and honest about it: what it really gives there lies within what it is taken to lie within
     assert abs(fit.force_N(2.0) - 2.6) < SURE * fit.deviation_N(2.0)
 
 
@@ -69,7 +68,7 @@ def test_force_and_model_are_each_others_inverse() -> None:
 
 
 STRONGEST = 1.53
-"With friction, modulus and field all at the ends that the plant card has for them."
+"Friction, modulus and field are all at the ends of the plant card."
 
 
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
@@ -170,7 +169,6 @@ KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)
 
 
 def heard(off_N: float, seconds: float, learns: tuple[bool, bool] = (True, True)) -> Strength:
-    """A known device after so long of readings with noise, that are off by so much from the model's 1.5 N."""
     strength = Strength(0.5, BOUNDS, learns)
     strength.forget(KNOWN)
     for noise_N in np.random.default_rng(2).normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():

@@ -1,4 +1,4 @@
-"""The carriages: duties towards where the plan leads, within the limits; and what is said of limits that act."""
+"""The carriages: duties towards where the plan leads, within the limits; and which limits are reported."""
 
 import math
 
@@ -36,8 +36,8 @@ def test_skew_pulls_the_carriages_together(make_bench) -> None:
 
 def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running) -> None:
     running.step(running.plan(80.0, gap_speed_mm_s=-10.0), count=60)
-    # the reference has come to where the plan leads in CARRY_S, although the plan is much older, and closes in on it
-    # with the plan's own speed, which the closing speed makes up for APPROACH_S away
+    # the reference closes in on where the plan leads in CARRY_S with the plan's own speed, which the closing speed
+    # makes up for APPROACH_S away
     lag_s = EXCHANGE_S + electrical_time_s(CONFIG.motor)
     led_mm = 80.0 - 10.0 * (CARRY_S + lag_s)
     assert running.move.reference.gap_mm == pytest.approx(led_mm - 10.0 * APPROACH_S, abs=0.02)
@@ -133,7 +133,6 @@ def test_only_carriages_that_gain_speed_sooner_than_expected_are_asked_for_more(
 
 
 def acted(bench) -> tuple[int, int, int, int]:
-    """How often: rate, slew, not finite, range."""
     counts = bench.move.acted
     return counts.rate, counts.slew, counts.not_finite, counts.range
 
@@ -143,7 +142,7 @@ def test_each_stage_of_the_output_is_counted_when_it_acts(running) -> None:
     assert acted(running) == (0, 0, 0, 0), "a gap that is where it should be is held back by nothing"
     running.step(79.95)
     assert acted(running) == (0, 1, 0, 0), "a short way takes no speed, but the reference does not leap"
-    running.step(50.0, count=40)  # and is not followed: the duty grows beyond what may be given
+    running.step(50.0, count=40)
     rate, slew, not_finite, cut = acted(running)
     assert 0 < rate < slew + rate <= 2 * 41
     assert 0 < cut <= 40

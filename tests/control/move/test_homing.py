@@ -13,8 +13,6 @@ HOMED = {"mode": DeviceMode.IDLE, "switches": Switches.HOMED | BOTH}
 
 
 class Home:
-    """A device that homes, a look every millisecond."""
-
     def __init__(self, measure) -> None:
         self._measure, self.ticks = measure, 0
         self.homing = Homing(CEILING_N)
@@ -28,7 +26,6 @@ class Home:
             self.faults += self.homing.faults
 
     def travel(self, left_mm: float, right_mm: float) -> None:
-        """Both carriages go there from -20 mm, the further at 15 mm/s."""
         steps = max(round(max(abs(left_mm), abs(right_mm)) / 15.0 * 1e3), 1)
         for step in range(1, steps + 1):
             share = step / steps

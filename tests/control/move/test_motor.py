@@ -79,12 +79,11 @@ def test_the_mechanical_time_constant_is_where_the_speed_has_come_to_63_percent(
 
 
 def open_loop(motor: Motor, position: Position, frequency_Hz: float) -> complex:
-    """The loop's response at one frequency: scipy's plant in state space, the controller's difference equations."""
+    """The loop's response at one frequency: scipy's plant, and the controller's difference equations."""
     system = continuous(motor)
     a, b, c, _, _ = cont2discrete((system.A, system.B, system.C, system.D), PERIOD_S, method="zoh")
     z = np.exp(2j * np.pi * frequency_Hz * PERIOD_S)
     plant = (c @ np.linalg.solve(z * np.eye(3) - a, b))[0, 0]
-    # integral += e dt / Ti, used from the same update; speed += share ((x - x_last) / dt - speed)
     integral = PERIOD_S / position.integral_time_s * z / (z - 1.0)
     share = PERIOD_S / (position.derivative_filter_s + PERIOD_S)
     speed = share * ((z - 1.0) / (z * PERIOD_S)) / (1.0 - (1.0 - share) / z)
@@ -144,10 +143,8 @@ def test_margins_are_numbers_at_every_corner_of_what_is_accepted(motor: Motor, g
 
 
 def closed_loop_radius(motor: Motor, position: Position) -> float:
-    """Spectral radius of the closed loop, from its characteristic polynomial: above 1 it diverges."""
     plant = zero_order_hold(motor, PERIOD_S)
     share = PERIOD_S / (position.derivative_filter_s + PERIOD_S)
-    # controller over a common denominator z (z - 1) (z - (1 - share)), and a delay of one period
     integral = np.poly1d([PERIOD_S / position.integral_time_s, 0.0])
     filtered = np.poly1d([1.0, share - 1.0])
     origin, unity = np.poly1d([1.0, 0.0]), np.poly1d([1.0, -1.0])
@@ -172,7 +169,7 @@ def test_positive_margins_are_what_makes_the_closed_loop_stable(factor: float) -
 SHORT_INTEGRAL = Position(
     proportional_per_mm=0.09375, integral_time_s=0.005859375, derivative_time_s=0.75, derivative_filter_s=0.0001
 )
-"Just unstable at 1.8 Hz, where the gain is 1 for the first time, and robust at its crossover of 10 Hz."
+"Just unstable at 1.8 Hz, where the gain is first 1, and robust at its crossover of 10 Hz."
 
 
 @settings(max_examples=150, deadline=None)

@@ -16,8 +16,6 @@ LATCHED = {"mode": DeviceMode.LATCHED, "switches": Switches(0)}
 
 
 class Opens:
-    """A device that is to open, a look every millisecond; faults are latched as the core does."""
-
     def __init__(self, measure) -> None:
         self._measure, self.ticks = measure, 0
         self.opening = Opening(CONFIG, load_scene("coronary"))
@@ -28,7 +26,6 @@ class Opens:
         self.safety = self.safety.ask(DeviceRequest.RETRACT)
 
     def look(self, seconds: float, start_mm: float = -20.0, speed_mm_s: float = 0.0, **changes: object) -> float | None:
-        """After how many seconds a fault shows; None where none does."""
         for step in range(1, round(seconds * 1e3) + 1):
             self.ticks += 1
             at_mm = min(start_mm + 1e-3 * step * speed_mm_s, 0.0)
@@ -117,10 +114,10 @@ def test_at_the_start_a_homed_device_that_stands_half_closed_is_named_unasked(op
 def test_a_device_without_a_zero_is_judged_by_what_it_says(opens: Opens) -> None:
     unhomed = {"switches": Switches(0)}
     opens.safety = SafetyState()
-    assert opens.look(5.0, mode=DeviceMode.IDLE, **unhomed) is None  # nobody has asked
+    assert opens.look(5.0, mode=DeviceMode.IDLE, **unhomed) is None
     opens.ask()
     assert opens.look(5.0, mode=DeviceMode.IDLE, switches=BOTH) is None
-    assert opens.look(4.0, **unhomed) is None  # it searches
+    assert opens.look(4.0, **unhomed) is None
     assert opens.look(5.0, 0.0, mode=DeviceMode.IDLE, switches=BOTH) is None
     assert opens.look(1.0, mode=DeviceMode.IDLE, **unhomed) == pytest.approx(LATE_S, abs=3e-3)
     assert f"not open by its switches for {LATE_S:.2f} s" in str(opens.opening)

@@ -26,14 +26,12 @@ positions = st.builds(
 
 
 def begun(position: Position = SHIPPED, integral: float = 0.0) -> Pid:
-    """A PID that has learned this."""
     stage = Pid(position)
     stage.integral = integral
     return stage
 
 
 def updated(stage: Pid, error_mm: float, error_mm_s: float = 0.0, ahead: float = 0.0, count: int = 1) -> float:
-    """The duty after some updates, a millisecond apart."""
     for _ in range(count):
         duty = stage.update(error_mm, error_mm_s, ahead, DT_S, False)
     return duty
@@ -137,7 +135,7 @@ def test_a_carriage_at_rest_on_target_forgets_within_its_integral_time(integral:
     for _ in range(round(SHIPPED.integral_time_s / DT_S)):
         stage.rest(error_mm, DT_S)
     if abs(error_mm) > ON_TARGET_MM:
-        assert stage.integral == integral  # it is still on its way, and the integral is what gets it there
+        assert stage.integral == integral
     else:
         assert stage.integral == pytest.approx(integral / math.e, rel=0.01)
 

@@ -14,11 +14,8 @@ DT_S = 1e-3
 LIMITS = Config().position
 MAX_MM_S2 = LIMITS.gap_acceleration_mm_s2
 NO_LOAD_MM_S = 2.0 * full_speed_mm_s(Config().motor)
-"Speed of the gap at full duty, of the shipped motor."
 SPEEDS = Speeds(NO_LOAD_MM_S, LIMITS.gap_speed_mm_s, LIMITS.gap_speed_mm_s)
-"Both ways alike."
 HALF_COUNT_MM = 0.5 * 8.0 / 4480.0
-"Less than this no encoder sees."
 
 
 def followed(
@@ -28,7 +25,6 @@ def followed(
     speeds: Speeds = SPEEDS,
     floor_mm: float = -math.inf,
 ) -> Iterator[Reference]:
-    """The reference after each of these targets, a period apart, from rest and with the shipped acceleration."""
     reference = Reference(start_mm)
     for target in targets:
         reference, _, _ = follow(MAX_MM_S2, reference, target, dt_s, speeds, floor_mm)
@@ -104,7 +100,6 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
     for _ in range(800):
         target += speed * DT_S
         reference, is_limited, _ = follow(MAX_MM_S2, reference, Reference(target, speed), DT_S, SPEEDS)
-    # its sampling is one period late at most
     assert abs(reference.gap_mm - target) <= abs(speed) * DT_S + 1e-6
     assert (reference.speed_mm_s, is_limited) == (pytest.approx(speed, abs=1e-3), False)
 

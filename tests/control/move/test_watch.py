@@ -1,4 +1,4 @@
-"""What is watched: every way a run can fail ends it, in its time, and what a device may do does not."""
+"""What is watched: every failure of a run ends it in time, and what a device may do does not."""
 
 import msgspec
 import pytest
@@ -13,8 +13,6 @@ from tormagd.safety.codes import Fault, Limit
 PERIOD_S = 1e-3
 CONFIG = Config()
 TIMEOUT_S = CONFIG.device.measurement_timeout_ms * 1e-3
-
-# -- the device and its streams ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bit", DeviceFault)
@@ -86,19 +84,16 @@ def test_a_sensor_that_stays_doubted_is_a_fault(running) -> None:
     assert running.run_into(Fault.SENSOR, running.plan(80.0, sensor_doubted_s=1.01 * SENSOR_FAULT_S)) == 1
 
 
-# -- where the carriages are ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_skew(running, side: float) -> None:
     def apart(skew_mm: float) -> dict[str, float]:
         return {"left_mm": -7.5 + side * skew_mm / 2.0, "right_mm": -7.5 - side * skew_mm / 2.0}
 
     allowed_mm = CONFIG.limits.skew_fault_mm
-    for part in range(1, 41):  # no faster than carriages do
+    for part in range(1, 41):
         running.step(**apart(0.98 * allowed_mm * part / 40.0))
     running.step(count=20, **apart(0.98 * allowed_mm))
-    for back_mm in (0.008, 0.016, 0.024, 0.032):  # as the loop wants it, so that nothing goes the wrong way
+    for back_mm in (0.008, 0.016, 0.024, 0.032):
         running.step(**apart(0.98 * allowed_mm - back_mm))
     running.step(count=20, **apart(0.98 * allowed_mm - back_mm))
     assert not running.faults
@@ -157,9 +152,6 @@ def test_a_switch_that_is_newer_than_the_position_says_nothing(running) -> None:
     assert not running.faults
 
 
-# -- how they move -------------------------------------------------------------------------------------------------
-
-
 def test_a_gap_that_does_not_follow(make_bench) -> None:
     bench = make_bench(limits={"no_motion_time_s": 10.0}).enabled()
     while bench.watch.straying_s == 0.0:
@@ -173,7 +165,6 @@ def test_a_gap_that_does_not_follow(make_bench) -> None:
 def test_following_again_in_time_is_no_fault(running) -> None:
     away_mm = [80.0 - 3.5 * part / 16.0 for part in range(1, 17)]
     for _ in range(3):
-        # the gap is 3.5 mm away from where the reference rests, for less than the time allowed
         for gap_mm in (*away_mm, *[away_mm[-1]] * 20, *reversed(away_mm)):
             running.step(**running.gap(gap_mm))
         running.step(count=20)
@@ -236,9 +227,6 @@ def test_a_force_that_is_too_much_again_and_again_is_a_fault(running) -> None:
             break
         assert Limit.OVER_FORCE not in limits or tick % 120 <= 60
     assert running.faults == (Fault.OVER_FORCE,)
-
-
-# -- the wire and the clock ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -32,12 +32,12 @@ from tormagd.scenes.scene import Scene
 _INSIDE: Final = Reach.INSIDE
 
 OLDEST_ANSWER_S: Final = 0.5
-"With an older answer of a search beside the plans planning fails, and the gap opens."
+"Planning fails with an answer that is older than this, and the gap opens."
 
 _PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
 _TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
 _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
-"Weights from a path's distances from its beginning to speed and acceleration there, of the nearest parabola."
+"Weights from distances along a path to the speed and acceleration of a fitted parabola at its start."
 
 
 class Element(NamedTuple):
@@ -54,16 +54,14 @@ class Element(NamedTuple):
 
 @final
 class Aim:
-    """The last stage of planning: turns the force asked for into a field, the field into a gap, both into a plan."""
+    """The last stage of planning: turns the force into a field, the field into a gap, and both into a plan."""
 
     number: int = 0
-    "Number of the newest plan."
     element_mT: float = 0.0
-    "The element's field at the newest plan: of several fields that give a force, the nearest to this is taken."
+    "Of several fields that give a force, the nearest to this is taken."
     question: Question | None = None
-    "The newest plan's question to a search beside the plans; None where plans search themselves."
+    "None where plans search themselves."
     answer: Answer
-    "The newest answer of a search beside the plans; plans use it until the next one comes."
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
         self._nominal: Final = element.nominal
@@ -81,7 +79,7 @@ class Aim:
         self._low_confidence: Final = config.limits.low_confidence
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
-        """Begin at `now_s`, and return a plan with the gap open, no setpoint, the limit NO_SETPOINT and this `number`."""
+        """Begin at `now_s`, and return a plan with the gap open and no setpoint."""
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
@@ -97,7 +95,6 @@ class Aim:
         memory: ElementMemory,
         measured: Measured | None,
     ) -> Plan:
-        """Return the next plan, for the force in `ask` and the device in `belief`."""
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
@@ -116,12 +113,11 @@ class Aim:
         return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
 
     def answer_to(self, question: Question) -> Answer:
-        """Search the field for `question`, for a search that runs beside the plans, and return the answer."""
+        """Answer `question` in the search that runs beside the plans."""
         curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
         return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        """Return the field for the model's force `wanted_N` along `curve`; of several the one nearest `element_mT`."""
         if not self._is_beside:
             return self._search.solve(curve, wanted_N, self.element_mT)
         self.question = Question(now_s, curve.displacement_mm, curve.rate_mm_s, wanted_N, self.element_mT)
@@ -143,7 +139,6 @@ class Aim:
         limits: tuple[Limit, ...],
         outside: tuple[Outside, ...],
     ) -> Plan:
-        """Return the record of the plan to `gap_mm` at `now_s`, with the gap's motion ahead on the path of `ask`."""
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
@@ -176,7 +171,6 @@ class Aim:
         is_held: bool,
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
-        """Return what holds the force back, in the order in which it does; empty where nothing does."""
         limits = (*ask.limits, *believed)
         if outside:
             limits = (*limits, Limit.MODEL_RANGE)
@@ -192,8 +186,8 @@ class Aim:
         return limits
 
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
-        """Return the gap's speed, mm/s, and acceleration, mm/s^2, at the beginning of the path `path_N` (7) of forces."""
-        # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
+        """Return the gap's speed and acceleration at the start of a path of forces, by a fitted parabola."""
+        # along the portrait: a difference of two solutions would amplify the solver's grain
         start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))
         speed, acceleration = 0.0, 0.0
         for place, force_N in enumerate(path_N):

@@ -1,4 +1,4 @@
-"""Guards of the gap: how close it may come, and how far from the force law the search's field is followed."""
+"""Guards of the gap: how close it may come, and how far the field may differ from the force law's."""
 
 from typing import Final
 
@@ -9,11 +9,11 @@ from tormagd.control.records import Belief
 CEILING: Final = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
 LAW_SHARE: Final = 0.12
-"Greatest share by which a field may differ from the force law's; on sample 1 the search's differs by 1 to 11%."
+"On sample 1 the search's field differs from the force law's by 1 to 11%."
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap allowed, mm, within the portrait's: that of `ceiling_mm` for the believed device."""
+    """Return the least gap allowed for the believed device, and for an unseen one where there is one."""
     known_mm = ceiling_mm(portrait, belief.device, ceiling_N, bounds)
     if belief.unseen is None:
         return known_mm
@@ -21,12 +21,11 @@ def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Devic
 
 
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
-    """Return the least gap, mm, at which the device, taken SURE deviations stronger, gives no more than `ceiling_N`."""
+    """Return the least gap at which the device surely gives no more than `ceiling_N`."""
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
-    """Return `field_mT`, held within a share LAW_SHARE of the field that the force law gives for `wanted_N`."""
     if law is None:
         return field_mT
     law_mT = law.field_mT(wanted_N)

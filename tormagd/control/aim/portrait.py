@@ -14,12 +14,13 @@ from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
-"Number of gaps in a portrait."
 
 
 @final
 class Portrait:
-    """Force, N, and its slope |dF/dgap|, N/mm, over the gap, mm, at n >= 2 points, for one contact and without memory."""
+    """Force and its slope |dF/dgap| over the gap, from open to closed, without memory. Beyond the ends the nearer end
+    holds.
+    """
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
@@ -37,39 +38,33 @@ class Portrait:
         return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
-        """Return |dF/dgap|, N/mm, at the gap that gives `force_N`; at the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
-        """Return the gap, mm, of `force_N`, as `gap_mm_at`, and |dF/dgap|, N/mm, at the next point of more force."""
+        """Return the gap of `force_N`, and |dF/dgap| at the next point of more force."""
         after = self._rising_N.after(force_N)
         gap_mm = interpolated_before(after, force_N, self._rising_N, self.gap_mm)
         return gap_mm, self.slope_N_mm[min(after, len(self.slope_N_mm) - 1)]
 
     def gap_mm_at(self, force_N: float) -> float:
-        """Return the gap, mm, that gives `force_N`; the nearer end of the range where none does."""
         return interpolated(force_N, self._rising_N, self.gap_mm)
 
     def force_N_at(self, gap_mm: float) -> float:
-        """Return the force, N, at `gap_mm`; outside the range, the force of the nearer end."""
         return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
-        """Return the rate of force, N/s, that the speed `gap_speed_mm_s` makes at the gap that gives `force_N`."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 
 @final
 class PortraitSearch:
-    """Field search of a scene without the term `rate`: looks the force's gap up in a portrait, and takes that gap's
-    field."""
+    """The field search of a scene without the term `rate`: a look into the portrait."""
 
     def __init__(self, shown: Portrait, field: FieldOfGap) -> None:
         self._portrait: Final = shown
         self._field: Final = field
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
-        """Return the field for `force_N`: that of the gap which gives it in the portrait."""
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
         field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
@@ -82,21 +77,19 @@ class PortraitSearch:
 
 @final
 class LawOfField:
-    """The magnetoelastic law of the insert (Eq. 29 to 34) over a portrait's gaps, scaled to the portrait's force."""
+    """The insert's magnetoelastic law (Eq. 29 to 34) over a portrait's gaps, scaled to its force."""
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
         self._rising_N: Final = Rising(force_N)
         self.fields_mT: Final = fields_mT
 
     def field_mT(self, force_N: float) -> float:
-        """Return the field, mT, that gives `force_N` by the law; the field of the nearer end where none does."""
         return interpolated(force_N, self._rising_N, self.fields_mT)
 
 
 def law_beside(
     shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
 ) -> LawOfField:
-    """Return the force law at the gaps of the portrait `shown`, scaled to the portrait's force."""
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
     scaled_N: list[float] = (scale * forces_N).tolist()
@@ -104,7 +97,7 @@ def law_beside(
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
-    """Return the portrait that the model's `curve` predicts, at GRID gaps over `gap_range_mm`, closed to open."""
+    """Return the portrait that the model's `curve` predicts over `gap_range_mm` (closed, open)."""
     gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))

@@ -22,39 +22,37 @@ from tormagd.control.interpolation import at_step
 Array = npt.NDArray[np.float64]
 
 GRID_S: Final = 0.01
-"Step of the grid of time on which forces are remembered. Counts below are of its points."
+"Step of the time grid of remembered forces. The counts below are in its points."
 HISTORY: Final = 1_000
-"Ten seconds: a dozen heart beats, two breaths."
+"Ten seconds: a dozen heart beats, or two breaths."
 MIN_HISTORY: Final = 100
-"With fewer points nothing is forecast."
+"Nothing is forecast from fewer points."
 RISE_DELAYS: Final = (1, 2, 4, 7, 11)
 BEAT_DELAYS: Final = (1, 3, 8, 18, 38)
-"""Delays of the two embeddings, in points: a stretch is compared at these points before its end, as changes from the
-end."""
+"A stretch is compared at these points before its end, as changes from the end."
 TAPS: Final = 5
-"Number of delays in each embedding."
 STRIDE: Final = 3
 "Every third stretch of the history is compared."
 HORIZON: Final = 8
-"Points that are forecast: a plan looks 30 ms ahead, and further by the carriages' lag."
+"A plan looks 30 ms ahead, and further by the carriages' lag."
 HORIZON_S: Final = HORIZON * GRID_S
 EVERY: Final = 2
-"A forecast is made for every second point of the grid: it takes several times as long as a plan."
+"A forecast takes several times as long as a plan."
 JUDGED: Final = 4
-"The point ahead that forecasts are judged at: the middle of what a plan looks at."
+"Forecasts are judged in the middle of what a plan looks at."
 MAX_STEP_S: Final = 0.1
-"Setpoints further apart than this are no stream: the forecast begins anew."
+"Setpoints that are further apart are no stream."
 SAME_N: Final = 1e-4
 "Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
 UNLIKE_N: Final = 0.05
-"Where every stretch differs by more, nothing is forecast. On sample 1 30 mN do as well, 80 a little worse."
+"Nothing is forecast where every stretch differs by more. On sample 1, 30 mN do as well, 80 a little worse."
 RIDGE: Final = 0.01
-"Share by which the regression's variances are raised: stretches that hardly differ teach no dependence."
+"Raises the regression's variances, because stretches that hardly differ teach nothing."
 MAX_LEVERAGE: Final = 100.0
-"""Nothing is forecast from a stretch of more leverage, as after a jump."""
+"Nothing is forecast from a stretch of more leverage, as after a jump."
 LONG_S: Final = 2.0
 SHORT_S: Final = 0.2
-"Skill is earned over the long time, a few beats, and lost over the short."
+"Skill is earned over the long time, a few beats, and lost over the short one."
 _LONG_SHARE: Final = EVERY * GRID_S / (LONG_S + EVERY * GRID_S)
 _SHORT_SHARE: Final = EVERY * GRID_S / (SHORT_S + EVERY * GRID_S)
 _MIN_BYTES: Final = MIN_HISTORY * array("d").itemsize
@@ -63,20 +61,19 @@ _LONGEST: Final = BEAT_DELAYS[-1]
 
 
 def embedding(delays: tuple[int, ...]) -> Array:
-    """Return the places of all stretches in a full history, as negative indices from its end."""
+    """Return the places of all stretches in a full history, as indices from its end."""
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
     ends = np.arange(-1 - HORIZON, _LONGEST - HISTORY - 1, -STRIDE)
     return np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
 
 
 EMBEDDINGS: Final = np.stack([embedding(RISE_DELAYS), embedding(BEAT_DELAYS)])
-"The places of both embeddings' stretches, shape (2, TAPS + 1 + HORIZON, n): see `embedding`."
+"Shape (2, TAPS + 1 + HORIZON, n)."
 
 
 @final
 class Guess(Value):
-    """The force that was forecast for one point of the grid, N: by each embedding, by their mixture and by the
-    slope."""
+    """The force that was forecast for one point of the grid."""
 
     def __init__(self, rise_N: float, beat_N: float, forecast_N: float, slope_N: float) -> None:
         self.rise_N: Final = rise_N
@@ -86,56 +83,49 @@ class Guess(Value):
 
 
 NOTHING_SAID: Final[tuple[Guess | None, ...]] = (None,) * JUDGED
-"The guesses awaited while nothing is forecast."
 UNJUDGED_SHORT: Final = Skill(0.0, 0.0)
 LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
-"The skill over SHORT_S where nothing is like the newest stretch: the next forecast has to earn trust again."
+"Where no stretch is like the newest one, the next forecast has to earn trust again."
 
 
 @final
 class Forecast:
-    """Learner of one stream of setpoints, which forecasts how the force goes on."""
+    """Learns one stream of setpoints, and forecasts how its force goes on."""
 
     stamp_s: float
-    "Stamp of the newest setpoint; -inf before the first."
+    "-inf before the first setpoint."
     force_N: float
-    "Force of the newest setpoint."
     time_s: float
-    "Time of the newest point of the grid, not after the newest setpoint."
     history: bytes
     "The forces on the grid, float64, newest last."
     from_s: float
-    "The point of the grid from which the forecast was made; -inf without a forecast."
+    "The point of the grid from which the forecast was made; -inf without one."
     changes_N: list[float]
-    "The forecast: changes of force from that point to itself and the points ahead; empty while nothing is forecast."
+    "The forecast changes of force from that point to itself and to the points ahead."
     awaited: tuple[Guess | None, ...]
-    "Guesses (JUDGED) for the next points of the grid, to be judged by what comes; None where none was made."
+    "Guesses for the next points of the grid; None where none was made."
     long: Skill
-    "Skill of the forecast over the slope, of LONG_S."
     short: Skill
-    "Skill of the forecast over the slope, of SHORT_S."
     rise_missed: float
-    "Mean squared error of the embedding RISE_DELAYS, N²."
+    "Mean squared error, N², of the embedding RISE_DELAYS."
     beat_missed: float
-    "Mean squared error of the embedding BEAT_DELAYS, N²."
 
     def __init__(self) -> None:
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     @property
     def trust(self) -> float:
-        """Return how far the forecast takes the place of the slope, 0..1; 0 while nothing is forecast."""
+        """Return how far the forecast takes the place of the slope, 0..1."""
         if not self.changes_N:
             return 0.0
         earned, lost = self.long.score, -self.short.score
         return min(max(earned, 0.0), 1.0) * min(max(1.0 - lost, 0.0), 1.0)
 
     def forget(self) -> None:
-        """Begin anew, with nothing learned: no setpoint, no history, no forecast, and no skill."""
         self._begin(-math.inf, 0.0, -math.inf, b"")
 
     def update(self, stamp_s: float, force_N: float) -> None:
-        """Take one setpoint, judge what was forecast for its time, and remember it on the grid."""
+        """Take one setpoint: judge what was forecast for its time, and remember it."""
         if -GRID_S < stamp_s - self.stamp_s < 0.0:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
         spacing_s = stamp_s - self.stamp_s
@@ -168,22 +158,21 @@ class Forecast:
         return True
 
     def forces_N(self, begins_after_s: float, after_s: list[float]) -> list[float]:
-        """Return the forecast forces (n), N, at `begins_after_s` + `after_s` (n), s, after the newest setpoint's stamp."""
+        """Return the forecast forces at `begins_after_s` + `after_s` after the newest setpoint's stamp."""
         changes = self.changes_N
-        # the forecast is shifted through the newest setpoint, which may have come after the point it was made from
+        # shifted through the newest setpoint, which may have come after the point the forecast was made from
         since_s = self.stamp_s - self.from_s
         base_N = self.force_N - at_step(since_s / GRID_S, changes)
         return [base_N + at_step((since_s + begins_after_s + later_s) / GRID_S, changes) for later_s in after_s]
 
     def _begin(self, stamp_s: float, force_N: float, time_s: float, history: bytes) -> None:
-        """Set all fields: these, no forecast, no guesses, and skills and errors as before the first judgement."""
         self.stamp_s, self.force_N, self.time_s, self.history = stamp_s, force_N, time_s, history
         self.from_s, self.changes_N, self.awaited = -math.inf, [], NOTHING_SAID
         self.long, self.short = UNJUDGED, UNJUDGED_SHORT
         self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
 
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
-        """Add `count` >= 1 points to the grid, up to a setpoint later than the newest, and judge the guesses for them."""
+        """Add `count` points to the grid, and judge the guesses for them."""
         spacing_s = stamp_s - self.stamp_s
         times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]
         shares = [(time_s - self.stamp_s) / spacing_s for time_s in times_s]
@@ -199,8 +188,6 @@ class Forecast:
             self.changes_N = []
 
     def _judge(self, guess: Guess, came_N: float) -> None:
-        """Update both skills and both embeddings' mean squared errors by one guess and `came_N`, the force at its
-        point."""
         error_N, slope_error_N = guess.forecast_N - came_N, guess.slope_N - came_N
         self.long = self.long.after(error_N, slope_error_N, _LONG_SHARE)
         self.short = self.short.after(error_N, slope_error_N, _SHORT_SHARE)
@@ -223,8 +210,8 @@ def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
 
 
 def _search(history: Array) -> list[tuple[list[float], float]]:
-    """Forecast with each embedding, and return for each the changes of force, N, and a distance, N²."""
-    # both embeddings at once: most of the time goes into the calls, not into their numbers
+    """Forecast with each embedding: return the changes of force, N, and the distance, N², of each."""
+    # both at once: most of the time goes into the calls, not into their numbers
     changes = history[EMBEDDINGS[:, :, : (len(history) - _LONGEST - 1 - HORIZON) // STRIDE + 2]]
     changes -= changes[:, TAPS : TAPS + 1]
     before = changes[:, :TAPS]
@@ -241,7 +228,7 @@ def _search(history: Array) -> list[tuple[list[float], float]]:
 
 
 def _constants(rows: list[list[float]]) -> list[float]:
-    """Return the regressions' constants (1 + HORIZON), N, by elimination: 0, then one for each point that followed."""
+    """Return the regressions' constants, by elimination."""
     total = rows[TAPS][TAPS]
     variance = 0.0
     for place in range(TAPS):

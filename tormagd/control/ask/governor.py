@@ -6,8 +6,8 @@ path      where forces ahead are known: those of the gap's path that misses them
           over the force there
 blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes
 decay     without a setpoint, or with one that is too old: to the device's least force at the scene's release rate
-passing   to a publisher's forces at the release rate, from another publisher's or from a force that followed none. That
-          is so before the first setpoint, while the gap was open or held, and after a silence
+passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none
+          (before the first setpoint, while the gap was open or held, after a silence)
 """
 
 import math
@@ -29,18 +29,17 @@ from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 _LARGEST: Final[float] = LARGEST
 SLOPE_FILTER_S: Final = 0.003
 AHEAD_S: Final = 0.05
-"Setpoints are carried forward along their slope, or past the end of their preview, by no more than this."
+"Setpoints are carried on along their slope, or past their preview's end, by no more than this."
 MIN_TIMES: Final = 9
-"So many of TIMES_S are looked at even where a preview ends before, and of a forecast."
+"At least this many of TIMES_S are looked at, however short a preview is."
 _FORECAST_S: Final = TIMES_S[:MIN_TIMES]
 OUTRUN_N: Final = 0.02
-"Where the path misses what is known ahead by more, the carriages are too slow: the limit RATE."
+"The limit RATE acts where the carriages make the path miss what is known ahead by more."
 
 EARLY_N: Final = 0.08
-"""By so much more than is felt there the gap closes before a wall: 0.1 N with what is not known of a device."""
+"The gap closes before a wall by this much more than is felt there: 0.1 N with what is not known of a device."
 
 Bounds = tuple[float, float]
-"The least and the greatest force that the scene allows and the device gives."
 
 
 @final
@@ -48,39 +47,34 @@ class Governor:
     """The stage that turns setpoints, of one publisher after another, into the forces to render."""
 
     time_s: float
-    "Time of the newest plan."
     asked_N: float
-    "Force that the newest plan asked of the device."
     above_N: float
-    "By how much `asked_N` was above the least force of the device, as it was known then."
+    "`asked_N` less the device's least force, as that was known then."
     stamp_s: float
-    "Stamp of the setpoint that the force follows; -inf where it follows none."
+    "-inf where the force follows no setpoint."
     slope_N_s: float
-    "Slope of the setpoints, filtered."
     last_N: float
     "The newest setpoint's force, within what the scene allows."
     holder: int
-    "Number of the publisher whose setpoint was followed last; 0 for the first one, and before it."
+    "Number of the publisher whose setpoint was followed last."
     is_passing: bool
     "Whether the force is on the ramp to the forces of its holder."
     sent_mm: float | None
-    """The portrait's gap that the carriages were sent to; None where nothing is known ahead."""
+    "The portrait's gap that the carriages were sent to; None where nothing is known ahead."
     from_mm: float
-    "The portrait's gap that the newest plan asked for, where `sent_mm` is not None."
+    "The portrait's gap that the newest plan asked for."
     expected_N: float | None
-    "Force that the lagging gap should give by now on its path; None where it follows no path."
+    "What the lagging gap should give by now on its path; None where it follows no path."
     law_N: float | None
-    "Force asked for at the place `law_mm` by a wall, or on the ramp from one; None without either."
+    "The force asked at the place `law_mm` by a wall, or on the ramp from one."
     law_mm: float
     blend_N: float
-    "What is left of the ramp from one wall to another, or to none; 0 off the ramp."
+    "What is left of the ramp from one wall to another, or to none."
     was_pushing: bool
-    "Whether the handle pushed at the last plan."
 
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
     ) -> None:
-        """Begin at `now_s` with the gap open and no publisher."""
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._path: Final = Path(portrait, gap_speed_mm_s)
@@ -106,7 +100,7 @@ class Governor:
         travel: Travel = AT_REST,
         held_N: float | None = None,
     ) -> Ask:
-        """Return the force to render now and those ahead, N, with the limits that hold them back."""
+        """Return the force to render now and the forces ahead, with the limits on them."""
         lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
         dt_s = max(now_s - self.time_s, 0.0)
         self.time_s = now_s
@@ -120,7 +114,7 @@ class Governor:
             return self._decay(dt_s, lowest_N, age_s, (Limit.STALE, *setpoint.limits))
         soon_s = max(age_s, 0.0)
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
-        # slope and forecast are of what is asked: the least force of the device is learned, and varies
+        # slope and forecast are of what is asked, because the device's least force is learned and varies
         asked_N = setpoint.asked_N(travel)
         allowed_N = within(asked_N, self._allowed)
         blended_N = self._blended(setpoint, travel, allowed_N, dt_s)
@@ -163,13 +157,11 @@ class Governor:
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def foresee(self) -> bool:
-        """Make a forecast for the next plans, if one is due, and return whether it was."""
         return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def _note_setpoint(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
-        """Update the setpoints' slope, newest force, stamp and holder."""
         spacing_s = setpoint.stamp_s - self.stamp_s
-        if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
+        if setpoint.holder != self.holder:  # another publisher's forces say nothing about this one's
             self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
             self.forecast.forget()
         elif spacing_s > MAX_STEP_S or not self._has_forecast or setpoint.wall is not None:
@@ -181,13 +173,13 @@ class Governor:
         self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
 
     def _blended(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, dt_s: float) -> float:
-        """Return `allowed_N`, or a force on the ramp to it where another wall, or none, has replaced a wall."""
+        """Return `allowed_N`, or a force on the ramp to it after the wall was replaced or removed."""
         wall, place_mm = setpoint.wall, travel.place_mm
         before_N = self.law_N
         if before_N is None and wall is not None and self.stamp_s != -math.inf and self.was_pushing:
             before_N = self.last_N
         blended_N = allowed_N
-        # a new holder has a ramp of its own, and one that withdraws is let go at once
+        # a new holder has a ramp of its own, and a hand that draws back is let go at once
         if before_N is not None and travel.is_pushing and setpoint.holder == self.holder:
             moved_N = 0.0 if wall is None else wall.stiffness_N_mm * abs(place_mm - self.law_mm)
             most_N = self._release_N_s * dt_s + moved_N
@@ -208,7 +200,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S on the best path for a handle that pushes against `wall` at its present rate."""
+        """Return the forces at PATH_S for a handle that pushes on at its present rate."""
         place_mm, rate_mm_s, added_N = travel.place_mm, travel.rate_mm_s, self.blend_N
         begins_s = lag_s + SPEEDING_UP_S
         wanted_N = [
@@ -223,7 +215,7 @@ class Governor:
         return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
-        """Give the forecast one setpoint, and return how far the forecast is trusted, 0..1."""
+        """Give the forecast one setpoint, and return how far it is trusted, 0..1."""
         if not self._has_forecast:
             return 0.0
         self.forecast.update(stamp_s, allowed_N)
@@ -240,9 +232,8 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S on the best path for the setpoint's preview."""
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
-            # what comes after its end is foreseen from there
+            # what comes after the preview is foreseen from its end
             self.slope_N_s = setpoint.preview_slope_N_s
             last_N = within(setpoint.preview_N[-1], self._allowed)
             self.forecast.update(setpoint.stamp_s + setpoint.preview_s, last_N)
@@ -261,10 +252,10 @@ class Governor:
         lag_s: float,
         most_N: list[Bounds] | None = None,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S, within `bounds`, on the gap's best path for `wanted_N` at TIMES_S."""
+        """Return the forces at PATH_S on the gap's best path for `wanted_N` at TIMES_S."""
         from_mm, sent_mm = self._left_from(force_N, device)
         path_N, self.sent_mm = self._path.pursue(from_mm, sent_mm, dt_s, wanted_N, device, lag_s, most_N)
-        # the path sets out sooner by as much as the carriages come later
+        # the path sets out earlier by as much as the carriages come later
         expected_N = force_N if self.is_passing else self.expected_N
         if expected_N is None:
             expected_N = self.asked_N
@@ -283,7 +274,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
     ) -> list[float]:
-        """Return the forces (7) at PATH_S along the setpoints' slope, or the forecast, weighted by `foresight`, 0..1."""
+        """Return the forces at PATH_S along the setpoints' slope and the forecast."""
         begins_s = soon_s + foresight * lag_s
         times_s = _FORECAST_S if foresight > 0.0 else PATH_S
         slope_N_s = self.slope_N_s
@@ -301,7 +292,7 @@ class Governor:
         return path_N[: len(PATH_S)]
 
     def _left_from(self, force_N: float, device: DeviceFit) -> tuple[float, float]:
-        """Return two of the portrait's gaps, mm: that at the last plan, and that which the carriages were sent to then."""
+        """Return two of the portrait's gaps: the last plan's, and where the carriages were sent."""
         # a ramp leads to what is asked, whatever the gap can make of it
         if self.is_passing or self.sent_mm is None:
             gap_mm = self._path.gap_mm(force_N if self.is_passing else self.asked_N, device)
@@ -311,7 +302,6 @@ class Governor:
     def _within_reach(
         self, asked_N: float, allowed_N: float, lowest_N: float, highest_N: float
     ) -> tuple[float, tuple[Limit, ...]]:
-        """Return `allowed_N` held to what the device gives, `lowest_N` to `highest_N`, and the limits in force."""
         limits: tuple[Limit, ...] = () if self._least_N <= asked_N <= self._allowed[1] else (Limit.RANGE,)
         if asked_N < self._allowed[0] and self._least_N < self._allowed[0]:
             limits = (*limits, Limit.STANDBY)
@@ -322,7 +312,7 @@ class Governor:
         return allowed_N, limits
 
     def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
-        """Return a force that falls to `lowest_N` at the release rate, for no valid setpoint, and forget the last one."""
+        """Forget the setpoint, and return a force that falls to `lowest_N` at the release rate."""
         # where a device turns out weaker, the force above its least does not grow
         above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
         self.asked_N, self.above_N, self.is_passing = lowest_N + above_N, above_N, True
@@ -330,7 +320,6 @@ class Governor:
         return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, limits)
 
     def _forget(self) -> None:
-        """Forget the setpoint that was followed: its slope, wall, path and forecast."""
         self.stamp_s, self.slope_N_s, self.last_N = -math.inf, 0.0, 0.0
         self.sent_mm, self.from_mm, self.expected_N = None, 0.0, None
         self.law_N, self.law_mm, self.blend_N, self.was_pushing = None, 0.0, 0.0, True
@@ -338,7 +327,7 @@ class Governor:
 
 
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
-    """Raise DomainError, naming the field, where a number of `setpoint` or its age is not finite or beyond LARGEST."""
+    """Raise DomainError, naming the field, unless all numbers are finite and within LARGEST."""
     if not (
         -_LARGEST <= age_s <= _LARGEST
         and -_LARGEST <= setpoint.force_N <= _LARGEST
@@ -357,14 +346,14 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         return
     if not 0.0 < setpoint.preview_dt_s <= _LARGEST:
         raise DomainError("preview_dt_s", setpoint.preview_dt_s, "above 0 s")
-    # one sum finds NaN and infinity anywhere; each force is held to its bounds where it is used
+    # one sum finds NaN and infinity anywhere
     if not -_LARGEST <= sum(setpoint.preview_N) <= _LARGEST:
         for force_N in setpoint.preview_N:
             require_number("preview_N", force_N)
 
 
 def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:
-    """Return the forces of a preview, N, held to `bounds`, at the times TIMES_S from `begins_s` >= 0 after its stamp."""
+    """Return the forces of a preview at TIMES_S from `begins_s` after its stamp."""
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
     ends_s, mean_N_s, trust = setpoint.preview_s, setpoint.preview_slope_N_s, forecast.trust

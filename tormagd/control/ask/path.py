@@ -17,39 +17,37 @@ from tormagd.model.features import require_number
 from tormagd.model.force_curve import within
 
 PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
-"The times, from the moment that is planned for, at which a plan looks at the force to come."
+"When, after the moment planned for, a plan looks at the force to come."
 PATH_STEP_S: Final = 0.005
 TIMES_S: Final = [*PATH_S, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25, 0.33, 0.4]
-"The times at which what is known ahead is looked at. By the last the gap crosses a third of its stroke."
+"When what is known ahead is looked at. By the last the gap crosses a third of its stroke."
 LASTS_S: Final = [
     0.5 * (after_s - before_s)
     for before_s, after_s in zip([0.0, *TIMES_S[:-1]], [*TIMES_S[1:], TIMES_S[-1]], strict=True)
 ]
-"The time that each of TIMES_S stands for: from half way to the one before to half way to the next."
+"Each of TIMES_S stands for the time from half way to the one before to half way to the next."
 CHANGES_PER_S: Final = [1.0 / (after_s - before_s) for before_s, after_s in pairwise(TIMES_S)]
-"Factors from the difference of a path's neighbouring points to its speed between them."
 SPEEDING_UP_S: Final = 0.025
-"Time constant with which the gap comes to another speed where carriages are in time; sample 1: 20 to 30 ms do as well."
+"Time constant of the gap's speed where carriages are in time; 20 to 30 ms do as well (sample 1)."
 NEAR_S: Final = 0.18
-"""What the gap gets to in this time is near."""
+"What the gap reaches within this time is near."
 FLATTEST_N_MM: Final = 1e-3
-"Least slope |dF/dgap| of a weight: a force that hardly depends on the gap counts as if it did by this much."
+"The least weight's slope, for forces that hardly depend on the gap."
 
 
 @final
 class Path:
-    """Finder of the gap's best path, for one portrait (force over gap) and one top speed of the gap; without state."""
+    """Finds the gap's best path, for one portrait and one top speed of the gap."""
 
     def __init__(self, portrait: Portrait, gap_speed_mm_s: float) -> None:
         self._portrait: Final = portrait
         self._gap_speed_mm_s: Final = gap_speed_mm_s
 
     def gap_mm(self, force_N: float, device: DeviceFit) -> float:
-        """Return the portrait's gap at which the device gives `force_N`; its nearer end where none does."""
         return self._portrait.gap_mm_at(device.model_N(force_N))
 
     def is_near(self, from_mm: float, to_N: float, device: DeviceFit) -> bool:
-        """Tell whether the device's gap, at its top speed, gets from `from_mm` to the force `to_N` within NEAR_S."""
+        """Tell whether the gap gets from `from_mm` to the force `to_N` within NEAR_S."""
         return abs(from_mm - self.gap_mm(to_N, device)) < NEAR_S * self._gap_speed_mm_s
 
     def pursue(
@@ -62,7 +60,7 @@ class Path:
         lag_s: float,
         most_N: list[tuple[float, float]] | None = None,
     ) -> tuple[list[float], float]:
-        """Find the best path for the forces `wanted_N` at TIMES_S, and return forces (7) at PATH_S and a gap to send."""
+        """Find the best path for `wanted_N` at TIMES_S; return its forces at PATH_S and a gap to send."""
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
         require_number("sent_mm", sent_mm)
@@ -100,7 +98,7 @@ def nearest_path_mm(
     speed_mm_s: float,
     count: int,
 ) -> list[float]:
-    """Return the first `count` gaps of the path that misses `wanted_mm` (n) least, in squares times `weights` (n) > 0."""
+    """Return the first `count` gaps of the path that misses `wanted_mm` least."""
     best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
     path_mm: list[float] = []
     gap_mm, before_s = start_mm, times_s[0] - elapsed_s
@@ -113,12 +111,11 @@ def nearest_path_mm(
 
 
 def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
-    """Return for each of n points the gap, mm, from which this point and all later ones are missed least."""
+    """Return for each point the gap from which it and all later ones are missed least."""
     best_mm = wanted_mm[:]
-    # the least cost of what comes is convex in the gap, with a piecewise linear derivative: one point further back in
-    # time, its two sides are shifted apart by what the gap can move, and the point adds a line
-    # kinks of the derivative below and above its zero, nearest last, each less the shift of its side from there back to
-    # time 0; and by how much the derivative's slope grows where a kink is passed on the way out
+    # The least cost of what comes is convex in the gap, with a piecewise linear derivative. One point further back in
+    # time, its two sides move apart by what the gap can move, and the point adds a line. Kept are the kinks on both
+    # sides of the derivative's zero, nearest last, shifted back to time 0, and the growth of the slope at each.
     below_mm: list[float] = []
     below: list[float] = []
     above_mm: list[float] = []

@@ -12,14 +12,14 @@ FORGIVEN_N: Final = 0.003
 
 @final
 class Skill(Value):
-    """Skill of one guess over another: means of squares, N², with the newest counting most."""
+    """Skill of one guess over another, as running means of squares, N²."""
 
     def __init__(self, gained: float, apart: float) -> None:
         self.gained: Final = gained
         self.apart: Final = apart
 
     def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
-        """Return the skill with both guesses' newest errors, N, which count for `share` of the means, 0..1."""
+        """Return the skill after both guesses' newest errors, weighted by `share`."""
         gained = other_error_N * other_error_N - error_N * error_N
         difference_N = other_error_N - error_N
         apart = difference_N * difference_N
@@ -31,4 +31,3 @@ class Skill(Value):
 
 
 UNJUDGED: Final = Skill(0.0, DOUBT_N * DOUBT_N)
-"The skill before an error is judged."

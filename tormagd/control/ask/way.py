@@ -3,8 +3,8 @@
 pulled   the force is over PULLS_N the other way, whether the encoder shows it yet or not
 slid     the encoder shows the handle going the other way, and it came SLID_MM
 
-Either changes the way. A held handle that trembles turns back by what bristles give, but its hand goes on pushing: its
-way stays.
+Either changes the way. A held handle that trembles turns back by what its bristles give, while its hand goes on
+pushing: the way stays.
 """
 
 from typing import Final, final
@@ -12,31 +12,27 @@ from typing import Final, final
 from tormagd.control.records import AT_REST, Measured, Travel
 
 PULLS_N: Final = 0.1
-"Least force of a hand that pulls: more than a force sensor's noise, and than what of its zero is not known."
+"More than the force sensor's noise and the uncertainty of its zero."
 SLID_MM: Final = 0.5
-"More than the bristles of the softest elastomer give, 5 N/mm at 1.5 N either way."
+"More than the bristles of the softest elastomer give, at 5 N/mm and 1.5 N either way."
 
 
 def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
-    """Return the handle's place, mm, and rate, mm/s, both positive pushing on."""
     handle = measured.handle
     return push_sign * measured.handle_mm, push_sign * handle.turn.direction * handle.quick_mm_s
 
 
 @final
 class Way:
-    """The stage that follows a brake's handle along the way of the task: its place, its rate, and whether it pushes on."""
+    """Follows a brake's handle along the way of the task."""
 
     travel: Travel = AT_REST
-    "The newest travel; at rest before a measurement."
     changed_mm: float = 0.0
-    "The encoder's place where the way last changed."
 
     def __init__(self, push_sign: int) -> None:
         self._push_sign: Final = float(push_sign)
 
     def update(self, measured: Measured | None, zero_N: float, is_sensor_believed: bool) -> Travel:
-        """Return the handle's travel, and keep it in `travel`."""
         before = self.travel
         if measured is None:
             self.travel = Travel(before.place_mm, 0.0, before.is_pushing)

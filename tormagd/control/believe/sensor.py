@@ -158,7 +158,8 @@ class SensorTrust:
             self._begin(over_N)
 
     def zero_moved(self, found_N: float) -> float:
-        """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts the fit, N."""
+        """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts
+        the fit, N."""
         self.relaxed_N = 0.0
         return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
 

@@ -37,7 +37,8 @@ NOISE_N: Final = 0.03
 
 @final
 class SlowFriction:
-    """Estimator of one device's factor k, its force at rest over its force at speed, and of how much of it was learned."""
+    """Estimator of one device's factor k, its force at rest over its force at speed, and of how much of
+    it was learned."""
 
     factor: float = 1.0
     "k, before its bounds: a fit that errs at another rate, and comes back, leaves it as it was."
@@ -80,14 +81,16 @@ class SlowFriction:
         return self.followed_N
 
     def rescale(self, before_N: float, after_N: float, rate_mm_s: float) -> None:
-        """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N` to `after_N`."""
+        """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N`
+        to `after_N`."""
         if before_N > 0.0 and after_N > 0.0:
             kept = self.learned * max(1.0 - _slowness(rate_mm_s) / self.slowness, 0.0)
             at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
             self.factor = 1.0 + (min(max(at_creep, self._least), self._most) - 1.0) / self.slowness
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within `believable`."""
+        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within
+        `believable`."""
         if reading_N < self._bounds.min_scale * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)

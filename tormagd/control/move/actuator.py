@@ -12,16 +12,15 @@ from tormagd.safety.codes import Limit
 
 @final
 class Acted:
-    """Number of ticks in which each limit of the output has acted. There is no limit on how fast duties change."""
+    """The number of ticks in which each limit of the output has acted."""
 
     rate: int = 0
-    "The limit on the speed of the gap's reference."
+    "The speed of the gap's reference was limited."
     slew: int = 0
-    "The limit on the acceleration of the gap's reference."
+    "The acceleration of the gap's reference was limited."
     not_finite: int = 0
-    "A number was not finite."
     range: int = 0
-    "A duty was out of its range."
+    "A duty was limited."
 
 
 @final
@@ -39,19 +38,18 @@ class Drive(Value):
 
 
 class Actuator:
-    """What makes the gap follow a plan, by duties of two motors."""
+    """What makes the gap follow a plan, by the duties of two motors."""
 
     reference: Reference | None = None
-    "Where the gap is driven; None while nothing is driven."
+    "None while nothing is driven."
     acceleration_scale: float = 1.0
-    "Acceleration that the actuator has shown over the one that is asked of all devices, 1 or more."
+    "What the actuator has shown over what every device must reach, 1 or more."
 
     def __init__(self) -> None:
         self.acted = Acted()
 
     @property
     def reference_mm(self) -> float:
-        """The gap that is driven to, mm; NaN while nothing is driven."""
         return math.nan if self.reference is None else self.reference.gap_mm
 
     def begin(self, gap_mm: float) -> None:
@@ -59,7 +57,7 @@ class Actuator:
         raise NotImplementedError
 
     def resume(self, measured: Measured) -> None:
-        """Go on, without a jump, from the measured gap and speed that a blind time ended with."""
+        """Go on without a jump from the measured gap and speed that a blind time ended with."""
         raise NotImplementedError
 
     def update(
@@ -72,19 +70,19 @@ class Actuator:
         is_over: bool,
     ) -> Drive:
         """Return the duties of one tick, `dt_s` > 0 after the last. Call `begin` first, and again after `stop`. Raises
-        DomainError for a duty that is not finite: call `forget` then."""
+        DomainError for a duty that is not finite; call `forget` then.
+        """
         raise NotImplementedError
 
     def stop(self) -> None:
-        """Drop the reference: nothing is driven."""
         self.reference = None
 
     def lose_device(self) -> None:
-        """Forget how fast this device's motors gain speed: another device may come."""
+        """Forget how fast this device's motors accelerate, because another device may come."""
         self.acceleration_scale = 1.0
 
     def forget(self) -> None:
-        """Stop, forget the device, and count in `acted` a number that was not finite."""
+        """Stop, forget the device, and count a number that was not finite."""
         self.stop()
         self.lose_device()
         self.acted.not_finite += 1

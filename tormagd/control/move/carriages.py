@@ -20,26 +20,23 @@ from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene
 
 WEAK_MM: Final = 1.0
-"Carriages further behind than this have weaker motors than believed."
+"Carriages that are further behind have weaker motors than believed."
 EXCHANGE_S: Final = 0.0015
-"Time from a duty to its effect in the encoders' report: a period in the exchange, half a period that it is held."
+"A duty shows in the encoders' report after one period of exchange and half a period of holding."
 COULOMB_SPEED_MM_S: Final = 0.5
-"Below this reference speed the friction feed-forward fades."
+"The friction feed-forward fades below this reference speed."
 RESTING_MM_S: Final = 0.02
 "A slower reference has arrived."
 MAX_ACCELERATION_SCALE: Final = 2.0
-"Greatest `acceleration_scale`; the liveliest motors of the plant card do 2.4 times as much."
+"The liveliest motors of the plant card reach 2.4."
 SCALE_PER_MM_S: Final = 100.0
-"""Growth of `acceleration_scale` a second, for each mm that carriages are ahead of what is expected while acceleration
-limits them."""
+"Growth per second and mm that carriages are ahead while acceleration limits them."
 LAGGING_MM: Final = 0.1
-"The speed limit is reported as RATE only where it leaves the reference this far behind its target."
+"The speed limit is reported as RATE where the reference is this far behind its target."
 
 
 @final
 class Carriages(Actuator):
-    """The actuator that drives the two carriages of one device."""
-
     def __init__(self, config: Config, scene: Scene) -> None:
         super().__init__()
         position, motor = config.position, config.motor
@@ -72,11 +69,10 @@ class Carriages(Actuator):
         self.right.begin()
 
     def resume(self, measured: Measured) -> None:
-        """Go on from the measured gap and speed after a blind time, in which the device kept its last duty."""
+        """Go on from the measured gap and speed, because the device kept its last duty in the blind time."""
         self.reference = self._begun_at(measured)
 
     def forget(self) -> None:
-        """Forget all motion and the device, and count in `acted` a number that was not finite, as `Actuator.forget`."""
         self.begin(0.0)
         super().forget()
 
@@ -89,10 +85,9 @@ class Carriages(Actuator):
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """Return the duties of one tick, `dt_s` > 0 after the last, and take both position loops one tick on."""
         assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
-        # a homed carriage may be found beyond the closed end: its pull counts as at the closed end
+        # a homed carriage may be found beyond the closed end
         pull = 0.0
         if self._has_motor:
             pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._closed_mm)) / self._supply_V
@@ -101,7 +96,7 @@ class Carriages(Actuator):
             self.reference, now_s, dt_s, plan, self._speeds(pull, measured), measured, is_over, limits
         )
         self.reference = reference
-        # each carriage also takes half of the skew as an error, so that the faster waits for the slower
+        # each carriage also takes half of the skew as an error, so that the faster one waits
         skew_mm = self._synchronisation * measured.skew_mm / 2.0
         half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
         left_mm, right_mm = half_mm - measured.left_mm - skew_mm, half_mm - measured.right_mm + skew_mm
@@ -128,7 +123,7 @@ class Carriages(Actuator):
         is_over: bool,
         limits: list[Limit],
     ) -> tuple[Reference, bool]:
-        """Return the reference `dt_s` later, and whether the limit of its acceleration held it back."""
+        """Return the reference `dt_s` later, and whether its acceleration limit acted."""
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
@@ -149,23 +144,21 @@ class Carriages(Actuator):
         return reference, is_slewed
 
     def _begun_at(self, measured: Measured) -> Reference:
-        """Begin the expected gap anew at the measured gap and speed, and return a reference there."""
         speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
         self.expected.begin(measured.gap_mm, speed_mm_s)
         return Reference(measured.gap_mm, speed_mm_s)
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
-        """Return the gap's speeds, mm/s: at no load, and the greatest that the reference may open and close with."""
+        """Return the gap's speed at no load, and the greatest at which it may open and close."""
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
         closing_mm_s = min(motors_mm_s, self._gap_speed_mm_s)
-        # the magnets' pull helps to close, but there a reserve of duty is worth more than a little speed
+        # the pull helps to close, but a reserve of duty is worth more there than a little speed
         opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
-        """Update `acceleration_scale` after a period in which the acceleration limit held the reference back."""
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
             return
         # a carriage that did not get as far as it should is not ahead because it need not come back as far
@@ -175,12 +168,12 @@ class Carriages(Actuator):
         self.acceleration_scale = min(max(scale, 1.0), MAX_ACCELERATION_SCALE)
 
     def _feed_forward(self, reference: Reference, pull: float) -> float:
-        """Return one carriage's duty, positive to open and not limited, at the nominal supply."""
+        """Return one carriage's duty at the nominal supply, positive to open."""
         if not self._has_motor:
             return 0.0
         speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
         moving = min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
-        # to close, the pull helps a fifth as much: the screw's friction eats the rest
+        # the pull helps to close by a fifth only: the screw's friction takes the rest
         resisting = self._coulomb + (pull if moving > 0.0 else 0.0)
         # the gears' loss has to be added to speed up, and helps to brake
         loss = math.copysign(self._gear_loss, acceleration * speed)
@@ -188,7 +181,6 @@ class Carriages(Actuator):
         return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
     def _drive(self, left: float, right: float, supply_V: float, limits: list[Limit]) -> Drive:
-        """Return the duties at the device's real supply, held within the duty limit."""
         is_saturated = self.left.is_saturated or self.right.is_saturated
         if is_saturated:
             limits.append(Limit.SATURATED)

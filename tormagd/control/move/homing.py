@@ -12,16 +12,16 @@ from tormagd.safety.codes import Fault
 LONGEST_S: Final = 12.0
 "The slowest homing from a closed gap takes under 10 s."
 BACKS_OFF_MM: Final = 3.0
-"A firmware backs off less from a switch: a carriage that goes further towards closed goes the wrong way."
+"A firmware backs off less from a switch: a carriage that goes further goes the wrong way."
 WENT_BACK_MM: Final = 0.5
-"A carriage whose homing failed went the wrong way if it came so far towards closed."
+"A carriage whose homing failed went the wrong way if it moved this far towards closed."
 ZEROED_MM: Final = 1.0
-"No carriage moves so far between two looks: the device has set its zero."
+"No carriage moves this far between two looks: the device has set its zero."
 STATUS_S: Final = 0.1
-"A homing device sends a Status every 20 ms: without one for so long it is not known to home still."
+"A homing device sends a Status every 20 ms."
 OVER_S: Final = 0.04
 RISES: Final = 1.25
-"The sensor may show this many times what it showed when homing began, for OVER_S at most."
+"The sensor may show this many times what it showed at the start, for OVER_S at most."
 
 _HOMING: Final = DeviceMode.HOMING
 _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
@@ -29,30 +29,23 @@ _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
 
 @final
 class Homing:
-    """The watch on one homing of the device after another; `faults` are those of the newest look."""
+    """The watch on one homing of the device after another. `faults` are those of the newest look."""
 
     is_running: bool = False
-    "Whether the device homes, as of the newest look."
     began_s: float = 0.0
-    "When the homing began."
     time_s: float = 0.0
-    "When the newest look of a homing was."
     left_mm: float = 0.0
-    "How far open the left carriage has been."
+    "How far open the carriage has been."
     right_mm: float = 0.0
-    "How far open the right carriage has been."
     left_at_mm: float = 0.0
-    "Where the left carriage is."
+    "Where it is."
     right_at_mm: float = 0.0
-    "Where the right carriage is."
     switches: int = 0
-    "Which open switches were seen closed, as bits of `Switches`."
+    "The open switches that were seen closed."
     max_N: float = 0.0
-    "The greatest force that the sensor may show in this homing."
+    "The greatest force that the sensor may show."
     over_s: float = 0.0
-    "How long the sensor has shown more."
     faults: tuple[Fault, ...] = ()
-    "What was wrong at the newest look."
 
     def __init__(self, ceiling_N: float) -> None:
         self._ceiling_N: Final = ceiling_N
@@ -72,7 +65,7 @@ class Homing:
         )
 
     def update(self, now_s: float, measurement: Measurement) -> None:
-        """Take one look at the device, and set `faults`: WRONG_DIRECTION, HOMING, OVER_FORCE, STATUS_STALE, or none."""
+        """Look at the device once, and set `faults`."""
         self.faults = ()
         if measurement.mode is not _HOMING:
             if self.is_running:
@@ -83,7 +76,6 @@ class Homing:
             self._follow(now_s, measurement)
 
     def _begin(self, now_s: float, measurement: Measurement) -> None:
-        """Begin with a device that was found homing: note the time, its places and switches, and the force it may show."""
         self.is_running, self.began_s, self.time_s, self.over_s = True, now_s, now_s, 0.0
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -91,7 +83,6 @@ class Homing:
         self.max_N = max(self._ceiling_N, RISES * abs(measurement.force_N))
 
     def _follow(self, now_s: float, measurement: Measurement) -> None:
-        """Watch a homing that goes on, and set the first fault that shows; else leave `faults`."""
         self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
         self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
         self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
@@ -108,7 +99,7 @@ class Homing:
             self.faults = (Fault.STATUS_STALE,)
 
     def _end(self, now_s: float, measurement: Measurement) -> None:
-        """Judge a homing that has ended, and set `faults`; it is done, given up, or ended by a request to open."""
+        """Judge a homing that was completed, given up, or replaced by a request to open."""
         self.is_running, self.time_s = False, now_s
         self.switches |= int(measurement.switches) & _BOTH_OPEN
         if measurement.is_homed:
@@ -118,7 +109,6 @@ class Homing:
             self.faults = (self._went_back(WENT_BACK_MM, measurement),)
 
     def _went_back(self, most_mm: float, measurement: Measurement) -> Fault:
-        """Return the fault of a carriage that has gone over `most_mm` towards closed from where it was most open."""
         left_mm, right_mm = self.went_back_mm
         is_left_stuck = left_mm > most_mm and measurement.is_left_open
         is_right_stuck = right_mm > most_mm and measurement.is_right_open

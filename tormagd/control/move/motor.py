@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 PULL_STATED_MM: Final = 45.0
 "The gap for which `motor.pull_V` is stated."
 MAX_MARGIN_DB: Final = 200.0
-"Bound of a gain margin: that of a loop that no gain makes swing, or, negative, that swings with every gain."
+"No gain makes such a loop swing or, negative, every gain does."
 PULL_DEPTH_MM: Final = 32.0
 "Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
 
@@ -31,40 +31,37 @@ class TransferFunction(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Stability margins of the open position loop."""
-
     gain_margin_dB: float
     phase_margin_deg: float
     crossover_Hz: float
 
 
 def full_speed_mm_s(motor: Motor) -> float:
-    """Return the speed of one carriage at full duty without load, mm/s."""
+    """Return the speed of one carriage at full duty without load."""
     return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:
-    """Return the voltage that one motor needs against the magnets' pull, to open from `gap_mm` >= 0."""
+    """Return the voltage that one motor needs against the magnets' pull at `gap_mm`."""
     nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
     nearness *= nearness
     return stated_V * nearness * nearness
 
 
 def mechanical_time_s(motor: Motor) -> float:
-    """Return the time constant of the speed after a voltage step, s: J R / Ke^2."""
+    """Return the time constant of the speed: J R / Ke^2."""
     return motor.inertia_kg_m2 * motor.resistance_ohm / motor.back_emf_V_s**2
 
 
 def electrical_time_s(motor: Motor) -> float:
-    """Return the time constant of the current after a voltage step, s: L / R."""
     return motor.inductance_mH * 1e-3 / motor.resistance_ohm
 
 
 def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
-    """Return H(z) from duty to carriage position, mm, of third order, exact for a duty held over each period."""
+    """Return H(z) from duty to carriage position, mm, exact for a duty held over each period."""
     inductance_H = motor.inductance_mH * 1e-3
     advance_mm = motor.screw_lead_mm / (2.0 * math.pi * motor.gear_ratio)
-    # states: current A, motor speed rad/s, carriage position mm; last row and column carry the held input
+    # states: current A, motor speed rad/s, carriage position mm; last, the held input
     continuous = np.zeros((4, 4))
     continuous[0] = [
         -motor.resistance_ohm / inductance_H,
@@ -88,7 +85,7 @@ def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
 
 
 def _exponential(matrix: Array) -> Array:
-    """Return the exponential of a square matrix, by scaling and squaring a Taylor series; the matrix stays as it is."""
+    """Return the exponential of a square matrix, by scaling and squaring a Taylor series."""
     squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300))) + 4)
     scaled = matrix / 2.0**squarings
     total = term = np.eye(len(matrix))
@@ -101,13 +98,14 @@ def _exponential(matrix: Array) -> Array:
 
 
 def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
-    """Return the delay, s, beyond one period's exchange, that the position loop bears before it swings."""
+    """Return the delay beyond one period's exchange that the position loop bears."""
     known = margins(motor, position, period_s)
     return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
 
 
 def margins(motor: Motor, position: Position, period_s: float) -> Margins:
-    """Return the margins of one carriage's position loop as it is computed: PID and its filter in z, H(z), and a delay."""
+    """Return the margins of one carriage's position loop as it is computed: PID and its filter in z,
+    H(z), and a delay."""
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
     z = np.exp(2j * np.pi * frequency * period_s)
     plant = zero_order_hold(motor, period_s)

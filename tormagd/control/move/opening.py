@@ -2,10 +2,9 @@
 
     late  <-  max(late + dt - way / v, 0)        way: opened by since the last State; v: the device's own speed
 
-A carriage that is later than LATE_S is a fault. Opening is the firmware's own routine.
-
-Without known positions (not homed, or no State comes) the device's word is judged. Once asked to open, it must show
-both open switches, or that it failed. Or it says that it opens, for no longer than a search of the switches takes.
+A carriage that is later than LATE_S is a fault. Opening is the firmware's own routine. Without known positions (not
+homed, or no State comes) the device's word is judged. Once asked to open, it must show both open switches, report that
+it failed, or say that it is opening, for no longer than a search of the switches takes.
 """
 
 from typing import Final, final
@@ -20,13 +19,13 @@ from tormagd.scenes.scene import Scene
 LATE_S: Final = 0.35
 "Turning round, a request that a bad line loses twice, and weak motors take 0.1 s each."
 OPEN_MM: Final = 0.5
-"A carriage so near its switch is open: the force is within 2 % of the open gap's."
+"A carriage this near its switch is open: the force is within 2 % of the open gap's."
 SEARCH_SHARE: Final = 0.5
-"Without a zero a device opens at half of its speed or more."
+"A device without a zero opens at half of its speed or more."
 REPORT_S: Final = 0.1
-"A longer pause between two Status counts as this."
+"A longer pause between two Status messages counts as this."
 LOWEST_SUPPLY: Final = 0.5
-"Least share of the nominal voltage that counts: a lower reading gives no speed, and the device reports it."
+"A lower reading gives no speed, and the device reports it."
 
 _HOMING: Final = DeviceMode.HOMING
 _RETRACTING: Final = DeviceMode.RETRACTING
@@ -35,7 +34,6 @@ _FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED
 
 
 def is_open(measurement: Measurement, is_placed: bool) -> bool:
-    """Tell whether the gap is open."""
     if is_placed:
         return min(measurement.left_mm, measurement.right_mm) >= -OPEN_MM
     return measurement.is_left_open and measurement.is_right_open
@@ -43,35 +41,30 @@ def is_open(measurement: Measurement, is_placed: bool) -> bool:
 
 @final
 class Opening:
-    """The watch on the opening of a device that is not driven by the core; `faults` are those of the newest look."""
+    """The watch on the opening of a device that the core does not drive. `faults` are those of the newest look."""
 
     is_watching: bool = False
-    "Whether the newest look was judged."
     device_s: float = 0.0
     "The device's clock at the newest State."
     left_mm: float = 0.0
-    "Where the left carriage was at that State."
     right_mm: float = 0.0
-    "Where the right carriage was at that State."
     left_late_s: float = 0.0
-    "How late the left carriage is against the device's own speed."
+    "How late the carriage is against the device's own speed."
     right_late_s: float = 0.0
-    "How late the right carriage is against the device's own speed."
     reported_s: float = 0.0
-    "When the newest Status came."
     waits_s: float = 0.0
-    "How long a device whose carriages' places are not known has not been open."
+    "How long a device whose carriages' places are unknown has not been open."
     unheard_request: int = 0
-    "The newest request before this watch began: it was another device's, or for another end."
+    "The newest request before this watch began, which had another purpose."
     told_request: int = -1
-    "The request that followed the newest fault: only later requests are judged. -1: none."
+    "The request that followed the newest fault; only later ones are judged."
     faults: tuple[Fault, ...] = ()
-    "What was wrong at the newest look; told once."
 
     def __init__(self, config: Config, scene: Scene) -> None:
         self._full_mm_s: Final = config.device.retract_mm_s
         self._supply_V: Final = config.motor.supply_V
-        # a device without a zero may be anywhere, and says by itself that it failed: this is for one that does not
+        # a device without a zero may be anywhere, and should report by itself that it failed: this is in case it does
+        # not
         self._search_s: Final = 0.5 * scene.insert.gap_open_mm / (SEARCH_SHARE * self._full_mm_s) + LATE_S
 
     def __str__(self) -> str:
@@ -83,11 +76,10 @@ class Opening:
         )
 
     def rest(self, request_number: int) -> None:
-        """Stop watching, and clear `faults`: the device is driven, homes or has gone."""
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
-        """Take one look at a device that is not driven, and set `faults` to NOT_OPENING or to none."""
+        """Look once at a device that is not driven, and set `faults`."""
         number = safety.request_number
         if self.faults:
             self.told_request, self.faults = number, ()
@@ -106,7 +98,6 @@ class Opening:
             self._judge_by_places(measurement)
 
     def _begin(self, measurement: Measurement) -> None:
-        """Begin to watch: nothing is late yet; note when the device was heard, and where its carriages are."""
         self.is_watching = True
         self.left_late_s = self.right_late_s = self.waits_s = 0.0
         self.reported_s = measurement.reported_s
@@ -117,7 +108,6 @@ class Opening:
         self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
 
     def _judge_by_places(self, measurement: Measurement) -> None:
-        """Judge the carriages by their places, and set `faults` to NOT_OPENING where one is later than LATE_S."""
         dt_s = max(measurement.device_time_s - self.device_s, 0.0)
         share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
         speed_mm_s = share * self._full_mm_s
@@ -129,8 +119,7 @@ class Opening:
             self.faults = (Fault.NOT_OPENING,)
 
     def _judge_by_word(self, measurement: Measurement, is_asked: bool, is_placed: bool) -> None:
-        """Judge the device by its word, while its places are unknown or the loop is blind; may set `faults` to
-        NOT_OPENING."""
+        """Judge the device by its own report, while its places are unknown or the loop is blind."""
         if not is_placed:
             self._place(measurement)
         dt_s = min(measurement.reported_s - self.reported_s, REPORT_S)

@@ -15,17 +15,15 @@ from tormagd.model.features import LARGEST, require_number
 # compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST
 ON_TARGET_MM: Final = 0.001
-"Just over half a count of 4,480 on 8 mm: a carriage cannot be told to stand nearer."
+"Just over half an encoder count: a carriage cannot be told to stand nearer."
 
 
 @final
 class Pid:
-    """The position loop of one carriage: it keeps the integral, and whether the newest duty was held back."""
+    """The position loop of one carriage."""
 
     integral: float = 0.0
-    "The integral part of the duty."
     is_saturated: bool = False
-    "Whether the duty limit held the newest duty back."
 
     def __init__(self, position: Position) -> None:
         self._proportional_per_mm: Final = position.proportional_per_mm
@@ -35,16 +33,15 @@ class Pid:
         self._limit: Final = position.duty_limit
 
     def begin(self) -> None:
-        """Begin with an empty integral, and without saturation."""
         self.integral, self.is_saturated = 0.0, False
 
     def rest(self, error_mm: float, dt_s: float) -> None:
-        """Let the integral decay for `dt_s`, in the integral time, where |`error_mm`| is at most ON_TARGET_MM."""
+        """Let the integral decay while the carriage is on its target."""
         if abs(error_mm) <= ON_TARGET_MM:
             self.integral = self.integral * self._integral_time_s / (self._integral_time_s + dt_s)
 
     def update(self, error_mm: float, error_mm_s: float, feed_forward: float, dt_s: float, is_blocked: bool) -> float:
-        """Return the duty, within the duty limit, `dt_s` > 0 after the last; update `integral` and `is_saturated`."""
+        """Return the duty after `dt_s` > 0."""
         proportional = self._proportional_per_mm * error_mm
         derivative = self._proportional_per_mm * self._derivative_time_s * error_mm_s
         asked = proportional + self.integral + derivative + feed_forward
@@ -55,7 +52,7 @@ class Pid:
         growth = proportional / self._integral_time_s + (duty - asked) / self._back_calculation_s
         if is_blocked:
             growth = min(growth, 0.0)
-        # no carriage needs more than the whole duty from the integral, whatever a long saturation adds up to
+        # no carriage needs more than the whole duty from the integral
         self.integral = min(max(self.integral + growth * dt_s, -self._limit), self._limit)
         self.is_saturated = within != asked and duty == within
         return duty

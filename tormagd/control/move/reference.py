@@ -8,16 +8,16 @@ from tormagd.control.filter import low_pass
 from tormagd.control.records import Plan
 
 CARRY_S: Final = 0.012
-"A plan's gap is carried forward along its motion by no more than this, three inference periods."
+"A plan's gap is carried on for no more than three inference periods."
 APPROACH_S: Final = 0.01
-"Time constant of the last stretch: below it the reference would chase every quantum of its target."
+"With less the reference would chase every quantum of its target."
 MIN_BRAKING: Final = 0.2
-"Share of the acceleration that is left to brake with, however hard the target itself turns."
+"Share of the acceleration that is left to brake with, however hard the target turns."
 
 
 @final
 class Reference(Value):
-    """A place to drive the gap to, mm, with its speed, mm/s, and acceleration, mm/s^2."""
+    """A place to drive the gap to, with its speed and acceleration."""
 
     def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, acceleration_mm_s2: float = 0.0) -> None:
         self.gap_mm: Final = gap_mm
@@ -27,8 +27,6 @@ class Reference(Value):
 
 @final
 class Speeds(Value):
-    """Speeds of the gap, mm/s, > 0."""
-
     def __init__(self, no_load_mm_s: float, opening_mm_s: float, closing_mm_s: float) -> None:
         self.no_load_mm_s: Final = no_load_mm_s
         self.opening_mm_s: Final = opening_mm_s
@@ -36,7 +34,7 @@ class Speeds(Value):
 
 
 def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
-    """Return where `plan` leads, with speed and acceleration, `lag_s` from now, when the present duty takes effect."""
+    """Return where `plan` leads `lag_s` from now, when the present duty takes effect."""
     age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + lag_s
     gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
     speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
@@ -56,7 +54,7 @@ def follow(
     speeds: Speeds,
     floor_mm: float = -math.inf,
 ) -> tuple[Reference, bool, bool]:
-    """Return the reference `dt_s` > 0 later, and two limits: whether speed held it back, and whether acceleration did."""
+    """Return the reference `dt_s` later, and whether its speed and its acceleration held it back."""
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
     relative = max(relative, MIN_BRAKING * acceleration_mm_s2)
@@ -76,7 +74,7 @@ def follow(
 
 
 def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> float:
-    """Return the greatest speed, mm/s, from which `distance_mm` >= 0 still suffices to come to rest in steps of `dt_s`."""
+    """Return the greatest speed from which `distance_mm` suffices to stop in steps of `dt_s`."""
     change = braking_mm_s2 * dt_s
     fastest = (math.sqrt(change * change + 8.0 * braking_mm_s2 * distance_mm) - change) / 2.0
     return min(fastest, distance_mm / max(APPROACH_S, dt_s))
@@ -84,19 +82,17 @@ def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> flo
 
 @final
 class Expected:
-    """The gap that the carriages are expected at: the reference with its jerk limited."""
+    """Where the carriages are expected: the reference with its jerk limited."""
 
     gap_mm: float = 0.0
     speed_mm_s: float = 0.0
     filtered_mm_s: float = 0.0
-    "The speed, filtered as the measured speeds are."
+    "Filtered like the measured speeds."
 
     def begin(self, gap_mm: float, speed_mm_s: float = 0.0) -> None:
-        """Begin at the gap `gap_mm` with the speed `speed_mm_s`."""
         self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
 
     def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
-        """Follow the place and speed of `reference` for `dt_s` > 0, with the time constant `lag_s`."""
         self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
         self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)
         self.filtered_mm_s = low_pass(self.filtered_mm_s, self.speed_mm_s, dt_s, filter_s)

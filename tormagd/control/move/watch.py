@@ -16,50 +16,49 @@ from tormagd.safety.operating_state import Conditions, SafetyState
 from tormagd.scenes.scene import Scene
 
 STARTING_S: Final = 0.15
-"After enabling, the device may take this long to report that it runs."
+"The device may take this long to report that it runs."
 STILL_MM_S: Final = 0.5
-"Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
+"A slower carriage stands still: half an encoder count per millisecond, filtered."
 STARTS_OVER: Final = 1.25
-"Static over kinetic friction at most: a start from rest may take so many times the greatest force."
+"Static over kinetic friction: a start from rest may take this many times the greatest force."
 OVER_N: Final = 0.1
-"How far the sensor may be off besides."
+"An allowance for the sensor's error."
 OVER_HELD_S: Final = 0.03
 OVER_FAULT_S: Final = 0.1
-"A force over the ceiling opens the gap after OVER_HELD_S, and is a fault after OVER_FAULT_S."
+"A force over the ceiling opens the gap after the first, and is a fault after the second."
 OVER_FADES: Final = 0.25
-"While it is under, the time over it falls by so much a second."
+"The time over the ceiling falls by this much per second while the force is below."
 SENSOR_FAULT_S: Final = 2.0
-"A sensor not believed for so long of sliding is a fault: forces are then only as good as the model."
+"A sensor that is not believed for this long of sliding leaves forces only as good as the model."
 SENSE_FAULT_S: Final = 0.1
 STATUS_FAULT_S: Final = 0.1
-"A Sense, or a Status, that is older is a fault: Status comes every 20 ms, Sense with every State."
+"Status comes every 20 ms, Sense with every State."
 OPPOSED_S: Final = 0.1
-"A carriage that moves against its duty for so long does not brake: it brakes from full speed within 0.06 s."
+"A carriage that brakes moves against its duty for 0.06 s at most."
 WENT_AGAINST_S: Final = 0.015
-"Carriages that come apart, or to a stop, do so by wrong wiring if one has gone against its duty for so long."
+"Carriages that come apart or stop are wired wrong if one has moved against its duty for this long."
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
-"""Shares of the delay that the position loop bears besides its own period."""
+"Shares of the delay that the position loop bears besides its period: a limit, and a fault."
 CLOCK_OFF: Final = 0.01
 CLOCK_FAULT: Final = 0.1
-"A device's clock that is off by more than CLOCK_OFF is a limit, by more than CLOCK_FAULT a fault."
 STALL_SHARE: Final = 0.8
-"A stall of the host shorter than this share of the device's timeout did not make it run out."
+"Of the device's timeout: a shorter stall of the host did not let it expire."
 
 _DEVICE_RUN: Final = DeviceMode.RUN
 
 
 def ceiling_N(scene: Scene) -> float:
-    """Return the greatest force, N, that the sensor may show in `scene`."""
+    """Return the greatest force that the sensor may show in `scene`."""
     return STARTS_OVER * scene.force.most_N + OVER_N
 
 
 @final
 class Watch:
-    """The watch on one device: counts for how long a driven device misbehaves, and tells its faults and limits."""
+    """The watch on one device: counts how long it misbehaves, and tells its faults and limits."""
 
     enabled_s: float = math.inf
-    "When the device was enabled; inf while it is not."
+    "inf while the device is not enabled."
     straying_s: float = 0.0
     "How long the gap has been too far from its reference."
     still_s: float = 0.0
@@ -67,13 +66,11 @@ class Watch:
     opposed_s: float = 0.0
     "How long a carriage has moved against its duty."
     over_s: float = 0.0
-    "How long the measured force has been over the ceiling of late while the handle moved."
+    "How long the force has been over the ceiling of late while the handle moved."
     is_over: bool = False
-    "Whether the force is over the ceiling, and has been for so long of late that the gap has to open."
+    "Whether the gap has to open, because the force has been over the ceiling for too long."
     left_duty: float = 0.0
-    "The left motor's duty at the step before."
     right_duty: float = 0.0
-    "The right motor's duty at the step before."
 
     def __init__(self, config: Config, scene: Scene) -> None:
         limits, device, period_s = config.limits, config.device, 1.0 / config.rates.control_hz
@@ -98,7 +95,7 @@ class Watch:
         self._ceiling_N: Final = ceiling_N(scene)
 
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
-        """Return `conditions` completed by the carriages' skew, and by the greatest values that a command may find."""
+        """Return `conditions` with the carriages' skew and what a command allows."""
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
@@ -108,7 +105,7 @@ class Watch:
         )
 
     def begin(self, enabled_s: float) -> None:
-        """Begin all counts anew for a device enabled at `enabled_s`; inf: not enabled."""
+        """Restart all counts for a device enabled at `enabled_s`."""
         self.enabled_s = enabled_s
         self.straying_s = self.still_s = self.opposed_s = self.over_s = 0.0
         self.is_over = False
@@ -123,13 +120,12 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        """Return all faults that show now, and change nothing: `operating_state.latch` sorts them."""
         faults = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
                 faults.append(Fault.ENCODER)
         elif measured.is_homed and not safety.needs_homing:
-            # switches come with Status: an older Status, or an older State, is of another place
+            # switches come with Status: with an older Status or State they are of another place
             is_told = not sight.is_blind and measurement.reported_s >= measurement.received_s
             switches: int = measurement.switches
             if is_outside(measured, self._closed_mm, self._open_mm) or (
@@ -138,14 +134,13 @@ class Watch:
                 faults.append(Fault.OUT_OF_STROKE)
         if safety.is_driven:
             faults += self._of_link(now_s, measurement, sight)
-            if leap is None:  # after a leap positions say nothing of the motion
+            if leap is None:  # after a leap positions say nothing about the motion
                 faults += self._of_motion(measured, sensor_doubted_s)
                 if measurement.mode is not _DEVICE_RUN and not faults and now_s - self.enabled_s > STARTING_S:
                     faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
 
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        """Return the limits that show now, and change nothing: SKEW, HOST_STALL, SENSE_STALE, LINK_DEGRADED and CLOCK."""
         limits: list[Limit] = []
         if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
@@ -161,7 +156,7 @@ class Watch:
         return limits
 
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
-        """Take one tick, `dt_s` long, in which the motors were driven with these duties towards the gap `reference_mm`."""
+        """Count one tick of driving with these duties towards `reference_mm`."""
         is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
@@ -173,11 +168,11 @@ class Watch:
         self.left_duty, self.right_duty = left_duty, right_duty
 
     def rest(self) -> None:
-        """Take one tick without duties: the newest duties become 0, and the counted times stand."""
+        """Count one tick without duties."""
         self.left_duty = self.right_duty = 0.0
 
     def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
-        """Return the faults that the device reports; none while a clearing of its faults may still be under way."""
+        """Return the faults that the device reports, except while they are being cleared."""
         shown: int = measurement.faults
         if not shown or now_s < safety.clearing_until_s:
             return []
@@ -187,9 +182,8 @@ class Watch:
         return list(device_faults(measurement.faults, is_host_stall=is_ours))
 
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
-        """Return the faults of the link: messages too old, a round trip too long, a device's clock too far off."""
         faults: list[Fault] = []
-        # the tick nearest to the end of a timeout judges it: the next one could be a period late
+        # the next tick could be a period late
         at_s = now_s + self._period_s / 2.0
         if not sight.is_waiting(now_s):
             # a State that has just come over a slow line is old too, and a loop around such a delay would swing
@@ -206,7 +200,6 @@ class Watch:
         return faults
 
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
-        """Return the faults of motion and force, by the counted times; empty for none."""
         faults: list[Fault] = []
         is_skewed = abs(measured.skew_mm) > self._max_apart_mm
         is_still = self.still_s > self._no_motion_time_s
@@ -216,7 +209,7 @@ class Watch:
             faults.append(Fault.SKEW)
         if self.straying_s > self._following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
-        if self.over_s > OVER_FAULT_S and self._slides:  # on a pad the finger itself may press so hard
+        if self.over_s > OVER_FAULT_S and self._slides:  # on a pad the finger itself may press this hard
             faults.append(Fault.OVER_FORCE)
         if self._needs_sensor and sensor_doubted_s > SENSOR_FAULT_S:
             faults.append(Fault.SENSOR)
@@ -225,8 +218,8 @@ class Watch:
         return faults
 
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
-        """Tell whether a carriage stands while it is driven the same way as a step before; one of the two is enough."""
-        # a duty that turns round before the carriage could move drives it nowhere
+        """Tell whether a carriage stands still although it is driven the same way as a step before."""
+        # a duty that reverses before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
         is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
         is_left_still = is_left_driven and abs(measured.left_mm_s) < STILL_MM_S
@@ -234,7 +227,6 @@ class Watch:
         return is_left_still or is_right_still
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        """Count in `opposed_s`, by `dt_s`, for how long a carriage moves against its duty."""
         left_mm_s = right_mm_s = 0.0
         is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
         if is_left_driven:
