@@ -35,12 +35,11 @@ class Arming:
         self._given_s = self._moved_s = now_s
 
     def end(self, refusal: RefusedError | None = None) -> None:
-        """End the arming, with `refusal` if it failed."""
         if not self.is_over:
             self.is_over, self.refusal = True, refusal
 
     def advance(self, now_s: float, safety: SafetyState, present: Conditions, give: Callable[[str], None]) -> None:
-        """Give the next command through `give` once its time has come; end in ENABLED or with a refusal."""
+        """Give the next command once its time has come; end in ENABLED or with a refusal."""
         if self.is_over:
             return
         try:
@@ -64,7 +63,6 @@ class Arming:
             raise RefusedError("fault", f"a fault came while arming: {', '.join(news)}", "tormagctl status")
 
     def _attempt(self, now_s: float, command: Event, give: Callable[[str], None]) -> None:
-        """Give `command` and add it to `given`."""
         try:
             if command in self.given:
                 raise RefusedError("busy", f"{command} was taken, and has not come to its end", "tormagctl status")

@@ -8,8 +8,6 @@ _EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 
 
 class Arrivals:
-    """Knows which ZeroMQ sockets hold messages, by polling their descriptors once a beat."""
-
     def __init__(self) -> None:
         self._poll = select.poll()
         self._sockets: dict[int, zmq.Socket[bytes]] = {}
@@ -22,7 +20,6 @@ class Arrivals:
         self._poll.register(descriptor, select.POLLIN)
 
     def look(self) -> None:
-        """Poll all watched sockets without waiting, and note which have signalled."""
         for descriptor, _ in self._poll.poll(0):
             self._ready.add(self._sockets[descriptor])
 
@@ -31,7 +28,6 @@ class Arrivals:
         self._ready.add(socket)
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
-        """Tell whether a message waits in a watched socket."""
         if socket in self._ready and not is_readable(socket):
             self._ready.discard(socket)
         return socket in self._ready

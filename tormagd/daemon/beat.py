@@ -30,7 +30,7 @@ class Beat(NamedTuple):
 
 
 Part = tuple[str, Callable[[Beat], object]]
-"Name and function of a part of a beat; the function returns False if it had nothing to do."
+"The function returns False if it had nothing to do."
 
 
 class Delay(NamedTuple):
@@ -62,7 +62,6 @@ class Phases:
         self.spent: dict[str, Histogram] = {}
         self._errors: dict[str, str] = {}
         self.blamed: Counter[str] = Counter()
-        "Number of late beats by the part that caused them."
         self._late, self._worst = 0, Delay(0, "", 0)
         self._tell_ns = clock_ns()
 
@@ -87,7 +86,6 @@ class Phases:
                 self.spent[name].add(end_ns * 1e-9, (end_ns - start_ns) * 1e-3)
 
     def on_time(self) -> None:
-        """Note that the device was driven in time."""
         self._cpu_before_ns = self._cpu_ns()
 
     def ran_ns(self) -> int:
@@ -116,7 +114,6 @@ class Phases:
         return delay
 
     def tell(self) -> None:
-        """Log the number of late beats and the worst one since the last line, at most once in NEWS_NS."""
         now_ns = self._clock_ns()
         if self._late and now_ns >= self._tell_ns:
             took_ns, culprit, share_ns = self._worst
@@ -129,7 +126,6 @@ class Phases:
             self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
-        """Run one part and keep its times; return False if it had nothing to do."""
         start_ns = self._clock_ns()
         try:
             is_done = part(beat) is not False

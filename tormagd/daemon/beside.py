@@ -9,7 +9,7 @@ MAX_PACKET = 65_536
 
 
 def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
-    """Start `python -m module DESCRIPTOR`, which inherits `its_end` as that descriptor."""
+    """Start `python -m module DESCRIPTOR` with `its_end` as that descriptor."""
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
     # a session of its own: signals to our process group must not end it before us
@@ -25,7 +25,6 @@ class Beside:
         with its:
             self.process = start_beside(module, its)
         self.is_gone = False
-        "Whether the process has ended, or this end is closed."
 
     def send(self, data: bytes) -> bool:
         """Send one packet without waiting, and return whether the socket took it."""
@@ -38,7 +37,6 @@ class Beside:
         return not self.is_gone
 
     def receive(self, wait_s: float = 0.0) -> bytes | None:
-        """Wait up to `wait_s` for the next packet, and return it if there is one."""
         try:
             if wait_s:
                 select.select([self.socket], [], [], wait_s)

@@ -1,4 +1,4 @@
-"""The calibration of the connected device: it is read by serial number, and the core is rebuilt with it."""
+"""The calibration of the connected device: it is read by serial number."""
 
 import asyncio
 import logging
@@ -34,11 +34,11 @@ class Calibrations:
         self._file = self._refusal = ""
 
     def is_awaited(self, serial_number: int | None) -> bool:
-        """Tell whether this device may not be driven yet because its calibration is not in force."""
+        """Tell whether this device must wait for its calibration."""
         return self._folder is not None and serial_number not in (None, self._of)
 
     def look(self, serial_number: int | None, running: Config, *, is_idle: bool) -> None:
-        """Bring the connected device's calibration into force, step by step, while the device `is_idle`."""
+        """Bring the device's calibration into force, step by step, while it `is_idle`."""
         if not is_idle or serial_number is None or self._folder is None or serial_number == self._of:
             return
         # the scene may have changed while the device was away
@@ -53,14 +53,12 @@ class Calibrations:
             self._note(serial_number, self._making[1])
 
     def read_again(self) -> None:
-        """Read the calibration again, and put it into force once the device is idle."""
         self._of = self._making = None
 
     def report(self) -> CalibrationReport:
         return CalibrationReport(file=self._file, refusal=self._refusal, folder=str(self._folder or ""))
 
     def _note(self, serial_number: int, making: "asyncio.Future[Made]") -> None:
-        """Put a finished calibration into force, or note why it is refused."""
         refusal_before = self._refusal
         try:
             made = making.result()

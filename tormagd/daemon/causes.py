@@ -19,7 +19,6 @@ SILENCES = {
     *("LINK_LOST", "MEASUREMENT_STALE", "SENSE_STALE", "STATUS_STALE", "LINK_DEGRADED", "DEVICE_COMMAND_TIMEOUT"),
     "DEVICE_SILENT",
 }
-"Faults and limits of messages that are late or missing."
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +39,6 @@ class Causes:
             self.stall = StallReport(stall_ms, delay.culprit)
 
     def note_wait(self, now_s: float, wait_s: float) -> None:
-        """Note that the control loop waited `wait_s` for the processor, at most since the last such wait."""
         last_s = self._waits[-1][0] if self._waits else -math.inf
         self._waits.append((now_s, min(wait_s, now_s - last_s)))
 
@@ -55,7 +53,6 @@ class Causes:
         )
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
-        """Log the newly latched `faults` with cause and remedy, and remember the figures of their causes."""
         figures = {} if measurement is None else _figures(stepper, measurement)
         causes = {fault: f"{FAULTS[fault].cause}: {figure}" for fault, figure in figures.items()}
         opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
@@ -83,7 +80,6 @@ class Causes:
         measurement: Measurement | None,
         now_s: float,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause, in figures if there are any, and its remedy."""
         told = {
             Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered",
             Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}",

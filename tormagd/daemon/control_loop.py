@@ -16,14 +16,11 @@ from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, RefusedError, reason
 
 REPEATED_S = 1.0
-"How often a command that changes nothing is logged."
 
 log = logging.getLogger(__name__)
 
 
 class ControlLoop:
-    """Steps the core on the newest measurement each period, and drives the device."""
-
     def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
         self.stepper, self._connection, self._journal = stepper, connection, journal
         self.output: Duty | None = None
@@ -36,7 +33,6 @@ class ControlLoop:
         self._told: dict[str, tuple[float, int]] = {}
 
     def drive(self, beat: Beat, plan: Plan) -> None:
-        """Step the core along `plan`, and send its output to the device."""
         now_s = time.monotonic()  # not the beat's start: a stall within the beat counts, too
         self.used, self.measurement = plan, self._connection.measurement
         self._journal.stepped()
@@ -62,7 +58,6 @@ class ControlLoop:
             raise self.arming.refusal
 
     def go_on_arming(self, conditions: Conditions) -> None:
-        """Give the next command of an arming under way, if its time has come."""
         arming = self.arming
         if arming is None or arming.is_over:
             return
@@ -71,7 +66,6 @@ class ControlLoop:
             log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
 
     def _give(self, name: str, conditions: Conditions) -> None:
-        """Give an operator's command to the core, note it in the journal, and log it if taken."""
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
             self.stepper.command(name, now_s, conditions)
@@ -87,7 +81,6 @@ class ControlLoop:
         log.info("%s: %s%s", name, reason(name, source), f"; {count} times more before" if count else "")
 
     def latch(self, fault: Fault) -> None:
-        """Latch a fault that was found outside the step."""
         self._journal.latched(fault)
         self.stepper.latch(fault)
 
@@ -96,7 +89,6 @@ class ControlLoop:
         self.stepper.lose_link()
 
     def new_faults(self) -> tuple[Fault, ...]:
-        """Return the faults latched since the last call."""
         faults, known = self.stepper.safety.faults, self._known_faults
         self._known_faults = faults
         return tuple(fault for fault in faults if fault not in known)

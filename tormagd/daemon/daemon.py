@@ -1,4 +1,4 @@
-"""The daemon put together: one thread, one event loop, and one beat a period that runs the three loops."""
+"""The daemon put together: one thread, one event loop, one beat a period."""
 
 import asyncio
 import contextlib
@@ -65,7 +65,6 @@ class Daemon:
         beside: SearchProcess | None = None,
         config_file: str | None = None,
     ) -> None:
-        """Bind the endpoints and put the loops together; `run` opens the device."""
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
@@ -128,7 +127,6 @@ class Daemon:
         self._ended = asyncio.Event()
 
     def _profiles_of(self, core: Core) -> Profiles:
-        """Return the profiles for a core's insert and model; without a folder they keep nothing."""
         folder, bounds = state_folder(core.config.device.profiles, "profiles"), device_bounds(core.config.trim)
         known = core.scene.insert.name, core.model, bounds, gains_of(core.config)
         of_insert = None if folder is None else ProfileFolder(folder, *known)
@@ -169,7 +167,7 @@ class Daemon:
         log.info("tormagd has ended")
 
     def _beat(self, heartbeat: Heartbeat) -> None:
-        if beats := heartbeat.beats():  # a spurious wake-up has none
+        if beats := heartbeat.beats():
             self._phases.run(heartbeat.due_ns, beats - 1)
 
     def _receive(self, beat: Beat) -> None:
@@ -197,11 +195,11 @@ class Daemon:
             self._phases.on_time()
         if faults := control.new_faults():
             self._causes.tell(faults, control.stepper, control.measurement)
-            with contextlib.suppress(RefusedError):  # no black box is kept
+            with contextlib.suppress(RefusedError):
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
 
     async def _build(self, scene: str) -> Core:
-        """Build the core of another scene at the running rates, once pending profiles are written."""
+        """Build the core of another scene at the running rates."""
         # in a thread, so that no beat waits
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
         if core.element.is_beside or self._inference.beside is not None:
@@ -213,7 +211,7 @@ class Daemon:
         self._control.command("use-scene", self._telemetry.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
-        """Run `core`, made for `scene`; what was learned is kept if model and insert are the same."""
+        """Run `core`, made for `scene`; if model and insert are the same, keep what was learned."""
         before, learned = self._core, self._inference.planner.believe.learned()
         self._calibrations.configured = msgspec.structs.replace(self._calibrations.configured, scene=scene)
         self._run_core(msgspec.structs.replace(self._config, scene=scene), core)
@@ -240,8 +238,7 @@ class Daemon:
         self._reloading.add_done_callback(asyncio.Task.result)
 
     async def _reload(self) -> None:
-        """Read keys and configuration again, and take over what may change while control runs."""
-        # in threads, so that no beat waits
+        """Read keys and configuration again."""
         try:
             if self._keys is None:
                 log.info("no list of keys to read again: there is no endpoints.curve")

@@ -15,7 +15,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Heartbeat:
-    """A periodic timer of the kernel on CLOCK_MONOTONIC (timerfd), which the event loop watches."""
+    """A periodic timer on CLOCK_MONOTONIC (timerfd)."""
 
     def __init__(self, period_ns: int) -> None:
         self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
@@ -35,7 +35,7 @@ class Heartbeat:
         return self._fd
 
     def beats(self) -> int:
-        """Return the number of beats due since the last call, more than 1 if some were missed."""
+        """Return the number of beats due since the last call."""
         try:
             expirations: int = struct.unpack("=Q", os.read(self._fd, 8))[0]
         except BlockingIOError:

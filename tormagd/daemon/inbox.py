@@ -1,10 +1,8 @@
 """The inbox: chooses the setpoint to plan for among those of several publishers, and hands it on when it is due.
 
-Each message is judged once, by its `Source`: whether it is new, in time and evenly sent. The inbox decides which source
-holds the brake. A source keeps it until it is stale, one of higher priority sends, or an operator gives the brake away.
-With `sources.playout_ms` every setpoint waits until that long after its stamp, which removes the jitter of its way.
-
-No sockets and no clock: times are arguments.
+Each message is judged once, by its `Source`. A source holds the brake until it is stale, one of higher priority sends,
+or an operator gives the brake away. With `sources.playout_ms` every setpoint waits until that long after its stamp,
+which removes the jitter of its way. Times are arguments.
 """
 
 import logging
@@ -24,12 +22,11 @@ from tormagd_client.messages import MessageError, PlayoutReport, Setpoint, Setpo
 SOURCES = 16
 "One more publisher is refused until another has fallen silent."
 SILENT_S = 1.0
-"After this silence a source makes room for another, and a refused one is no longer reported."
+"After this silence a source makes room for another."
 LONGEST_REFUSAL = 200
 REPORTED = 6
 "An answer has limited length: the newest sources are reported in full."
 NEWS, NEWS_S = 4, 1.0
-"Log lines that wait, and the time between two of them."
 MAX_WAITING = 1_024
 "What one publisher may send in the longest playout."
 
@@ -48,7 +45,7 @@ class Taken(NamedTuple):
 
 
 class SetpointInbox:
-    """Chooses the setpoint to plan for, `newest`: the newest valid one of the `holder` of the brake, once it is due."""
+    """Chooses the newest valid setpoint of the `holder` of the brake, once it is due."""
 
     def __init__(self, sources: Sources = EQUAL_SOURCES) -> None:
         self.has_way = True
@@ -74,8 +71,8 @@ class SetpointInbox:
         self._told_s = -NEWS_S
         self._turn = 0
 
-    def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
-        """Decode, judge and count one message; return True if another setpoint is in force after it."""
+    def take(self, data: bytes, now_s: float, realtime_ns: int, key: str = "") -> bool:
+        """Take one message; return True if another setpoint is in force after it."""
         try:
             setpoint = decode(data, Setpoint)
             allowed = self.sources.keys.get(setpoint.source, (key,))
@@ -111,7 +108,7 @@ class SetpointInbox:
         return self._follow(source, now_s)
 
     def give(self, name: str, now_s: float) -> None:
-        """Make the source `name` the holder of the brake, as an operator's choice."""
+        """Give the brake to the source `name`, as an operator's choice."""
         source = self._sources.get(name)
         if source is None:
             known = ", ".join(sorted(self._sources)) or "none"
@@ -142,24 +139,22 @@ class SetpointInbox:
         return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
 
     def begin_scene(self, scene: Scene) -> None:
-        """Judge by the needs of `scene` from now on, and forget the setpoints of the last one."""
         self._forget()
         self.has_way, self._needs = scene.element == "torque", needs_of(scene)
 
     def withdraw(self, reason: str) -> None:
-        """Forget all setpoints, and count the one in force as refused for `reason`."""
+        """Forget all setpoints, and count one as refused for `reason`."""
         if self.in_force is not None:
             self._forget()
             self._refuse(reason)
 
     def tell(self, now_s: float) -> None:
-        """Log the next waiting line, at most one in NEWS_S."""
         if self._news and now_s - self._told_s >= NEWS_S:
             self._told_s = now_s
             log.warning("%s", self._news.popleft())
 
     def told(self, now_s: float) -> dict[Limit, Explanation]:
-        """Return explanations of the limits about sources, whether these are in force or not."""
+        """Return explanations of the limits about sources, also of those that are not in force."""
         holder = self._sources.get(self.holder)
         if holder is None:
             return {}
@@ -167,7 +162,6 @@ class SetpointInbox:
         return why | holder.found
 
     def refresh(self, now_s: float) -> None:
-        """Update the reported figures of the playout and of one source, in turn."""
         if self._sources:
             self._turn += 1
             if self.sources.playout_ms > 0.0:
@@ -176,7 +170,7 @@ class SetpointInbox:
             if source.refresh(now_s):
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
-    def report(self, now_s: float, oversize: int = 0) -> SetpointReport:
+    def report(self, now_s: float) -> SetpointReport:
         newest = sorted(self._sources, key=lambda name: (name != self.holder, -self._sources[name].heard_s))
         reported = {name: "holds" if name == self.holder else "refused" for name in newest[:REPORTED]}
         playout_ms = self.sources.playout_ms
@@ -232,7 +226,6 @@ class SetpointInbox:
         return self.hand_on(now_s)
 
     def _hand_over(self, name: str, why: str) -> None:
-        """Make `name` the holder, log `why`, and begin a ramp."""
         if self.holder:
             self._news.append(f"source {name!r} holds the brake instead of {self.holder!r}: {why}")
             self._number += 1
@@ -253,7 +246,7 @@ class SetpointInbox:
         self._waiting.clear()
 
     def _add(self, setpoint: Setpoint, now_s: float) -> Source:
-        """Add the source of `setpoint`, in the place of a silent or unlisted one if there are too many."""
+        """Add the source of `setpoint`, in the place of a silent or unlisted one."""
         name = setpoint.source
         if len(self._sources) >= SOURCES:
             others = [source for other, source in self._sources.items() if other != self.holder]
@@ -269,7 +262,6 @@ class SetpointInbox:
         return source
 
     def _why_stale(self, holder: Source, now_s: float) -> Explanation:
-        """Return why the holder is stale: it is silent, its messages come late, or they wait too long."""
         name, silent_ms = self.holder, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
@@ -292,7 +284,6 @@ class SetpointInbox:
         )
 
     def _why_other(self, holder: Source, now_s: float) -> Explanation:
-        """Return why setpoints compete: two publishers share the holder's name, or another source sends."""
         if holder.sequence.is_doubled(now_s):
             return Explanation(
                 f"two publishers call themselves {self.holder!r}, or one repeats itself: one of them is followed",

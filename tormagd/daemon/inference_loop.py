@@ -1,4 +1,4 @@
-"""The inference loop, a phase of every beat: plans for each new setpoint, and at least `inference_hz` times a second."""
+"""The inference loop, a phase of every beat: plans for each new setpoint, and at least at its own rate."""
 
 import logging
 import time
@@ -35,7 +35,6 @@ class InferenceLoop:
         clock_ns: Callable[[], int] = time.monotonic_ns,
         beside: SearchProcess | None = None,
     ) -> None:
-        """`beside` is the search in a process of its own; without one, plans search by themselves."""
         self.planner, self._inbox, self._clock_ns, self._journal = planner, inbox, clock_ns, journal
         self._on_failure, self._failure = on_failure, ""
         self.beside: Final = beside
@@ -43,17 +42,14 @@ class InferenceLoop:
         self._due_ns = 0
 
     def teach(self, learned: Learned) -> None:
-        """Replace what is known of the device by `learned`."""
         self._journal.taught(learned)
         self.planner.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word that the device has changed, or that its sensor is wrong."""
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
-        """Plan for the inbox's newest setpoint, if one has come (`is_asked`) or a plan is due."""
         period_ns = self.timing.period_ns
         # counted from when beats are due, not when they begin: lateness does not lower the rate
         if not is_asked and beat.due_ns < self._due_ns:
@@ -88,7 +84,6 @@ class InferenceLoop:
         return is_made
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
-        """Reset the planner after a failure, withdraw the setpoint, and call `on_failure`."""
         if str(error) != self._failure:  # only the first of equal failures is news
             self._failure = str(error)
             log.error(

@@ -27,7 +27,6 @@ def parser() -> Parser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run `tormagd` with `arguments`, by default those of the process; return the exit code."""
     write_in_any_encoding()
     try:
         options = parser().parse_args(arguments)

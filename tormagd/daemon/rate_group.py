@@ -1,4 +1,4 @@
-"""How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
+"""How well one rate group keeps its time."""
 
 import math
 from collections import deque
@@ -22,7 +22,7 @@ _BINS: Final = _EXACT + 32 * _DOUBLINGS
 
 @final
 class Histogram:
-    """Counts durations in bins, over one to two horizons (HORIZON_NS)."""
+    """Counts durations in bins, over one to two horizons."""
 
     def __init__(self) -> None:
         self._now = [0] * _BINS
@@ -44,7 +44,6 @@ class Histogram:
             self._max_now = value_us
 
     def refresh(self) -> None:
-        """Compute `report` from the counts."""
         most = round(max(self._max_now, self._max_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []
@@ -72,8 +71,6 @@ def _upper_edge(index: int) -> int:
 
 
 class _Mark(NamedTuple):
-    """The counts of a rate group at the beginning of a horizon."""
-
     time_ns: int
     runs: int
     overruns: int
@@ -82,8 +79,6 @@ class _Mark(NamedTuple):
 
 @final
 class RateGroup:
-    """The timing of one periodic activity: counts, lateness and execution time of its runs."""
-
     def __init__(self, name: str, period_ns: int) -> None:
         self.name = name
         self.period_ns = period_ns
@@ -103,7 +98,6 @@ class RateGroup:
         self._newest_ns = 0
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
-        """Count one run, which stands for `merged` missed ones, too."""
         if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
             self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
         self.lateness_us = (start_ns - due_ns) * 1e-3

@@ -12,7 +12,7 @@ from tormagd.config import RealTime
 from tormagd.slices import ask_for_slices
 
 OPEN_FILES = 1_024
-"Open files that the daemon needs: about 50 of its own, its four endpoints' connections (`admission`), and a reserve."
+"About 50 of the daemon's own, its endpoints' connections (`admission`), and a reserve."
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _LATENCY = Path("/dev/cpu_dma_latency")
 """While it is open, no processor sleeps so deeply that waking takes longer than the us written to it (the kernel's
@@ -22,7 +22,6 @@ log = logging.getLogger(__name__)
 
 
 def raise_open_files() -> None:
-    """Raise the soft limit of open files to the hard one."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < OPEN_FILES:
         raise OSError(
@@ -32,7 +31,7 @@ def raise_open_files() -> None:
 
 
 def prepare(settings: RealTime) -> list[str]:
-    """Ask the kernel for these settings; return and log what it refused, a line each."""
+    """Ask the kernel for these settings; return what it refused, a line each."""
     refused = []
     if settings.cpus:
         try:

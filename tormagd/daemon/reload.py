@@ -8,8 +8,8 @@ import msgspec
 from tormagd.config import Config
 from tormagd_client.printable import require
 
-LIVE = frozenset({"sources.priority", "sources.playout_ms", "realtime.watchdog_ms"})
-"From all other keys something was built at the start."
+LIVE = "realtime.watchdog_ms", "sources."
+"Keys, or how they begin; from all others something was built at the start."
 
 
 class Reread(NamedTuple):
@@ -40,7 +40,6 @@ def reread(running: Config, read: Config) -> Reread:
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:
-    """Yield the paths of the keys whose values differ between two nested tables."""
     for name in sorted(before.keys() | after.keys()):
         old, new = before.get(name), after.get(name)
         if isinstance(old, dict) and isinstance(new, dict):

@@ -26,7 +26,6 @@ class SceneChange:
         self._changing: asyncio.Task[None] | None = None
 
     def begin(self, scene: object) -> None:
-        """Begin to change to `scene`, a name or a path, in a task of its own."""
         if not isinstance(scene, str) or not 0 < len(scene) <= LONGEST_NAME:
             raise RefusedError(
                 "bad_scene", f"args.scene is no text of 1..{LONGEST_NAME} characters", "tormagctl scene list"
@@ -40,7 +39,6 @@ class SceneChange:
         self._changing.add_done_callback(asyncio.Task.result)
 
     async def _change(self, scene: str) -> None:
-        """Build the core, and put it in place if the device is still not in use."""
         error = None
         try:
             core = await self._build(scene)

@@ -1,8 +1,8 @@
 """The search for the field in a process of its own, if it takes longer than a plan has.
 
-The process runs `python -m tormagd.daemon.search_process FD`, and answers one question after another over a packet
-socket. The daemon never waits: a plan takes the newest answer. It asks the next question once the last is answered and
-a period has passed. Both ends belong to one installation and one parent, so packets are pickled.
+The process answers one question after another over a packet socket. The daemon never waits: a plan takes the newest
+answer. It asks the next question once the last is answered and a period has passed. Both ends belong to one
+installation and one parent, so packets are pickled.
 """
 
 import logging
@@ -41,7 +41,6 @@ class SearchProcess:
             )
 
     def answer(self) -> Answer | None:
-        """Return the answer that has come since the last call, if one has."""
         data = None if self._is_idle else self._beside.receive()
         if data is None:
             return None
@@ -68,14 +67,12 @@ class SearchProcess:
         self._is_idle = not self._beside.send(pickle.dumps(question))
 
     def close(self) -> None:
-        """Close the socket, kill the process and wait for its end."""
         self._beside.close()
         self._beside.process.kill()
         self._beside.process.wait()
 
 
 def main() -> None:
-    """Answer questions that come over a socket until its other end is closed."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd signals the whole service, and the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:
         config, scene, models = pickle.loads(asked.recv(MAX_PACKET))

@@ -14,8 +14,6 @@ _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
 
 
 class Service:
-    """What systemd is to be told of the daemon; `notify` sends it."""
-
     def __init__(self) -> None:
         self.is_ready = False
         "Whether a device has been identified; from then on systemd's watchdog runs."
@@ -53,7 +51,7 @@ class Service:
 def status_line(
     link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
 ) -> str:
-    """Return one line for `systemctl status`: the operating state with its faults, or else with the scene."""
+    """Return one line for `systemctl status`."""
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:
         # texts of the device or the kernel may have several lines

@@ -1,12 +1,10 @@
 """One publisher of setpoints: which of its messages count, how old they are, and how evenly they come.
 
 A message that does not follow the newest may be the first of a new run; a few messages show whether it is. A message's
-lateness, our time less its stamp, is the offset of its clock plus the time on the way. No message arrives before it was
-sent, those of one publisher do not overtake each other, and clocks drift slowly. So the least lateness is the offset
-plus the constant part of the way, and what exceeds it is delay. From one side these two cannot be told apart: up to
-MAX_WAY_S counts as the way.
-
-No I/O and no clock: times are arguments.
+lateness, our time less its stamp, is the offset of its clock plus the time on the way. Messages of one publisher do not
+overtake each other, and clocks drift slowly. So the least lateness is the offset plus the constant part of the way, and
+what exceeds it is delay. From one side these two cannot be told apart: up to MAX_WAY_S counts as the way. Times are
+arguments.
 """
 
 import math
@@ -28,18 +26,15 @@ from tormagd_client.messages import ClockReport, MessageError, Setpoint, SourceR
 LONGEST_JUMP = 1_000
 "A jump of `seq` by more steps is no loss: it is another run or a wrong number."
 RUN = 3
-"So many messages in a row, each newer than the one before, make a run of their own."
 STRAYS_S = 1.0
-"RUN strays within this time, between messages of the run, are a second publisher of the same name."
+"RUN strays within this time are a second publisher of the same name."
 
 FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
 "ns in each unit that publishers send by mistake."
 FAR_S = 86_400.0
 "Stamps in a wrong unit are years away from our clock. No setpoint is older than this."
 LOOKED_AT, MIN_S = 8, 0.005
-"Messages and seconds that show how fast far stamps advance."
 SLOW = 0.03
-"Share of our clock's rate: no clock runs this slowly, even one that was never set."
 
 MAX_WAY_S = 0.2
 "A least lateness up to this is the way's: half of the delay allowed from sensor to force."
@@ -49,21 +44,18 @@ way."""
 AHEAD_S = 0.05
 "A clock that is further ahead of ours is wrong."
 SETTLED_S = 0.2
-"A new publisher's clock counts as wrong only after this time, in which a backlog drains."
+"A backlog drains in this time, before a new publisher's clock counts as wrong."
 STEP_S = 0.005
 "If stamps run back by more than this, the clock was set back."
 DRIFT = 500e-6
-"No clock drifts faster."
 FORGOTTEN_S = 5.0
 "After a longer silence the clock may have been set by any amount."
 JITTER_SHARE = 1.0 / 16.0
-"From RFC 3550."
 MAX_DRIFT_PPM = 100.0
 "Quartz drifts less."
 NEVER_SET_NS = 946_684_800 * 10**9
 "The year 2000: a clock that starts in 1970 has not been set."
 SURE_WINDOWS = 20
-"Half seconds that a clock's line needs before its scatter tells how certain its slope is."
 STEP_NAMED_S = 60.0
 
 WINDOW_S, MIN_MESSAGES = 1.0, 4
@@ -71,20 +63,17 @@ MAX_LOST = 0.05
 SPREAD_S = 0.02
 "A delay that varies more shows in the force: the slope bridges 50 ms."
 SLACK = 1.25
-"Tolerance of the publisher's own timer."
 PLAYOUT_STEP_MS = 10
 
 
 class Order(Enum):
-    """How a message relates to those taken before it."""
-
     NEWER = "newer"
     RESTARTED = "restarted"
     "The first of a new run, announced by a `session` above every earlier one."
     REPLACED = "replaced"
     "The first of a new run that was not announced."
     STRAY = "stray"
-    "Old, repeated, from a finished run, or from one that is not recognised yet."
+    "Old, repeated, or from another run."
 
 
 @final
@@ -102,7 +91,6 @@ class Sequence:
         self._strays, self._strays_since_s = 0, 0.0
 
     def order(self, now_s: float, session: int | None, seq: int, *, is_over: bool) -> Order:
-        """Judge one message by its numbers, and follow it unless it is a stray."""
         if session == self.session and seq > self.seq:
             step = seq - self.seq
             known = self._step
@@ -128,7 +116,6 @@ class Sequence:
         return Order.STRAY
 
     def is_doubled(self, now_s: float) -> bool:
-        """Tell whether two publishers seem to use this name at once."""
         return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
 
     def _begin(self, session: int | None, seq: int, order: Order) -> Order:
@@ -145,21 +132,18 @@ class SourceClock:
 
     def __init__(self) -> None:
         self.offset_s = 0.0
-        "How far the clock is behind ours, s."
+        "The clock's lag behind ours."
         self.way_s = 0.0
-        "The constant part of the way."
         self.jitter_s = 0.0
         "RFC 3550's interarrival jitter."
         self.steps = 0
-        "How often the clock was set."
         self.stepped_s = 0.0
-        "The newest setting of the clock, forward positive."
+        "Forward positive."
         self.stepped_at_s = -math.inf
         self._lateness_s = self._leaked_s = 0.0
         self._heard_s: float | None = None
         self._settles_s: float | None = None
         self.line = DeviceClock()
-        "The line through the last half minute, or since the clock was set."
 
     @property
     def is_settled(self) -> bool:
@@ -174,7 +158,7 @@ class SourceClock:
         return self.offset_s if 0.0 < self.offset_s < MAX_LATE_S and not self.steps else 0.0
 
     def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
-        """Take the message that came at `now_s`, and return its delay, s."""
+        """Take a message, and return its delay, s."""
         if self._heard_s is None:
             self._begin(now_s, lateness_s)
         else:
@@ -188,7 +172,7 @@ class SourceClock:
         return max(lateness_s - self.offset_s, 0.0)
 
     def wrong(self, now_s: float, stamp_ns: int, fit: ClockReport | None) -> str:
-        """Return what is wrong with the clock, by its newest stamp and its line `fit`; empty if nothing is."""
+        """Return what is wrong with the clock, empty if nothing is."""
         causes = []
         if self.is_wrong and stamp_ns < NEVER_SET_NS:
             causes.append(f"it was never set (it says {time.gmtime(stamp_ns * 1e-9).tm_year}), and is corrected")
@@ -207,7 +191,6 @@ class SourceClock:
         return "; ".join(causes)
 
     def _begin(self, now_s: float, lateness_s: float) -> None:
-        """Begin a new estimate with this lateness alone."""
         self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
         self._settles_s = now_s + SETTLED_S
         self.line = DeviceClock()
@@ -221,7 +204,6 @@ class SourceClock:
             self.offset_s, self.way_s = 0.0, self.offset_s
 
     def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
-        """Update offset, way and jitter from a message that came `gap_s` after the last."""
         rise_s = lateness_s - self._lateness_s
         if not is_continued or gap_s > FORGOTTEN_S:
             above_s = lateness_s - self.offset_s - self.way_s
@@ -255,7 +237,6 @@ class SourceClock:
             self._set(now_s, ahead_s)
 
     def _set(self, now_s: float, by_s: float) -> None:
-        """Note that the clock was set by `by_s`, forward positive, and begin its line anew."""
         self.steps += 1
         self.stepped_s, self.stepped_at_s = by_s, now_s
         self.line = DeviceClock()
@@ -279,7 +260,7 @@ def needs_of(scene: Scene) -> Needs:
 
 @final
 class Source:
-    """One publisher. `judge` takes its messages; the newest is `setpoint`, meant at `stamp_s` on our clock."""
+    """One publisher: its newest setpoint was meant at `stamp_s` on our clock."""
 
     def __init__(self, setpoint: Setpoint) -> None:
         self.setpoint = setpoint
@@ -294,13 +275,12 @@ class Source:
         self._begun = Order.NEWER
         self._unit = ""
         self._far, self._far_s, self._far_ns = 0, 0.0, 0
-        "Number of far stamps under observation; arrival and stamp of the first."
         self._began_s: float | None = None
         self._sent_s = 0.0
         self._window: list[tuple[int, float, float]] = []
 
     def judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int, playout_s: float, needs: Needs) -> Order:
-        """Judge a message, and keep it as the newest unless it is a stray. Raises MessageError."""
+        """Judge a message, and keep it as the newest unless it is a stray."""
         order = Order.NEWER
         if self.heard_s > -math.inf:
             is_over = self.is_stale(now_s)
@@ -331,7 +311,7 @@ class Source:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def refresh(self, now_s: float) -> bool:
-        """Update percentiles, cause and remedy; return True if something is newly wrong."""
+        """Update the report; return True if something is newly wrong."""
         self.delays.refresh()
         self._fit = self.clock.line.fit()
         self.cause = self.remedy = ""
@@ -346,7 +326,6 @@ class Source:
         return self._is_named and not was_named
 
     def report(self, now_s: float, state: str) -> SourceReport:
-        """Return the report, with `state` while the newest setpoint is valid."""
         clock, sequence, is_known = self.clock, self.sequence, self.clock.is_settled and self.stamp_s > -math.inf
         return SourceReport(
             state="stale" if self.is_stale(now_s) else state,
@@ -392,7 +371,6 @@ class Source:
         )
 
     def _note_manner(self, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
-        """Note how the newest setpoint came, and judge the window that it fills."""
         sent_s, missing = now_s - delay_s, self.sequence.missing
         spacing_s, self._sent_s = (sent_s - self._sent_s) / (1 + missing), sent_s
         if self._began_s is None:
@@ -404,7 +382,7 @@ class Source:
             self._began_s, self._window = now_s, []
 
     def _judged(self, playout_s: float, needs: Needs) -> dict[Limit, Explanation]:
-        """Return what is wrong in a full window, with cause and remedy."""
+        """Return what is wrong in a full window."""
         lost, received, hidden_s = sum([each[0] for each in self._window]), len(self._window), self.clock.hidden_s
         late_s = [each[2] for each in self._window]
         found = {}

@@ -1,4 +1,4 @@
-"""Starting the daemon: builds the core as configured and runs the daemon, or prints what would run."""
+"""Starting the daemon, or printing what would run."""
 
 import argparse
 import sys
@@ -25,7 +25,6 @@ from tormagd_client.printable import printable
 
 
 def start(options: argparse.Namespace) -> int:
-    """Build the core, and run the daemon or print its configuration; return the exit code."""
     try:
         config = _configured(options)
         keys = KeyRing(config.endpoints) if any(map(config.endpoints.is_guarded, ENDPOINTS)) else None
@@ -44,7 +43,6 @@ def start(options: argparse.Namespace) -> int:
 
 
 def _configured(options: argparse.Namespace) -> Config:
-    """Return the configuration, with the command line's scene if it names one."""
     config = load_config(options.config)
     if options.scene is not None:
         config = msgspec.structs.replace(config, scene=options.scene)
@@ -59,6 +57,7 @@ async def _run(
     options: argparse.Namespace,
 ) -> None:
     """Start the processes beside it, make this thread a real-time one, and run the daemon to its end."""
+    raise_open_files()
     # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     known = {} if folder is None else header(config, core)

@@ -28,18 +28,17 @@ class Tally:
         self._newest = "", Peer(""), ""
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
-        """Count one more refusal; beyond `most` entries, the oldest one is merged with others."""
+        newest = endpoint, peer, reason
+        self._in_a_row = self._in_a_row + 1 if newest == self._newest else 1
+        self._newest = newest
         self.total += 1
 
     def report(self) -> tuple[PeerReport, ...]:
-        """Return the entries, the newest last, with keys and addresses as people know them."""
-        return tuple(
-            PeerReport(endpoint, shown(peer.address), peer.key and self._name(peer.key), reason, count)
-            for (endpoint, peer, reason), count in self._counts.items()
-        )
+        endpoint, peer, reason = self._newest
+        key = peer.key and self._name(peer.key)
+        return (PeerReport(endpoint, shown(peer.address), key, reason, self._in_a_row),) if self.total else ()
 
     def tell(self, now_s: float) -> None:
-        """Log the refusals since the last line and the newest entry, at most once in NEWS_S."""
         if self.total > self._told and now_s >= self._tell_s:
             (it,) = self.report()
             newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"

@@ -51,12 +51,10 @@ from tormagd_client.messages import (
 )
 
 MAX_TICKS = 100
-"In one recording message."
 REQUESTS = 16
 "Answered in a telemetry period: a client that keeps asking must not keep a `stop` waiting."
 TELL_S = 0.1
 REFRESHED = 2
-"Histograms whose percentiles are updated each time."
 FORGETS_S = 5.0
 "After this time a tracking error counts 1/e."
 PORTRAIT_STEP = 5
@@ -66,8 +64,6 @@ log = logging.getLogger(__name__)
 
 
 class TelemetryLoop:
-    """Publishes what the control and inference loops do, and answers requests."""
-
     def __init__(
         self,
         config: Config,
@@ -108,7 +104,6 @@ class TelemetryLoop:
         self.run_scene(config, core, profiles)
 
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
-        """Publish and report on `core` from now on."""
         self.config = config
         "A reload replaces it, with changes only in keys that are looked up at each use."
         self._core, self.topics.core, self._profiles = core, core, profiles
@@ -117,7 +112,6 @@ class TelemetryLoop:
         self._reported_s = -math.inf
 
     def record(self, _beat: Beat) -> None:
-        """Keep the record of the control tick that just ran, for recording and black box."""
         control = self._control
         if control.output is None or control.used is None:
             return
@@ -179,7 +173,7 @@ class TelemetryLoop:
         self._ticks = []
 
     def tell(self, _beat: Beat) -> bool:
-        """Feed log, systemd and black box every TELL_S, and continue an arming; return False between."""
+        """Feed log, systemd and black box, and continue an arming; return False if it is not time."""
         now_s = time.monotonic()
         if now_s - self._told_s < TELL_S:
             return False
@@ -196,13 +190,12 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answer requests that waited at the last snapshot, for a limited time; return False if none did."""
+        """Answer requests that waited at the last snapshot; return False if none did."""
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
 
     def keep(self, reason: str, after_s: float) -> Path:
-        """Ask for a black box that includes the next `after_s`, and return its path."""
         link = self._connection.report()
         details = {
             "firmware": link.firmware or "",
@@ -212,7 +205,6 @@ class TelemetryLoop:
         return self._box.write(reason, after_s, details)
 
     def conditions(self) -> Conditions:
-        """Return the present conditions, by which a command is taken or refused."""
         control, doubted = self._control, self._inference.planner.believe.sensor.is_doubted
         found = conditions(
             time.monotonic(), self.config, self._connection, control.stepper, control.output, sensor_doubted=doubted
@@ -246,7 +238,6 @@ class TelemetryLoop:
         )
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
-        """Tell systemd what is new, and log when the device is ready."""
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
         is_alive = service.is_alive(
@@ -271,7 +262,6 @@ class TelemetryLoop:
             notify(message)
 
     def _in_turn(self) -> Iterator[Histogram]:
-        """Yield all histograms in turn, without end."""
         while True:
             for group in self._groups:
                 yield from (group.lateness, group.exec)
@@ -279,7 +269,6 @@ class TelemetryLoop:
 
     def _answer(self, request: Request) -> Any:
         if request.command == "status":
-            # built once for everybody who asks in this period
             if self._status is None:
                 self._status = msgspec.Raw(msgspec.msgpack.encode(self._build_status(self._newest)))
             return self._status
@@ -305,7 +294,7 @@ class TelemetryLoop:
         )
 
     def command(self, request: Request) -> dict[str, Any]:
-        """Carry out a request other than `status` and `describe`, and return its result as plain data."""
+        """Carry out a request that changes something."""
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
             return self._give(request.args.get("source"))
@@ -328,7 +317,7 @@ class TelemetryLoop:
         }
 
     def _add_mark(self, text: object) -> dict[str, Any]:
-        """Put a mark with this text into telemetry and recordings; return it as plain data."""
+        """Put a mark with this text into telemetry and recordings."""
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
             raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")
@@ -337,7 +326,6 @@ class TelemetryLoop:
         return msgspec.to_builtins(self._mark)  # type: ignore[no-any-return]
 
     def _confirm(self, what: object) -> dict[str, Any]:
-        """Take the operator's word on what is wrong, "device" or "sensor"."""
         try:
             wrong = msgspec.convert(what, Disputed)
         except msgspec.ValidationError as error:
@@ -356,7 +344,6 @@ class TelemetryLoop:
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
-        """Give the brake to the source of this name."""
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
         inbox = self._endpoint.inbox
@@ -427,7 +414,7 @@ class TelemetryLoop:
         return ArmReport(given=arming.given, is_over=arming.is_over, error=ended)
 
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:
-        """Return the reports that take most of the time, as fields of Status; made anew every TELL_S."""
+        """Return the reports that take most of the time; made anew every TELL_S."""
         if now_s - self._reported_s >= TELL_S or self._connection.state is not self._reported_state:
             self._reported_s, self._reported_state = now_s, self._connection.state
             link = self._connection.report()

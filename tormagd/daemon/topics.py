@@ -17,8 +17,6 @@ NS = 1_000_000_000
 
 
 class Topics:
-    """Publishes the topics `motion` and `verdict` as a phase of every beat, and makes both for snapshots."""
-
     def __init__(
         self, config: Config, core: Core, control: ControlLoop, inference: InferenceLoop, endpoint: Endpoint
     ) -> None:
@@ -31,7 +29,6 @@ class Topics:
         self._passed_over: tuple[str, int] | None = None
 
     def publish(self, beat: Beat) -> bool:
-        """Publish new verdicts, and the handle's motion if it is due; return False if there was neither."""
         listeners = self._endpoint.listeners
         is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
         return (listeners.has(MOTION_TOPIC) and self._publish_motion(beat)) or is_said
@@ -42,7 +39,6 @@ class Topics:
         return None if measured is None else place_and_rate(measured, self._push_sign)
 
     def verdict(self) -> Verdict | None:
-        """Return the present verdict on the newest setpoint."""
         in_force = self._endpoint.inbox.in_force
         return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
@@ -63,7 +59,7 @@ class Topics:
         return True
 
     def _publish_verdicts(self) -> bool:
-        """Publish the verdict on the setpoint in force, and on one refused because another source holds the brake."""
+        """Publish the verdict on the setpoint in force, and on one of another source that was passed over."""
         in_force, is_said = self._endpoint.inbox.in_force, False
         # by identity: a source may begin its numbers anew
         if in_force is not None and in_force is not self._judged:

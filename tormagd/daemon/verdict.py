@@ -12,14 +12,11 @@ RENDERED, ARRIVES, CANNOT = "rendered", "arrives", "cannot"
 HOLDING = frozenset({Limit.RANGE, Limit.STANDBY, Limit.F_MIN, Limit.F_MAX})
 "These keep a force from coming, as CEILING and MODEL_RANGE may; the others only delay it."
 FORGOTTEN = frozenset({Limit.STALE, Limit.OTHER_SOURCE})
-"These say why a setpoint is no longer followed."
 FIELD = "field_mT"
 "If this feature is outside the model's range, the force is out of reach."
 
 
 class Judged(NamedTuple):
-    """A judgement on a setpoint: rendered, arrives or cannot."""
-
     outcome: str
     arrives_ms: float | None
     why: tuple[str, ...] = ()
@@ -37,7 +34,6 @@ def judged(
     tolerance_N: float,
     release_N_s: float,
 ) -> Judged:
-    """Return the judgement on the setpoint that `plan` was made for."""
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:
         return Judged(CANNOT, None, (str(state),))

@@ -19,14 +19,11 @@ BUDGET_MS = 400.0
 
 
 class Way:
-    """Measures the delay from a setpoint's stamp to the first duty that follows it."""
-
     def __init__(self) -> None:
         self.to_duty = Histogram()
         self._stamp_s = -math.inf
 
     def ticked(self, now_s: float, used: Plan, playout_s: float) -> None:
-        """Count the delay of a setpoint at the first control tick that follows it."""
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
@@ -34,7 +31,6 @@ class Way:
                 self.to_duty.add(now_s, (now_s - stamp_s + playout_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float, budget: Budget) -> WayReport:
-        """Return the parts of the delay, and their sum once all are known."""
         to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
             total_ms = round((to_duty_us.p99 + device_us) * 1e-3 + carriages_ms, 2)
