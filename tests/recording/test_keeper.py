@@ -55,8 +55,6 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
 
 
 class Process:
-    """A keeper, and the daemon's end of its socket."""
-
     def __init__(self) -> None:
         self.ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.ours.settimeout(PATIENCE_S)
