@@ -9,6 +9,7 @@ import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -38,9 +39,11 @@ from tormagd.model.displacement import MOVING_MM_S, Turn
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.inserts import insert
+from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
+from tormagd_client.endpoints import Endpoints
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)
@@ -323,6 +326,17 @@ def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_mo
     arguments = [*fake_daemon.at, "--json", "calibrate", "--yes", "--insert", name]
     assert told[1] in ctl(*arguments, "--out", str(tmp_path / "m.safetensors")).ended(1).error[told[0]]
     assert fake_daemon.commands == asked
+
+
+def test_a_fit_is_the_commands_result_and_is_told(tmp_path, monkeypatch):
+    metrics = {"judged_r2": 0.99, "judged_mae_N": 0.012, "most_mae_N": 0.02, "noise_mae_N": 0.003}
+    fitted = {"model": "m", "insert": INSERT, "created": "today", "rows": 7, "metrics": metrics}
+    monkeypatch.setattr(ctl_calibrate, "_ask_fitter", lambda *arguments: fitted)
+    for name in ("Client", "known_of", "armed", "write_sweeps"):
+        monkeypatch.setattr(ctl_calibrate, name, MagicMock())
+    about = Config(), Endpoints(), load_scene("pulse"), INSERT, tmp_path / "m.safetensors"
+    outcome = ctl_calibrate.calibrate_insert(*about, None, (), False, 1.0)
+    assert (outcome.result, "mean error 12.0 mN (allowed 20.0" in outcome.text) == (fitted, True)
 
 
 def test_a_refused_fit_is_the_commands_refusal(tmp_path):

@@ -208,6 +208,12 @@ def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_t
     )
 
 
+def test_a_run_directory_that_others_may_write_to_is_found(good):
+    (good / "run/tormag").chmod(0o777)
+    finding = checks.run_directory(Config(), Machine(good))
+    assert (finding.verdict, "mode 0777" in finding.found, finding.remedy[:11]) == ("fail", True, "chmod go-w ")
+
+
 def test_a_port_that_is_not_there_is_missed(good):
     (good / "dev/ttyUSB0").unlink()
     assert "does not exist" in checks.port(Config(), Machine(good)).found

@@ -25,6 +25,8 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl, file):
     result = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "2").ended(0).result
     recording = RecordingFile(file)
     assert recording.is_complete
+    # what is not known of a daemon, as where its configuration is, is left out
+    assert (recording.metadata["version"], "configuration_file" in recording.metadata) == ("0", False)
     assert recording.overview.ticks == result["ticks"] > 0
     assert recording.overview.snapshots == result["telemetry"] > 0
     assert (result["ticks_lost"], result["telemetry_lost"], result["unreadable"]) == (0, 0, 0)

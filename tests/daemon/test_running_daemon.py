@@ -399,10 +399,9 @@ def test_a_command_that_is_repeated_is_logged_once_a_second(alone: Running, capl
             alone.command("stop")
         alone.tick(1_000)
         alone.command("stop")
-    asked = "the device is asked to open the gap"
     assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("stop")] == [
-        f"stop: DISABLED to FAULT: {asked}",
-        f"stop: FAULT to FAULT: {asked}; 4 times more before",
+        "stop: DISABLED to FAULT: the device is asked to open the gap",
+        "stop: FAULT to FAULT: the device is asked to open the gap; 4 times more before",
     ]
 
 

@@ -418,10 +418,13 @@ def test_an_overview_that_no_tormagd_writes_is_refused(path: Path, change: dict[
 
 def test_any_length_is_held_in_bounds() -> None:
     builder = OverviewBuilder()
-    for k in range(20_000):
-        builder.add(k * 1_600_000_000_000, False, {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k)})
+    late_us = [edge_us - early_us for edge_us in (10, 20, 50, 100, 200, 500, 1e3, 2e3, 5e3) for early_us in (0.1, 0.0)]
+    for k in range(19_800):
+        seen = {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k), "lateness_us": late_us[k % 18]}
+        builder.add(k * 1_600_000_000_000, False, seen)
     made = builder.made()
+    assert made.late_counts == [1_100, *[2_200] * 8, 1_100]
     assert len(made.packed()) < 200_000
     gap = made.series("gap_mm")
-    assert (gap.low.min(), gap.high.max()) == (0.0, 19_999.0)
+    assert (gap.low.min(), gap.high.max()) == (0.0, 19_799.0)
     assert len(made.codes["limits"]["RATE"].spans_ns) <= 1_000

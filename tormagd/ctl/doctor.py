@@ -21,8 +21,9 @@ from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rat
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd.ctl.status import RECOMMISSION, refused
+from tormagd.keys import require_own
 from tormagd_client.blocking import Client
-from tormagd_client.endpoints import Endpoints
+from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, not_understood
 from tormagd_client.messages import Status
 
@@ -351,6 +352,7 @@ def autogroup(config: Config, machine: Machine) -> Finding:
 
 
 def run_directory(config: Config, machine: Machine) -> Finding:
+    """Judge whether the caller, and nobody else, can write where the control socket is."""
     address = config.endpoints.control
     if not address.startswith("ipc:///"):
         return Finding("run directory", Severity.OK, f"none needed for {address}")
@@ -363,6 +365,10 @@ def run_directory(config: Config, machine: Machine) -> Finding:
             f"{directory} does not exist",
             "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own",
         )
+    try:
+        require_own(path)
+    except ConfigError as error:
+        return Finding("run directory", Severity.FAIL, *str(error).rsplit("; ", 1))
     is_open = os.access(path, os.W_OK | os.X_OK)
     return _finding(
         "run directory",

@@ -28,10 +28,6 @@ class Arrivals:
         self._ready.add(socket)
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
-        if socket in self._ready and not is_readable(socket):
+        if socket in self._ready and not int(socket.get(_EVENTS)) & _POLLIN:
             self._ready.discard(socket)
         return socket in self._ready
-
-
-def is_readable(socket: "zmq.Socket[bytes]") -> bool:
-    return bool(int(socket.get(_EVENTS)) & _POLLIN)

@@ -1,7 +1,6 @@
 """The control loop, a phase of every beat: step on the newest measurement and plan, and drive."""
 
 import logging
-import math
 import time
 
 from tormagd.assembly.journal import Journal
@@ -73,7 +72,7 @@ class ControlLoop:
             self._journal.commanded(name, now_s, conditions, is_refused=True)
             raise
         self._journal.commanded(name, now_s, conditions, is_refused=False)
-        told_s, count = self._told.get(name, (-math.inf, 0))
+        told_s, count = self._told.get(name, (-REPEATED_S, 0))
         if source is self.stepper.safety.operating_state and now_s - told_s < REPEATED_S:
             self._told[name] = told_s, count + 1
             return

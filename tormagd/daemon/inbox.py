@@ -75,8 +75,7 @@ class SetpointInbox:
         """Take one message; return True if another setpoint is in force after it."""
         try:
             setpoint = decode(data, Setpoint)
-            allowed = self.sources.keys.get(setpoint.source, (key,))
-            if key not in allowed:
+            if key not in (allowed := self.sources.keys.get(setpoint.source, (key,))):
                 raise MessageError(
                     f"source {setpoint.source!r} from the key {key}: allowed by sources.keys is {', '.join(allowed)}"
                 )

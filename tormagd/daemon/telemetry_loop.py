@@ -34,6 +34,7 @@ from tormagd.daemon.topics import Topics
 from tormagd.daemon.way import Way
 from tormagd.following import Following
 from tormagd.hardware.connection import Connection
+from tormagd.keeping import REQUEST
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd_client.messages import (
     MAX_MARK_CHARACTERS,
@@ -303,7 +304,7 @@ class TelemetryLoop:
         if request.command == "mark":
             return self._add_mark(request.args.get("text"))
         if request.command == "blackbox":
-            return {"file": str(self.keep("REQUEST", 0.0))}
+            return {"file": str(self.keep(REQUEST, 0.0))}
         if request.command == "arm":
             self._control.arm(self.conditions())
         elif request.command == "use-scene":
