@@ -286,7 +286,7 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
-    """Judge whether the processors of `realtime.cpus` are online, and at least two."""
+    """Judge whether the processors of `realtime.cpus`, and at least two, are online."""
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:

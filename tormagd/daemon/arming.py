@@ -39,7 +39,6 @@ class Arming:
             self.is_over, self.refusal = True, refusal
 
     def advance(self, now_s: float, safety: SafetyState, present: Conditions, give: Callable[[str], None]) -> None:
-        """Give the next command once its time has come; end in ENABLED or with a refusal."""
         if self.is_over:
             return
         try:
@@ -76,7 +75,6 @@ class Arming:
 
 
 def _next(safety: SafetyState, present: Conditions) -> Event:
-    """Return the next command towards ENABLED; `clear-fault` if only the device has latched a fault."""
     if present.device_latched and safety.operating_state is OperatingState.DISABLED:
         return Event.CLEAR_FAULT
     return next_commands(safety, present.homed)[0]

@@ -24,8 +24,6 @@ log = logging.getLogger(__name__)
 
 
 class Causes:
-    """Remembers how the control loop was kept waiting, and the cause of each latched fault in figures."""
-
     def __init__(self, device: Device) -> None:
         self._device = device
         self.stall: StallReport | None = None

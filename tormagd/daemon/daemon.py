@@ -219,7 +219,6 @@ class Daemon:
             self._inference.teach(learned)
 
     def _run_core(self, config: Config, core: Core) -> None:
-        """Replace the running core by `core`, made of `config`, between two beats."""
         control, inference, now_s = self._control, self._inference, time.monotonic()
         safety, stepper, planner = control.stepper.safety, core.stepper(now_s), core.planner(now_s)
         stepper.safety = safety

@@ -126,7 +126,7 @@ class SetpointInbox:
         return None if self.in_force is None else self.in_force.setpoint
 
     def hand_on(self, now_s: float) -> bool:
-        """Put the newest setpoint that is due in force; return True if that is another one."""
+        """Put the newest setpoint that is due in force."""
         before = self.in_force
         while self._waiting and self._waiting[0].setpoint.stamp_s <= now_s:
             self.in_force = self._waiting.popleft()
@@ -193,7 +193,7 @@ class SetpointInbox:
         )
 
     def _follow(self, source: Source, now_s: float) -> bool:
-        """Let the source's newest setpoint wait until it is due; return True if another one is in force then."""
+        """Let the source's newest setpoint wait until it is due."""
         setpoint, playout_s, wall = source.setpoint, self.sources.playout_ms * 1e-3, source.setpoint.contact
         is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
         others = (Limit.OTHER_SOURCE,) if is_contested else ()

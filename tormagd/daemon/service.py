@@ -33,7 +33,6 @@ class Service:
         return now_s - self._heard_s < limit_s
 
     def news(self, is_alive: bool, link: LinkState, status: str) -> list[str]:
-        """Return the messages that are due: READY once, STATUS on a change, WATCHDOG while the daemon lives."""
         messages = []
         if not self.is_ready and link is LinkState.RUNNING:
             self.is_ready = True
@@ -51,7 +50,6 @@ class Service:
 def status_line(
     link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
 ) -> str:
-    """Return one line for `systemctl status`."""
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:
         # texts of the device or the kernel may have several lines

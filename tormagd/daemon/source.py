@@ -119,7 +119,6 @@ class Sequence:
         return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
 
     def _begin(self, session: int | None, seq: int, order: Order) -> Order:
-        """Begin a new run with this message, count a restart, and return `order`."""
         self.session, self.seq, self._step = session, seq, 0
         self._in_row = self._strays = self.missing = 0
         self.restarts += 1
@@ -172,7 +171,6 @@ class SourceClock:
         return max(lateness_s - self.offset_s, 0.0)
 
     def wrong(self, now_s: float, stamp_ns: int, fit: ClockReport | None) -> str:
-        """Return what is wrong with the clock, empty if nothing is."""
         causes = []
         if self.is_wrong and stamp_ns < NEVER_SET_NS:
             causes.append(f"it was never set (it says {time.gmtime(stamp_ns * 1e-9).tm_year}), and is corrected")
@@ -198,7 +196,6 @@ class SourceClock:
             self._settle()
 
     def _settle(self) -> None:
-        """Accept the offset; a small one becomes the constant part of the way."""
         self._settles_s = None
         if 0.0 < self.offset_s <= MAX_WAY_S:
             self.offset_s, self.way_s = 0.0, self.offset_s
@@ -382,7 +379,6 @@ class Source:
             self._began_s, self._window = now_s, []
 
     def _judged(self, playout_s: float, needs: Needs) -> dict[Limit, Explanation]:
-        """Return what is wrong in a full window."""
         lost, received, hidden_s = sum([each[0] for each in self._window]), len(self._window), self.clock.hidden_s
         late_s = [each[2] for each in self._window]
         found = {}

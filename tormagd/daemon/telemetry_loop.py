@@ -134,7 +134,6 @@ class TelemetryLoop:
         self._box.ticked(record, control.stepper, self._inference.planner)
 
     def publish(self, beat: Beat) -> bool:
-        """Publish snapshot and ticks of a telemetry period; return False if none is due."""
         if self._left > 0 or not self._ticks:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
@@ -191,7 +190,6 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answer requests that waited at the last snapshot; return False if none did."""
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
@@ -318,7 +316,6 @@ class TelemetryLoop:
         }
 
     def _add_mark(self, text: object) -> dict[str, Any]:
-        """Put a mark with this text into telemetry and recordings."""
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
             raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")

@@ -43,7 +43,6 @@ class Topics:
         return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
-        """Publish the handle's newest motion; return False if it is not due or not sensed anew."""
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
             return False

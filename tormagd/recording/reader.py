@@ -127,7 +127,7 @@ def _within(chunk: Chunk) -> list[McapRecord]:
 def scan(
     file: BinaryIO, name: str, take: Callable[[McapRecord, int], None], message: Callable[[Message], None]
 ) -> bool:
-    """Read an MCAP file: each message goes to `message`, other records with the byte after them to `take`."""
+    """Read an MCAP file: each message goes to `message`, other records and where they begin to `take`."""
     at, size = MAGIC_SIZE, 0
     with readable(name):
         try:
@@ -196,7 +196,7 @@ def _crc(file: BinaryIO, first: int, end: int) -> int:
 
 
 class Place(NamedTuple):
-    """Where a chunk is: its messages' times, ns since 1970, and the byte after it."""
+    """Where a chunk begins in the file, and its messages' times, ns since 1970."""
 
     from_ns: int
     to_ns: int
