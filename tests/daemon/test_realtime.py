@@ -1,5 +1,3 @@
-"""What the kernel is asked for: granted or a plain warning, never a failure."""
-
 import ctypes
 import os
 import resource

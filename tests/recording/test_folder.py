@@ -28,8 +28,6 @@ SETTINGS = Recordings(segment_MB=0.1, segment_minutes=60.0, most_MB=2.0, most_da
 
 
 class Clock:
-    """The time that a test says, s since 1970."""
-
     def __init__(self) -> None:
         self.now_s = START_NS * 1e-9
 
@@ -38,7 +36,6 @@ class Clock:
 
 
 def write(folder: RecordingFolder, clock: Clock) -> Path:
-    """A small recording of this moment."""
     with RecordingWriter(folder) as writer:
         ms = (clock.now_s - START_NS * 1e-9) * 1e3
         rng = random.Random(ms)
@@ -153,8 +150,6 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
 
 
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
-    """Through the recorder, as it goes on for so long: a large tick every three minutes, now and then a mark; the
-    marks."""
     told, newest = [], None
     with RecordingWriter(RecordingFolder(path, budget_of(SETTINGS), clock)) as recorder:
         for number in range(hours * 20):
@@ -169,7 +164,6 @@ def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str
 
 
 def marks_in(path: Path) -> set[str]:
-    """What the recordings that are kept tell."""
     kept = [RecordingFile(each) for each in path.glob("*.marked.mcap")]
     return {known.text for each in kept for known in each.overview.marks}
 

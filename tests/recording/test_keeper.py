@@ -60,8 +60,6 @@ def test_a_list_that_begins_with_a_number_is_a_tick() -> None:
 
 
 class Process:
-    """A keeper, and the daemon's end of its socket."""
-
     def __init__(self) -> None:
         self.ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.ours.settimeout(PATIENCE_S)

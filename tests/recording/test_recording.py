@@ -32,7 +32,6 @@ from tormagd_client.messages import Mark, MessageError, encode
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    """100 ms: asked 1.5 N, measured 1.6; RATE for the middle 40 ms, then a fault for the last 20."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, {"scene": "pulse"}) as writer:
         for k in range(5):
@@ -80,7 +79,6 @@ def test_other_tools_find_json_messages_with_schemas(written):
 
 
 def obey(path: Path) -> int:
-    """How many messages there are in a file, each of which obeys the schema that the file has for it."""
     validator = cache(lambda schema: Draft202012Validator(json.loads(schema)))
     with path.open("rb") as file:
         messages = list(make_reader(file).iter_messages())
@@ -309,7 +307,6 @@ ALL_COLUMNS = (
 
 
 def row(k: int) -> tuple[Any, ...]:
-    """A tick each ms: 1 s of approach, then a sine that comes 20 ms late; RATE in the third second, SKEW at 25 s."""
     asked_N = 1.5 + 0.3 * math.sin(2e-3 * math.pi * k)
     felt_N = 0.5 if k < 1_000 else 1.5 + 0.3 * math.sin(2e-3 * math.pi * (k - 20))
     limits, faults = ("RATE",) if 2_000 <= k < 3_000 else (), ("SKEW",) if k >= 25_000 else ()
@@ -317,7 +314,6 @@ def row(k: int) -> tuple[Any, ...]:
 
 
 def write(path: Path, **settings: Any) -> Path:
-    """Thirty seconds, with a mark at 15 s."""
     with RecordingWriter(path, **settings) as writer:
         for k in range(0, 30_000, 20):
             writer.ticks(batch(*(row(k + i) for i in range(20)), columns=ALL_COLUMNS))
