@@ -15,7 +15,8 @@ from tormagd_client.blocking import Client
 
 
 def mark(client: Client, text: str) -> Outcome:
-    """Put an event into telemetry, and so into every recording; a folder's present segment is then kept from pruning."""
+    """Put an event into telemetry, and so into every recording; a folder's present segment is then kept
+    from pruning."""
     return Outcome(client.request("mark", text=text), f"marked: {text}")
 
 

@@ -128,7 +128,8 @@ class RecordingFolder:
         return gone
 
     def _too_old(self, segments: list[Segment]) -> Iterator[Segment]:
-        """Yield the segments that were last written longer than the budget's age before the newest, the newest first."""
+        """Yield the segments that were last written longer than the budget's age before the newest, the
+        newest first."""
         for segment, later in zip(segments[-2::-1], segments[:0:-1], strict=True):
             began_s = later.began_s or 0.0
             if max(abs(began_s - segment.ended_s), abs(later.ended_s - began_s)) > LONGEST_PAUSE_S:
