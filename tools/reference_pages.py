@@ -19,7 +19,6 @@ from tormagd import config
 from tormagd.ctl import main as ctl
 from tormagd.daemon import main as daemon
 from tormagd.hardware import can_backend, serial_backend
-from tormagd.lab.pages import table
 from tormagd.simulation import __main__ as simulation
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
@@ -30,7 +29,7 @@ BACKENDS = {
 _CONFIGURATION_HEAD = """# Configuration: every key
 
 `python tools/reference_pages.py` writes this page from the types. See [configure](../guides/configure.md);
-`tormagd --check --config FILE` prints what is in force.
+`tormagd --check --config FILE` prints what is in force. Brackets hold the default and what is allowed.
 """
 _COMMANDS_HEAD = """# Commands: every option
 
@@ -50,7 +49,7 @@ def configuration_page() -> str:
     for heading, kind in (*tables(config.Config, ""), *BACKENDS.items()):
         says = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
         parts.append(f"## {heading or 'At the top'}\n\n{says}\n")
-        parts.append(table(("key", "default", "allowed", "what and why"), keys(kind)))
+        parts.append("".join(f"- {name} ({default}; {allowed}): {why}\n" for name, default, allowed, why in keys(kind)))
     return "\n".join(parts)
 
 
@@ -119,7 +118,7 @@ def _says(action: argparse.Action) -> str:
 
 def _default(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
-        return "-"
+        return "required"
     value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
     # TOML writes as JSON does, except for a table
     return "`{}`" if isinstance(value, dict) else f"`{msgspec.json.encode(value).decode()}`"
@@ -138,7 +137,7 @@ def _allowed(hint: Any) -> str:
         for name, text in BOUNDS.items()
         if getattr(meta, name) is not None
     ]
-    words = {int: "whole", float: "", str: "text", bool: "true, false"}
+    words = {int: "whole", float: "", str: "text", bool: "true or false"}
     return " ".join((words.get(inner, "table"), *bounds)).strip()
 
 
