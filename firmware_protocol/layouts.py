@@ -23,7 +23,9 @@ class Retract(Value):
 
 @final
 class Drive(Value):
-    """Host -> Device. Motor duties. Every 1 ms; each accepted one is answered by State and Sense."""
+    """Host -> Device. Motor duties. Every 1 ms; each accepted one is answered by State and Sense. In RUN, 50 ms
+    without a valid one makes the device open the gap and latch COMMAND_TIMEOUT.
+    """
 
     def __init__(self, left_duty: float, right_duty: float, mode: DriveMode, counter: int) -> None:
         # Share of the supply voltage at the left motor; positive opens.

@@ -24,8 +24,8 @@ FOLDER = ROOT / "docs" / "evidence"
 README = "README.md"
 HEADER = """# Evidence
 
-`make evidence` measures this on simulated devices; `python tools/evidence.py NAME` repeats a part. *Measured* parts have
-no verdict.
+`make evidence` measures this on simulated devices; `python tools/evidence.py NAME` repeats a part. *Measured* parts
+have no verdict.
 
 | part | command | version, day | held | figures |
 | --- | --- | --- | --- | --- |

@@ -46,7 +46,7 @@ def decisions(function: ast.AST) -> int:
 def lines(function: Function) -> int:
     """Return how many lines a function has without its docstring."""
     docs = function.body[0] if said(function.body[0]) else None
-    return (function.end_lineno or 0) - function.lineno + 1 - (docs.end_lineno - docs.lineno + 1 if docs else 0)
+    return (function.end_lineno or 0) - function.lineno + 1 - ((docs.end_lineno or 0) - docs.lineno + 1 if docs else 0)
 
 
 def findings(root: Path, house: dict[str, dict[str, int]]) -> Iterator[str]:

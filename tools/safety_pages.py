@@ -35,13 +35,13 @@ _STATES_HEAD = """# Operating states, faults and limits
 """
 _MATRIX_HEAD = """# Fault matrix
 
-What each fault comes to, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
-[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`, which also has all times.
+The effect of each fault, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
+[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`.
 
-Faults are put in while 1.8 ± 0.1 N are rendered at a turning handle; those of homing and of the start are there from
-the beginning. A row is of both buses, where they agree. *Safe after* is when the gap was open or at rest, or the limit
-was told. *Leads out* are the commands that the daemon names, once the cause has gone. Then the force is followed again
-within 0.15 N.
+Faults are injected while 1.8 ± 0.1 N are rendered at a turning handle, those of homing and of the start from the
+beginning. A row is for both buses if they agree. *Safe after* is when the gap was open or at rest, or the limit was
+told. The headings have the commands that the daemon names once the cause has gone. After them the force is followed
+again.
 
 """
 
@@ -77,12 +77,14 @@ def matrix_page(record: dict[str, Any]) -> str:
     for cell in cells:
         lines.setdefault((cell["fault"], *_outcome(cell)), []).append(cell)
     buses = Counter(fault for fault, *_ in lines)
-    made = []
+    made: dict[str, list[tuple[str, ...]]] = {}
     for (fault, named, reaction, leads_out), alike in lines.items():
         name = fault if buses[fault] == 1 else f"{fault} ({alike[0]['bus']})"
         safe_s = [cell["seconds"] for cell in alike if cell["seconds"] is not None]
-        made.append((name, named, reaction, f"{max(safe_s):.3f} s" if safe_s else "-", leads_out))
-    return _MATRIX_HEAD + says + table(("fault", "named as", "reaction", "safe after", "leads out"), made)
+        made.setdefault(leads_out, [("fault", "named as", "reaction, safe after")]).append(
+            (name, named, f"{reaction}, {max(safe_s):.3f} s" if safe_s else reaction)
+        )
+    return _MATRIX_HEAD + says + "\n".join(f"## Leads out: {by}\n\n{table(of[0], of[1:])}" for by, of in made.items())
 
 
 def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
@@ -91,7 +93,7 @@ def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
     told = [name for name in told if name.replace("device:", "DEVICE_") not in told or not name.startswith("device:")]
     failed = [f"not {word}" for name, word in HELD.items() if not cell[name]]
     reaction = cell["expected"] + (f" (**{', '.join(failed)}**)" if failed else "")
-    return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "-"
+    return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "no command"
 
 
 def _transitions() -> str:

@@ -20,7 +20,6 @@ MAX_LISTED = 8
 "Fewer sources than are kept apart, so that an unlisted one is heard too."
 MAX_PLAYOUT_MS = 200.0
 "Half of what the whole way from sensor to force may take."
-_FINGERPRINT = re.compile("[0-9a-f]{4}(:[0-9a-f]{4}){3}")
 
 
 class Device(Strict, frozen=True):
@@ -70,7 +69,7 @@ class Sources(Strict, frozen=True):
         )
         for name, keys in self.keys.items():
             require(
-                keys != () and all(map(_FINGERPRINT.fullmatch, keys)),
+                keys != () and all(re.fullmatch("[0-9a-f]{4}(:[0-9a-f]{4}){3}", key) for key in keys),
                 f"sources.keys.{name}",
                 keys,
                 "fingerprints as tormagctl keys show says them, one or more",
@@ -221,7 +220,7 @@ class Recordings(Strict, frozen=True):
     most_MB: Annotated[float, Meta(gt=0.0, le=1e8)] = 20_000.0
     "The folder's budget; the oldest unmarked files go first."
     most_days: Annotated[float, Meta(gt=0.0, le=36_500.0)] = 30.0
-    "The same for age."
+    "The same for age before the newest. Before a pause of over three days only `most_MB` counts."
     free_MB: Annotated[float, Meta(ge=1.0, le=1e8)] = 500.0
     "Space that stays free on that disk."
     one_tick_of: Annotated[int, Meta(ge=1, le=1_000)] = 1

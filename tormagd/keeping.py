@@ -4,6 +4,8 @@ import msgspec
 
 KEEPER = "tormagd.recording.keeper"
 "The keeper's main module, with its socket's descriptor as the argument."
+REQUEST = "REQUEST"
+"Reason of a black box that somebody asked for; any other is a fault's."
 READ, WROTE = "read", "wrote"
 "Entries of what passed between daemon and device: `[READ, time_s, raw, ...]`."
 

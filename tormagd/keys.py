@@ -1,20 +1,22 @@
 """Who may do what at the daemon: its own key pair, and a folder of public keys for each role."""
 
+import os
 import stat
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from tormagd_client.endpoints import ROLES, ConfigError, Endpoints
-from tormagd_client.keys import PUBLIC, load_pair, load_public, regular
+from tormagd_client.keys import PUBLIC, fingerprint, load_pair, load_public, regular
 
 MAX_KEYS = 256
 
 
 class Listed(NamedTuple):
-    """A client's key that the daemon accepts: its file's name, and the roles of its folders."""
+    """A client's key that the daemon accepts: its file's name, its fingerprint, and the roles of its folders."""
 
     name: str
+    fingerprint: str
     roles: frozenset[str]
 
 
@@ -40,7 +42,7 @@ class KeyRing:
         for role, folder in self._folders.items():
             for name, public in load_folder(folder):
                 before = found.get(public)
-                found[public] = Listed(name, (before.roles if before else frozenset()) | {role})
+                found[public] = Listed(name, fingerprint(public), (before.roles if before else frozenset()) | {role})
         return found
 
 
@@ -59,6 +61,18 @@ def load_folder(folder: Path) -> Iterable[tuple[str, str]]:
     for path in paths:
         _refuse_writable(path, regular(path).st_mode)
         yield path.stem, load_public(path).decode()
+
+
+def require_own(folder: Path) -> None:
+    """Raise ConfigError, with the remedy, where others could put something of theirs in the place of what is in
+    `folder`."""
+    found = folder.stat()
+    if found.st_uid not in (0, os.geteuid()):
+        raise ConfigError(
+            f"{folder} belongs to user {found.st_uid}: allowed are this process's own and root; name another folder"
+        )
+    if not found.st_mode & stat.S_ISVTX:
+        _refuse_writable(folder, found.st_mode)
 
 
 def _refuse_writable(path: Path, mode: int) -> None:

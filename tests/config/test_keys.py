@@ -6,12 +6,13 @@ import stat
 from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import zmq
 
 from tormagd.config import Config
-from tormagd.keys import KeyRing, load_folder
+from tormagd.keys import KeyRing, load_folder, require_own
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.keys import MAX_KEY_FILE_BYTES, fingerprint, generate, load_pair, load_public
 
@@ -43,6 +44,12 @@ def test_keys_are_their_owners_only_and_a_pair(tmp_path: Path) -> None:
     assert zmq.curve_public(pair.secret) == pair.public == load_public(public) == load_public(secret)
     assert "secret-key" not in public.read_text()
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["publish", "robot.key_secret"]
+
+
+def test_a_folder_of_somebody_else_is_refused() -> None:
+    folder = Mock(stat=Mock(return_value=Mock(st_uid=os.geteuid() + 1, st_mode=0o40755)))
+    with pytest.raises(ConfigError, match=r"belongs to user \d+: allowed are this process's own and root"):
+        require_own(folder)
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:

@@ -38,7 +38,6 @@ COLUMNS = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "righ
 
 
 def telemetry(seq: int, t_ns: int, **changes: Any) -> Telemetry:
-    """A snapshot of an enabled device in good order."""
     known: dict[str, Any] = {
         "v": VERSION,
         "t_ns": t_ns,
@@ -109,7 +108,6 @@ SOURCE: dict[str, Any] = {
     "cause": "its clock: it is 1.001 s behind this machine's, and is corrected",
     "remedy": "keep the clocks",
 }
-"What the daemon says of a publisher that holds the brake, and whose clock is wrong."
 
 
 TIMES_US = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
@@ -117,11 +115,9 @@ RATE: dict[str, Any] = {
     **{"grade": "warning", "hz": 999.6, "runs": 9, "merged": 1, "overruns": 2, "stalls": 3},
     **{"lateness_us": TIMES_US | {"worst": 2000.0}, "exec_us": TIMES_US},
 }
-"How a loop keeps its rate."
 
 
 def status(**changes: Any) -> dict[str, Any]:
-    """What the daemon answers to `status`."""
     known: dict[str, Any] = msgspec.to_builtins(telemetry(1, 1))
     return (
         known
@@ -176,8 +172,6 @@ DESCRIPTION: dict[str, Any] = {
 
 
 class FakeDaemon(threading.Thread):
-    """Binds the four endpoints in `directory`."""
-
     def __init__(self, directory: Path) -> None:
         super().__init__(daemon=True)
         self.directory = directory
@@ -197,17 +191,14 @@ class FakeDaemon(threading.Thread):
         self.is_over = threading.Event()
 
     def says(self, **changes: Any) -> None:
-        """Its status is this from now on."""
         self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | changes)}
 
     def taken(self) -> dict[str, Any]:
-        """Of its status, what became of the setpoints."""
         counts = Counter(setpoint.source for setpoint in self.setpoints)
         by_source = {name: SOURCE | {"accepted": count} for name, count in counts.items()}
         return status()["setpoints"] | {"by_source": by_source if self.taken_by_source else {}}
 
     def arrived(self, count: int) -> list[Setpoint]:
-        """What it was sent, once that is so many."""
         until_s = time.monotonic() + PATIENCE_S
         while len(self.setpoints) < count:
             assert time.monotonic() < until_s, f"{len(self.setpoints)} of {count} setpoints arrived"
@@ -260,20 +251,16 @@ class FakeDaemon(threading.Thread):
 
 
 class Ran(NamedTuple):
-    """How a command ended, and what it wrote."""
-
     code: int
     out: str
     err: str
 
     def ended(self, code: int) -> "Ran":
-        """The same, which has to have ended so."""
         assert self.code == code, self
         return self
 
     @property
     def said(self) -> dict[str, Any]:
-        """The object of `--json`, which has all its keys."""
         found: dict[str, Any] = json.loads(self.out)
         assert (list(found), found["ok"]) == (["command", "ok", "result", "error"], self.code == 0)
         return found
@@ -289,8 +276,6 @@ class Ran(NamedTuple):
 
 @pytest.fixture
 def ctl(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Runs `tormagctl` with these arguments."""
-
     def run(*arguments: str) -> Ran:
         capsys.readouterr()
         return Ran(main(list(arguments)), *capsys.readouterr())
@@ -299,46 +284,37 @@ def ctl(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
 
 
 class Terminal(io.StringIO):
-    """A terminal, with what a person has typed."""
-
     def isatty(self) -> bool:
         return True
 
 
 class Files:
-    """Files below `root`, which stands for a machine's own."""
-
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def write(self, texts: Mapping[str, str]) -> None:
-        """Each file's text, by its path."""
         for path, text in texts.items():
             (self.root / path).parent.mkdir(parents=True, exist_ok=True)
             (self.root / path).write_text(text)
 
     def process(self, number: int, name: str, *opened: str) -> None:
-        """A process of this name that has these paths open."""
         self.write({f"proc/{number}/comm": f"{name}\n"})
         (self.root / f"proc/{number}/fd").mkdir()
         for descriptor, path in enumerate(opened):
             (self.root / f"proc/{number}/fd/{descriptor}").symlink_to(path)
 
     def inode(self, path: str) -> str:
-        """A file as the kernel's list of locks names it."""
         status = (self.root / path).stat()
         return f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
 
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Files:
-    """A machine without any file."""
     return Files(tmp_path)
 
 
 @pytest.fixture
 def terminal() -> type[Terminal]:
-    """Makes a stream that is a terminal."""
     return Terminal
 
 
@@ -360,25 +336,21 @@ def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def status_with() -> Callable[..., dict[str, Any]]:
-    """Makes an answer to `status` with some keys changed."""
     return status
 
 
 @pytest.fixture
 def telemetry_with() -> Callable[..., Telemetry]:
-    """Makes a snapshot, of a number and a time in ns, with some keys changed."""
     return telemetry
 
 
 @pytest.fixture
 def source_with() -> Callable[..., dict[str, Any]]:
-    """Makes what the daemon says of a source with some keys changed."""
     return lambda **changes: SOURCE | changes
 
 
 @pytest.fixture
 def run_dir() -> Iterator[Path]:
-    """A directory with a short path: an ipc address holds 107 characters."""
     with tempfile.TemporaryDirectory(prefix="tormag") as directory:
         yield Path(directory)
 

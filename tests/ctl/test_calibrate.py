@@ -9,6 +9,7 @@ import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -38,9 +39,11 @@ from tormagd.model.displacement import MOVING_MM_S, Turn
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.inserts import insert
+from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
+from tormagd_client.endpoints import Endpoints
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)
@@ -48,7 +51,6 @@ CREATED = datetime.date(2024, 2, 29)
 
 @pytest.fixture(scope="module")
 def sweeps():
-    """The ticks of each sweep, as the daemon would publish them."""
     core = build_core(Config())
     device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), seed=3)
     loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
@@ -71,7 +73,6 @@ def sweeps():
 
 @pytest.fixture
 def table(sweeps, tmp_path):
-    """The sweep file of a good run, as an array; tests spoil it."""
     write_sweeps(tmp_path / "sweep.csv", sweeps)
     return calibration.read_sweep(tmp_path / "sweep.csv")
 
@@ -85,13 +86,11 @@ def column(name):
 
 
 def fitted(data: Dataset) -> ForceModel:
-    """The model of usable data."""
     require_usable(data)
     return fit(data, INSERT, CREATED, hidden=12, epochs=60)
 
 
 def refusal(table):
-    """The code and the text with which a sweep is refused."""
     with pytest.raises(CalibrationError) as refused:
         fitted(rows(table))
     return refused.value.code, str(refused.value)
@@ -107,8 +106,7 @@ def test_a_good_sweep_gives_a_model_that_knows_what_it_was_judged_on(table):
     assert metrics["judged_rows"] == (data.cycle == 1).sum()
     assert metrics["judged_rows"] + metrics["train_rows"] + metrics["validation_rows"] == len(data)
     assert (model.metadata.insert, model.metadata.created) == (INSERT, CREATED)
-    # what the shipped model, made from bench sweeps of the same plant and freed of memory, says of a turning handle,
-    # less what the plant's elastomer has relaxed
+    # the shipped model of a turning handle, less what the plant's elastomer has relaxed
     relaxed = 1.0 - sum(load_plant("sample_1").relaxation.fractions)
     shipped = load_model(model_path("torque_mre_50_40", Path()), element="torque", insert=INSERT)
     asked = [[2.0, 30.0, field, 40.0] for field in np.linspace(*model.field_range_mT, 9)]
@@ -119,7 +117,7 @@ def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, caps
     write_sweeps(tmp_path / "sweep.csv", sweeps[:2])
     out, data = tmp_path / "m.safetensors", tmp_path / "t.csv"
     arguments = [str(tmp_path / "sweep.csv"), "--insert", INSERT, "--out", str(out), "--csv", str(data)]
-    # one that is refused leaves nothing that would be in the way of the same command
+    # a refused one leaves nothing in the way of the next
     assert calibration.main(arguments) == 1
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "few_sweeps"
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.csv"]
@@ -239,7 +237,6 @@ def test_a_sweep_file_that_is_none_says_why(tmp_path, text, told):
 
 
 def ticks(count=200):
-    """Control ticks of a carriage that opens evenly; the device answers every millisecond."""
     known = dict.fromkeys(MOTOR_COLUMNS, np.zeros(count))
     time_s = 5.0 + 1e-3 * np.arange(count)
     return known | {
@@ -260,7 +257,7 @@ def test_a_motor_log_has_volts_and_even_times_whatever_the_ticks_missed():
         pytest.approx([0.0, 0.012, 0.024]),
         40.0,
     )
-    # a tick without news from the device, one that never came, one before the device was known
+    # a tick without news, a lost one, one before the device was known
     order = np.array([0, 1, 2, *range(3, 50), *range(51, 200)])
     spoilt = {name: values[order].copy() for name, values in given.items()}
     spoilt["device_time_s"][2] = spoilt["device_time_s"][1]
@@ -270,8 +267,8 @@ def test_a_motor_log_has_volts_and_even_times_whatever_the_ticks_missed():
     assert np.diff(log["t_s"]) == pytest.approx(1e-3)
     assert all(np.isfinite(values).all() for values in log.values())
     assert log["position_mm"] == pytest.approx(plain["position_mm"][1 : len(log["t_s"]) + 1], abs=1e-9)
-    assert log["input_V"][0] == pytest.approx(0.024)  # the duty that the device went on with
-    assert log["input_V"][48] == log["input_V"][49]  # held where a tick is missing
+    assert log["input_V"][0] == pytest.approx(0.024)
+    assert log["input_V"][48] == log["input_V"][49]
 
 
 def test_a_motor_log_with_a_hole_is_refused():
@@ -282,8 +279,6 @@ def test_a_motor_log_with_a_hole_is_refused():
 
 
 class Played:
-    """A run that finds this, whatever is asked."""
-
     def __init__(self, found) -> None:
         self._found = found
         self.progress = Progress()
@@ -317,7 +312,7 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, t
 @pytest.mark.parametrize(
     ("name", "age_ms", "state", "told", "asked"),
     [
-        # one that sends, and one whose old setpoint is still valid and keeps ours out
+        # one sends, the other's old setpoint is still valid
         (INSERT, 12.0, "stale", ("code", "other_publisher"), ["status"]),
         (INSERT, 20_000.0, "holds", ("code", "other_publisher"), ["status"]),
         ("MRE-99-99", None, "stale", ("message", "MRE-99-99"), []),
@@ -333,6 +328,17 @@ def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_mo
     assert fake_daemon.commands == asked
 
 
+def test_a_fit_is_the_commands_result_and_is_told(tmp_path, monkeypatch):
+    metrics = {"judged_r2": 0.99, "judged_mae_N": 0.012, "most_mae_N": 0.02, "noise_mae_N": 0.003}
+    fitted = {"model": "m", "insert": INSERT, "created": "today", "rows": 7, "metrics": metrics}
+    monkeypatch.setattr(ctl_calibrate, "_ask_fitter", lambda *arguments: fitted)
+    for name in ("Client", "known_of", "armed", "write_sweeps"):
+        monkeypatch.setattr(ctl_calibrate, name, MagicMock())
+    about = Config(), Endpoints(), load_scene("pulse"), INSERT, tmp_path / "m.safetensors"
+    outcome = ctl_calibrate.calibrate_insert(*about, None, (), False, 1.0)
+    assert (outcome.result, "mean error 12.0 mN (allowed 20.0" in outcome.text) == (fitted, True)
+
+
 def test_a_refused_fit_is_the_commands_refusal(tmp_path):
     path = tmp_path / "sweep.csv"
     rows = (f"{k * 1e-3},0,80,{k * 1e-3},0,1\n" for k in range(100))
@@ -342,13 +348,11 @@ def test_a_refused_fit_is_the_commands_refusal(tmp_path):
     assert (refused.value.code, list(tmp_path.iterdir())) == ("handle_still", [path])
 
 
-# -- `--device`: what becomes of its findings; tests/commission has its courses ----------------------------------------
+# -- --device ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def calibrated(fake_daemon, monkeypatch, ctl):
-    """Runs the command beside a daemon that says so."""
-
     def run(**status):
         monkeypatch.setattr(
             calibrate_device,
@@ -390,7 +394,7 @@ def test_what_taught_nothing_is_refused(calibrated, status, told) -> None:
     assert calibrated(**status).ended(1).error["code"] == told
 
 
-# -- `commission`: the files that it leaves; tests/commission has its steps -----------------------------------------
+# -- commission --------------------------------------------------------------------------------------------------------
 
 
 def test_a_commissioning_keeps_findings_and_page_and_can_be_resumed(fake_daemon, monkeypatch, tmp_path, ctl) -> None:

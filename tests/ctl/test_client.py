@@ -20,7 +20,7 @@ PATIENCE_S = 20.0
 
 
 class Blocking:
-    """Calls the asynchronous client as if it blocked, in a loop of its own: one set of tests for both."""
+    """Lets one set of tests serve both clients."""
 
     def __init__(self, folder: str, wait_s: float) -> None:
         async def made() -> AsyncClient:
@@ -69,7 +69,7 @@ def test_a_refusal_names_command_reason_and_remedy(client, fake_daemon, code, ki
         "do this first",
         "enable: cannot enable; do this first",
     )
-    assert client.status().is_homed  # and the client goes on
+    assert client.status().is_homed
 
 
 def test_what_the_daemon_says_reaches_no_terminal_raw(client, fake_daemon):
@@ -119,7 +119,6 @@ def test_late_answers_do_not_hold_a_call_nor_are_they_taken_for_its_own(fake_dae
 
 
 def arming(*reports):
-    """Answers to `status` one after the other, of an `arm` that comes so far."""
     left = list(reports)
 
     def answer():
@@ -190,7 +189,7 @@ def test_a_daemon_that_has_gone_takes_no_setpoints(run_dir, fake_daemon, kind):
     fake_daemon.is_over.set()
     fake_daemon.join(PATIENCE_S)
     with pytest.raises(UnreachableError, match="nobody takes setpoints"):
-        deque(client.publish(1.5) for _ in repeat(None))  # the system tells of the end in its own time
+        deque(client.publish(1.5) for _ in repeat(None))  # the system reports the end in its own time
     client.close()
 
 

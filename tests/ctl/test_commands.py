@@ -34,7 +34,6 @@ NOT_UNDERSTOOD: list[Row] = [
 ARMED = {"given": ["home", "enable"], "is_over": True, "error": None}
 A_FAULT = {"code": "fault", "cause": "it came back", "remedy": "tormagctl status"}
 ANSWERS: dict[str, list[Row]] = {
-    # what is shown is the daemon's own
     "status": [
         ({"operating_state": "ENABLED"}, {}, 0, ["state     ENABLED, homed"]),
         (IN_FAULT, {}, 4, ["fault     SUPPLY", "supply voltage low", "next: check the power supply"]),
@@ -47,7 +46,6 @@ ANSWERS: dict[str, list[Row]] = {
     "--json firmware": NOT_UNDERSTOOD,
     "top": [({}, {}, 2, ["next: tormagctl status"])],  # there is no terminal
     "record /nowhere/a.mcap": [({}, {}, 2, ["/nowhere/a.mcap: No such file"])],
-    # a command is done where the answer says so
     "stop": [
         ({"is_open": True}, {"operating_state": "FAULT", "is_connected": True}, 0, ["latched; the gap is open"]),
         ({}, {"operating_state": "FAULT", "is_connected": False}, 1, ["nothing could be sent"]),
@@ -75,7 +73,7 @@ ANSWERS: dict[str, list[Row]] = {
         ({}, {"confirmed": "device"}, 1, ["'device' is confirmed, not 'sensor'"]),
     ],
     "mark stuck": [({}, {"t_ns": 7, "text": "stuck"}, 0, ["marked: stuck\n"])],
-    # a fault that is there still, or comes back, is no success
+    # a fault that stays or comes back is no success
     "clear-fault": [
         ({}, {"operating_state": "DISABLED"}, 0, ["no fault is latched; it is DISABLED"]),
         ({}, {"operating_state": "PAUSED"}, 0, ["no fault is latched; it is PAUSED"]),
@@ -104,7 +102,6 @@ ARGS = {
     "confirm sensor": {"what": "sensor"},
     "mark stuck": {"text": "stuck"},
 }
-"What the daemon is asked with; nothing where a command has no arguments."
 
 
 @pytest.mark.parametrize(
@@ -231,15 +228,13 @@ def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_writ
     assert found["daemon_share"] == min(shares[way] for way in errors_N)
     found = ctl(*words, "--share", "1.0", "--out", str(exact)).ended(0).result
     assert found["rms_N"] == min(errors_N.values())
-    for path in (cheap, exact):  # what is written asks for the same, and is taken
+    for path in (cheap, exact):  # what is written is the same scene, and is taken
         assert load_scene(str(path)).fingerprint == load_scene("pulse").fingerprint
         ctl("scene", "check", str(path)).ended(0)
 
 
 @pytest.fixture
 def states(status_with: Any) -> Any:
-    """Makes answers to `status`, one (is_homed, is_busy) after the other, the last one for ever."""
-
     def answers(*pairs: tuple[bool, bool], **changes: Any) -> Any:
         sequence = chain(pairs, repeat(pairs[-1]))
 
@@ -373,7 +368,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
         ("core      compiled",),
     ),
     "nothing of the core of an older daemon": ({"build": ""}, (), ("\ncore",)),
-    # no command is said to be next that a missing device would refuse
+    # no command is proposed that a missing device would refuse
     **{
         f"what is next at a link that is {state}": (
             {"next_commands": ("home", "enable"), "link": NO_PORT | {"state": state}},
@@ -387,8 +382,6 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
 
 @pytest.fixture
 def shown(status_with: Any) -> Any:
-    """Makes the text of a status with some keys changed, or some keys of a part."""
-
     def text(**changes: Any) -> str:
         usual = status_with()
         changed = {name: usual[name] | it if isinstance(usual.get(name), dict) else it for name, it in changes.items()}
@@ -460,7 +453,6 @@ def test_a_black_box_is_fetched_once_it_is_written(fake_daemon, status_with, ctl
     fetch = (*fake_daemon.at, "--json", "blackbox", str(copy))
     assert ctl(*fetch).ended(0).result == {"file": str(copy), "original": str(original)}
     assert copy.read_bytes() == b"what is in it"
-    # nothing is overwritten, and nothing asked for
     asked = list(fake_daemon.commands)
     assert (ctl(*fetch).code, fake_daemon.commands) == (2, asked)
 
@@ -479,7 +471,7 @@ def test_a_black_box_that_cannot_be_had_says_why(fake_daemon, ctl, tmp_path):
     assert (error["code"], "/nowhere/b.mcap on the daemon's machine" in error["hint"]) == ("usage", True)
 
 
-# -- firmware: the link's report as it is, and as text -----------------------------------------------------------------
+# -- firmware ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -527,11 +519,10 @@ def test_the_keys_of_json_are_the_links(fake_daemon: Any, status_with: Any, ctl:
     assert "RUNNING" in ctl(*fake_daemon.at, "firmware").ended(0).out
 
 
-# -- scene new: what it makes of a recorded force, or of answers, the daemon takes; what can be none is told -----------
+# -- scene new ---------------------------------------------------------------------------------------------------------
 
 
 def recording(path: Path, least_N: float, most_N: float, rate_hz: float) -> Path:
-    """A sine of 20 s between two forces."""
     middle, half = (least_N + most_N) / 2.0, (most_N - least_N) / 2.0
     rows = [f"{0.02 * n:.2f},{middle - half * math.cos(0.04 * math.pi * rate_hz * n):.5f}" for n in range(1000)]
     path.write_text("t_s,force_N\n" + "\n".join(rows) + "\n")

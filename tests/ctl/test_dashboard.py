@@ -1,4 +1,4 @@
-"""`tormagctl dashboard`: what it serves, to whom, and the page in a headless Chromium where there is one."""
+"""`tormagctl dashboard`: what it serves, and the page in a headless Chromium if there is one."""
 
 import asyncio
 import itertools
@@ -43,7 +43,6 @@ Browser = TestClient[Any, Any]
 
 
 def tick(k: int) -> tuple[Any, ...]:
-    """Every 10 ms: a sine of 1.2 Hz; RATE from 5 to 7 s, SKEW from 29 s on."""
     t_s = 0.01 * k
     force_N = 1.5 + 0.3 * math.sin(2.4 * math.pi * t_s)
     state, faults = ("FAULT", ("SKEW",)) if t_s >= 29.0 else ("ENABLED", ())
@@ -69,7 +68,6 @@ async def served(shown: Live | Recorded) -> AsyncIterator[Browser]:
 
 @asynccontextmanager
 async def live(folder: Path) -> AsyncIterator[Live]:
-    """What is shown of the daemon in `folder`, while it is listened to."""
     async with AsyncClient(in_folder(str(folder)), 5.0) as client:
         shown = Live(client, await client.status(), await client.describe())
         listening = asyncio.create_task(shown.run())
@@ -78,7 +76,6 @@ async def live(folder: Path) -> AsyncIterator[Live]:
 
 
 async def event(stream: ClientResponse, wanted: str) -> Any:
-    """The next event of this name."""
     while True:
         name = (await stream.content.readline()).decode().removeprefix("event: ").strip()
         data = (await stream.content.readline()).decode().removeprefix("data: ")
@@ -110,7 +107,7 @@ async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
         then = msgspec.convert(await event(stream, "frame"), Frame)
         assert (first.asked_N[-1], first.gap_mm[-1], first.operating_state) == (1.5, 70.0, "ENABLED")
         assert then.t_s[0] > first.t_s[-1]
-        # one that comes later begins with the seconds that were
+        # a late one begins with the past seconds
         assert msgspec.convert(await event(await asks.get("/live"), "frame"), Frame).t_s[0] <= first.t_s[0]
         assert sum(then.late_counts) >= len(first.t_s)
         fake_daemon.is_silent = True
@@ -124,7 +121,7 @@ async def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telem
     described = Description(version="0", build="", model="", profile=profile, **unknown)
     context = zmq.Context()
     publishes = context.socket(zmq.XPUB)
-    publishes.setsockopt(zmq.XPUB_VERBOSE, 1)  # or only the first of them is told
+    publishes.setsockopt(zmq.XPUB_VERBOSE, 1)  # otherwise only the first is reported
     publishes.bind(f"ipc://{run_dir}/telemetry")
     async with AsyncClient(in_folder(str(run_dir)), 0.1) as client:
         shown = Live(client, msgspec.convert(status_with(), Status), described)
@@ -167,7 +164,7 @@ async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Rec
         for asset in ("page/dashboard.css", "page/dashboard.js", "page/vendor/uPlot.iife.min.js"):
             assert asset in text
             assert (await asks.get(f"/{asset}")).status == 200
-        # works without a network: everything is asked of where the page came from
+        # works without a network
         assert re.findall("https?://", text) == []
         assert [(await asks.get(path)).status for path in ("/page/../server.py", "/live")] == [404, 404]
 
@@ -183,7 +180,7 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     assert msgspec.to_builtins(about["portrait"]) == {name: tuple(values) for name, values in PORTRAIT.items()}
     assert (about["overview"]["limits"], about["overview"]["marks"]) == ([pytest.approx((5.0, 7.0))], [])
     assert max(known for known in about["overview"]["high_N"] if known is not None) == pytest.approx(1.81, abs=1e-3)
-    # a limit and a fault of one name are two things
+    # a limit and a fault share the name
     assert about["explained"]["limits"][Limit.SKEW].remedy == LIMITS[Limit.SKEW].remedy
     assert about["explained"]["faults"][Fault.SKEW].remedy == FAULTS[Fault.SKEW].remedy
     frame = recorded.frame(20.0)
@@ -196,13 +193,13 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     )
     assert [(held.code, round(held.share, 3), held.is_now) for held in frame.held] == [("RATE", 0.1, False)]
     assert (frame.operating_state, frame.faults) == ("ENABLED", [])
-    # all ticks are counted, not those alone that are drawn
+    # all ticks count, not only those drawn
     assert (sum(frame.late_counts), frame.late_counts[LATE_US.index(500.0)]) == (
         pytest.approx(2_000, abs=2),
         pytest.approx(20, abs=1),
     )
     fault = recorded.frame(29.5)
-    # in FAULT the gap opens: the field of the plan stands nowhere
+    # in FAULT no field is planned
     assert (fault.faults, fault.field_mT[-1], fault.field_mT[0]) == (["SKEW"], None, 120.0)
     assert frame.belief == {}  # ticks do not say
     assert [held.is_now for held in recorded.frame(6.0).held] == [True]
@@ -265,14 +262,11 @@ LONGEST_S = 60.0
 
 
 class Page:
-    """One page."""
-
     def __init__(self, socket: ClientWebSocketResponse) -> None:
         self._socket, self._ids = socket, itertools.count(1)
         self.complaints: list[str] = []
 
     async def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """The result of a command of the protocol."""
         number = next(self._ids)
         await self._socket.send_json({"id": number, "method": method, "params": parameters})
         while True:
@@ -286,7 +280,6 @@ class Page:
                 return said["result"]
 
     async def resize(self, width: int, height: int) -> None:
-        """Gives the window another size."""
         await self.tell(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -296,14 +289,12 @@ class Page:
         )
 
     async def ask(self, expression: str) -> Any:
-        """The value of a JavaScript expression."""
         said = await self.tell("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in said:
             raise RuntimeError(f"{expression}: {said['exceptionDetails']}")
         return said["result"].get("value")
 
     async def until(self, expression: str) -> None:
-        """Waits for it to be true."""
         async with asyncio.timeout(LONGEST_S):
             while not await self.ask(expression):
                 await asyncio.sleep(0.05)
@@ -311,7 +302,6 @@ class Page:
 
 @asynccontextmanager
 async def browser(profile: Path) -> AsyncIterator[Page]:
-    """A browser of its own, with its files in the folder `profile`; ends with it."""
     process = await asyncio.create_subprocess_exec(
         CHROMIUM,
         *OPTIONS,
@@ -338,7 +328,6 @@ async def browser(profile: Path) -> AsyncIterator[Page]:
 
 @asynccontextmanager
 async def page_of(shown: Live | Recorded, tmp_path: Path, width: int, height: int) -> AsyncIterator[Page]:
-    """The page in a window of this size; it has complained of nothing in the end."""
     async with served(shown) as asks, browser(tmp_path) as page:
         await page.resize(width, height)
         for domain in ("Runtime", "Log", "Page"):
@@ -389,7 +378,7 @@ async def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Pa
 @needs_chromium
 async def test_the_page_scrubs_through_a_recording(recorded: Recorded, tmp_path: Path) -> None:
     async with page_of(recorded, tmp_path, 390, 844) as page:
-        # it begins where the first fault is
+        # it begins at the first fault
         await page.until("document.querySelector('#moment')?.textContent.startsWith('29.')")
         await page.until("document.querySelector('#state').textContent === 'FAULT'")
         said = await page.ask("document.querySelector('#codes').textContent")

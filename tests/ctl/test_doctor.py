@@ -35,7 +35,6 @@ GOOD = {
 
 @pytest.fixture
 def good(machine: Any, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine on which nothing is to be wished for."""
     monkeypatch.setattr(checks, "settle", lambda: Build(True, ""))
     machine.write(GOOD)
     (machine.root / "dev/tormag").symlink_to("ttyUSB0")
@@ -66,7 +65,6 @@ FORCED = {"proc/version": DYNAMIC, "sys/kernel/debug/sched/preempt": "none volun
 
 
 def limited(memlock, rtprio):
-    """What the kernel says of this process's limits."""
     return {"proc/self/limits": LIMITS.format(memlock=memlock, rtprio=rtprio)}
 
 
@@ -135,7 +133,7 @@ REFUSED = ("realtime.fifo_priority = 50: not permitted; see LimitRTPRIO", "realt
 
 @pytest.fixture
 def told(good, fake_daemon, status_with):
-    """What is found where a daemon runs: of a caller and a file that allow everything, and as it says of itself."""
+    """With a caller and a file that allow everything."""
 
     def found(not_granted=(), realtime=REALTIME.realtime, **changes):
         known = fake_daemon.answers["describe"]()["result"]
@@ -160,7 +158,7 @@ def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
     assert refused["autogroup"]["verdict"] == "warn"
     assert (refused["swap"]["verdict"], "unlimited" in str(refused["memlock"]["found"])) == ("warn", False)
     assert not [each for each in refused.values() if each["remedy"].startswith("set realtime.")]
-    machine.write(NOTHING)  # what whoever calls may not do changes nothing
+    machine.write(NOTHING)
     granted = told()
     assert {each["verdict"] for each in granted.values()} == {"ok"}
     assert (granted["daemon"]["found"], granted["sched_fifo"]["found"]) == (
@@ -210,12 +208,18 @@ def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_t
     )
 
 
+def test_a_run_directory_that_others_may_write_to_is_found(good):
+    (good / "run/tormag").chmod(0o777)
+    finding = checks.run_directory(Config(), Machine(good))
+    assert (finding.verdict, "mode 0777" in finding.found, finding.remedy[:11]) == ("fail", True, "chmod go-w ")
+
+
 def test_a_port_that_is_not_there_is_missed(good):
     (good / "dev/ttyUSB0").unlink()
     assert "does not exist" in checks.port(Config(), Machine(good)).found
 
 
-@pytest.mark.parametrize("name", ["tormagd", "python", "sh"])  # of an interpreter's path that is short, spaced, long
+@pytest.mark.parametrize("name", ["tormagd", "python", "sh"])  # short, spaced and long paths of an interpreter
 def test_the_daemon_that_answers_holds_its_port_by_whatever_name(good, machine, told, name):
     machine.process(4242, name, "/dev/ttyUSB0")
     holder = told(process_id=4242)["port holder"]
@@ -262,7 +266,6 @@ def quantiles(typical_us: float, p99_us: float) -> headroom.Quantiles:
 
 
 def measured(late_us: float = 100.0, step_us: float = 80.0, plan_us: float = 100.0, **others) -> headroom.Headroom:
-    """A machine with these p99, lateness and step half as much in the middle."""
     return headroom.Headroom(
         machine_us=450.0,
         build=others.pop("build", "interpreted"),
@@ -281,7 +284,7 @@ def test_a_machine_with_headroom_holds_its_rates_and_says_up_to_which(good):
     outcome = judged(REALTIME, Machine(good), measured())
     assert (outcome.exit_code, outcome.result["fail"], outcome.result["warn"]) == (0, 0, 0)
     control = by_rate(measured(), "control")
-    # 100 us late and 1.25 times 80 us of work in a period of 1000, 500 and 250 us
+    # 100 us late and 1.25 times 80 us of work in 1000, 500 and 250 us
     assert [control[hz].used for hz in (1_000, 2_000, 4_000)] == [0.2, 0.4, 0.8]
     assert [hz for hz, row in control.items() if row.configured] == [1_000]
     assert [hz for hz, row in control.items() if not row.holds] == [4_000]
@@ -289,7 +292,7 @@ def test_a_machine_with_headroom_holds_its_rates_and_says_up_to_which(good):
 
 
 def test_inference_is_held_where_a_plan_fits_beside_the_ticks():
-    # half as much of both in the middle: 900 us for a plan; and a seventh of the processor gone besides
+    # half as much of both: 900 us for a plan, and a seventh of the processor
     assert all(row.holds for row in by_rate(measured(plan_us=500.0), "inference").values())
     slow = by_rate(measured(plan_us=650.0), "inference")
     assert (slow[83].holds, slow[83].used, set(slow)) == (False, pytest.approx(0.75), {83, 125, 250, 500, 1_000})

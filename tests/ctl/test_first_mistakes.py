@@ -1,4 +1,4 @@
-"""What is done wrong first, without a daemon: each gets one sentence with its remedy, and the documented exit code."""
+"""First mistakes without a daemon: each gets one sentence with its remedy, and its exit code."""
 
 import json
 import shlex
@@ -137,7 +137,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
         "unknown field `prot` - at `$.device`; did you mean `port`? (line 2)",
         {"misspelt.toml": '[device]\nprot = "/dev/ttyACM0"\n'},
     ),
-    (  # a byte order mark is no mistake: what is wrong behind it is found
+    (  # a byte order mark is no mistake
         "tormagd --check --config bom.toml",
         2,
         "`int` >= 83 - at `$.rates.control_hz` (it is 1) (line 2)",
@@ -172,7 +172,6 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
 
 
 def ended(command: str, files: dict[str, str]) -> int:
-    """Runs it beside these files; its exit code."""
     for file, text in files.items():
         Path(file).write_text(text, encoding="utf-8")
         Path(file).chmod(0o644)
@@ -192,7 +191,6 @@ def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_pat
     # a sentence, and what to do next
     assert [line for line in more if not line.startswith("  ")] == []
     assert "  next: " in said or command.startswith("tormagd --check")
-    # nothing is made, and what was there stays
     assert {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()} == files
 
 

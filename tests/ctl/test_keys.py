@@ -1,5 +1,3 @@
-"""`tormagctl keys`, and clients that show a key: to a daemon made of guarded sockets only."""
-
 import stat
 import threading
 from collections.abc import Iterator

@@ -40,7 +40,6 @@ def values(families: dict[str, Metric], name: str, **labels: str) -> list[float]
 def full(
     fake_daemon: Any, source_with: Callable[..., dict[str, Any]], status_with: Callable[..., dict[str, Any]]
 ) -> Any:
-    """A daemon of which everything is known."""
     setpoints = status_with()["setpoints"] | {"by_source": {'"\\\n': source_with()}}
     fake_daemon.says(
         setpoints=setpoints,
@@ -75,7 +74,7 @@ SHOWN: list[tuple[str, dict[str, str], Any]] = [
     ("late_ticks", {"culprit": "kernel"}, 2.0),
     ("link_round_trip_seconds", {"percentile": "p50"}, pytest.approx(402.5e-6)),
     ("setpoints_accepted", {}, 3.0),
-    # a name with a quote, a backslash and a line's end comes as one label: printable, as everything that a daemon says
+    # a name with quote, backslash and line's end is one printable label
     ("source_lost", {"source": '"\\\\n'}, 3.0),
 ]
 
@@ -161,13 +160,12 @@ EXPRESSION = re.compile(
     r"(abs\()?(?:(?P<over>increase|delta)\()?(?P<name>tormag_\w+)"
     r"(?:{(?P<label>\w+)(?P<how>=~|!~|=)\"(?P<wanted>.+)\"})?(?:\[\w+\]\)+)? (?P<compare>==|>) (?P<limit>.+)"
 )
-"All that the rules are made of."
 OF_USE = {"NO_SETPOINT", "STANDBY", "F_MIN", "TAKEOVER"}
 "Limits that nobody is to be called for."
 
 
 def fired(then: str, now: str) -> set[tuple[str, ...]]:
-    """Each alert of the rules that two scrapes make true, with the code or setting that it is about."""
+    """The alerts that two scrapes fire, with their code or setting."""
     found = set()
     before = {(each.name, *each.labels.values()): each.value for it in read(then).values() for each in it.samples}
     for alert, expression in RULES:

@@ -1,5 +1,3 @@
-"""What `tormagctl ports` finds, on a directory that stands for the machine, and on this machine's own pty."""
-
 import fcntl
 import os
 import subprocess
@@ -24,7 +22,6 @@ ON_BOARD = SimpleNamespace(device="/dev/ttyS0", description="n/a", vid=None, pid
 
 @pytest.fixture
 def root(machine: Any) -> Path:
-    """Two ports, /dev/tormag leading to the one with a chip of its own."""
     timer = "sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
     machine.write({"dev/ttyUSB0": "", "dev/ttyS0": "", timer: "16\n", "proc/locks": ""})
     (machine.root / "dev/tormag").symlink_to("ttyUSB0")

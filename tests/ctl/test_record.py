@@ -25,6 +25,8 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl, file):
     result = ctl(*fake_daemon.at, "--json", "record", str(file), "--duration", "2").ended(0).result
     recording = RecordingFile(file)
     assert recording.is_complete
+    # what is not known of a daemon, as where its configuration is, is left out
+    assert (recording.metadata["version"], "configuration_file" in recording.metadata) == ("0", False)
     assert recording.overview.ticks == result["ticks"] > 0
     assert recording.overview.snapshots == result["telemetry"] > 0
     assert (result["ticks_lost"], result["telemetry_lost"], result["unreadable"]) == (0, 0, 0)
@@ -85,7 +87,6 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     assert names[-1] == Path(made["file"]).name
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.mcap", names[-1])
     assert {row["is_marked"] for row in listed["recordings"]} == {False}
-    # what an operator keeps, stays
     kept = ctl(*command, "recordings", "mark", str(folder / names[-1])).ended(0).result["file"]
     copied = ctl(*command, "recordings", "export", kept, "--to", str(tmp_path)).ended(0).result
     assert copied["sha256"] == hashlib.sha256((tmp_path / Path(kept).name).read_bytes()).hexdigest()
@@ -108,7 +109,7 @@ def test_a_report_is_one_page_of_one_recording_or_of_two(fake_daemon, tmp_path, 
     assert list(said.values()) == [[], ["damaged: the CRC of its summary is wrong"]]
     both = page.read_text()
     assert both.count("data:image/png;base64,") == 2
-    # nothing is asked of elsewhere, and no name is taken for markup
+    # no network, and no name is taken for markup
     assert ["<b>" in both, "&lt;b&gt;" in both, *re.findall("https?://|<script", both)] == [False, True]
     assert ctl("--json", "report", str(file), str(tmp_path / "no.mcap"), "-o", str(page)).ended(2).error["hint"]
     assert ctl("--json", "report", *[str(file)] * 3, "-o", str(page)).ended(2).error["hint"]
@@ -147,7 +148,7 @@ def test_rubbish_is_counted_and_left_out(fake_daemon, ctl, file):
 @pytest.mark.parametrize(
     ("limit_bytes", "program", "said", "is_told"),
     [
-        # the same as a full disk to a program, with another errno
+        # to a program the same as a full disk
         (100_000, "", "File too large", False),
         (10**9, "writer.MIN_FREE_BYTES = 1 << 60; ", "No space left on device", True),
     ],

@@ -1,5 +1,3 @@
-"""`tormagctl send`: what it sends; when that was rendered, and why where it was not."""
-
 from itertools import chain, pairwise, repeat
 from pathlib import Path
 from typing import Any
@@ -18,8 +16,6 @@ from tormagd_client.messages import Setpoint, Status
 
 @pytest.fixture
 def published(fake_daemon: Any, ctl: Any) -> Any:
-    """Sends, and gives the result and all setpoints that have arrived, when these have."""
-
     def run(*arguments: str) -> tuple[dict[str, Any], list[Setpoint]]:
         before = len(fake_daemon.setpoints)
         result = ctl(*fake_daemon.at, "--json", "send", *arguments).ended(0).result
@@ -29,7 +25,6 @@ def published(fake_daemon: Any, ctl: Any) -> Any:
 
 
 def after_s(setpoint: Setpoint, first: Setpoint) -> float:
-    """How long after the first one it is meant."""
     return (setpoint.stamp_ns - first.stamp_ns) * 1e-9
 
 
@@ -43,10 +38,10 @@ def test_every_setpoint_arrives_from_the_first_on(published):
     assert result["sent"] + result["skipped"] == 61
     assert (len(arrived), arrived[0].servo_cf, arrived[-1].servo_cf) == (result["sent"], 1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
-    # the force belongs to the setpoint's own deadline, whatever was left out
+    # the force belongs to the setpoint's own deadline
     for setpoint in arrived:
         assert setpoint.servo_cf == pytest.approx(1.0 + after_s(setpoint, arrived[0]) / 0.3, abs=1e-6)
-    # who counts what is missing finds nothing: what was left out was never sent
+    # the count has no holes: what was left out was never sent
     assert [setpoint.seq for setpoint in arrived] == list(range(result["sent"]))
 
 
@@ -170,7 +165,7 @@ def test_shapes_have_their_frequency_and_their_step(name, frequency_hz, forces_N
     assert [waveform.at(t_s).force_N for t_s in forces_N] == pytest.approx([*forces_N.values()])
 
 
-# -- it is done when its setpoints were rendered, and says why when they were not --------------------------------------
+# -- whether its setpoints were rendered -------------------------------------------------------------------------------
 
 
 EXPLAINED = {
@@ -182,8 +177,6 @@ EXPLAINED = {
 
 @pytest.fixture
 def seen(status_with: Any, source_with: Any) -> Any:
-    """Makes a status as the watch sees it, with what it says of the source `me`."""
-
     def made(source: dict[str, Any] | None = None, **changes: Any) -> Status:
         by_source = {} if source is None else {"me": source_with(**source)}
         setpoints = status_with()["setpoints"] | {"by_source": by_source, "newest_source": "robot"}
@@ -235,7 +228,6 @@ def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes,
 
 @pytest.fixture
 def sent(fake_daemon: Any, ctl: Any) -> Any:
-    """Sends a step of 0.4 s."""
     return lambda: ctl(*fake_daemon.at, "--json", "send", "step", "--duration", "0.4", "--rate", "50")
 
 
@@ -259,7 +251,6 @@ def test_what_is_not_rendered_is_no_success(fake_daemon, sent, changes, expected
     done = sent().ended(expected)
     assert says in done.error["message"]
     assert says[-10:] in done.err
-    # in FAULT nothing is sent at all
     assert (done.result, done.error["code"], bool(fake_daemon.setpoints)) == (None, code, expected == 1)
 
 
@@ -284,7 +275,7 @@ def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon,
 def test_setpoints_that_nobody_took_are_no_success(fake_daemon, sent):
     fake_daemon.taken_by_source = False
     assert sent().ended(1).error["code"] == "not_heard"
-    # taken in part: another publisher of the same name, or a loss
+    # another publisher of the same name, or a loss
     fake_daemon.taken_by_source = True
     taken = fake_daemon.taken
     fake_daemon.taken = lambda: (

@@ -1,4 +1,4 @@
-"""What we say reaches the terminal as text that nothing obeys; a stream that is closed or full changes nothing else."""
+"""What others say reaches the terminal as plain text; a closed or full stream breaks nothing."""
 
 import io
 import json
@@ -17,7 +17,7 @@ from tormagd.daemon.log import LogFormatter
 from tormagd.output import write_line
 from tormagd_client.printable import printable
 
-# -- text: nothing that a daemon, a device or a file says is obeyed by the terminal ------------------------------------
+# -- text --------------------------------------------------------------------------------------------------------------
 
 
 EVIL = "\x1b[2J\x1b]0;owned\x07\r\n\x9b31m\u202eevil\x7f"
@@ -25,7 +25,6 @@ HARMLESS = r"\u001b[2J\u001b]0;owned\u0007\r\n\u009b31m\u202eevil\u007f"
 
 
 def spoil(value: Any) -> Any:
-    """The same with something evil in each text and each name."""
     if isinstance(value, str):
         return value + EVIL
     if isinstance(value, dict):
@@ -119,7 +118,7 @@ def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, ctl, status_with, so
     fake_daemon.answers["status"] = lambda: {"ok": True, "result": told}
     captured = ctl(*fake_daemon.at, command).ended(0)
     assert is_harmless(captured.out + captured.err)
-    # one line each: nobody makes up a line of ours
+    # one line each
     assert not any(line.startswith("evil") for line in captured.out.splitlines())
     assert HARMLESS in captured.out
     printed = ctl(*fake_daemon.at, "--json", command).ended(0).out
@@ -166,7 +165,7 @@ def test_the_log_has_a_line_for_each_record_and_a_traceback_its_own() -> None:
     assert "Traceback" in text.splitlines()[1]
 
 
-# -- streams: closed or full, or without a reader, they change neither what was done nor the exit code -----------------
+# -- streams -----------------------------------------------------------------------------------------------------------
 
 
 CTL, DAEMON = ("tormagd.ctl.main",), "tormagd.daemon.main"
@@ -175,7 +174,6 @@ LOST = "the answer could not be written: No space left on device"
 
 
 def run(redirected: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    """A module of ours, run by a shell that redirects its streams."""
     return subprocess.run(
         ["sh", "-c", f'"$@" {redirected}', "sh", sys.executable, "-m", *arguments],
         capture_output=True,
@@ -211,7 +209,6 @@ def test_a_refusal_without_stderr_leaves_the_object_alone_on_stdout(tmp_path: Pa
     [
         (LIST, 0, ""),
         ((DAEMON, "--check"), 0, ""),
-        # a device whose address nobody learns is of no use
         (("tormagd.simulation", "--pty"), 1, "could not be written to stdout"),
     ],
 )

@@ -1,4 +1,4 @@
-"""`tormagctl top`: its screen as a pure function at two sizes, and the whole in a terminal of its own."""
+"""`tormagctl top`: its screen at two sizes, and in a terminal of its own."""
 
 import math
 import os
@@ -31,7 +31,6 @@ EVIL = "\x1b[2J\x07\u202e"
 
 @pytest.fixture
 def seen(status_with, telemetry_with) -> Seen:
-    """20 s of a sine, the last tenth of it held by RATE."""
     link = status_with()["link"] | {"port": f"/tmp/{'a-port-with-a-long-name' * 9}"}
     known = msgspec.convert(status_with(link=link, uptime_s=7200.0), Status)
     snapshots = [
@@ -153,7 +152,7 @@ def test_a_column_stays_what_it_is_while_time_goes_on() -> None:
 
 
 def in_terminal(control: str, end: bytes | signal.Signals, **settings: str) -> tuple[int, str]:
-    """`top` in a terminal of its own until it has drawn, then ended by a key or a signal: exit code, what was drawn."""
+    """Ends it by a key or a signal; returns exit code and screen."""
     far, near = pty.openpty()
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"} | settings
     command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", control, "--wait", "5", "top"]

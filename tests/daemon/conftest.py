@@ -1,5 +1,3 @@
-"""What the daemon's tests share: one core."""
-
 import sys
 from pathlib import Path
 
@@ -13,5 +11,4 @@ from tormagd.config import Config
 
 @pytest.fixture(scope="session")
 def core() -> Core:
-    """Of the shipped coronary scene."""
     return build_core(Config())

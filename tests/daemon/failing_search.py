@@ -1,4 +1,4 @@
-"""A core whose plans fail when a test says so: its search for the field raises."""
+"""A core whose plans fail when a test says so."""
 
 from tormagd.assembly.build import Core
 from tormagd.inverse.solution import FieldSolution
@@ -6,7 +6,7 @@ from tormagd.model.force_curve import ForceCurve
 
 
 class FailingSearch:
-    """Searches as the core's does, until its `error` is set; `core` is the core that searches by it."""
+    """Searches as the core's does, until its `error` is set."""
 
     def __init__(self, core: Core) -> None:
         self._search = core.element.search
@@ -15,5 +15,5 @@ class FailingSearch:
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         if self.error is not None:
-            raise self.error.with_traceback(None)  # or it would grow by each time, and take long to log
+            raise self.error.with_traceback(None)  # the trace would grow each time, and take long to log
         return self._search.solve(curve, force_N, last_field_mT)

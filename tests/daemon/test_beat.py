@@ -1,5 +1,3 @@
-"""What a beat runs and in which order, and who is to blame for a late one, on a clock that the test moves."""
-
 from collections.abc import Callable
 
 import pytest
@@ -10,7 +8,7 @@ MS = 1_000_000
 
 
 class Rig:
-    """Phases `read` and `drive`, and slices; each takes as many ms as the test says, and drives judge the delay."""
+    """Each phase and slice takes as many ms as the test says, and drives judge the delay."""
 
     def __init__(self) -> None:
         self.now_ns = 0
@@ -51,7 +49,6 @@ class Rig:
         return run
 
     def beat(self, due_ms: int, **took: int) -> list[str]:
-        """One beat, not before it is due: what ran in it."""
         self.ran.clear()
         self.took |= {"read": 0, "drive": 0, **took}
         self.now_ns = max(self.now_ns, due_ms * MS)

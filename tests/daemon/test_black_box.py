@@ -16,7 +16,7 @@ from tormagd.assembly.journal import MAX_ENTRIES, TEACH, Journal
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
-from tormagd.daemon.black_box import PART_TICKS, BlackBox
+from tormagd.daemon.black_box import MAX_REQUESTED, PART_TICKS, BlackBox
 from tormagd.daemon.profiles import state_folder
 from tormagd.daemon.telemetry import tick_record
 from tormagd.exact import plain
@@ -131,6 +131,19 @@ def test_a_request_waits_for_a_process_that_is_held_up(rig: Rig) -> None:
         rig.its.send(msgspec.msgpack.encode(written))
         rig.box.look()
         assert (rig.box.report().newest, rig.box.report().refusal) == (path.name, written.refusal)
+
+
+def test_requests_take_no_place_of_a_fault(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time_ns", iter(range(0, 10**12, 10**6)).__next__)
+    for number in range(1_000):
+        with contextlib.nullcontext() if number < MAX_REQUESTED else pytest.raises(RefusedError, match="8 black boxes"):
+            rig.box.write("REQUEST", 0.0, {})
+        if number % 50 == 0:
+            rig.box.write("SKEW", 2.0, {})
+    assert [said.reason for said in rig.heard() if isinstance(said, Write)].count("SKEW") == 20
+    rig.its.send(msgspec.msgpack.encode(Written("19700101T000000.000Z-REQUEST.mcap")))
+    rig.box.look()
+    rig.box.write("REQUEST", 0.0, {})
 
 
 @pytest.mark.parametrize(

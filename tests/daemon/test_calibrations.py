@@ -1,5 +1,3 @@
-"""Which calibration is in force when one device takes the place of another; test_running_daemon has the whole way."""
-
 import asyncio
 from pathlib import Path
 
@@ -14,8 +12,6 @@ WEAK = "serial_number = 7\n[motor]\nresistance_ohm = 2.5\n[trim]\nleast = 0.5\n"
 
 
 class Rig:
-    """Calibrations in a folder with that of device 7, the configuration in force, and whether a core is built of it."""
-
     def __init__(self, folder: Path) -> None:
         (folder / "00000007.toml").write_text(WEAK)
         self.running, self.is_refused = Config(), False
@@ -27,7 +23,6 @@ class Rig:
         return config
 
     async def look(self, *serial_numbers: int | None, is_idle: bool = True) -> None:
-        """Look at each until it is done with; one that is not idle, or awaited on, for a while."""
         for serial_number in serial_numbers:
             for _ in range(200):
                 self.calibrations.look(serial_number, self.running, is_idle=is_idle)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgpack
 import pytest
@@ -195,13 +196,8 @@ def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:
 
 def test_a_message_that_is_too_large_is_not_read_and_its_publisher_is_heard_again(rig: Rig) -> None:
     publisher, numbers = rig.publisher(), itertools.count(1)
-    publisher.send(b"\x00" * 10_000_000)
-
-    def is_heard_again() -> bool:
-        publisher.send(setpoint(next(numbers)))
-        return rig.endpoint.inbox.accepted > 0
-
-    rig.until(is_heard_again)
+    publisher.send(b"\x00" * 10_000)
+    rig.until(lambda: publisher.send(setpoint(next(numbers))) is None and rig.endpoint.inbox.accepted > 0)
     assert rig.endpoint.inbox.refused == 0
 
 
@@ -339,9 +335,7 @@ def test_a_reply_has_the_envelope_of_its_request(rig: Rig, envelope: list[bytes]
     for name in ("stop", "status"):
         client.send_multipart([*envelope, command(name)])
         rig.until(lambda: client.poll(0) > 0, lambda: rig.take_and_serve(rig.answer))
-        *returned, reply = client.recv_multipart()
-        assert (returned, decode(reply, Reply).ok) == (envelope, True)
-    assert [each.command for each in rig.answered] == ["stop", "status"]
+        assert (client.recv_multipart()[:-1], rig.answered.pop().command) == (envelope, name)
 
 
 @pytest.mark.parametrize(
@@ -360,7 +354,6 @@ def test_a_request_of_several_parts_is_none(rig: Rig, parts: list[bytes]) -> Non
     client = rig.connect(zmq.DEALER, "control")
     client.send_multipart(parts)
     assert rig.serve(client, never).error.code == "bad_request"
-    assert rig.is_answered()
 
 
 # -- what goes first -----------------------------------------------------------------------------------------------
@@ -481,16 +474,13 @@ def test_a_client_that_says_stop_without_pause_is_cut_off_and_what_it_said_is_fo
     flood = rig.context.socket(zmq.DEALER)
     flood.setsockopt(zmq.SNDHWM, 0)
     flood.setsockopt(zmq.RECONNECT_IVL, 60_000)
+    flood.linger = 0
     flood.connect(rig.addresses["control"])
     for number in range(5_000):
         flood.send(command("stop", number))
     rig.take_until(lambda: rig.endpoint.report().dropped > 0 and rig.endpoint.report().connections["control"] == 0)
     assert [request.id for request in rig.answered] == list(range(len(rig.answered)))
     assert FIRST_BURST < len(rig.answered) < 2_500
-    flood.close(linger=0)
-    operator = rig.connect(zmq.DEALER, "control")
-    operator.send(command("stop", "operator"))
-    rig.take_until(lambda: operator.poll(0) > 0)
 
 
 @pytest.mark.parametrize("name", ["telemetry", "recording"])
@@ -569,6 +559,27 @@ def test_sockets_that_somebody_has_put_in_their_place_are_left_to_him(tmp_path: 
     assert {path.name for path in folder.iterdir() if path.is_socket()} == set(second.addresses)
     second.close()
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("remove", [lambda folder: (folder / "control").unlink(), shutil.rmtree], ids=["one", "all"])
+def test_sockets_that_were_removed_are_bound_again(rig: Rig, tmp_path: Path, remove: Callable[[Path], object]) -> None:
+    remove(tmp_path)
+    rig.look()
+    assert rig.is_answered()
+
+
+def test_a_folder_that_others_may_write_to_is_refused_unless_it_is_as_tmp_is(tmp_path: Path) -> None:
+    tmp_path.chmod(0o1777)
+    Rig(tmp_path).close()
+    tmp_path.chmod(0o777)
+    with pytest.raises(OSError, match=rf"^endpoints.setpoint = .*mode 0777\): .*; chmod go-w {tmp_path}$"):
+        Rig(tmp_path)
+
+
+def test_a_file_system_without_locks_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available")))
+    with pytest.raises(OSError, match=r"setpoint.lock cannot be locked: No locks available: .*; name a folder of"):
+        Rig(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["precious.txt", "precious.txt.lock"])

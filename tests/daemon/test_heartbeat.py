@@ -1,4 +1,4 @@
-"""The heartbeat: a kernel timer. What is waited for is its descriptor, never a time."""
+"""Tests wait for the heartbeat's descriptor, never for a time."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""Hints are walked: who follows `next:` word for word comes to what was wished, and arms only for a force."""
+"""Whoever follows `next:` word for word gets what was wished, and arms only for a force."""
 
 import pytest
 
@@ -25,7 +25,6 @@ WISHED = {
     "stop": (FAULT,),
     "clear-fault": (DISABLED, ENABLED, PAUSED),
 }
-"""The operating states in which a command's wish is fulfilled."""
 CONDITIONS: dict[str, dict[str, bool | float]] = {
     "ready": {},
     "lost by a fault": {},
@@ -39,11 +38,11 @@ CONDITIONS: dict[str, dict[str, bool | float]] = {
     "link_degraded": {"round_trip_s": 0.2, "most_round_trip_s": 0.1},
     "clock": {"clock_drift": 0.2, "most_clock_drift": 0.1},
 }
-"""What is amiss with a device, by the code of the refusal that it leads to."""
+"What is wrong with a device, by the code of the refusal."
 
 
 class Console:
-    """A device and a person: `given` are the commands, `hints` those that were followed."""
+    """`given` are the commands, `hints` those that were followed."""
 
     def __init__(self, state: OperatingState, amiss: str) -> None:
         faults = (Fault.STOPPED,) if state is FAULT else ()
@@ -53,7 +52,6 @@ class Console:
         self.hints: list[str] = []
 
     def give(self, name: str) -> None:
-        """Give a command; what the device is asked for it does, homing and opening not at once."""
         self.given.append(name)
         if name == "arm":
             self.arm()
@@ -79,7 +77,6 @@ class Console:
             raise arming.refusal
 
     def wish(self, name: str) -> None:
-        """Give a command, and follow its hints until it is taken, or there is nothing to do."""
         while len(self.hints) <= 2:
             try:
                 self.give(name)
@@ -91,7 +88,6 @@ class Console:
                 return
 
     def follow(self, refused: RefusedError) -> None:
-        """Do what the hint says: a command, waiting, or mending what the refusal names."""
         self.hints.append(refused.hint)
         name = refused.hint.removeprefix("tormagctl ")
         if name in (*COMMANDS, "arm"):
@@ -110,7 +106,7 @@ def test_two_hints_lead_to_what_was_wished_and_none_arms_without_a_wish(
     name: str, state: OperatingState, amiss: str
 ) -> None:
     if amiss == "not_connected" and state in (ENABLED, PAUSED):
-        return  # there is no such state: LINK_LOST comes with the loss
+        return  # no such state: LINK_LOST comes with the loss
     console = Console(state, amiss)
     console.wish(name)
     assert console.state.operating_state in WISHED[name], console.hints

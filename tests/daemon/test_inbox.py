@@ -1,5 +1,3 @@
-"""The setpoint inbox: whatever is published, the newest valid setpoint wins and everything else is counted."""
-
 import random
 from typing import Any
 
@@ -18,12 +16,10 @@ from tormagd_client.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointR
 
 PRIORITY = ("patient", "console")
 START_NS = 1_800_000_000_000_000_000
-"Some day on CLOCK_REALTIME that is second 0 of the control clock here."
+"Second 0 of the control clock."
 
 
 class Publishing:
-    """An inbox on a clock that the test moves."""
-
     def __init__(self, priority: tuple[str, ...] = ()) -> None:
         self.inbox = SetpointInbox(Sources(priority=priority))
         self.now_s = 0.0
@@ -43,7 +39,6 @@ class Publishing:
         at_s: float | None = None,
         **fields: Any,
     ) -> bool:
-        """Publishes one setpoint, at `at_s` where it is given, stamped `age_s` before."""
         self.now_s = self.now_s if at_s is None else at_s
         message = {
             "v": 1,
@@ -60,7 +55,6 @@ class Publishing:
 
     @property
     def newest(self) -> TimedSetpoint:
-        """Which there has to be."""
         assert self.inbox.newest is not None
         return self.inbox.newest
 
@@ -73,12 +67,10 @@ class Publishing:
         return self.now_s - self.newest.stamp_s
 
     def passed_over(self) -> tuple[tuple[str, int], tuple[str, int] | None]:
-        """Who is followed, and who was passed over, each with its number."""
         followed = self.inbox.in_force
         return (followed.source, followed.seq), self.inbox.passed_over()
 
     def of(self, source: str) -> SourceReport:
-        """What is reported of it."""
         self.inbox.refresh(self.now_s)
         return self.inbox.report(self.now_s).by_source[source]
 
@@ -122,7 +114,7 @@ def test_a_new_run_begins_a_ramp_also_where_its_first_messages_are_refused(publi
     assert publishing.force_N == 2.0
 
 
-# -- who holds the brake -------------------------------------------------------------------------------------------
+# -- who holds the brake -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -148,7 +140,6 @@ def test_what_is_listed_goes_before_what_comes_later_or_is_not(holder: str, othe
         if is_given:
             publishing.inbox.give(holder, 0.0)
         found.append(publishing.send(1, 2.0, other, at_s=at_s))
-    # while it is fresh, once it is stale, where it was given the brake, where nobody is listed
     assert found == [passed, True, False, False]
 
 
@@ -170,7 +161,6 @@ def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is
     assert (newest.force_N, newest.holder, newest.limits) == (2.0, 1, ())
     publishing.inbox.tell(publishing.now_s)
     assert "'b' holds the brake instead of 'a': that is stale" in caplog.text
-    # and now the first is the other one
     assert not publishing.send(3, 1.0, "a")
 
 
@@ -203,7 +193,6 @@ def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None
     publishing.now_s = 0.2
     with pytest.raises(RefusedError, match="source 'a' has sent nothing that is still valid"):
         publishing.inbox.give("a", publishing.now_s)
-    # it holds the brake no longer than any other
     assert publishing.send(3, 1.0, "a")
 
 
@@ -265,7 +254,7 @@ def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock
         publishing.inbox.last_refusal
     )
     assert publishing.send(2, 2.0, "a", -AHEAD_S - 0.001, at_s=SETTLED_S)
-    # of a source that is known, it is the clock; and no setpoint is younger than its arrival
+    # a known source: it is the clock; no setpoint is younger than its arrival
     assert publishing.send(1, 1.0, "b", 0.0, valid_for_ms=1.0) is False
     assert publishing.newest.stamp_s == SETTLED_S
 
@@ -296,7 +285,7 @@ def test_a_clock_that_was_never_set_is_corrected_and_named(publishing: Publishin
     noise = random.Random(1)
     for number in range(500):
         publishing.now_s += 0.002 * noise.uniform(0.2, 1.8)
-        uptime_ns = 1_790 * 10**9 + round(publishing.now_s * 1e9)  # as a time in ms, it would be a day of these
+        uptime_ns = 1_790 * 10**9 + round(publishing.now_s * 1e9)
         publishing.send(number, 1.5, "a", stamp_ns=uptime_ns)
     assert (publishing.force_N, publishing.age_s) == (1.5, pytest.approx(0.0, abs=0.002))
     assert publishing.of("a").cause == "its clock: it was never set (it says 1970), and is corrected"
@@ -339,7 +328,7 @@ def test_one_publisher_too_many_is_refused_until_one_is_silent(publishing: Publi
         publishing.send(1, at_s=number * 0.01, source=f"source {number}", valid_for_ms=60_000.0)
     publishing.send(1, 2.0, source="one more")
     assert "one more" in str(publishing.inbox.last_refusal)
-    # the first holds the brake and stays; the second has been silent for long enough, the third has not
+    # the first holds the brake, the second has been silent long enough, the third has not
     publishing.send(1, 2.0, at_s=SILENT_S + 0.015, source="one more")
     kept = {f"source {number}" for number in range(SOURCES) if number != 1}
     assert set(publishing.inbox.report(publishing.now_s).sources) == kept | {"one more"}
@@ -404,7 +393,7 @@ def test_the_report_fits_into_an_answer_whatever_the_sources_call_themselves(pub
     report = publishing.inbox.report(publishing.now_s)
     assert len(report.by_source) == REPORTED
     answer = encode(Reply(v=VERSION, id=1, ok=True, result=msgspec.to_builtins(report)))
-    # what is left is for the rest of the status
+    # the rest of the status needs room
     assert len(answer) < MAX_MESSAGE_BYTES - 4_000
     assert msgspec.convert(decode(answer, Reply).result, SetpointReport) == report
 

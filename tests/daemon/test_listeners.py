@@ -1,5 +1,3 @@
-"""Who listens to a topic, by the words that XPUB passes on."""
-
 import random
 
 from tormagd.daemon.listeners import PEERS, TOPICS, Listeners

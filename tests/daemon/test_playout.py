@@ -1,4 +1,4 @@
-"""The playout buffer: every setpoint is followed a stated time after its stamp, and its way's jitter is gone."""
+"""The playout buffer: every setpoint is followed a stated time after its stamp, without jitter."""
 
 import random
 from collections.abc import Callable
@@ -18,7 +18,7 @@ PERIOD_S = 0.01
 
 
 class Listening:
-    """A daemon's inbox with a playout, and what is in force in each tick: (now_s, stamp_s, force_N)."""
+    """What is in force in each tick: (now_s, stamp_s, force_N)."""
 
     def __init__(self, playout_ms: float, valid_for_ms: float = 500.0) -> None:
         self.inbox, self.valid_for_ms = SetpointInbox(Sources(playout_ms=playout_ms)), valid_for_ms
@@ -30,7 +30,6 @@ class Listening:
         return self.inbox.take(msgpack.packb(fields), now_s, START_NS + round(now_s * 1e9))
 
     def listen(self, delay_s: Callable[[int], float], lasts_s: float) -> None:
-        """To a publisher every PERIOD_S whose messages do not overtake each other."""
         arrives_s, coming = 0.0, []
         for seq in range(round(lasts_s / PERIOD_S)):
             arrives_s = max(arrives_s, seq * PERIOD_S + delay_s(seq))
@@ -74,7 +73,7 @@ def test_what_comes_too_late_is_followed_at_once_and_counted() -> None:
     listening.listen(lambda seq: 0.0805 if seq % 20 == 10 else 0.01 + 0.004 * (seq % 2), 4.0)
     listening.inbox.refresh(4.0)
     report = listening.inbox.report(4.0).playout
-    # the late one holds those behind it back: 81, 71, .. 31 ms after their stamps
+    # the late one delays those behind it: 81, 71, .. 31 ms after their stamps
     assert (report.setpoints, report.late, report.held_us.p50, report.jitter_us) == (
         399,
         20 * 6,

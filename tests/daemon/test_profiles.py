@@ -1,5 +1,3 @@
-"""Profiles in the daemon: read once a device has said which one it is, kept when it is no longer driven."""
-
 import asyncio
 import os
 from collections.abc import Callable, Iterator
@@ -22,8 +20,6 @@ STRONG = Learned(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)
 
 
 class Rig:
-    """Profiles of what is believed, on an event loop that runs while they are asked to look."""
-
     def __init__(self, core: Core, runner: asyncio.Runner, folder: Path | None) -> None:
         async def begun() -> Profiles:
             kept = None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL, BOUNDS)
@@ -38,7 +34,6 @@ class Rig:
         return self.believe.learned()
 
     def look(self, serial_number: int, *driven: bool, learned: Learned | None = None) -> None:
-        """Looks once for each of `driven`, and waits until the other thread has read and written."""
         self._runner.run(self._looked(serial_number, driven, learned))
 
     async def _looked(self, serial_number: int, driven: tuple[bool, ...], learned: Learned | None) -> None:
@@ -57,20 +52,18 @@ NewRig = Callable[[Path | None], Rig]
 @pytest.fixture
 def new_rig(core: Core) -> Iterator[NewRig]:
     with asyncio.Runner() as runner:
-        # what is given to one thread is done in turn, so that what comes last says that all is done
+        # one thread works in order: its last task shows that all are done
         runner.get_loop().set_default_executor(ThreadPoolExecutor(1))
         yield partial(Rig, core, runner)
 
 
 @pytest.fixture
 def rig(new_rig: NewRig, tmp_path: Path) -> Rig:
-    """Of a device that has no profile yet."""
     return new_rig(tmp_path)
 
 
 @pytest.fixture
 def known(new_rig: NewRig, tmp_path: Path) -> Rig:
-    """Of device 7, which has been read back as STRONG."""
     keep(tmp_path, 7)
     found = new_rig(tmp_path)
     found.look(7, False)

@@ -1,5 +1,3 @@
-"""Rate groups: how late, how long, how often, without a clock of their own."""
-
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -12,7 +10,6 @@ PERIOD_NS = 1_000_000
 
 
 def recorded(lateness_us: list[float], exec_us: list[float] | None = None) -> RateGroup:
-    """A group whose runs were this late and took this long."""
     group = RateGroup("test", PERIOD_NS)
     for number, late in enumerate(lateness_us):
         due = number * PERIOD_NS
@@ -87,7 +84,7 @@ def test_merged_runs_and_overruns_are_counted(group: RateGroup) -> None:
     group.record(0, 100, PERIOD_NS)
     assert group.overruns == 0
     group.record(PERIOD_NS, PERIOD_NS, 2 * PERIOD_NS + 1)
-    # late is as bad as slow: what counts is that the next one is due
+    # late is as bad as slow: the next one is due
     group.record(2 * PERIOD_NS, 3 * PERIOD_NS, 3 * PERIOD_NS + 1, merged=3)
     # the delay counts from the first run that was missed
     assert (group.delay_ns, group.lateness_us) == (4 * PERIOD_NS + 1, pytest.approx(1e3))
@@ -104,7 +101,7 @@ def test_a_stall_is_an_error_and_an_overrun_a_warning_for_as_long_as_the_horizon
         (2 * PERIOD_NS, stall_ns - 1, "warning"),
         (3 * PERIOD_NS, stall_ns, "error"),
         (4 * PERIOD_NS, 0, "error"),
-        # forgotten one to two horizons later, while the counters stay
+        # forgotten after one to two horizons, while the counters stay
         (HORIZON_NS + PERIOD_NS, 0, "error"),
         (2 * HORIZON_NS + 2 * PERIOD_NS, 0, "good"),
     ):

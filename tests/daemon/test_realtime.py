@@ -1,5 +1,3 @@
-"""What the kernel is asked for: granted or a plain warning, never a failure."""
-
 import ctypes
 import os
 import resource
@@ -40,21 +38,18 @@ def test_each_refusal_names_its_setting_and_reason(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("soft", [64, 4_096])
-def test_as_many_files_as_the_kernel_allows_may_be_open(monkeypatch: pytest.MonkeyPatch, soft: int) -> None:
+def test_as_many_files_as_the_kernel_allows_may_be_open_or_nothing_starts(
+    monkeypatch: pytest.MonkeyPatch, soft: int
+) -> None:
     set_limit = Mock()
     monkeypatch.setattr(resource, "setrlimit", set_limit)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (soft, 4_096))
     realtime.raise_open_files()
     set_limit.assert_called_once_with(resource.RLIMIT_NOFILE, (4_096, 4_096))
-
-
-def test_where_too_few_files_may_be_open_nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (512, 1_023))
     with pytest.raises(OSError, match=r"^the hard limit of open files is 1023: allowed is 1024 or more; raise Limit"):
         realtime.raise_open_files()
 
-
-def test_the_files_that_are_needed_hold_all_connections_and_a_reserve() -> None:
     assert 100 + len(admission.MAY) * (admission.CONNECTIONS + admission.CLOSING + 1) < realtime.OPEN_FILES
 
 

@@ -2,20 +2,18 @@ import msgspec
 
 from tormagd.config import Config, checked
 from tormagd.daemon.reload import reread
-from tormagd_client.endpoints import Endpoints
 
 RUNNING = Config()
-GUARDED = {"curve": {"server_secret": "s", "also_local": True}}
+GUARDED = {"endpoints": {"curve": {"server_secret": "s", "also_local": True}}}
 
 
 def test_what_only_a_loop_looks_at_is_taken_over():
-    guarded = msgspec.structs.replace(RUNNING, endpoints=checked(GUARDED, Endpoints))
     sources = {"priority": ["robot"], "playout_ms": 60.0, "keys": {"robot": ["0123:4567:89ab:cdef"]}}
-    read = checked({"sources": sources, "endpoints": GUARDED, "realtime": {"watchdog_ms": 800.0}}, Config)
-    again = reread(guarded, read)
+    read = checked(GUARDED | {"sources": sources, "realtime": {"watchdog_ms": 800.0}}, Config)
+    again = reread(checked(GUARDED, Config), read)
     assert reread(again.config, read) == (read, (), ())
-    taken = ("realtime.watchdog_ms", "sources.keys.robot", "sources.playout_ms", "sources.priority")
-    assert again == (read, taken, ())
+    keys = ("realtime.watchdog_ms", "sources.keys.robot", "sources.playout_ms", "sources.priority")
+    assert again == (read, keys, ())
 
 
 def test_what_something_was_built_from_is_named_and_stays():

@@ -1,5 +1,3 @@
-"""Requests in their turns, and what a peer may send: no sockets, no clock."""
-
 import msgpack
 import pytest
 

@@ -1,4 +1,4 @@
-"""The daemon's own loops in virtual time, at a simulated device or at none; it is spoken to over its sockets."""
+"""The daemon's own loops in virtual time, with a simulated device or none."""
 
 import asyncio
 import contextlib
@@ -38,35 +38,26 @@ from tormagd_client.wire import Pending
 
 NOT_GRANTED, CONFIG_FILE = ("realtime.lock_memory: no",), "/etc/tormag/a.toml"
 PATIENCE_TICKS = 20_000
-"Longer than anything takes; only a failure waits for it."
 LOOK_TICKS = 50
-"How often the status is looked at while something is waited for."
 SLOW_NS = 3_000_000_000
 START_NS = 1_800_000_000_000_000_000
-"The time of day at which CLOCK_MONOTONIC is 0."
 WATCHDOG_MS = 100.0
 SAMPLE = load_plant("sample_1")
 NEAR_HOME = msgspec.structs.replace(
     SAMPLE, assumed=msgspec.structs.replace(SAMPLE.assumed, start_left_mm=46.9, start_right_mm=46.7)
 )
-"Homing takes less time."
 
 
 class Clock:
-    """All clocks, standing still but for what the test says."""
-
     def __init__(self) -> None:
         self.now_ns = 0
 
     def slow(self, _record: object = None) -> bool:
-        """Three seconds that something takes."""
         self.now_ns += SLOW_NS
         return True
 
 
 class Heartbeat:
-    """Beats as the kernel's timer does, when they are asked for."""
-
     made: ClassVar["list[Heartbeat]"] = []
 
     def __init__(self, period_ns: int) -> None:
@@ -88,8 +79,6 @@ class Heartbeat:
 
 
 class Port:
-    """The line of a simulated device."""
-
     def __init__(self) -> None:
         self.line = VirtualPort(VirtualDevice(NEAR_HOME, ReversingHand(2.0), seed=1))
         self.is_plugged_in, self.is_mute = True, False
@@ -122,7 +111,7 @@ class Port:
 
 
 class Running:
-    """A daemon that beats when the test says so, and an operator's client, which publishes, too."""
+    """A daemon that beats when the test says so, and an operator's client."""
 
     def __init__(self, runner: asyncio.Runner, clock: Clock, core: Core, folder: Path) -> None:
         self.search = FailingSearch(core)
@@ -132,7 +121,6 @@ class Running:
         self.client = self.publisher("test")
 
     def publisher(self, source: str) -> Client:
-        """A client with a name of its own."""
         self.clients.append(Client.local(self.folder, 1e-3, source))
         return self.clients[-1]
 
@@ -143,14 +131,13 @@ class Running:
         is_plugged_in: bool = True,
         device: DeviceTable = DeviceTable(),  # noqa: B008
     ) -> None:
-        """Begins to run; that takes some seconds."""
         self.port.is_plugged_in = is_plugged_in
         config = Config(endpoints=in_folder(self.folder), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
         self._runner.run(self._begun(msgspec.structs.replace(config, device=device)))
 
     async def _begun(self, config: Config) -> None:
         self.daemon = Daemon(config, self.core, self.port.open, list(NOT_GRANTED), config_file=CONFIG_FILE)
-        # what was bound before the clock was made
+        # bound before the clock was replaced
         self.daemon._inference._clock_ns = self.daemon._phases._clock_ns = time.monotonic_ns
         self.clock.slow()
         self._run = asyncio.create_task(self.daemon.run())
@@ -159,7 +146,6 @@ class Running:
         self._heartbeat = Heartbeat.made.pop()
 
     def tick(self, times: int = 1) -> None:
-        """So many control periods."""
         self._runner.run(self._ticked(times))
 
     async def _ticked(self, times: int) -> None:
@@ -170,7 +156,6 @@ class Running:
             await asyncio.sleep(0)
 
     def answer(self, pending: Pending) -> dict[str, Any]:
-        """The result of what was asked."""
         for _ in range(PATIENCE_TICKS):
             if (result := self.client.answer(pending, 1e-3)) is not None:
                 return result
@@ -178,17 +163,14 @@ class Running:
         pytest.fail(f"no answer to {pending}")
 
     def command(self, name: str, **args: Any) -> dict[str, Any]:
-        """The result of a command."""
         return self.answer(self.client.ask(name, **args))
 
     def refused(self, name: str, **args: Any) -> str:
-        """The code with which a command is refused."""
         with pytest.raises(RefusedError) as refused:
             self.command(name, **args)
         return refused.value.code
 
     def until(self, reached: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
-        """The status in which that is so."""
         for _ in range(PATIENCE_TICKS // LOOK_TICKS):
             self.tick(LOOK_TICKS)
             if reached(status := self.command("status")):
@@ -196,7 +178,6 @@ class Running:
         pytest.fail(f"not reached: {what}")
 
     def arm(self) -> None:
-        """Homes, where that is still to do, and enables."""
         status = self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
         if not status["is_homed"]:
             self.command("home")
@@ -204,7 +185,6 @@ class Running:
         self.command("enable")
 
     def scene(self, name: str) -> dict[str, Any]:
-        """The status once the daemon has changed its scene, or has not."""
         self.command("use-scene", scene=name)
         for _ in range(PATIENCE_TICKS):
             if (status := self.command("status"))["scene_change"]["is_over"]:
@@ -212,11 +192,10 @@ class Running:
         pytest.fail("the scene did not change")
 
     def ask(self, force_N: float, valid_for_ms: float = 30_000.0, by: Client | None = None) -> None:
-        """Publishes one setpoint, and waits until it is taken or refused."""
         inbox = self.daemon._endpoint.inbox
         before = inbox.accepted + inbox.refused
         for _ in range(PATIENCE_TICKS):
-            with contextlib.suppress(UnreachableError):  # who does not beat tells nobody that it listens
+            with contextlib.suppress(UnreachableError):  # without beats nobody is told that the daemon listens
                 (by or self.client).publish(force_N, valid_for_ms)
                 break
             self.tick()
@@ -224,7 +203,6 @@ class Running:
             self.tick()
 
     def end(self) -> None:
-        """Ends it as SIGTERM does, and the clients."""
         signal.raise_signal(signal.SIGTERM)
         self._runner.run(self._ended())
         for client in self.clients:
@@ -244,7 +222,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     monkeypatch.setattr(daemon_module, "Heartbeat", Heartbeat)
     yield made
     Heartbeat.made.clear()
-    gc.unfreeze()  # the daemon takes what lives out of the collector's reach
+    gc.unfreeze()  # the daemon freezes garbage
 
 
 @pytest.fixture
@@ -257,7 +235,6 @@ def running(clock: Clock, core: Core, tmp_path: Path) -> Iterator[Running]:
 
 @pytest.fixture
 def alone(running: Running) -> Running:
-    """One that has no device."""
     running.start(is_plugged_in=False)
     return running
 
@@ -314,7 +291,7 @@ def test_a_daemon_describes_what_it_runs(alone: Running) -> None:
         None,
     )
     assert (described.configuration_file, alone.command("status")["not_granted"]) == (CONFIG_FILE, [*NOT_GRANTED])
-    # a device that has shown nothing yet is the model, at the gap speed of the configuration
+    # a device that has shown nothing yet is the model
     shown, told = alone.core.portrait, described.portrait
     assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
     speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]
@@ -355,7 +332,7 @@ def test_the_watchdog_is_fed_while_plans_are_fresh(alone: Running, monkeypatch: 
             800.0,
         ),
         (
-            # in the file it is above the timeout, which waits for a restart
+            # a file's value is above the timeout
             Config(
                 realtime=RealTime(watchdog_ms=40.0),
                 device=DeviceTable(command_timeout_ms=30.0, measurement_timeout_ms=30.0),
@@ -422,10 +399,9 @@ def test_a_command_that_is_repeated_is_logged_once_a_second(alone: Running, capl
             alone.command("stop")
         alone.tick(1_000)
         alone.command("stop")
-    asked = "the device is asked to open the gap"
     assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("stop")] == [
-        f"stop: DISABLED to FAULT: {asked}",
-        f"stop: FAULT to FAULT: {asked}; 4 times more before",
+        "stop: DISABLED to FAULT: the device is asked to open the gap",
+        "stop: FAULT to FAULT: the device is asked to open the gap; 4 times more before",
     ]
 
 
@@ -441,7 +417,6 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
         causes.note_stall(stepper, Delay(round(took_s * 1e9), culprit, 1))
 
     stall(10.0, 0.083, KERNEL)
-    # a late tick that is no stall is not taken for one
     control.stepper.time_s = 10.1
     causes.note_stall(control.stepper, Delay(2_000_000, "TelemetryLoop.publish", 1_500_000))
     control.latch(Fault.HOST_STALL)
@@ -466,7 +441,7 @@ def test_a_homing_that_is_over_shows_as_one_that_succeeded(running: Running) -> 
     running.command("home")
     telemetry = running.daemon._telemetry
     for _ in range(PATIENCE_TICKS):
-        running.port.advance(time.monotonic() + 0.5e-3)  # a look between two ticks
+        running.port.advance(time.monotonic() + 0.5e-3)  # between two ticks
         running.daemon._connection.receive(time.monotonic())
         look = telemetry._build_status(telemetry._newest)
         if not look.is_busy:
@@ -536,7 +511,6 @@ def test_when_the_last_listener_has_gone_no_motion_is_sent(running: Running) -> 
 
 
 def verdicts(client: Client, count: int) -> list[Verdict]:
-    """So many as are sent, however long they take."""
     found: list[Verdict] = []
     while len(found) < count:
         found += client.verdicts(1.0)
@@ -654,7 +628,6 @@ def test_a_device_runs_by_its_calibration_and_is_busy_until_then(
     monkeypatch.setattr("tormagd.daemon.calibrations.load_calibration", once_open)
 
     def in_force(text: str) -> tuple[float, dict[str, str]]:
-        """The motor's resistance in force, and what status says, once this file was read."""
         file.write_text(text)
         running.until(lambda status: awaits(1), "it is to be read")
         assert running.refused("enable") == running.refused("use-scene", scene="pulse") == "busy"
@@ -692,7 +665,7 @@ def test_fifty_changes_of_the_scene_leave_nothing_behind(alone: Running) -> None
             gc.collect()
             counts.append((len(gc.get_objects()), len(list(Path("/proc/self/fd").iterdir())), threading.active_count()))
     assert counts[1][1:] == counts[0][1:]
-    assert counts[1][0] - counts[0][0] < 300  # some for each of thirty changes would be more
+    assert counts[1][0] - counts[0][0] < 300
 
 
 def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(armed: Running) -> None:

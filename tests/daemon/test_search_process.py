@@ -1,5 +1,3 @@
-"""The search that takes longer than a plan has: what plans make of its answers, and the process that it runs in."""
-
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +25,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope="module")
 def core(tmp_path_factory: pytest.TempPathFactory) -> Core:
-    """A tenth of the thesis's fields: how fine they are does not matter here, and each is a pass of torch."""
+    """A tenth of the thesis's fields: each takes a pass of torch."""
     scene = tmp_path_factory.mktemp("scenes") / "thesis.toml"
     scene.write_text(SHIPPED.read_text(encoding="utf-8").replace("step_mT = 1.0", "step_mT = 10.0"), encoding="utf-8")
     return build_core(Config(rates=Rates(inference_hz=250), scene=str(scene)))
@@ -99,7 +97,7 @@ def test_the_process_answers_what_the_search_would_and_one_question_at_a_time(
     assert answered(process) == core.planner().aim.answer_to(question)
     assert process.timing.runs == 1
     assert process.answer() is None
-    # a period later: what it cannot search for it says, and goes on
+    # a period later: it reports what it cannot search for, and goes on
     time.sleep(process.timing.period_ns * 1e-9)
     process.ask(Question(9.0, 2.0, 42.0, float("nan"), 300.0))
     assert answered(process, until=2) is None
@@ -109,7 +107,6 @@ def test_the_process_answers_what_the_search_would_and_one_question_at_a_time(
 
 
 def answered(process: SearchProcess, until: int = -1) -> Answer | None:
-    """The next answer; or None once so many questions were answered."""
     until_s = time.monotonic() + PATIENCE_S
     while (answer := process.answer()) is None and process.timing.runs != until:
         assert time.monotonic() < until_s

@@ -11,7 +11,6 @@ ABSENT = (LinkState.LOST, LinkState.BACK_OFF, LinkState.CLOSED)
 
 
 def ready() -> Service:
-    """One whose device was identified at 0 s."""
     service = Service()
     assert service.is_alive(0.0, LIMIT_S, 0.0, LinkState.RUNNING, 0.0)
     assert service.news(True, LinkState.RUNNING, "up") == ["READY=1", "STATUS=up", "WATCHDOG=1"]
@@ -29,7 +28,7 @@ def test_while_it_waits_a_daemon_that_lives_is_given_more_time_to_start():
     service = Service()
     extension = f"EXTEND_TIMEOUT_USEC={EXTENSION_S * 1e6:.0f}"
     told = [extension in service.news(is_alive, LinkState.BACK_OFF, "") for is_alive in (True, True, False)]
-    assert told == [True, True, False]  # one that hangs is given none
+    assert told == [True, True, False]
     assert service.news(True, LinkState.RUNNING, "") == ["READY=1", "WATCHDOG=1"]
 
 
@@ -106,7 +105,7 @@ KNOWN: dict[str, Any] = {
         ({"state": "ENABLED"}, "ENABLED, scene coronary"),
         ({"is_homed": False}, "DISABLED, scene coronary; next: tormagctl arm"),
         ({"state": "FAULT", "faults": ["SKEW", "STOPPED"]}, "FAULT: SKEW, STOPPED; next: tormagctl status"),
-        # what the device or the kernel says makes no lines of its own
+        # texts of device or kernel must not add lines
         (
             {"link": LinkState.BACK_OFF, "cause": "no port\nREADY=1", "remedy": "plug it in"},
             "DISABLED, scene coronary; waiting for the device (BACK_OFF): no port READY=1; plug it in",

@@ -1,5 +1,3 @@
-"""One publisher, by its numbers and its clock: no number keeps it out, and its setpoints are as old as they are."""
-
 import math
 import random
 from collections.abc import Callable
@@ -27,14 +25,14 @@ from tormagd.daemon.source import (
 )
 from tormagd.safety.codes import Limit
 
-# -- numbers: what is newer, what is a restart, what is neither -------------------------------------------------------
+# -- numbers -----------------------------------------------------------------------------------------------------------
 
 
 NEWER, RESTARTED, REPLACED, STRAY = Order.NEWER, Order.RESTARTED, Order.REPLACED, Order.STRAY
 
 
 class Part(NamedTuple):
-    """Some messages of a stream, and what each has to be taken for."""
+    """Some messages of a stream, and how each must be taken."""
 
     numbers: list[int]
     orders: list[Order]
@@ -65,7 +63,6 @@ STREAMS: dict[str, tuple[Start, list[Part], dict[str, int]]] = {
         (7, 1_000),
         [
             Part([0, 1, 2], [RESTARTED, NEWER, NEWER], 8),
-            # what the one before has left on the way is not taken any more
             Part([1_001, 1_002], [STRAY, STRAY], 7),
             Part([3], [NEWER], 8),
         ],
@@ -84,7 +81,7 @@ STREAMS: dict[str, tuple[Start, list[Part], dict[str, int]]] = {
     **{
         f"no number locks a source out, as {wrong}": (
             (None, 0),
-            # one wrong message in a stream is no more than that; nothing of the stream is lost
+            # one wrong message costs nothing of the stream
             [Part([1, 2, wrong, 3, 4], [NEWER, NEWER, STRAY, NEWER, NEWER])],
             {},
         )
@@ -161,7 +158,7 @@ def test_whatever_came_before_a_stream_is_heard_within_a_few_messages(before: li
         assert STRAY not in heard[RUN - 1 :]
 
 
-# -- a clock: what it does is said. Known here is when each message was sent, and how long it was on the way -----------
+# -- clocks; known are when each message was sent, and its delay -------------------------------------------------------
 
 
 PERIOD_S = 0.01
@@ -169,8 +166,6 @@ JITTER_S = 0.002
 
 
 class Heard(NamedTuple):
-    """One message: when it was sent, how long it was on the way, and how long it is believed to have been."""
-
     sent_s: float
     way_s: float
     believed_s: float
@@ -188,13 +183,13 @@ def listen(
     period_s: float = PERIOD_S,
     lost: Callable[[int], bool] = lambda number: False,
 ) -> tuple[SourceClock, list[Heard]]:
-    """A stream whose clock shows `clock_s` at a time, in order of arrival, which is that of sending."""
+    """Messages in order of arrival, from a clock that shows `clock_s`."""
     clock, heard, last_s = SourceClock(), [], -math.inf
     for number in range(round(lasts_s / period_s)):
         if lost(number):
             continue
         sent_s = number * period_s
-        # nobody overtakes: who would be there before the one before comes with it
+        # nobody overtakes: messages queue
         last_s = max(last_s, sent_s + way_s(sent_s))
         heard.append(Heard(sent_s, last_s - sent_s, clock.hear(last_s, last_s - clock_s(sent_s))))
     return clock, heard
@@ -222,8 +217,7 @@ CLOCKS: dict[str, tuple[Callable[[float], float], float]] = {
 def test_the_delay_is_believed_to_be_what_it_is_whatever_the_clock_shows(name: str) -> None:
     clock_s, behind_s = CLOCKS[name]
     clock, heard = listen(clock_s, exponential(1))
-    # the constant part of the way goes with the clock where that is wrong; and a clock that is set hides the jitter of
-    # that moment
+    # a wrong clock hides the constant part of the way; setting it hides the jitter of that moment
     assert worst_error_s(heard, SETTLED_S + PERIOD_S) <= 0.001 + 5.0 * JITTER_S
     assert (clock.is_settled, clock.offset_s, clock.is_wrong) == (
         True,
@@ -294,7 +288,7 @@ def test_after_a_long_silence_a_clock_may_have_been_set() -> None:
     assert (clock.hear(later_s, 0.9), clock.is_settled) == (0.9, False)
     clock.hear(later_s + SETTLED_S, 0.9)
     assert clock.hear(later_s + 2.0 * SETTLED_S, 0.901) == pytest.approx(0.001, abs=1e-4)
-    # but a message that fits into what was known is believed at once
+    # a message that fits what was known is believed at once
     clock, _ = listen(lambda t: t, lambda t: 0.001)
     assert (clock.hear(later_s, 0.15), clock.is_settled) == (pytest.approx(0.15, abs=1e-4), True)
 
@@ -323,13 +317,12 @@ def test_any_clock_any_jitter_any_losses(
     assert min(each.believed_s for each in settled) >= 0.0
     longest_s = max(each.way_s for each in heard)
     gap_s = max(b.sent_s + b.way_s - a.sent_s - a.way_s for a, b in pairwise(heard))
-    # a step back that is shorter than the pause in which it falls cannot be told from a longer way
-    # the rest: a plausible lateness at the start that was the clock's is kept as way
+    # a step back shorter than its pause looks like a longer way; a plausible lateness at the start is kept as way
     bound_s = longest_s + MAX_WAY_S + (1.0 + len(steps)) * (longest_s + gap_s + 0.005)
     assert worst_error_s(settled, 0.0) <= bound_s
 
 
-# -- how they come, through a network of stated delays and losses: the cause within two seconds ------------------------
+# -- networks with delays and losses: the cause shows within two seconds -----------------------------------------------
 
 
 START_NS = 1_800_000_000_000_000_000
@@ -369,7 +362,6 @@ def inbox() -> SetpointInbox:
 def hear(
     inbox: SetpointInbox, rate_hz: float, delay: Delay, lost: float, seed: int, from_s: float = 0.0, to_s: float = 2.1
 ) -> None:
-    """All that is sent from one time to the other; one connection's messages do not overtake each other."""
     noise, arrives_s = random.Random(seed), 0.0
     for number in range(round(from_s * rate_hz), round(to_s * rate_hz)):
         sent_s = number / rate_hz

@@ -1,5 +1,3 @@
-"""How the daemon's process begins: what it loads, how its log looks, and that Ctrl-C just ends it meanwhile."""
-
 import os
 import pty
 import re
@@ -13,7 +11,7 @@ import pytest
 from tormagd import entry
 from tormagd.daemon import main as daemon_main
 
-# -- Ctrl-C until a command runs: no traceback from the middle of an import --------------------------------------------
+# -- Ctrl-C until a command runs ---------------------------------------------------------------------------------------
 
 
 COMMANDS = {
@@ -38,7 +36,7 @@ sys.meta_path.insert(0, Finder)
 def test_ctrl_c_is_seen_to_before_anything_slow(monkeypatch: pytest.MonkeyPatch):
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr("tormagd.daemon.start.start", lambda _options: signal.getsignal(signal.SIGINT))
-    assert daemon_main.main([]) is signal.SIG_DFL  # what starts the daemon finds, and so its exit code here
+    assert daemon_main.main([]) is signal.SIG_DFL
     assert signal.getsignal(signal.SIGINT) == before
 
 
@@ -75,7 +73,7 @@ def test_ctrl_c_between_loading_and_running_is_quiet_too(monkeypatch: pytest.Mon
     assert signal.getsignal(signal.SIGINT) == before
 
 
-# -- what is loaded, in one place: a module more shows here, and nothing of the training comes with it -----------------
+# -- what is loaded: nothing of the training ---------------------------------------------------------------------------
 
 
 LOADED = """
@@ -154,7 +152,7 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
     assert libraries.split() == ["can", "msgpack", "msgspec", "numpy", "safetensors", "serial", "zmq"]
 
 
-# -- the log: one line for each record, with its time where nobody else writes that down -------------------------------
+# -- the log -----------------------------------------------------------------------------------------------------------
 
 
 SAY = "import logging, tormagd.daemon.log as log; log.log_to_stderr(); logging.getLogger('room').warning('a\\x1b[2J')"

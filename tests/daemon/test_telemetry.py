@@ -1,5 +1,3 @@
-"""What is told: snapshots, where what is not known is null; the way of a setpoint."""
-
 import math
 import time
 from typing import Any
@@ -45,7 +43,6 @@ MEASUREMENT = Measurement(
 
 
 def stepped(safety: SafetyState, measurement: Measurement | None, now_s: float = 1.0) -> Stepper:
-    """A stepper in this state, whose first measurement this is."""
     stepper = Stepper(Config(), load_scene("coronary"), now_s)
     stepper.safety = safety
     if measurement is not None:
@@ -56,7 +53,6 @@ def stepped(safety: SafetyState, measurement: Measurement | None, now_s: float =
 def telemetry(
     measurement: Measurement | None, safety: SafetyState, reference: Reference | None = None, is_busy: bool = False
 ) -> Telemetry:
-    """What is published, as a client decodes it."""
     stepper = stepped(safety, measurement)
     stepper.move.reference = reference
     tick = tick_record(stepper, OUTPUT, PLAN, measurement, 20.0, 150.0)
@@ -87,7 +83,7 @@ NOT_KNOWN = {"gap_mm": None, "measured_jp": None, "skew_mm": None, "gap_setpoint
                 "is_homed": True,
                 "is_busy": False,
                 "operating_state": "ENABLED",
-                # each limit once, those of the plan first
+                # each limit once, the plan's first
                 "limits": ("RANGE", "SKEW", "RATE"),
             },
         ),
@@ -221,7 +217,7 @@ def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(presen
     )
 
 
-# -- the way of a setpoint, part by part; what comes of it in a closed loop: tests/closed_loop/test_sources.py ---------
+# -- the way of a setpoint ---------------------------------------------------------------------------------------------
 
 
 def planned(stamp_s: float) -> Plan:
@@ -235,7 +231,7 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
     found = way.report(400.0, 0.013, Budget())
     assert (found.to_duty_us.max, found.total_ms) == (0.0, None)
     for tick in range(1_000):
-        # a new one every 10 ms, 20 ms old when it is followed first
+        # a new one every 10 ms, first followed at 20 ms
         way.ticked(1.0 + tick * 1e-3, planned(1.0 + tick // 10 * 0.01 - 0.015), 0.005)
     way.to_duty.refresh()
     found = way.report(400.0, 0.013, Budget())
@@ -243,13 +239,12 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
         pytest.approx(20_000.0, abs=1.0),
         pytest.approx(20_000.0, rel=0.04),
     )
-    # the whole is the sum of what is known of its parts
     assert (found.device_us, found.carriages_ms, found.total_ms) == (
         400.0,
         13.0,
         pytest.approx(20.0 + 0.4 + 13.0, abs=0.7),
     )
-    # one that has gone stale ends no way
+    # a stale one ends no way
     way.ticked(9.0, planned(-math.inf), 0.0)
     way.to_duty.refresh()
     found = way.report(None, 0.013, Budget())

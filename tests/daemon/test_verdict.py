@@ -1,5 +1,3 @@
-"""What becomes of a setpoint, as the gap stands and as it is held."""
-
 import math
 from typing import Any
 
@@ -19,7 +17,6 @@ NOTHING: tuple[Limit, ...] = ()
 
 
 def plan(asked_N: float | None = 1.5, limits: tuple[Limit, ...] = NOTHING, **fields: Any) -> Plan:
-    """One whose gap is the portrait's for the force that is governed, unless `gap_mm` says otherwise."""
     known: dict[str, Any] = {"predicted_N": None, "field_mT": 90.0, "gap_mm": math.nan, "gap_speed_mm_s": 0.0}
     return Plan(1, 1.0, asked_N, 0.01, asked_N or 0.5, confidence=1.0, limits=limits, **known | fields)
 
@@ -31,7 +28,6 @@ def found(
     state: OperatingState = OperatingState.ENABLED,
     device: DeviceFit = STRONG,
 ) -> Judged:
-    """What is found where the gap stands as for `shown_N`."""
     gap_mm = core.portrait.gap_mm_at(device.model_N(shown_N))
     if math.isnan(planned.gap_mm):
         planned = planned.replaced(gap_mm=core.portrait.gap_mm_at(device.model_N(planned.governed_N)))
@@ -69,7 +65,6 @@ def test_it_arrives_when_the_gap_has_gone_there_and_the_carriages_have_come(core
         (3.0, (Limit.RANGE, Limit.F_MAX, Limit.RATE), ("RANGE", "F_MAX")),
         (3.0, (Limit.STANDBY, Limit.OTHER_SOURCE), ("STANDBY",)),
         (0.1, (Limit.F_MIN,), ("F_MIN",)),
-        # one that is too old
         (None, (Limit.STALE, Limit.SENSOR), ("STALE",)),
         (None, (Limit.STALE, Limit.OTHER_SOURCE), ("STALE", "OTHER_SOURCE")),
     ],

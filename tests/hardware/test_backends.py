@@ -208,6 +208,11 @@ def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> No
     assert len(bus.backend.receive()) == min(queued, FRAMES_AT_ONCE)
 
 
+OF_INTERFACE: dict[str, dict[str, Any]] = {
+    "socketcan": {"can_filters": [{"can_id": 1, "can_mask": 0xF, "extended": False}]},
+    "udp_multicast": {"hop_limit": 0, "fd": False},
+    "tormagsim": {},
+}
 UP = "sudo ip link set can7 up type can bitrate 1000000 restart-ms 100"
 
 
@@ -218,6 +223,7 @@ UP = "sudo ip link set can7 up type can bitrate 1000000 restart-ms 100"
         ("socketcan", errno.EAFNOSUPPORT, "the kernel knows no CAN", f"sudo modprobe can_raw, then {UP}"),
         ("socketcan", errno.ENOMEM, os.strerror(errno.ENOMEM), ""),
         ("tormagsim", errno.ENODEV, os.strerror(errno.ENODEV), ""),
+        ("udp_multicast", errno.ENODEV, os.strerror(errno.ENODEV), ""),
     ],
 )
 def test_an_interface_that_is_not_there_says_how_it_comes(
@@ -227,6 +233,8 @@ def test_an_interface_that_is_not_there_says_how_it_comes(
     with pytest.raises(BackendError, match=f"^{interface} can7: cannot be opened: {said}$") as caught:
         opened(Device(backend="can", options={"interface": interface}, port="can7"))
     assert caught.value.remedy == remedy
+    usual = {"interface": interface, "channel": "can7", "bitrate": 1_000_000, "ignore_config": True}
+    assert can.Bus.call_args.kwargs == usual | OF_INTERFACE[interface]
 
 
 # -- behind an adapter on a serial line ----------------------------------------------------------------------------

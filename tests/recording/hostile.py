@@ -20,7 +20,6 @@ NESTED = b"[" * 100_000 + b"]" * 100_000
 
 
 def written(fill: Callable[[Writer], None]) -> bytes:
-    """A file by the usual writer."""
     file = io.BytesIO()
     writer = Writer(file)
     writer.start()
@@ -30,8 +29,6 @@ def written(fill: Callable[[Writer], None]) -> bytes:
 
 
 def messages(*data: bytes, topic: str = "/ticks", t_ns: int = 1, encoding: str = "json", **metadata: Any) -> bytes:
-    """A file of these messages."""
-
     def fill(writer: Writer) -> None:
         for name, known in metadata.items():
             writer.add_metadata({"header": "black_box", "about": "tormagd"}[name], known)
@@ -43,7 +40,6 @@ def messages(*data: bytes, topic: str = "/ticks", t_ns: int = 1, encoding: str =
 
 
 def record(*things: Any) -> bytes:
-    """Records one after the other."""
     builder = RecordBuilder()
     for thing in things:
         thing.write(builder)
@@ -51,24 +47,20 @@ def record(*things: Any) -> bytes:
 
 
 def chunk(data: bytes, size: int) -> bytes:
-    """A file of one chunk of packed data that says it has this size."""
     return MAGIC + record(Channel(1, "/ticks", "json", {}, 0), Chunk("zstd", data, 1, 1, 0, size))
 
 
 def ended(body: bytes, *summary: Any, at: int | None = None) -> bytes:
-    """A file with this body and summary."""
     data = MAGIC + body
     return data + record(*summary, Footer(len(data) if at is None else at, 0, 0)) + MAGIC
 
 
 def rows(count: int) -> Iterator[bytes]:
-    """Ticks with a column of their own each."""
     for number in range(count):
         yield b'{"c%d":1}' % number
 
 
 MANY = 220_000_000
-"Bytes, beyond all that a reader may take."
 CHANNEL = record(Channel(1, "/ticks", "json", {}, 0))
 FILES: dict[str, Callable[[], bytes]] = {
     "nothing": bytes,
@@ -121,7 +113,6 @@ FILES: dict[str, Callable[[], bytes]] = {
     "a chunk within a chunk": lambda: chunk(zstandard.compress(s := record(Chunk("", b"x" * 99, 1, 1, 0, 99))), len(s)),
     "another compression": lambda: MAGIC + record(Chunk("lz4", b"x", 1, 1, 0, 9)),
 }
-"What is no recording, and is refused."
 BOXES: dict[str, Callable[[], bytes]] = {
     "entries of brackets": lambda: messages(
         b"\x91" * 100_000 + b"\xc0", topic="/core", encoding="msgpack", header={"a": ""}
@@ -143,11 +134,9 @@ BOXES: dict[str, Callable[[], bytes]] = {
     ),
     "no header, and a long recording": lambda: messages(*[b"{}"] * 10_000),
 }
-"What is no black box, and is refused."
 
 
 def write(folder: Path) -> list[tuple[str, Path]]:
-    """All of them: what each is of, and the file."""
     made = []
     for kind, files in (("recording", FILES), ("black box", BOXES)):
         for number, (name, make) in enumerate(files.items()):

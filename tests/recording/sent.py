@@ -23,20 +23,16 @@ def telemetry(ms: float, seq: int, **changes: Any) -> Telemetry:
 
 
 class Back(NamedTuple):
-    """What a recording has: its ticks and its snapshots, and what its metadata say."""
-
     ticks: list[Seen]
     snapshots: list[Seen]
     metadata: dict[str, str]
     is_complete: bool
 
     def ms(self) -> list[int]:
-        """When the ticks were."""
         return [(each.t_ns - START_NS) // 1_000_000 for each in self.ticks]
 
 
 def back(path: Path) -> Back:
-    """Reads it all."""
     seen: list[Seen] = []
     found = read_recording(path, dict[str, Any], seen.append)
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))

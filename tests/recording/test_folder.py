@@ -1,10 +1,12 @@
 """A folder of recordings never outgrows its budget, and nothing marked is lost, wherever its recorder is killed."""
 
+import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,8 +28,6 @@ SETTINGS = Recordings(segment_MB=0.1, segment_minutes=60.0, most_MB=2.0, most_da
 
 
 class Clock:
-    """The time that a test says, s since 1970."""
-
     def __init__(self) -> None:
         self.now_s = START_NS * 1e-9
 
@@ -36,12 +36,44 @@ class Clock:
 
 
 def write(folder: RecordingFolder, clock: Clock) -> Path:
-    """A small recording of this moment."""
     with RecordingWriter(folder) as writer:
         ms = (clock.now_s - START_NS * 1e-9) * 1e3
         rng = random.Random(ms)
         writer.ticks(batch(*((ms + i, rng.random(), rng.random(), 35.0, 36.0, 0.25) for i in range(200))))
-    return writer.path
+    return dated(writer.path, clock.now_s)
+
+
+def dated(path: Path, now_s: float) -> Path:
+    """The file, last written at this time."""
+    path.touch()
+    os.utime(path, (now_s, now_s))
+    return path
+
+
+def of_days(folder: Path, now_s: float, *days: float) -> list[Path]:
+    """Recordings without content, so many days from `now_s`, by a clock that says so."""
+    times_s = [now_s + day * DAY_S for day in days]
+    return [dated(folder / time.strftime("%Y-%m-%dT%H-%M-%S.mcap", time.gmtime(at_s)), at_s) for at_s in times_s]
+
+
+@pytest.mark.parametrize("wrong_days", [40, -40, -20_774])
+def test_no_clock_takes_a_recording_away(tmp_path: Path, wrong_days: int) -> None:
+    clock = Clock()
+    folder = RecordingFolder(tmp_path, BUDGET, clock)
+    made = of_days(tmp_path, clock.now_s, *range(-29, 0))
+    clock.now_s += wrong_days * DAY_S
+    made += [folder.new(), *of_days(tmp_path, clock.now_s, 0.1, 0.2, 0.3)]
+    clock.now_s -= wrong_days * DAY_S
+    made += of_days(tmp_path, clock.now_s, 0.5, 1)
+    dated(made[29], clock.now_s)  # begun then, and written until the clock was set
+    assert folder.prune() == []
+    made[3].write_bytes(bytes(BUDGET.most_bytes))
+    assert made[0] in [each.path for each in folder.prune(1)]
+
+
+def test_what_ended_a_month_before_the_newest_goes_and_nothing_before_a_pause(tmp_path: Path) -> None:
+    made = of_days(tmp_path, START_NS * 1e-9, -44, -40, *range(-36, 1))
+    assert {each.path for each in RecordingFolder(tmp_path, BUDGET).prune()} == set(made[2:8])
 
 
 def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> None:
@@ -66,9 +98,11 @@ def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> N
     kept = [path for path in kept if path.exists()]
     with RecordingWriter(held) as writer:
         writer.ticks(batch((0, 1.0, 1.0, 35.0, 36.0, 0.25)))
-        clock.now_s += 31 * DAY_S
+        dated(held, clock.now_s)
+        of_days(tmp_path, clock.now_s, *range(1, 32))
         assert {each.path for each in folder.prune()} == set(kept)
         assert held.exists()
+    dated(held, clock.now_s)
     assert [each.path for each in folder.prune()] == [held]
     assert marked.exists()
 
@@ -116,8 +150,6 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
 
 
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
-    """Through the recorder, as it goes on for so long: a large tick every three minutes, now and then a mark; the
-    marks."""
     told, newest = [], None
     with RecordingWriter(RecordingFolder(path, budget_of(SETTINGS), clock)) as recorder:
         for number in range(hours * 20):
@@ -132,7 +164,6 @@ def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str
 
 
 def marks_in(path: Path) -> set[str]:
-    """What the recordings that are kept tell."""
     kept = [RecordingFile(each) for each in path.glob("*.marked.mcap")]
     return {known.text for each in kept for known in each.overview.marks}
 

@@ -12,7 +12,6 @@ READABLE = {
     "a million columns at once", "a time beyond all", "a summary that is the file", "a chunk within a chunk",
     "70,000 schemas in a chunk", "a message without a chunk, too short",
 }  # fmt: skip
-"Of what is in these, nothing is shown: a picture of them is empty."
 MAX_MB = 200
 READ = """
 import json, sys

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
-from tormagd.recording.black_box import read_black_box
+from tormagd.recording.black_box import is_tick, read_black_box
 from tormagd.recording.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring
 
 PATIENCE_S = 60.0
@@ -54,9 +54,12 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
         assert parts[-1].time_s == now_s
 
 
-class Process:
-    """A keeper, and the daemon's end of its socket."""
+def test_a_list_that_begins_with_a_number_is_a_tick() -> None:
+    entries = ([1, 2.0], [], ["step", 1], [True], [1.0], (1, 2), "step", 1)
+    assert [is_tick(entry) for entry in entries] == [True, *[False] * 7]
 
+
+class Process:
     def __init__(self) -> None:
         self.ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.ours.settimeout(PATIENCE_S)
@@ -92,14 +95,18 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     folder = tmp_path / "boxes"
     folder.mkdir()
     for number in range(MAX_FILES + 3):
-        (folder / f"20200101T0000{number:02d}.000Z-OLD.mcap").touch()
+        (folder / f"20400101T0000{number:02d}.000Z-OLD.mcap").touch()  # by a clock that was ahead
+        (folder / f"20200101T0000{number:02d}.000Z-REQUEST.mcap").touch()
     process.say(Begin(str(folder), HEADER), ticks(1, 20), ticks(21, 20))
     process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {"firmware": "1.2"}))
     assert process.heard() == Written("20300101T000000.000Z-SKEW.mcap")
     box = read_black_box(folder / "20300101T000000.000Z-SKEW.mcap")
     assert (box.header["reason"], box.header["firmware"], box.is_complete) == ("SKEW", "1.2", True)
     assert [entry[0] for entry in box.entries if entry != "step"] == list(range(1, 41))
-    assert len(list(folder.iterdir())) == MAX_FILES
+    assert len(list(folder.iterdir())) == MAX_FILES + MAX_FILES + 3
+    process.say(Write("20300101T000000.000Z-REQUEST.mcap", "REQUEST", 0.0, {}))
+    assert process.heard().refusal == ""
+    assert len(list(folder.iterdir())) == MAX_FILES + MAX_FILES
     # a name that is taken, or a folder that is none, says so
     process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {}))
     assert "exists" in process.heard().refusal
@@ -122,10 +129,12 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
 
 def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Process, tmp_path: Path) -> None:
     process.say(Begin(str(tmp_path), HEADER), ticks(1, 20))
-    process.say(*(Write(f"{number}Z-X.mcap", "X", 3_600.0, {}) for number in range(MAX_DUE + 1)))
+    asked = [Write(f"{number}Z-X.mcap", "X" if number % 2 else "REQUEST", 3_600.0, {}) for number in range(MAX_DUE + 1)]
+    process.say(*asked)
     assert "others are still to be written" in process.heard().refusal
     process.say(End())
     assert process.child.wait(PATIENCE_S) == 0
+    assert [process.heard().name for _ in range(3)] == ["1Z-X.mcap", "3Z-X.mcap", "5Z-X.mcap"]
     assert len(list(tmp_path.iterdir())) == MAX_DUE
 
 

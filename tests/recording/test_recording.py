@@ -32,7 +32,6 @@ from tormagd_client.messages import Mark, MessageError, encode
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    """100 ms: asked 1.5 N, measured 1.6; RATE for the middle 40 ms, then a fault for the last 20."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, {"scene": "pulse"}) as writer:
         for k in range(5):
@@ -80,7 +79,6 @@ def test_other_tools_find_json_messages_with_schemas(written):
 
 
 def obey(path: Path) -> int:
-    """How many messages there are in a file, each of which obeys the schema that the file has for it."""
     validator = cache(lambda schema: Draft202012Validator(json.loads(schema)))
     with path.open("rb") as file:
         messages = list(make_reader(file).iter_messages())
@@ -309,7 +307,6 @@ ALL_COLUMNS = (
 
 
 def row(k: int) -> tuple[Any, ...]:
-    """A tick each ms: 1 s of approach, then a sine that comes 20 ms late; RATE in the third second, SKEW at 25 s."""
     asked_N = 1.5 + 0.3 * math.sin(2e-3 * math.pi * k)
     felt_N = 0.5 if k < 1_000 else 1.5 + 0.3 * math.sin(2e-3 * math.pi * (k - 20))
     limits, faults = ("RATE",) if 2_000 <= k < 3_000 else (), ("SKEW",) if k >= 25_000 else ()
@@ -317,7 +314,6 @@ def row(k: int) -> tuple[Any, ...]:
 
 
 def write(path: Path, **settings: Any) -> Path:
-    """Thirty seconds, with a mark at 15 s."""
     with RecordingWriter(path, **settings) as writer:
         for k in range(0, 30_000, 20):
             writer.ticks(batch(*(row(k + i) for i in range(20)), columns=ALL_COLUMNS))
@@ -422,10 +418,13 @@ def test_an_overview_that_no_tormagd_writes_is_refused(path: Path, change: dict[
 
 def test_any_length_is_held_in_bounds() -> None:
     builder = OverviewBuilder()
-    for k in range(20_000):
-        builder.add(k * 1_600_000_000_000, False, {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k)})
+    late_us = [edge_us - early_us for edge_us in (10, 20, 50, 100, 200, 500, 1e3, 2e3, 5e3) for early_us in (0.1, 0.0)]
+    for k in range(19_800):
+        seen = {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k), "lateness_us": late_us[k % 18]}
+        builder.add(k * 1_600_000_000_000, False, seen)
     made = builder.made()
+    assert made.late_counts == [1_100, *[2_200] * 8, 1_100]
     assert len(made.packed()) < 200_000
     gap = made.series("gap_mm")
-    assert (gap.low.min(), gap.high.max()) == (0.0, 19_999.0)
+    assert (gap.low.min(), gap.high.max()) == (0.0, 19_799.0)
     assert len(made.codes["limits"]["RATE"].spans_ns) <= 1_000

@@ -51,18 +51,17 @@ def _row(path: Path, model: ForceModel) -> Json:
 
 
 def models_table(result: Json) -> str:
-    columns = ("insert", "full force, N", "model", "sample 1: mean, worst", "judging: mean", "worst", "bias")
+    columns = ("insert", "full force, N", "model", "sample 1: mean", "judging: mean")
     return table(columns, (_cells(row) for row in result["rows"]))
 
 
 def _cells(row: Json) -> list[str]:
-    own, full_N = row["sample_1"], row["full_N"]
     return [
         row["insert"],
-        f"{full_N:.2f}",
+        f"{row['full_N']:.2f}",
         f"`{row['model']}`",
-        f"{1e3 * own['mean_N']:.0f}, {1e3 * own['worst_N']:.0f}",
-        *(f"{1e3 * row[key]:.0f} ({100.0 * row[key] / full_N:.1f}%)" for key in ("mean_N", "worst_N", "bias_N")),
+        f"{1e3 * row['sample_1']['mean_N']:.0f}",
+        f"{1e3 * row['mean_N']:.0f} ({100.0 * row['mean_N'] / row['full_N']:.1f}%)",
     ]
 
 

@@ -1,1 +1,1 @@
-"""tormagctl: the operator's command line. It talks to the daemon over ZeroMQ only."""
+"""tormagctl: the operator's command line, which talks to the daemon over ZeroMQ only."""

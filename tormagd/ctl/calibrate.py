@@ -1,7 +1,7 @@
 """`tormagctl calibrate`: choose what is calibrated; for an insert, sweep the force and have a model fitted.
 
-The sweep asks for forces through the running daemon, so every limit of the daemon stays in force. A process of its own
-(`FITTING`) makes training data of it, fits, judges and saves: neither the daemon nor this program carries a training.
+The sweep asks for forces through the running daemon, so all its limits apply. A process of its own (`FITTING`) makes
+training data of it, fits, judges and saves: neither the daemon nor this program loads the training.
 """
 
 import csv
@@ -29,10 +29,9 @@ from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
 
 COLUMNS = ("monotonic_s", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s", "measured_cf")
-"Columns of the control ticks that make a sweep."
 FILE_COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 EVERY = 4
-"Every fourth tick is kept: neighbours say nearly the same."
+"Neighbouring ticks are nearly the same."
 
 PACES = ("steadily, about 20 turns a minute", "slowly, about 10 turns a minute", "quickly, about 25 turns a minute")
 FITTING = "tormagd.lab.training.calibration"
@@ -50,10 +49,9 @@ def calibrate_insert(
     by_law: bool,
     wait_s: float,
 ) -> Outcome:
-    """Sweep the force up and down once for each of `rates_N_s`, have a model of `insert` fitted, and
-    save it as `out`."""
+    """Sweep the force up and down at each rate, have a model of `insert` fitted, and save it."""
     law = ("--law",) if by_law else ()
-    _ask_fitter("--insert", insert, *law)  # an unknown insert is told now, not after the sweeps
+    _ask_fitter("--insert", insert, *law)  # an unknown insert is reported now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
         known = known_of(config, client.status(), scene.force.most_N)
         forces = Range(known.least_N, known.most_N)
@@ -72,7 +70,7 @@ def calibrate_insert(
 
 
 def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
-    """Tell the person on stderr how to turn the handle, wait until it moves, play one sweep, and return its ticks."""
+    """Ask for a moving handle, then play one sweep and return its ticks."""
     waveform = up_and_down(forces, rates_N_s[number])
     label = f"sweep {number + 1} of {len(rates_N_s)}"
     print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
@@ -82,13 +80,11 @@ def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> 
 
 
 def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
-    """Return a waveform from the least force to the most and back, at `rate_N_s`, which must be above 0."""
     half_s = (forces.most_N - forces.least_N) / rate_N_s
     return by_legs(forces.least_N, [(half_s, forces.most_N), (half_s, forces.least_N)])
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
-    """Write the sweeps as the CSV file `path` that `FITTING` reads; a file there is replaced."""
     start_s = min((float(sweep["monotonic_s"][0]) for sweep in sweeps if sweep["monotonic_s"].size), default=0.0)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -108,7 +104,7 @@ def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
 
 
 def _ask_fitter(*arguments: str) -> dict[str, Any]:
-    """Run the fitting process on `arguments`, and return the `result` that it prints; SIGINT and SIGTERM end it."""
+    """Run the fitting process, and return the `result` that it prints."""
     command = [sys.executable, "-m", FITTING, *arguments]
     with (
         interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted,
@@ -162,7 +158,7 @@ def calibrate(
     side: Literal["left", "right"],
     is_agreed: bool,
 ) -> Outcome:
-    """Calibrate one of: the device, an `insert`, or the `motors`; asks for agreement first unless `is_agreed`."""
+    """Calibrate the device, an `insert`, or the `motors`, with a person's agreement."""
     if [insert is not None, motors, device].count(True) != 1:
         raise usage_error("calibrate takes one of three things", "give one of --insert NAME, --motors and --device")
     if insert is None and csv is not None:
@@ -176,7 +172,6 @@ def calibrate(
             "--out is not for --device" if device else "--out is missing: the file of the model or the log",
             "leave it out: the daemon keeps the profile" if device else "give --out FILE",
         )
-    # before anything moves
     for option, path in (("--out", out), ("--csv", csv)):
         if path is not None and path.exists():
             raise usage_error(f"{option} {path} exists", "give another name; nothing is overwritten")
@@ -197,7 +192,7 @@ def calibrate(
 
 
 def agree() -> None:
-    """Say on stderr that the carriages will move, and wait until a person presses Enter."""
+    """Say that the carriages will move, and wait until a person presses Enter."""
     if not is_terminal(sys.stdin):
         raise usage_error("stdin is no terminal: nobody can agree to the carriages moving", "a script says --yes")
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)

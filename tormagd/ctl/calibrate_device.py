@@ -1,7 +1,7 @@
-"""`tormagctl calibrate --device`: the running daemon learns this device in under a minute and keeps it as its profile.
+"""`tormagctl calibrate --device`: the running daemon learns this device in under a minute and keeps its profile.
 
-Nothing is fitted here: the daemon learns while it drives. This program gives it the occasion: forces over the whole
-range, and a handle that reverses often enough for the sensor's zero. Steps then say how good the profile is.
+The daemon learns while it drives. This program gives it the occasion: forces over the whole range, and a handle that
+reverses often enough for the sensor's zero. Steps then show how good the profile is.
 """
 
 import sys
@@ -23,7 +23,6 @@ DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
 
 
 def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
-    """Let the daemon learn the device, judge it by steps, and wait until its profile is kept."""
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
         if not status.profile.folder:
@@ -47,8 +46,7 @@ def _in_N(value_mN: float | None) -> float:
 
 
 def require_believed(status: Status) -> None:
-    """Raise CommandError (REFUSED) where `status` has a limit of DOUBTS: the daemon doubts the force sensor, and
-    learned nothing."""
+    """Raise CommandError if the daemon doubts the force sensor, and so has learned nothing."""
     doubt = next((limit for limit in status.limit_details if limit.code in DOUBTS), None)
     if doubt is not None:
         raise CommandError(
@@ -57,7 +55,6 @@ def require_believed(status: Status) -> None:
 
 
 def _kept(client: Client) -> ProfileReport:
-    """Wait until the daemon has written the profile, and return its report."""
     began_s = time.monotonic()
     while True:
         profile = client.status().profile

@@ -1,7 +1,7 @@
 """`tormagctl calibrate --motors`: a log of one motor's voltage, current and motion, for `tormag-lab identify-motor`.
 
-Only forces are asked for, so every limit of the daemon stays in force. They are chosen for the motion they cause: slow
-ramps show friction, fast ones the speed term, jumps the inertia.
+It asks for forces, so all limits of the daemon apply. They are chosen for the motion they cause: slow ramps show
+friction, fast ones the speed term, jumps the inertia.
 """
 
 from pathlib import Path
@@ -30,35 +30,33 @@ COLUMNS = (
     "measured_cf",
     "reference_gap_mm",
 )
-"Columns of the control ticks that make a motor log."
 LOG_COLUMNS = ("t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm")
 
 CLEAR_N = 0.1
-"Distance kept from F_min: at the open end the firmware holds back a duty that would push on."
+"At the open end the firmware holds back a duty that would push on."
 RAMPS_S = (12.0, 6.0, 3.0)
-"Time from the least to the most force; then the same time back."
+"Up, then the same time down."
 JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.0)
-"Levels of the jumps, as shares of the range: small and large ones, up and down, over the whole stroke."
+"Shares of the range: small and large jumps, up and down, over the whole stroke."
 JUMP_S = 0.6
 ROUNDS = 2
-"The whole is done twice: one half is fitted, the other judges."
+"One half is fitted, the other judges."
 MIN_HZ = 900.0
-"Least control rate. A log of 500 Hz gets a motor's delay wrong, and the rest two to three times less exact."
+"A log of 500 Hz makes a motor's delay wrong and the rest less exact."
 LONGEST_HOLE_S = 0.02
-"A longer silence of the device is not bridged."
 
 
 def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
-    """Return the waveform to ask for, N over s from 0: ramps, then jumps, `rounds` times, between two forces."""
+    """Return the waveform to ask for: ramps, then jumps, `rounds` times."""
     low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
     ramps = [(ramp_s, force_N) for ramp_s in RAMPS_S for force_N in (high_N, low_N)]
-    # each there in a millisecond, and held
+    # each takes a millisecond, and is held
     jumps = [(lasts_s, low_N + share * (high_N - low_N)) for share in JUMP_SHARES for lasts_s in (1e-3, JUMP_S)]
     return by_legs(low_N, rounds * (ramps + jumps))
 
 
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
-    """Drive both carriages through `excitation`, and write the log of one to the new CSV file `path`."""
+    """Drive both carriages through `excitation`, and write the log of one as CSV."""
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
         waveform = excitation(reach(status, scene_most_N))
@@ -85,11 +83,10 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
 
 def motor_log(ticks: Columns, side: Side) -> Columns:
-    """Return the motor log of one side: an array for each of LOG_COLUMNS, evenly spaced on the device's clock, from 0
-    s."""
+    """Return the motor log of one side, evenly spaced on the device's clock."""
     known = np.isfinite(np.column_stack([ticks[name] for name in COLUMNS])).all(axis=1)
     time_s = ticks["device_time_s"][known]
-    # of ticks with the same measurement the last one's duty is what the device goes on with
+    # of ticks with the same measurement, the device follows the last one's duty
     fresh = np.append(np.diff(time_s) > 0.0, True)[: len(time_s)]
     time_s = time_s[fresh]
     holes = np.diff(time_s)

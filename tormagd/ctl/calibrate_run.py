@@ -41,15 +41,14 @@ from tormagd_client.wire import keys_of
 SOURCE = "calibrate"
 RATE_HZ = 200.0
 VALID_FOR_MS = 250.0
-"If this process dies, the force decays to the least one this much later."
+"If this process dies, the force decays this much later."
 SILENT_S = 1.0
-"Ticks come every 20 ms; without any for this long the daemon has gone."
+"Ticks come every 20 ms: after this silence the daemon has gone."
 RECENT_SETPOINT_MS = 1_000.0
 HOMING_S = 30.0
 
 
 def interrupted_run() -> CommandError:
-    """Return the error (REFUSED, code `interrupted`) for a run that the person ended; the caller raises it."""
     return CommandError(
         Exit.REFUSED,
         "interrupted",
@@ -59,26 +58,21 @@ def interrupted_run() -> CommandError:
 
 
 class Range(NamedTuple):
-    """The forces that a calibration may ask for, N: what the daemon gives with its present model, up to the scene's
-    most."""
+    """The forces that a calibration may ask for."""
 
     least_N: float
     most_N: float
 
 
 class Progress:
-    """One line of progress on stderr: what is done, for how long, and how long it takes."""
-
     def __init__(self) -> None:
         self._label, self._lasts_s, self._begun_s, self._is_shown = "", 0.0, 0.0, is_terminal(sys.stderr)
 
     def begin(self, label: str, lasts_s: float) -> None:
-        """Begin `label`, which takes about `lasts_s`, in place of what was shown; `show` shows it."""
         self.end()
         self._label, self._lasts_s, self._begun_s = label, lasts_s, time.monotonic()
 
     def show(self) -> None:
-        """Write the line anew, with the whole seconds since `begin`; before `begin` and after `end` do nothing."""
         if self._is_shown and self._label:
             since_s = time.monotonic() - self._begun_s
             print(
@@ -86,14 +80,13 @@ class Progress:
             )
 
     def end(self) -> None:
-        """Remove the line, so that `show` does nothing until the next `begin`."""
         if self._is_shown and self._label:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
         self._label = ""
 
 
 class Run(Device):
-    """The daemon's device for courses: commands and forces go out, control ticks come in. Made by `connected`."""
+    """The daemon's device for courses: commands and forces go out, control ticks come in."""
 
     def __init__(
         self,
@@ -108,7 +101,6 @@ class Run(Device):
         self.progress = Progress()
 
     def follow(self, course: Course[Found]) -> Found:
-        """Run `course` in real time, and return what it found; the line of progress ends with it."""
         try:
             return drive(course, self)
         except StoppedError as error:
@@ -118,17 +110,16 @@ class Run(Device):
             self.progress.end()
 
     def play(self, waveform: Waveform) -> Columns:
-        """Publish `waveform` in real time, and return its ticks as an array for each of COLUMNS."""
+        """Publish `waveform` in real time, and return its ticks by column."""
         return self.follow(watch(waveform.duration_s, lambda t_s: waveform.at(t_s).force_N))
 
     def command(self, name: str) -> None:
-        """Give the daemon a command by its name, and wait for the answer, which is not returned."""
         until_s = time.monotonic() + SILENT_S
         while True:
             try:
                 self._client.request(name)
             except ClientError as error:
-                # on a busy machine the newest measurement may be a little old once
+                # on a busy machine the newest measurement may once be a little old
                 if name == "enable" and error.code == "not_fresh" and time.monotonic() <= until_s:
                     continue
                 # in FAULT the gap opens already, and a daemon that has gone has opened it
@@ -137,8 +128,7 @@ class Run(Device):
             return
 
     def exchange(self, asked: Asked) -> Heard:
-        """Publish the force, N, valid for VALID_FOR_MS, and return the time and the ticks until the next is due,
-        1/RATE_HZ later."""
+        """Publish the force, and return the ticks until the next one is due."""
         if self._is_interrupted():
             raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
@@ -148,7 +138,7 @@ class Run(Device):
             self._client.publish(asked.force_N, VALID_FOR_MS, preview_N=ahead_N, preview_dt_ms=step_ms)
         self.progress.show()
         rows: list[Row] = []
-        # what waits is read even where this program came late
+        # whatever waits is read even if this program is late
         while self._ticks.poll(max(0, round((due_s - time.monotonic()) * 1e3))):
             rows += self._rows(self._ticks.recv_multipart()[-1])
         if time.monotonic() - self._heard_s > SILENT_S:
@@ -156,7 +146,7 @@ class Run(Device):
         return Heard(time.monotonic(), rows)
 
     def _rows(self, data: bytes) -> list[Row]:
-        """Return a batch's ticks, each a row by the course's COLUMNS, and note that the daemon was heard."""
+        """Return a batch's ticks as rows by the course's COLUMNS."""
         try:
             batch = decode_ticks(data)
             places = [batch.columns.index(name) for name in COLUMNS]
@@ -172,8 +162,6 @@ class Run(Device):
 
 
 def reach(status: Status, scene_most_N: float) -> Range:
-    """Return the forces that can be asked for, N: from the daemon's least to its most, or to `scene_most_N` where that
-    is less."""
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
     is_held = holder is not None and holder.state == "holds"  # an old setpoint may be valid for long
@@ -188,8 +176,6 @@ def reach(status: Status, scene_most_N: float) -> Range:
 
 
 def known_of(config: Config, status: Status, scene_most_N: float, weight_N: float | None = None) -> Known:
-    """Return what a course may use: configuration, the daemon's control period, s, the forces of `reach`, and the
-    weight."""
     forces = reach(status, scene_most_N)
     known = Known(config, 1.0 / status.rates["control"].hz, forces.least_N, forces.most_N, weight_N)
     if not known.force_N(0.0) < forces.most_N:
@@ -204,7 +190,7 @@ def known_of(config: Config, status: Status, scene_most_N: float, weight_N: floa
 
 @contextmanager
 def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
-    """Give a `Run`, as a context; however it ends, the device is told to disable, so that the gap opens."""
+    """Yield a `Run`; however it ends, the device is disabled and the gap opens."""
     context = zmq.Context()
     try:
         ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
@@ -221,7 +207,7 @@ def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
 
 @contextmanager
 def armed(endpoints: Endpoints, client: Client, force_N: float) -> Iterator[Run]:
-    """Home where needed, enable with the setpoint `force_N`, N, and give a `Run`, as a context."""
+    """Home if needed, enable with the setpoint `force_N`, and yield a `Run`."""
     with connected(endpoints, client) as run:
         if not client.status().is_homed:
             home(client, HOMING_S, is_waiting=True)

@@ -9,11 +9,10 @@ from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
-"Environment variables that stand for `--key` and `--server-key`."
 
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
-"An argument: what `argparse.ArgumentParser.add_argument` takes, by place and by name."
+"What `argparse.ArgumentParser.add_argument` takes, by place and by name."
 
 
 class Command(NamedTuple):
@@ -27,12 +26,11 @@ class Command(NamedTuple):
 
 
 def option(*names: str, **settings: Any) -> Option:
-    """Describe one argument of a command, by the names and settings that `add_argument` takes."""
     return names, settings
 
 
 def number(text: str) -> float:
-    """Parse a finite number, also in a form such as `1e3`."""
+    """Parse a finite number."""
     try:
         value = float(text)
     except ValueError:
@@ -43,7 +41,7 @@ def number(text: str) -> float:
 
 
 class Within(NamedTuple):
-    """Parses a number from `least` to `most`; raises ArgumentTypeError for any other."""
+    """Parses a number from `least` to `most`."""
 
     least: float
     most: float
@@ -57,7 +55,7 @@ class Within(NamedTuple):
 
 
 def port(text: str) -> int:
-    """Return the TCP port in `text`, 0..65535; 0 takes one that is free."""
+    """Parse a TCP port; 0 takes one that is free."""
     value = Within(0, 65_535)(text)
     if not value.is_integer():
         raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number, 0..65535")
@@ -65,7 +63,7 @@ def port(text: str) -> int:
 
 
 def rates(text: str) -> tuple[float, ...]:
-    """Return 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas, in their order; equal ones are allowed."""
+    """Parse 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas."""
     found = tuple(Within(0.02, 10.0, " N/s")(part) for part in text.split(","))
     if not 3 <= len(found) <= 60:
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 3..60 rates")
@@ -73,7 +71,6 @@ def rates(text: str) -> tuple[float, ...]:
 
 
 def source(text: str) -> str:
-    """Return a publisher's name as it is."""
     if not 0 < len(text) <= 64 or not text.isprintable():
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
     return text
@@ -112,7 +109,7 @@ def _waiting(usual_s: float) -> tuple[Option, ...]:
 
 
 def _open_gap(help_text: str) -> Command:
-    # a device without a zero searches its switches for six seconds at most
+    # homing takes six seconds at most
     return Command(help_text, "operate.open_gap", ("client", "command"), _waiting(10.0))
 
 

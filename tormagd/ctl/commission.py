@@ -26,13 +26,13 @@ Read = TypeVar("Read")
 
 
 class _Conformance(msgspec.Struct):
-    """What is read of the conformance kit's report."""
+    """The fields used of the conformance kit's report."""
 
     checks: list["_Check"]
 
 
 class _Scene(msgspec.Struct):
-    """What is read of the daemon's scene."""
+    """The fields used of the daemon's scene."""
 
     force: "_Force"
 
@@ -57,7 +57,7 @@ def commission(
     conformance: Path | None,
     is_agreed: bool,
 ) -> Outcome:
-    """Run all steps on the device, and keep findings and page in `folder`, named by its serial number."""
+    """Run all steps on the device, and keep findings and page in `folder`, by serial number."""
     checks = None if conformance is None else _failed_checks(conformance)
     with Client(endpoints, wait_s, SOURCE) as client:
         status, running = client.status(), client.describe()
@@ -75,7 +75,7 @@ def commission(
         if is_resumed:
             if before is None:
                 raise usage_error(f"{path}: there is nothing to resume", "leave --resume out")
-            if before.motor != config.motor:  # a calibration came into force: what was found is of another motor
+            if before.motor != config.motor:  # a calibration came into force: the findings are of another motor
                 raise usage_error(f"{path}: [motor] has changed since, in the daemon", "leave --resume out")
             report = before.resumed(weight_N)
         else:
@@ -97,15 +97,14 @@ def commission(
 
 
 class Kept:
-    """A report that is written to its file, with the page beside it, after each step."""
+    """A report that is written to its file after each step, with the page beside it."""
 
     def __init__(self, path: Path, report: Report) -> None:
         self._path, self.report, self._step = path, report, ""
         self._write()
 
     def follow(self, run: Run, known: Known) -> None:
-        """Run the steps that are `due`, in order, and write the report after each; say each on stderr, with
-        its number."""
+        """Run the steps that are `due`, in order, and write the report after each."""
         steps = due(STEPS, known, self.report.findings)
 
         def begins(step: Step) -> None:
@@ -132,7 +131,6 @@ class Kept:
         self.write(".html", page_of(self.report))
 
     def write(self, suffix: str, text: str) -> None:
-        """Write the report's file with this suffix, whole or not at all."""
         with as_usage_error(OSError, hint="give a folder that you may write to"):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with in_place_of(self._path.with_suffix(suffix)) as beside:
@@ -145,7 +143,7 @@ def _failed_checks(path: Path) -> list[tuple[str, str, str]]:
 
 
 def _decoded(path: Path, kind: type[Read], hint: str) -> Read:
-    """Read the JSON file `path`, of at most MAX_BYTES, as a `kind`; the caller says what helps, as `hint`."""
+    """Read a JSON file of limited size as a `kind`; on an error `hint` says what to do."""
     with as_usage_error(OSError, ValueError, hint=hint):
         try:
             return msgspec.json.decode(read_bounded(path, MAX_BYTES), type=kind)

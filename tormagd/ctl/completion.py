@@ -9,19 +9,18 @@ from tormagd.ctl.outcome import Outcome
 
 
 def completion(parser: ArgumentParser, shell: str) -> Outcome:
-    """Return the completion script for `shell`, as result and as text."""
     text = script(parser, shell)
     return Outcome({"shell": shell, "script": text}, text)
 
 
 def script(parser: ArgumentParser, shell: str) -> str:
-    """Return the script by which `shell`, bash or zsh, completes the program of `parser`; paths complete to files."""
+    """Return the script by which `shell`, bash or zsh, completes a program."""
     _complete_paths(parser)
     return str(shtab.complete(parser, shell=shell))
 
 
 def _complete_paths(parser: ArgumentParser) -> None:
-    """Mark arguments of type Path or with metavar FILE, also of subcommands, so that shtab completes them by files."""
+    """Mark arguments that are files, so that shtab completes their paths."""
     for action in parser._actions:
         if action.type is Path or action.metavar == "FILE":
             action.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab looks for it here

@@ -1,5 +1,4 @@
-"""`tormagctl dashboard`: a page for a browser on this machine, showing the daemon live or a recording. It changes
-nothing."""
+"""`tormagctl dashboard`: a page for a browser on this machine, showing the daemon live or a recording."""
 
 import asyncio
 import sys
@@ -17,7 +16,7 @@ from tormagd_client.endpoints import Endpoints
 
 
 def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
-    """Serve the page until Ctrl-C or SIGTERM: of the daemon live where `path` is None, else of that recording."""
+    """Serve the page of a recording, or of the live daemon, until Ctrl-C or SIGTERM."""
     start_s = time.monotonic()
     try:
         asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(path, port))
@@ -30,7 +29,6 @@ def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float)
 
 
 async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
-    """Serve the page of the daemon until a signal, listening to it meanwhile."""
     async with AsyncClient(endpoints, wait_s) as client:
         shown = Live(client, await client.status(), await client.describe())
         listening = asyncio.create_task(shown.run())
@@ -41,7 +39,6 @@ async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
 
 
 async def _recorded(path: Path, port: int) -> None:
-    """Serve the page of a recording."""
     (file,) = opened([path])
     with as_usage_error(ValueError, hint="give a recording with data"):
         shown = Recorded(file)

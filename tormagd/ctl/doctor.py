@@ -1,9 +1,8 @@
 """`tormagctl doctor`: what on this machine would hurt real time or access, each with its remedy.
 
-Each check is a small function of the machine and the configuration that returns one finding and changes nothing. With
-`--measure` some more judge what was measured (`headroom.py`). A daemon that runs here tells its configuration and what
-it was granted; without one, the caller's rights are judged. A *fail* keeps tormagd from doing what it is configured to
-do; a *warn* costs timing.
+Each check is a small function of the machine and the configuration that returns one finding; `--measure` adds more
+(`headroom.py`). A daemon that runs here tells its configuration and what it was granted; without one, the caller's
+rights are judged. A *fail* keeps tormagd from doing what it is configured to do; a *warn* costs timing.
 """
 
 import os
@@ -22,25 +21,23 @@ from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rat
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd.ctl.status import RECOMMISSION, refused
+from tormagd.keys import require_own
 from tormagd_client.blocking import Client
-from tormagd_client.endpoints import Endpoints
+from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, not_understood
 from tormagd_client.messages import Status
 
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
 MEMORY_TO_LOCK_BYTES = 1_000_000_000
-"What the daemon occupies with its models loaded and locked, rounded up."
 GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
 FAST_LATENCY_MS = 1
 LATE_SHARE = 0.25
-"Share of a control period: a bare timer later than this at p99 leaves the daemon too little."
+"If a bare timer is later at p99, as a share of a control period, the daemon has too little left."
 MISSED_SHARE = 0.001
-"Share of its beats that a bare timer may miss."
 STOP_OTHERS = "stop what else runs here; top shows it"
 RULES = "udev's 60-tormag.rules"
 BY_UNIT = "run tormagd by its systemd unit, or add "
 HERE = r"ipc://|tcp://(127\.|localhost:)"
-"An address of this machine."
 LIMITS_D = (
     "to /etc/security/limits.d/tormag.conf where it is started by hand; then start it again. Where that is there, its "
     "container or cgroup withholds it"
@@ -61,19 +58,17 @@ ASKED = (
         f"{RULES} opens it to the group, where the machine has that file; then start it again",
     ),
 )
-"What a daemon may ask the kernel for: the finding, the key of `realtime`, its usual value, and what helps."
+"What a daemon may ask of the kernel: finding, key of `realtime`, usual value, remedy."
 
 
 class Severity(StrEnum):
-    """How much a finding matters."""
-
     OK = "ok"
     WARN = "warn"
     FAIL = "fail"
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One line of the report: what was found, and what to do about it; an empty `remedy` where all is well."""
+    """One line of the report; `remedy` is empty if all is well."""
 
     name: str
     verdict: Severity
@@ -82,7 +77,7 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 class Running(NamedTuple):
-    """A daemon on this machine: its status, its configuration, and the configuration's file; None for its defaults."""
+    """A daemon on this machine; `file` is None if it runs by the defaults."""
 
     status: Status
     config: Config
@@ -90,7 +85,7 @@ class Running(NamedTuple):
 
 
 def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_s: float, measure: bool) -> Outcome:
-    """Check this machine, and with `measure` also which rates it holds; return the report as text and result."""
+    """Check this machine, and with `measure` also the rates that it holds."""
     machine = Machine(Path("/"))
     known: Running | ClientError = running(endpoints, wait_s)
     if isinstance(known, Running):
@@ -99,7 +94,7 @@ def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_
 
 
 def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
-    """Ask the daemon at the control endpoint for its status and configuration, and return both with the file's path."""
+    """Ask a daemon on this machine for its status and configuration."""
     if not re.match(HERE, endpoints.control):
         return ClientError("elsewhere", f"{endpoints.control} is another machine's", "run tormagctl doctor there")
     try:
@@ -116,7 +111,6 @@ def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
 def judged(
     config: Config, machine: Machine, found: Headroom | None = None, known: Running | ClientError | None = None
 ) -> Outcome:
-    """Return the report on a machine, on the daemon `known` there, and on the headroom `found`."""
     if isinstance(known, Running):
         findings = (*of_daemon(known, machine), *(check(_in_force(known), machine) for check in OF_MACHINE))
     else:
@@ -144,7 +138,7 @@ def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Sever
 
 
 def of_daemon(known: Running, machine: Machine) -> tuple[Finding, ...]:
-    """Return findings on what a daemon says of itself: that it runs, its build, its link and port, its calibration."""
+    """Return findings on build, rights, link, port and calibration, as a daemon tells them."""
     status, realtime, file = known.status, known.config.realtime, known.file or "a file, given with --config,"
     link, lacking = status.link, refused(status.not_granted)
     findings = [
@@ -172,8 +166,7 @@ def of_daemon(known: Running, machine: Machine) -> tuple[Finding, ...]:
 
 
 def _in_force(known: Running) -> Config:
-    """Return a daemon's configuration as it is in force: `lock_memory` and `fifo_priority` count as not asked for where
-    the kernel refused them."""
+    """Return a daemon's configuration without the wishes that the kernel refused."""
     config, lacking = known.config, refused(known.status.not_granted)
     nothing = {"lock_memory": False, "fifo_priority": 0}
     kept = {key: value for key, value in nothing.items() if f"realtime.{key}" in lacking}
@@ -181,8 +174,6 @@ def _in_force(known: Running) -> Config:
 
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
-    """Return five findings on a measurement: bare timer, what others took, the core's cost, control rate, inference
-    rate."""
     held = {row.loop: row for row in rates(config, found) if row.configured}
     return (
         bare_timer(found),
@@ -193,7 +184,7 @@ def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
 
 
 def bare_timer(found: Headroom) -> Finding:
-    """Judge how late a thread wakes that does nothing else, at the control rate, us."""
+    """Judge how late an idle thread wakes at the control rate."""
     late_us, rate_hz = found.bare.lateness_us, found.bare.rate_hz
     return _finding(
         "bare timer",
@@ -205,7 +196,7 @@ def bare_timer(found: Headroom) -> Finding:
 
 
 def others(found: Headroom) -> Finding:
-    """Judge what a hypervisor and other programs took during the measurement, as shares of its time."""
+    """Judge what a hypervisor and other programs took during the measurement."""
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
     is_stolen = found.steal > MAX_STOLEN
     return _finding(
@@ -217,7 +208,7 @@ def others(found: Headroom) -> Finding:
 
 
 def core(found: Headroom) -> Finding:
-    """Report the core's build, what its step and plan take, us, and how long the reference loop took here."""
+    """Report the core's build, and what its step and plan take."""
     step, plan = found.step_us, found.plan_us
     return Finding(
         "core",
@@ -228,16 +219,16 @@ def core(found: Headroom) -> Finding:
 
 
 def configured_rate(row: Rate) -> Finding:
-    """Judge one configured rate: OK with margin, WARN without, FAIL where it takes more than there is."""
+    """Judge one configured rate: WARN without margin, FAIL if it needs more than there is."""
     verdict = Severity.OK if row.holds else Severity.WARN if row.used <= 1.0 else Severity.FAIL
     return Finding(f"{row.loop} rate", verdict, f"{row.hz} Hz takes {row.used:.0%} of what there is", row.change)
 
 
 def preemption(config: Config, machine: Machine) -> Finding:
-    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT, else WARN, naming the model in force."""
+    """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT."""
     version = machine.text("/proc/version") or ""
     is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
-    # the model in force stands in brackets or parentheses; reading it takes root
+    # the model in force is in brackets or parentheses; only root can read it
     active = re.search(r"[\[(](\w+)[\])]", machine.text("/sys/kernel/debug/sched/preempt") or "")
     asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")
     if is_real_time:
@@ -257,7 +248,7 @@ def preemption(config: Config, machine: Machine) -> Finding:
 
 
 def governor(config: Config, machine: Machine) -> Finding:
-    """Judge whether processors slow down between ticks: WARN unless every scaling governor is `performance`."""
+    """Judge whether processors slow down between ticks."""
     files = machine.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governors = {text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))}
     return _finding(
@@ -269,8 +260,7 @@ def governor(config: Config, machine: Machine) -> Finding:
 
 
 def scheduling(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller may use SCHED_FIFO at the configured priority: FAIL where not; WARN for priority 0,
-    which asks for none."""
+    """Judge whether the caller may use SCHED_FIFO at the configured priority."""
     wanted = config.realtime.fifo_priority
     allowed = 99 if machine.has_capability(CAP_SYS_NICE) else int(machine.limit("Max realtime priority"))
     return _finding(
@@ -285,8 +275,6 @@ def scheduling(config: Config, machine: Machine) -> Finding:
 
 
 def memory_lock(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller may lock MEMORY_TO_LOCK_BYTES; where not, FAIL if `lock_memory` is configured, else
-    WARN."""
     limit = float("inf") if machine.has_capability(CAP_IPC_LOCK) else machine.limit("Max locked memory")
     return _finding(
         "memlock",
@@ -298,7 +286,7 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
-    """Judge the processors online: FAIL where `realtime.cpus` names one that is not, WARN for under two, else OK."""
+    """Judge whether the processors of `realtime.cpus`, and at least two, are online."""
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:
@@ -312,8 +300,6 @@ def cores(config: Config, machine: Machine) -> Finding:
 
 
 def load(config: Config, machine: Machine) -> Finding:
-    """Judge whether other programs want the processors: WARN for a one-minute load over 0.8 for each, or an unknown
-    one."""
     fields = (machine.text("/proc/loadavg") or "").split()
     if not fields:
         return Finding("load", Severity.WARN, "not known", "mount /proc")
@@ -322,8 +308,7 @@ def load(config: Config, machine: Machine) -> Finding:
 
 
 def clock_source(config: Config, machine: Machine) -> Finding:
-    """Judge whether reading the time is fast and even: OK where the clock source is of GOOD_CLOCKS, or not told, else
-    WARN."""
+    """Judge whether reading the time is fast and even."""
     name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     return _finding(
         "clock source",
@@ -334,8 +319,7 @@ def clock_source(config: Config, machine: Machine) -> Finding:
 
 
 def swap(config: Config, machine: Machine) -> Finding:
-    """Judge whether the daemon's memory can be paged out: WARN where swap is on, and `realtime.lock_memory` is not
-    configured."""
+    """Judge whether the daemon's memory can be paged out."""
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
         return Finding("swap", Severity.OK, "off")
@@ -345,7 +329,7 @@ def swap(config: Config, machine: Machine) -> Finding:
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
-    """Judge whether the kernel stops processes to make huge pages: WARN where transparent huge pages are `always`."""
+    """Judge whether the kernel stops processes to make huge pages."""
     active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
     found = active[1] if active else "not in this kernel"
     return _finding(
@@ -357,8 +341,7 @@ def huge_pages(config: Config, machine: Machine) -> Finding:
 
 
 def autogroup(config: Config, machine: Machine) -> Finding:
-    """Judge whether the kernel shares processors between sessions first: WARN where it does, without
-    `realtime.fifo_priority`."""
+    """Judge whether the kernel shares processors between sessions first."""
     is_on = machine.text("/proc/sys/kernel/sched_autogroup_enabled") == "1"
     return _finding(
         "autogroup",
@@ -369,8 +352,7 @@ def autogroup(config: Config, machine: Machine) -> Finding:
 
 
 def run_directory(config: Config, machine: Machine) -> Finding:
-    """Judge whether the caller can write where the configured control socket lies: FAIL where not, or where there is no
-    folder."""
+    """Judge whether the caller, and nobody else, can write where the control socket is."""
     address = config.endpoints.control
     if not address.startswith("ipc:///"):
         return Finding("run directory", Severity.OK, f"none needed for {address}")
@@ -383,6 +365,10 @@ def run_directory(config: Config, machine: Machine) -> Finding:
             f"{directory} does not exist",
             "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own",
         )
+    try:
+        require_own(path)
+    except ConfigError as error:
+        return Finding("run directory", Severity.FAIL, *str(error).rsplit("; ", 1))
     is_open = os.access(path, os.W_OK | os.X_OK)
     return _finding(
         "run directory",
@@ -394,7 +380,6 @@ def run_directory(config: Config, machine: Machine) -> Finding:
 
 
 def port(config: Config, machine: Machine) -> Finding:
-    """Judge whether the configured device's port is there, and readable and writable for the caller: FAIL where not."""
     name = config.device.port
     if not name.startswith("/"):
         is_there = machine.path(f"/sys/class/net/{name}").exists()
@@ -421,11 +406,11 @@ def port(config: Config, machine: Machine) -> Finding:
 
 
 def port_holder(config: Config, machine: Machine, daemon_id: int | None = None) -> Finding:
-    """Judge whether a process other than the daemon `daemon_id` has the port open: FAIL, naming each, else OK."""
+    """Judge whether a process other than the daemon `daemon_id` has the port open."""
     name = config.device.port
     target = machine.resolved(name)
     holders = machine.holders([target])[0][target] if name.startswith("/") else []
-    if target.startswith("/dev/pts/"):  # whoever made a pseudo-terminal has it open as well
+    if target.startswith("/dev/pts/"):  # the maker of a pseudo-terminal has it open as well
         locking = machine.lock_owners(target)
         holders = [(pid, comm) for pid, comm in holders if pid in locking]
     found = ", ".join(f"{comm} (process {pid})" for pid, comm in holders if pid != daemon_id)
@@ -435,7 +420,6 @@ def port_holder(config: Config, machine: Machine, daemon_id: int | None = None) 
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:
-    """Judge how long a USB serial chip keeps received bytes back: WARN over FAST_LATENCY_MS."""
     adapter = os.path.basename(machine.resolved(config.device.port))  # noqa: PTH119
     file = f"/sys/bus/usb-serial/devices/{adapter}/latency_timer"
     latency_ms = machine.number(file) if adapter else None
@@ -449,14 +433,13 @@ def usb_latency(config: Config, machine: Machine) -> Finding:
 
 
 def build(config: Config, machine: Machine) -> Finding:
-    """Judge whether the installed core is compiled; a daemon of this installation runs the same build."""
     runs = settle()
     return _finding("build", runs.is_compiled, str(runs) if runs.is_compiled else f"{runs}; {COST}", REMEDY)
 
 
 Check = Callable[[Config, Machine], Finding]
 OF_CALLER: tuple[Check, ...] = (build, scheduling, memory_lock, run_directory, port, port_holder)
-"Checks of the caller's rights and installation, which stand for a daemon that the caller starts."
+"Judged for a daemon that the caller starts."
 OF_MACHINE: tuple[Check, ...] = (
     preemption,
     governor,
@@ -485,7 +468,6 @@ def _table(table: tuple[Rate, ...]) -> str:
 
 
 def _text(findings: tuple[Finding, ...]) -> str:
-    """Return a line for each finding, in their order: verdict, name and what was found; a remedy has the line below."""
     colour = Colour(sys.stdout)
     paint = {Severity.OK: colour.green, Severity.WARN: colour.yellow, Severity.FAIL: colour.red}
     return "\n".join(

@@ -6,11 +6,11 @@ from tormagd.ctl.outcome import Outcome, usage_error
 from tormagd.named_file import did_you_mean, shipped
 
 FOLDERS = ("guides", "reference", ".")
-"Folders of the pages, in the order of the list."
+"In the order of the list."
 
 
 def guide(name: str | None) -> Outcome:
-    """Return a page of the documentation, as text and as `name` and `text`; with None, the list of all pages."""
+    """Return a page of the documentation, or the list of all pages."""
     folders = [files("tormagd") / "docs" / folder for folder in FOLDERS]
     pages = {
         page: (folder / f"{page}.md").read_text(encoding="utf-8")

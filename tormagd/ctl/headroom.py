@@ -1,7 +1,7 @@
 """`tormagctl doctor --measure`: which control and inference rates this machine holds with margin.
 
-`python -m tormagd.headroom` measures, in a process of its own that needs neither daemon nor device. Here its figures
-are judged, beside what the kernel counts meanwhile of steal and of processes that waited.
+`python -m tormagd.headroom` measures, in a process that needs neither daemon nor device. Here its figures are judged,
+beside what the kernel counts meanwhile of steal and of processes that waited.
 """
 
 import time
@@ -18,27 +18,24 @@ from tormagd.ctl.process import answer_of
 from tormagd_client.messages import ExecReport
 
 LONGEST_S = 120.0
-"Longest wait; the measurement takes 6 s on an idle machine, half of them to load libraries."
 RATES_HZ = (MIN_INFERENCE_HZ, 125, 250, 500, 1_000, 2_000, 4_000)
 TICK_OVER_STEP = 1.25
-"What a control tick takes over its step alone: the link and the write besides. Measured on the interpreted daemon."
+"A control tick over its step alone, measured on the interpreted daemon: it includes link and write."
 PERIOD_OVER_STEP = 3.5
-"What a period takes of the processor over the step, plans apart: reading, record, telemetry, ZeroMQ. Measured alike."
+"""A period's processor time over the step, without plans, measured alike: it includes reading, record, telemetry,
+ZeroMQ."""
 MAX_USED = 0.7
-"Share of a period or a processor. The rest is for clients that ask, and for hours when the machine gives less."
+"The rest is for clients that ask, and for times when the machine gives less."
 MAX_STOLEN, MAX_WAITED = 0.01, 0.1
-"Shares of the time above which what others take is worth a warning."
+"Others may take these shares of the time without a warning."
 
 
 class Quantiles(ExecReport, frozen=True, kw_only=True):
-    """Quantiles and mean of a duration, us."""
-
     mean: float
 
 
 class Bare(msgspec.Struct, frozen=True):
-    """A bare timer's lateness at the configured control rate, the share of beats it missed, and what the kernel
-    refused."""
+    """A bare timer at the configured control rate, and what the kernel refused."""
 
     rate_hz: int
     lateness_us: Quantiles
@@ -70,7 +67,6 @@ class Rate(msgspec.Struct, frozen=True):
 
 
 def measured(path: Path | None, machine: Machine) -> Headroom:
-    """Measure this machine in a process of its own, for the configuration in `path`; None takes the defaults."""
     before, started_s = machine.taken(), time.monotonic()
     try:
         printed = answer_of("tormagd.headroom", [f"--config={path}"] if path else [], LONGEST_S)
@@ -84,7 +80,7 @@ def measured(path: Path | None, machine: Machine) -> Headroom:
 
 
 def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | None]:
-    """Return the share of time stolen between two readings, and the share in which something waited for a processor."""
+    """Return the shares of time that were stolen, and in which something waited for a processor."""
     steal = (after.stolen - before.stolen) / max(after.ticks - before.ticks, 1)
     if before.waited_us is None or after.waited_us is None:
         return steal, None
@@ -92,7 +88,7 @@ def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | N
 
 
 def rates(config: Config, found: Headroom) -> Iterator[Rate]:
-    """Yield a verdict on each of RATES_HZ and the configured rate, for control, then for inference, each rising."""
+    """Yield a verdict on each of RATES_HZ and the configured rate, for control, then for inference."""
     control_hz, inference_hz = config.rates.control_hz, config.rates.inference_hz
     for hz in sorted({*RATES_HZ, control_hz}):
         yield _judged("control", hz, hz == control_hz, found, hz, min(inference_hz, hz))
@@ -101,8 +97,6 @@ def rates(config: Config, found: Headroom) -> Iterator[Rate]:
 
 
 def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: int, inference_hz: int) -> Rate:
-    """Judge the rate `hz` of `loop`, "control" or "inference", where the loops run at `control_hz` and
-    `inference_hz`."""
     late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us
     period = 1e-6 * control_hz
     if loop == "control":

@@ -12,13 +12,11 @@ HINT = "tormagctl keys generate --help; the guide has the whole exchange"
 
 
 def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) -> Outcome:
-    """Show fingerprints at `path` for `action` "show", else generate keys in the folder `path`."""
     return show_keys(path) if action == "show" else generate_keys(path, clients, client)
 
 
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
-    """Make the daemon's key pair where there is none, and one for each of `clients`, by role; or only
-    one for `client`."""
+    """Make the daemon's key pair if there is none, and one for each of `clients`, or for `client`."""
     names = [name for listed in clients.values() for name in listed]
     if client is not None and names:
         raise usage_error("--client stands alone: it makes a pair that no list of this machine has", HINT)
@@ -35,7 +33,7 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
 
 
 def show_keys(path: Path) -> Outcome:
-    """Return the fingerprint of the key in a file, or of every `NAME.key` in a folder; nothing is written."""
+    """Return the fingerprint of a key file, or of every `NAME.key` in a folder."""
     with as_usage_error(ConfigError, hint="give a .key or .key_secret file, or a folder of them"):
         found = load_folder(path) if path.is_dir() else [(path.stem, load_public(path).decode())]
         keys = [{"name": name, "fingerprint": fingerprint(public)} for name, public in found]

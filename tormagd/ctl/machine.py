@@ -10,7 +10,7 @@ from tormagd_client.printable import printable
 
 
 class Taken(NamedTuple):
-    """The kernel's counters of what others took; the difference of two readings tells of the time between them."""
+    """Counters of what others took from this machine."""
 
     stolen: int
     ticks: int
@@ -18,64 +18,58 @@ class Taken(NamedTuple):
 
 
 class Machine:
-    """A machine described by the file system under `root`; every path that a method takes is absolute on that
-    machine."""
+    """A machine described by the file system under `root`; paths are absolute on that machine."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def path(self, absolute: str) -> Path:
-        """Return where `absolute` is under the root."""
         return self.root / absolute.lstrip("/")
 
     def text(self, absolute: str) -> str | None:
-        """Read a file's text, stripped; None where it does not exist or cannot be read."""
+        """Read a file's text, stripped; None if it cannot be read."""
         try:
             return self.path(absolute).read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
             return None
 
     def number(self, absolute: str) -> int | None:
-        """Read the whole number in a file; None where it holds none."""
         text = self.text(absolute)
         return int(text) if text is not None and re.fullmatch(r"\d+", text) else None
 
     def limit(self, name: str) -> float:
-        """Return this process's soft limit `name`, infinity for unlimited; 0 where it is not listed."""
+        """Return this process's soft limit; infinity for unlimited, 0 if it is not listed."""
         found = re.search(rf"^{name}\s+(\S+)", self.text("/proc/self/limits") or "", re.MULTILINE)
         return 0.0 if found is None else float(found[1].replace("unlimited", "inf"))
 
     def has_capability(self, bit: int) -> bool:
-        """Return whether this process holds an effective capability, by its number in capabilities(7)."""
+        """Tell whether this process holds a capability of capabilities(7)."""
         found = re.search(r"^CapEff:\s*([0-9a-f]+)$", self.text("/proc/self/status") or "", re.MULTILINE)
         return found is not None and bool(int(found[1], 16) >> bit & 1)
 
     def cores(self) -> int:
-        """Return the number of processors online; 1 where the kernel does not say."""
         ranges = re.findall(r"(\d+)(?:-(\d+))?", self.text("/sys/devices/system/cpu/online") or "0")
         return sum(int(last or first) - int(first) + 1 for first, last in ranges) or 1
 
     def taken(self) -> Taken:
         """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi)."""
         first = (self.text("/proc/stat") or "").split("\n", 1)[0]
-        fields = [int(field) for field in first.split()[1:9]]  # beyond: guests, who are counted as users already
+        fields = [int(field) for field in first.split()[1:9]]  # without guests, which count as users already
         some = re.search(r"^some .*total=(\d+)$", self.text("/proc/pressure/cpu") or "", re.MULTILINE)
         return Taken(fields[7] if len(fields) == 8 else 0, sum(fields), int(some[1]) if some else None)
 
     def resolved(self, absolute: str) -> str:
-        """Return the path that `absolute` leads to, following symbolic links inside the root."""
         there, root = os.path.realpath(self.path(absolute)), os.path.realpath(self.root)
         return f"/{os.path.relpath(there, root)}"
 
     def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
-        """Return, for each of `paths`, id and name of each process that has it open; and how many processes could not
-        be looked into."""
+        """Return the processes that have each of `paths` open, and how many processes are hidden."""
         holding: dict[str, list[tuple[int, str]]] = {path: [] for path in paths}
         hidden = 0
         for process in sorted(self.path("/proc").glob("[0-9]*")):
             if process.name == str(os.getpid()):
                 continue
-            # a process may end, or its files be another user's, while we look
+            # a process may end meanwhile, or its files be another user's
             try:
                 targets = {os.path.realpath(link) for link in (process / "fd").iterdir()}
             except PermissionError:
@@ -88,11 +82,10 @@ class Machine:
         return holding, hidden
 
     def process_name(self, process_id: int) -> str:
-        """Return what a process calls itself; `?` where there is none."""
         return printable(self.text(f"/proc/{process_id}/comm") or "?")
 
     def lock_owners(self, absolute: str) -> list[int]:
-        """Return the ids of the processes, of any user, that hold a flock on a file, in rising order."""
+        """Return the ids of the processes that hold a flock on a file."""
         try:
             status = self.path(absolute).stat()
         except OSError:

@@ -40,13 +40,12 @@ EXTRAS = {
     "tqdm": "lab",
 }
 SERVICE_CONFIG = Path("/etc/tormag/tormagd.toml")
-"What the service reads, and `doctor` where no other is named."
 EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,
 4 device in FAULT. With --json stdout carries one object: {command, ok, result, error}."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command, print its outcome or error, and return the exit code; 130 after Ctrl-C."""
+    """Run one command, print its outcome or error, and return the exit code."""
     write_in_any_encoding()
     given = sys.argv[1:] if arguments is None else arguments
     try:
@@ -77,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Outcome:
-    """Import the command's function, call it with its options and what it needs, and return its outcome."""
+    """Import the command's function, and call it with its options and what it needs."""
     command = COMMANDS[options.command]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
@@ -103,7 +102,7 @@ def _run(options: argparse.Namespace) -> Outcome:
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
-    """Return the configured endpoints and keys with the changes that options, or else the environment, make."""
+    """Return the configured endpoints and keys with the changes of options and environment."""
     changed: dict[str, object] = {}
     given = {
         "client_secret": options.key or os.environ.get(KEY),
@@ -127,7 +126,6 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of `tormagctl`'s arguments; completions and man pages are made from it, too."""
     # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
     shared = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     _add(shared, SHARED)
@@ -137,7 +135,7 @@ def parser() -> argparse.ArgumentParser:
     made.options = tuple(name for names, _ in (*SHARED, *of_commands) for name in names)
     made.set_defaults(**USUAL)
     made.add_argument("--version", action="version", version=f"tormagctl {__version__}")
-    # its own name is given, or argparse would lay a usage out to find it
+    # otherwise argparse would lay out a usage to find it
     commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=made.prog)
     for name, (text, _, _, options, _) in COMMANDS.items():
         _add(

@@ -35,8 +35,7 @@ UP = "Whether the daemon answers"
 
 
 def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
-    """Return the metrics as text where `port` is None; else serve them at that port of 127.0.0.1 until Ctrl-C or
-    SIGTERM."""
+    """Return the metrics as text, or serve them at `port` until Ctrl-C or SIGTERM."""
     with Client(endpoints, wait_s) as client:
         client.status()
     registry = CollectorRegistry()
@@ -60,19 +59,17 @@ def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
 
 
 class Scrape(Collector):
-    """A collector that asks the daemon anew at each scrape, by a connection of its own: scrapes come in separate
-    threads."""
+    """A collector that asks the daemon at each scrape, by a connection of its own: scrapes come in separate threads."""
 
     def __init__(self, endpoints: Endpoints, wait_s: float) -> None:
         self._endpoints, self._wait_s = endpoints, wait_s
 
     def describe(self) -> list[Metric]:
-        """Name no metrics beforehand, so that registering does not ask the daemon."""
+        """Name no metrics, so that registering does not ask the daemon."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Ask the daemon, waiting for it, and yield `tormag_up`: 1 with all other metrics where it answers, else 0
-        alone."""
+        """Ask the daemon, and yield all metrics; without an answer only `tormag_up`, 0."""
         try:
             with Client(self._endpoints, self._wait_s) as client:
                 status = client.status()
@@ -95,7 +92,7 @@ def _family(
     values: Mapping[tuple[str, ...], float | None],
     unit: float = 1.0,
 ) -> Iterator[Metric]:
-    """Yield one metric, `tormag_` and `name`, with a sample for each value, times `unit`; `text` is its help."""
+    """Yield one metric with a sample for each value, times `unit`."""
     family = kind(f"tormag_{name}", text, labels=labels)
     for key, value in values.items():
         if value is not None:
@@ -105,7 +102,7 @@ def _family(
 
 
 def _families(status: Status) -> Iterator[Metric]:
-    """Yield the metrics of a status that are numbers, faults or limits, in base units (s, N, m, T)."""
+    """Yield the metrics of a status, in base units (s, N, m, T)."""
     link, setpoints, rates, followed = status.link, status.setpoints, status.rates, status.following
     error_N, aligned_N, delay_ms = (None, None, None) if followed is None else msgspec.structs.astuple(followed)
     sources, trip_us = setpoints.by_source, status.link.round_trip_us

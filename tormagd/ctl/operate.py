@@ -1,5 +1,4 @@
-"""The commands that change what the device does: arm, enable, disable, pause, resume, stop, clear-fault, take, confirm,
-home."""
+"""The commands that change what the device does."""
 
 import sys
 import time
@@ -12,7 +11,7 @@ from tormagd_client.messages import Explained, Status
 
 POLL_S = 0.05
 BEGIN_S = 2.0
-"By then a device that took the command is busy, over the slowest link."
+"By then a device that took the command is busy, even over the slowest link."
 
 DONE: dict[str, tuple[str, tuple[str, ...]]] = {
     "enable": ("enabled", ("ENABLED",)),
@@ -20,10 +19,10 @@ DONE: dict[str, tuple[str, tuple[str, ...]]] = {
     "pause": ("paused; the gap is held", ("PAUSED",)),
     "resume": ("resumed", ("ENABLED",)),
     "stop": ("stopped and latched; the gap opens. tormagctl arm when it is safe to go on", ("FAULT",)),
-    # while nothing is latched there is nothing to clear
+    # nothing is latched, so there is nothing to clear
     "clear-fault": ("fault cleared; nothing moves before tormagctl arm", ("DISABLED", "ENABLED", "PAUSED")),
 }
-"By command, what it has done, and the operating states that show it."
+"What each command has done, and the operating states that show it."
 STOPPED_WITHOUT_DEVICE = (
     "latched, but no device is connected: nothing could be sent, and the gap does not open. The device is told to open "
     "it when it is back; tormagctl status shows the link"
@@ -33,13 +32,12 @@ IS_OPEN = {
     "stop": "stopped and latched; the gap is open. tormagctl arm when it is safe to go on",
 }
 STAYED_SHUT = ("NOT_OPENING", "DEVICE_RETRACT_FAILED")
-"Faults that say that the gap does not open."
 COMES_BACK_S = 0.6
-"How long the daemon waits for the device to drop a cleared fault (CLEARING_S) before it latches the fault again."
+"The daemon waits this long for the device to drop a cleared fault (CLEARING_S), then latches it again."
 
 
 def arm(client: Client, timeout_s: float) -> Outcome:
-    """Have the daemon clear faults, home and enable, as far as needed, and say each step on stderr."""
+    """Have the daemon clear faults, home and enable as needed, and report each step on stderr."""
     begun_s = time.monotonic()
     given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
     known = client.status()
@@ -53,7 +51,6 @@ def arm(client: Client, timeout_s: float) -> Outcome:
 
 
 def operate(client: Client, command: str) -> Outcome:
-    """Give one command of DONE (enable, disable, pause, resume, stop, clear-fault), and return the daemon's answer."""
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
     state = result.get("operating_state")
@@ -80,7 +77,7 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
         gap_mm = state.gap_mm
         if state.is_open and not state.is_busy:
             return Outcome({**begun.result, "seconds": round(elapsed_s, 2)}, IS_OPEN[command])
-        # stop has latched STOPPED itself, and what was latched before it may be over
+        # stop has latched STOPPED itself, and earlier faults may be over
         if command == "disable" or (not state.is_busy and not set(STAYED_SHUT).isdisjoint(state.faults)):
             require_no_fault(state, "the gap is not open")
     raise CommandError(
@@ -92,7 +89,6 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
 
 
 def take(client: Client, source: str) -> Outcome:
-    """Give the brake to `source`, whoever holds it, so that its setpoints are rendered."""
     result = client.request("take", source=source)
     if result.get("source") != source:
         raise _not_done(f"the daemon answers that {result.get('source')!r} holds the brake, not {source!r}")
@@ -102,7 +98,7 @@ def take(client: Client, source: str) -> Outcome:
 
 
 def confirm(client: Client, what: str) -> Outcome:
-    """Settle a dispute between force sensor and believed device, by saying what is to be doubted."""
+    """Settle a dispute between force sensor and believed device."""
     result = client.request("confirm", what=what)
     if result.get("confirmed") != what:
         raise _not_done(f"the daemon answers that {result.get('confirmed')!r} is confirmed, not {what!r}")
@@ -115,7 +111,6 @@ def _not_done(what: str) -> CommandError:
 
 
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
-    """Home both carriages, and with `is_waiting` wait until they are homed, showing progress on a terminal."""
     was_homed = client.status().is_homed
     result = client.request("home")
     if not is_waiting:
@@ -123,7 +118,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     has_begun = False
     for elapsed_s, state in statuses(client, timeout_s, "homing"):
         require_no_fault(state, "fault while homing")
-        # a homing that was over between two looks still shows, as a device that is homed and was not
+        # a homing too short to be seen has changed the device to homed
         has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
         if has_begun and not state.is_busy:
             if state.is_homed:
@@ -144,7 +139,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
 
 
 def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tuple[float, Status]]:
-    """Yield seconds since the start and status, every POLL_S; end after `timeout_s` without raising anything."""
+    """Yield seconds since the start and status, every POLL_S, until `timeout_s`."""
     started_s = time.monotonic()
     shows_progress = bool(doing) and is_terminal(sys.stderr)
     try:
@@ -161,11 +156,10 @@ def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tupl
 
 
 def require_no_fault(state: Status, what: str, then: str = "tormagctl clear-fault") -> None:
-    """Raise CommandError (FAULT) where `state` is of a device in FAULT: which faults, why, and what to
-    do; else return."""
+    """Raise CommandError if the device is in FAULT, with causes and remedy."""
     if state.operating_state != "FAULT":
         return
-    # what the device met says more than that somebody stopped it
+    # what the device met is worth more than that somebody stopped it
     told = sorted(state.fault_details, key=lambda each: each.code == "STOPPED")
     first = told[0] if told else Explained("FAULT", "see tormagctl status", "tormagctl arm")
     raise CommandError(

@@ -1,4 +1,4 @@
-"""How a command ends: exit codes, the errors that stand for them, and what is printed."""
+"""How a command ends: exit codes, the errors behind them, and what is printed."""
 
 import os
 import re
@@ -19,12 +19,9 @@ from tormagd_client.printable import printable
 
 NARROWEST = 20
 LABEL = re.compile(r"\S{0,24} +")
-"A line's label and the space behind it."
 
 
 class Exit(IntEnum):
-    """The exit codes of `tormagctl`."""
-
     DONE = 0
     REFUSED = 1
     USAGE = 2
@@ -33,7 +30,7 @@ class Exit(IntEnum):
 
 
 class CommandError(ClientError):
-    """A command that did not do what was asked, for a reason that `tormagctl` itself found; has the `exit_code`."""
+    """A command that failed for a reason that `tormagctl` itself found."""
 
     def __init__(self, exit_code: Exit, code: str, message: str, hint: str) -> None:
         super().__init__(code, message, hint)
@@ -41,7 +38,7 @@ class CommandError(ClientError):
 
 
 def exit_code(error: ClientError) -> Exit:
-    """Return the exit code for an error: its own for a CommandError, REFUSED for an unknown kind."""
+    """Return the exit code for an error, REFUSED for an unknown kind."""
     if isinstance(error, CommandError):
         return error.exit_code
     codes = {InFaultError: Exit.FAULT, UnreachableError: Exit.UNREACHABLE, SettingError: Exit.USAGE}
@@ -55,7 +52,7 @@ def usage_error(message: str, hint: str) -> CommandError:
 
 @contextmanager
 def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
-    """Turn an exception of these kinds raised within this context into a CommandError (USAGE) with `hint`."""
+    """Turn exceptions of these kinds into a CommandError (USAGE) with `hint`."""
     try:
         yield
     except kinds as error:
@@ -64,8 +61,7 @@ def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a command gave: its result (the stable keys of `--json`), the same as text for a person, and the exit
-    code."""
+    """What a command gave: its result (the stable keys of `--json`), the same as text, and the exit code."""
 
     result: dict[str, Any]
     text: str
@@ -73,8 +69,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
-    """Print the outcome to stdout, as text or as one JSON object `{command, ok, result, error}`; return
-    the exit code."""
+    """Print the outcome as text or as one JSON object; return the exit code."""
     is_done = outcome.exit_code is Exit.DONE
     text = _object(command, is_done, outcome.result, None) if as_json else outcome.text
     is_written = write_answer(text, f"tormagctl {command}")
@@ -82,7 +77,7 @@ def print_outcome(command: str, outcome: Outcome, as_json: bool) -> Exit:
 
 
 def print_error(command: str, error: ClientError, as_json: bool) -> None:
-    """Print the error and its remedy to stderr, made printable, and with `as_json` an object to stdout as well."""
+    """Print error and remedy to stderr, and with `as_json` an object to stdout as well."""
     colour = Colour(sys.stderr)
     said, hint = colour.red(printable(error.message)), printable(error.hint)
     write_line(f"{f'tormagctl {command}'.rstrip()}: {said}\n  next: {hint}", sys.stderr)
@@ -96,8 +91,7 @@ def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[s
 
 
 def folded(text: str) -> str:
-    """Wrap `text` to the terminal's width, with a line's rest indented under its words; unchanged where stdout is no
-    terminal."""
+    """Wrap `text` to the terminal's width, with a line's rest indented under its words."""
     if not is_terminal(sys.stdout):
         return text
     width = max(shutil.get_terminal_size().columns, NARROWEST)
@@ -110,13 +104,11 @@ def folded(text: str) -> str:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Return whether `stream` is a terminal; False for None, a closed stream."""
     return stream is not None and stream.isatty()
 
 
 class Colour:
-    """ANSI colours for one stream; plain text where it is no terminal, TERM is dumb, or NO_COLOR is set and not
-    empty."""
+    """ANSI colours for one stream; plain text if it is no terminal, TERM is dumb, or NO_COLOR is set."""
 
     def __init__(self, stream: TextIO | None) -> None:
         self._is_on = is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

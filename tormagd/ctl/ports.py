@@ -1,7 +1,7 @@
 """`tormagctl ports`: where a device could be connected, and which processes hold those ports.
 
 Serial ports are those of the kernel's drivers, and the configured one. Open files show who has a port open; only root
-sees everybody's. A lock on a port shows in the kernel's list of locks to anybody.
+sees everybody's. Locks are in the kernel's list, which anybody can read.
 """
 
 import logging
@@ -19,21 +19,19 @@ from tormagd.ctl.outcome import Colour, Outcome, folded
 from tormagd_client.printable import printable
 
 DETECTION_S = 2.0
-"python-can asks every interface at once; what has not answered by then is left out."
+"python-can asks every interface at once; slower ones are left out."
 NOT_ASKED = ("serial", "socketcand", "virtual")
-"Interfaces left out: they repeat serial ports, listen for seconds for network beacons, or reach no other process."
+"They repeat serial ports, listen for seconds for network beacons, or reach no other process."
 
 
 class Holder(msgspec.Struct, frozen=True):
-    """A process that has a port open, or has locked it."""
-
     process_id: int
     name: str
     is_locking: bool
 
 
 class ListedPort(msgspec.Struct, frozen=True):
-    """A serial port. `latency_ms` is that of a USB chip's driver, None where there is no such timer."""
+    """A serial port. `latency_ms` is that of a USB chip's driver, if it has such a timer."""
 
     port: str
     description: str
@@ -46,8 +44,6 @@ class ListedPort(msgspec.Struct, frozen=True):
 
 
 class CanChannel(msgspec.Struct, frozen=True):
-    """A CAN channel that python-can could connect to now, or the configured one."""
-
     interface: str
     channel: str
     is_configured: bool
@@ -55,8 +51,7 @@ class CanChannel(msgspec.Struct, frozen=True):
 
 
 class Ports(msgspec.Struct, frozen=True):
-    """What `tormagctl ports` found: the keys of `--json`. `hidden_processes` counts those whose open files are not
-    shown to us."""
+    """What `tormagctl ports` found. `hidden_processes` counts those whose open files we may not see."""
 
     serial: tuple[ListedPort, ...]
     can: tuple[CanChannel, ...]
@@ -64,8 +59,7 @@ class Ports(msgspec.Struct, frozen=True):
 
 
 def ports(config: Config, root: Path = Path("/")) -> Outcome:
-    """Look for serial ports and CAN channels now, for at most about DETECTION_S, and report them."""
-    # it says at every start which makers' libraries are not installed
+    # it reports at every start which makers' libraries are not installed
     logging.getLogger("can").setLevel(logging.CRITICAL)
     import can
     from serial.tools.list_ports import comports
@@ -77,7 +71,7 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
 
 
 def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:
-    """Describe serial ports, CAN channels, and the processes that hold ports; serial ports are sorted by path."""
+    """Describe serial ports, sorted by path, CAN channels, and the processes that hold them."""
     known = {machine.resolved(info.device): info for info in listed}
     configured = machine.resolved(config.device.port) if _is_line(config) else ""
     if configured and machine.path(configured).exists():
@@ -97,8 +91,7 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
 def _serial_port(
     machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
 ) -> ListedPort:
-    """Describe the serial port at `path`, which has no symbolic links; `info` is pyserial's, None where
-    it lists none."""
+    """Describe the serial port at `path`, without symbolic links; `info` is pyserial's."""
     locking = machine.lock_owners(path)
     names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
     has_usb_id = info is not None and info.vid is not None
@@ -120,7 +113,7 @@ def _is_line(config: Config) -> bool:
 
 
 def _is_up(machine: Machine, channel: str) -> bool | None:
-    """Return whether a CAN channel is up, or its path exists; None where it cannot be told."""
+    """Return whether a CAN channel is up, or its path exists; None if it cannot be told."""
     if "/" in channel:
         return machine.path(channel).exists()
     state = machine.text(f"/sys/class/net/{channel}/operstate")
@@ -128,7 +121,6 @@ def _is_up(machine: Machine, channel: str) -> bool | None:
 
 
 def _text(found: Ports, config: Config, colour: Colour) -> str:
-    """Return a line for each serial port, its holders below it, then one for each CAN channel."""
     lines = []
     for entry in found.serial:
         marks = [

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 
 def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
-    """Run `python -m MODULE` with `arguments` and return what it prints to stdout, as text."""
+    """Run `python -m MODULE`, and return what it prints to stdout."""
     command = [sys.executable, "-P", "-m", module, *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=longest_s, check=False)

@@ -26,14 +26,12 @@ from tormagd_client.wire import keys_of
 
 POLL_MS = 100
 LONGEST_END_S = 60.0
-"Longest time at the end for writing what has already arrived."
 SILENT_S = 1.0
-"A daemon that is silent for this long at the end has gone."
+"After this silence at the end, the daemon has gone."
 
 
 def budget_of(settings: Recordings) -> Budget:
-    """Return what the configuration allows a folder of recordings, in bytes and s; 1 MB is 1e6 bytes, and a day 86400
-    s."""
+    """Return the budget of a folder of recordings; 1 MB is 1e6 bytes, a day 86400 s."""
     return Budget(
         segment_bytes=round(settings.segment_MB * 1e6),
         segment_s=settings.segment_minutes * 60.0,
@@ -44,7 +42,7 @@ def budget_of(settings: Recordings) -> Budget:
 
 
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
-    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder."""
+    """Record for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder."""
     if path.suffix != ".mcap" and not path.is_dir():
         raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
     keys = keys_of(endpoints.curve)
@@ -66,7 +64,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
             try:
                 with writer:
                     outcome = _record(writer, telemetry, ticks, duration_s, is_interrupted)
-                    with contextlib.suppress(ClientError):  # the daemon has gone: what was true at the start stands
+                    with contextlib.suppress(ClientError):  # if the daemon has gone, what was true at the start remains
                         writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
                     return outcome
             except OSError as error:
@@ -82,7 +80,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
-    """Ask the daemon what it runs, within `wait_s`, and return it as a recording's metadata."""
+    """Ask the daemon what it runs, as a recording's metadata."""
     with Client(endpoints, wait_s) as client:
         known = msgspec.to_builtins(client.describe())
     return {
@@ -93,7 +91,7 @@ def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
 
 
 def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
-    """Wait until a socket has a message, and return True; False after `wait_s`, or once interrupted, within POLL_MS."""
+    """Wait until a socket has a message; return False after `wait_s` or an interrupt."""
     end_s = time.monotonic() + wait_s
     while True:
         ready, _, _ = zmq.select(list(sockets), [], [], POLL_MS / 1e3)
@@ -108,7 +106,6 @@ def _record(
     duration_s: float,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
-    """Write what arrives until the time or an interrupt ends it, then what still waits, for LONGEST_END_S at most."""
     unreadable = 0
     start_s = heard_s = time.monotonic()
     is_over = False
@@ -117,7 +114,7 @@ def _record(
         is_over = is_interrupted() or left_s <= 0.0
         if not is_over:
             _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
-        # what waits when it is over came before that, and belongs into the file
+        # what waits at the end came before it
         until_s = time.monotonic() + (LONGEST_END_S if is_over else POLL_MS / 1e3)
         for socket in (telemetry, ticks):
             while socket.poll(0) and time.monotonic() < until_s:

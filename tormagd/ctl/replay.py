@@ -24,8 +24,7 @@ def replay(
     faults: Sequence[str],
     config_file: Path | None,
 ) -> Outcome:
-    """Replay a black box from `from_s` in a process of its own; with `settings` or `faults`, on the
-    simulated `plant`."""
+    """Replay a black box; with `settings` or `faults`, on the simulated `plant`."""
     arguments = [
         f"--from={from_s!r}",
         f"--plant={plant}",
@@ -52,7 +51,7 @@ def replay(
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
-    """Return the text on `done`, the report's `rerun`, and whether it was bit-exact: no first difference."""
+    """Return the text on the report's `rerun`, and whether it was bit-exact."""
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     difference = done["difference"]
     span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
@@ -67,7 +66,7 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
 
 
 def _instead(result: dict[str, Any]) -> str:
-    """Compare in words what was recorded with what the simulator met, as configured then and with the settings."""
+    """Say what was recorded, and what the simulator met with the old and the new settings."""
     told = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
     if result["instead"] is not None:
         told[f"simulated with {', '.join(result['settings'])}"] = result["instead"]
@@ -89,7 +88,6 @@ def _instead(result: dict[str, Any]) -> str:
 
 
 def _happened(what: dict[str, Any]) -> str:
-    """Say in words what was met in a run, of `what`, a part of the replay's report."""
     faults = ", ".join(f"{name} at {at_s:.3f} s" for name, at_s in what["faults"].items()) or "no fault"
     limits = ", ".join(f"{name} {held_s:.3f} s" for name, held_s in what["limits"].items()) or "none"
     refused = f"; refused: {', '.join(what['refused'])}" if what["refused"] else ""

@@ -13,13 +13,12 @@ WRITABLE = "give a file in a directory you may write to"
 
 
 def opened(sources: list[Path]) -> list[RecordingFile]:
-    """Open recordings, in the order of `sources`."""
     with as_usage_error(ValueError, hint="give files that tormagctl record has made"):
         return [RecordingFile(source) for source in sources]
 
 
 def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> Outcome:
-    """Say what was written, and before that what is to be noted of each recording; REFUSED where one is damaged."""
+    """Say what was written, and what to note of each recording; REFUSED if one is damaged."""
     said = (f"{each.path}: {'. '.join(each.notes)}" for each in of if each.notes)
     notes = {str(each.path): each.notes for each in of}
     exit_code = Exit.REFUSED if any(each.damage for each in of) else Exit.DONE
@@ -27,7 +26,7 @@ def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> O
 
 
 def report(sources: list[Path], target: Path) -> Outcome:
-    """Write an HTML page on one or two recordings to `target`; a page there is replaced, whole or not at all."""
+    """Write an HTML page on one or two recordings to `target`."""
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"
         raise usage_error(said, "tormagctl report A.mcap B.mcap -o AB.html")
@@ -40,7 +39,6 @@ def report(sources: list[Path], target: Path) -> Outcome:
 
 
 def plot(source: Path, target: Path) -> Outcome:
-    """Draw the recording `source` into the picture file `target`; a picture there is replaced, whole or not at all."""
     (recording,) = of = opened([source])
     overview, following = recording.overview, recording.overview.following
     with as_usage_error(ValueError, hint="give -o a picture's name, such as pulse.png, and a recording with data"):

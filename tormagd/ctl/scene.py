@@ -12,11 +12,11 @@ from tormagd.scenes.measured import MeasuredScene, Measurements, OperatingPoint,
 from tormagd.scenes.scene import Force, Scene, load_scene, shipped_scenes
 from tormagd_client.endpoints import ConfigError, Endpoints
 
-if TYPE_CHECKING:  # whoever lists scenes needs no sockets
+if TYPE_CHECKING:  # listing scenes needs no sockets
     from tormagd_client.blocking import Client
 
 LONGEST_S = 30.0
-"Longest wait for the daemon's own check, which takes half a second, or for its change of scene."
+"The daemon's own check takes half a second."
 
 
 def scene(
@@ -32,8 +32,7 @@ def scene(
     plant: str | None = None,
     **recorded: Any,
 ) -> Outcome:
-    """Do one of list, show, check, explain, new and use; `name` None takes the configuration's scene,
-    except for new."""
+    """Do one of list, show, check, explain, new and use; without `name`, for the configuration's scene."""
     named = name or config.scene
     if action == "new":
         if name is None:
@@ -67,7 +66,6 @@ def scene(
 
 
 def use_scene(client: "Client", name: str) -> Outcome:
-    """Have a disabled daemon change its scene, and wait until it has."""
     from tormagd.ctl.operate import statuses
 
     scene = str(Path(name).absolute()) if name not in shipped_scenes() and Path(name).exists() else name
@@ -84,7 +82,6 @@ def use_scene(client: "Client", name: str) -> Outcome:
 
 
 def list_scenes() -> Outcome:
-    """List the shipped scenes, by name; the result's `scenes` have `name` and `description` each."""
     scenes = [load_scene(name) for name in shipped_scenes()]
     width = max(len(scene.name) for scene in scenes)
     return Outcome(
@@ -101,7 +98,6 @@ def show_scene(name: str) -> Outcome:
 
 
 def as_toml(tables: dict[str, Any]) -> str:
-    """Return the text of a scene file with these keys and tables, without a line's end after the last."""
     lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
     for title, table in tables.items():
         if isinstance(table, dict):
@@ -110,8 +106,7 @@ def as_toml(tables: dict[str, Any]) -> str:
 
 
 def torque_range(scene: Scene) -> str:
-    """Return the scene's least and greatest force and its resolution as torques at the handle's shaft,
-    mNm, in words."""
+    """Return the scene's forces and resolution as torques at the handle's shaft, mNm."""
     radius_mm, force = scene.roller_radius_mm, scene.force
     if radius_mm is None:
         return ""
@@ -121,12 +116,12 @@ def torque_range(scene: Scene) -> str:
 
 
 def _line(key: str, value: object) -> str:
-    # a number or a text reads the same in JSON and TOML
+    # numbers and texts read the same in JSON and TOML
     return f"{key} = {msgspec.json.encode(value).decode()}"
 
 
 def check_scene(name: str, config: Path | None, plant: str | None = None) -> Outcome:
-    """Say whether a daemon with the configuration file `config` takes the scene, how it serves it, and at what cost."""
+    """Say whether a daemon with this configuration takes the scene, how it serves it, and at what cost."""
     scene = loaded(name)
     derived = _derived(name, config)
     file = measured()
@@ -188,7 +183,7 @@ def check_scene(name: str, config: Path | None, plant: str | None = None) -> Out
 
 
 def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
-    """Return a line on how soon a force comes from where the brake waits, and from higher standby forces."""
+    """Return a line on how soon a force comes from where the brake waits."""
     if not approaches_s:
         return []
     (wait_N, now_s), *nearer = approaches_s
@@ -200,7 +195,7 @@ def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]
 
 
 def explain_scene(name: str, config: Path | None) -> Outcome:
-    """Show every way to serve a scene that was measured, the chosen one, and how well that served other signals."""
+    """Show every measured way to serve a scene, the chosen one, and how well it served other signals."""
     file = measured()
     found = measured_as(loaded(name), file)
     derived = _derived(name, config)
@@ -227,7 +222,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
 
 
 def _tried(tried: Tried, share: Share | None, chosen: OperatingPoint, runs: OperatingPoint) -> str:
-    """Return one way's row: errors on three samples, share of a processor, whether chosen, whether it runs here."""
+    """Return one way's row: errors on three samples, share of a processor, whether chosen."""
     marks = [word for way, word in ((chosen, "chosen"), (runs, "runs here")) if way == tried.way]
     errors = " ".join(f"{1e3 * error_N:6.1f}" for error_N in tried.rms_N)
     taken = "not measured" if share is None else f"{share.daemon:.1%}"
@@ -235,12 +230,11 @@ def _tried(tried: Tried, share: Share | None, chosen: OperatingPoint, runs: Oper
 
 
 def way_of(derived: dict[str, Any]) -> OperatingPoint:
-    """Return the way (rates and search) by which the daemon's own check would serve the scene."""
     return OperatingPoint(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
 
 
 def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
-    """Return what was measured of the scene that asks for exactly what `scene` does, under whatever name."""
+    """Return what was measured of a scene that asks for the same, under whatever name."""
     found = file.scene(scene.fingerprint)
     if found is None:
         raise CommandError(
@@ -253,13 +247,12 @@ def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
 
 
 def loaded(name: str) -> Scene:
-    """Load a scene."""
     with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
         return load_scene(name)
 
 
 def _derived(name: str, config: Path | None) -> dict[str, Any]:
-    """Run the daemon's own check of the scene in a process of its own, and return what it derives."""
+    """Run the daemon's own check in a process, and return what it derives."""
     arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
     try:
         derived: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.daemon.main", arguments, LONGEST_S))["derived"]

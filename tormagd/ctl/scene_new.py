@@ -18,38 +18,34 @@ from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError
 
 INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
-"Inserts with a shipped model, from the softest, whose least force is the lowest."
+"From the softest, whose least force is the lowest."
 TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
-"Proposed tolerance: this share of the range, and at least this share of the greatest force."
+"The proposed tolerance is this share of the range, but at least this share of the greatest force."
 RESERVED = 0.7
-"""Share of the greatest force that the model gives."""
 OVER_MISSED = 4.0
-"""A tolerance under this many times what the gap's speed alone misses may be missed: carriages have mass and delay."""
+"A tolerance under this multiple of what the gap's speed alone misses may be missed: carriages have mass and delay."
 
 UNMET, UNMET_IF_WEAK = "# NOT MET: ", "# NOT MET BY A WEAK DEVICE: "
-"Begin a line of a scene file that says what the device does not give."
+"They begin a line of a scene file that says what the device does not give."
 
 Tables = dict[str, Any]
 
 
 class Recorded(NamedTuple):
-    """A recorded quantity that becomes the scene's force, and what a person states of the scene; None is not stated."""
+    """A recorded quantity that becomes the scene's force, and what a person states of the scene."""
 
     force: Path | None = None
-    "A CSV with the column `t_s` and one of the quantity; None: ask a person."
+    "A CSV with the column `t_s` and one of the quantity; without it, a person is asked."
     column: str | None = None
-    "The quantity's; `force_N` by default."
     scale: float | None = None
-    "Newtons for each of its units; 1 by default."
+    "Newtons for each unit of the column."
     offset_N: float | None = None
-    "Newtons at its 0; 0 by default."
     insert: str | None = None
     "By default the softest that renders the scene."
     tolerance_N: float | None = None
 
 
 def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | None = None) -> Outcome:
-    """Write the new scene file `out` from a recorded force, or without one from a person's answers."""
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
     force_file = _forces_of(out, recorded)
@@ -64,7 +60,7 @@ def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | N
 def _proposed(
     out: Path, force_file: Path | None, recorded: Recorded, config: Path | None, plant: str | None
 ) -> Outcome:
-    """Write the scene file `out` for the forces in `force_file`, and for None from a person's answers."""
+    """Write the scene file `out` for the forces in `force_file`, or from a person's answers."""
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
     if recorded.tolerance_N is not None:
         tables["force"] |= {"tolerance_rms_N": recorded.tolerance_N, "resolution_N": 2.0 * recorded.tolerance_N}
@@ -89,7 +85,7 @@ def _proposed(
 
 
 def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
-    """Return what a weak device does not give of a scene that is taken, a text for each, with what it does give."""
+    """Return what a weak device does not give of the scene, with what it does give."""
     force, missed_N = tables["force"], checked.result["missed_rms_N"] or 0.0
     weak = []
     if not _has_reserve(tables, checked):
@@ -100,8 +96,7 @@ def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
 
 
 def _forces_of(out: Path, recorded: Recorded) -> Path | None:
-    """Return the file of the scene's forces: the recorded one, or where it has to be converted, a new
-    CSV beside `out`."""
+    """Return the file of the scene's forces, if need be a converted one."""
     is_converted = (recorded.column, recorded.scale, recorded.offset_N) != (None, None, None)
     if recorded.force is None:
         if is_converted:
@@ -135,7 +130,7 @@ def _softest(
             taken[insert] = check_scene(str(out), config, plant)
         except CommandError as error:
             reason = error.message.removeprefix(f"scene {tables['name']}: ")
-            # a machine too busy to say, or an insert or model that there is not
+            # a machine too busy to say, or an unknown insert or model
             if error.code not in ("refused", "budget") or reason.startswith("insert."):
                 out.unlink()
                 raise
@@ -147,7 +142,7 @@ def _softest(
         insert = next(iter(taken))
         _write(out, tables, insert)
         return insert, taken[insert], []
-    # of those that are strong enough the softest, which follows fastest; else the stiffest
+    # the softest of those that are strong enough follows fastest; else the stiffest
     strong = [name for name in inserts if not any(reason.startswith("force.most_N") for reason in lacks[name])]
     insert = min(strong, key=lambda name: len(lacks[name])) if strong else inserts[-1]
     _write(out, tables, insert, lacks[insert])
@@ -168,8 +163,7 @@ def _has_reserve(tables: Tables, checked: Outcome) -> bool:
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
-    """Propose a scene's tables for a recorded force: its range, rounded outwards, a tolerance, a steady handle of 42
-    mm/s."""
+    """Propose a scene's tables for a recorded force, at a steady handle of 42 mm/s."""
     hint = "a CSV with the columns t_s,force_N, no force below 0; else --column, --scale, --offset"
     with as_usage_error(ConfigError, hint=hint):
         time_s, force_N = recorded(force_file)
@@ -186,8 +180,7 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
 
 
 def _from_answers(name: str) -> Tables:
-    """Ask a person on stderr for each value of the scene `name`, each with a proposal, and return its tables, without
-    an insert."""
+    """Ask a person for each value of the scene, each with a proposal, and return its tables."""
     if not is_terminal(sys.stdin):
         raise usage_error(
             "stdin is no terminal: there is nobody to ask",
@@ -209,8 +202,6 @@ def _from_answers(name: str) -> Tables:
 
 
 def _answer(question: str, usual: str) -> str:
-    """Ask one question on stderr, and return the line from stdin without spaces around it; an empty one
-    takes `usual`."""
     print(f"{question} [{usual}]: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:
@@ -219,7 +210,7 @@ def _answer(question: str, usual: str) -> str:
 
 
 def _number(question: str, usual: float) -> float:
-    """Ask until the answer is a number, `nan` and `inf` included, and return it; an empty line takes `usual`."""
+    """Ask until the answer is a number."""
     while True:
         answer = _answer(question, f"{usual:g}")
         try:

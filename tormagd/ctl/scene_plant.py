@@ -13,11 +13,11 @@ from tormagd.scenes.scene import Scene, scene_path
 from tormagd.scenes.signal import asked
 
 LONGEST_S, SIGNAL_S, SIGNAL_HZ = 120.0, 5.0, 200
-"Longest wait for the laboratory, and so much of the scene's signal, which tells enough."
+"This much of the scene's signal is enough."
 
 
 def on_plant(scene: Scene, name: str, plant: str) -> dict[str, Any]:
-    """Return what ideal carriages of `plant` give of a scene, N: range, RMS errors, and the asked force's deviation."""
+    """Return what ideal carriages of `plant` give of a scene: range and RMS errors, N."""
     force = scene.force
     times_s, forces_N = (
         np.array([0.0, SIGNAL_S / 2.0, SIGNAL_S]),
@@ -33,7 +33,7 @@ def on_plant(scene: Scene, name: str, plant: str) -> dict[str, Any]:
         try:
             found: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.lab.__main__", words, LONGEST_S))
         except (TimeoutError, ChildProcessError) as error:
-            # what the laboratory lacks is told with the command that brings it
+            # the laboratory names the command that installs what it lacks
             said, lacks, remedy = str(error).partition(" is not installed")
             hint = remedy.removeprefix(": ") or "tormag-lab twin makes a plant file"
             raise usage_error(f"--plant {plant}: {said}{lacks}", hint) from error

@@ -13,14 +13,14 @@ from tormagd.scenes.scene import load_scene, scene_path
 
 
 class Served(NamedTuple):
-    """A measured way to serve a scene, and its figures: the share of a processor, and the worst RMS error, N."""
+    """A measured way to serve a scene: its share of a processor and worst RMS error."""
 
     way: OperatingPoint
     figures: tuple[float, float]
 
 
 def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
-    """Choose the most exact measured way that takes at most `share` of a processor, or the cheapest within an error."""
+    """Choose the most exact measured way within `share` of a processor, or the cheapest within an error."""
     if action != "check" or (share is None) == (tolerance_N is None):
         raise usage_error(
             "--share, --tolerance and --out choose how a scene is served",
@@ -45,8 +45,7 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
 
 
 def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served:
-    """Return the most exact of `ways` whose share is at most `share`, or for None the cheapest whose error is at most
-    `tolerance_N`."""
+    """Return the most exact of `ways` within `share`, or without one the cheapest within `tolerance_N`."""
     bounds = ("--tolerance", 1, tolerance_N, "N") if share is None else ("--share", 0, share, "of a processor")
     asked, bounded, most, unit = bounds
     fits = [way for way in ways if way.figures[bounded] <= most]
@@ -62,8 +61,7 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
 
 
 def _write(name: str, way: OperatingPoint, out: Path) -> None:
-    """Write the scene `name` with this way's rates and search to the new file `out`; relative paths in
-    it are adapted."""
+    """Write the scene with this way's rates and search to the new file `out`; relative paths are adapted."""
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
     tables = {key: value for key, value in tables.items() if value is not None}

@@ -34,7 +34,7 @@ def send(
     preview_ms: float,
     is_blind: bool,
 ) -> Outcome:
-    """Publish `what`, a shape or a CSV file, at `rate_hz`, and report what became of it."""
+    """Publish a shape or a CSV file at `rate_hz`, and report what became of it."""
     with as_usage_error(
         WaveformError,
         ForceFileError,
@@ -105,11 +105,10 @@ def _publish(
     is_interrupted: Callable[[], bool],
     watch: StatusWatch | None,
 ) -> dict[str, Any]:
-    """Publish setpoints until the time or an interrupt, and return the counts."""
     sent = skipped = index = 0
     worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()
-    # the margin keeps the last one where the times of a file are off by a rounding error
+    # the margin keeps the last one despite the rounding of a file's times
     last = int(duration_s * rate_hz + 1e-6)
     while index <= last and not is_interrupted():
         t_s = index / rate_hz
@@ -127,7 +126,7 @@ def _publish(
             client.publish(
                 sample.force_N,
                 valid_for_ms,
-                start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
+                start_ns + round(index / rate_hz * 1e9),  # the time for which the force is meant, whenever it is sent
                 displacement_mm=sample.displacement_mm,
                 rate_mm_s=sample.rate_mm_s,
                 preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,

@@ -29,15 +29,13 @@ RECOMMISSION = "tormagctl commission FOLDER writes a new one; then systemctl rel
 OLD_MS = 1_000.0
 "An older setpoint may still be valid; its age is shown."
 SURE_WINDOWS = 20
-"A clock's drift is shown once it is fitted over this many windows: ten seconds."
+"Ten seconds of windows, after which a clock's drift is shown."
 SETPOINT_COUNTS = ("accepted", "refused", "dropped")
 LINK_COUNTS = ("losses", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 LINK_COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")
 
 
 def status(client: Client) -> Outcome:
-    """Ask for the daemon's status, and return it as result and as text; the outcome is FAULT while the device is in
-    FAULT."""
     result = client.request("status")
     known = understood(result, Status)
     code = Exit.FAULT if known.operating_state == "FAULT" else Exit.DONE
@@ -45,7 +43,7 @@ def status(client: Client) -> Outcome:
 
 
 def status_text(known: Status, colour: Colour) -> str:
-    """Return a status as labelled lines of text, the most important first; an unknown value shows as `-`."""
+    """Return a status as labelled lines of text, the most important first."""
     state = known.operating_state
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
     is_running = known.link.state == "RUNNING"
@@ -57,7 +55,7 @@ def status_text(known: Status, colour: Colour) -> str:
     lines = [
         f"state     {paint(state)}, {', '.join(flags)}",
         *_codes(known.faults, known.fault_details, "fault", colour.red),
-        # without a device none of them is taken: the link says what comes first
+        # without a device none of them would be taken: the link says what comes first
         *([f"next      tormagctl arm: {', '.join(known.next_commands)}"] if known.next_commands and is_running else []),
         *_codes(known.limits, known.limit_details, "held by", colour.yellow),
         f"force     asked {_number(known.setpoint_cf, 'N')}{_long_ago(known)}, "
@@ -101,7 +99,7 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 
 
 def _device(known: Status, colour: Colour) -> list[str]:
-    """Return lines on what the device has shown of itself: scale, offset, sensor's zero, each with its deviation."""
+    """Return lines on what the device has shown of itself: scale, offset, sensor's zero."""
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
     # without a folder nothing was to be kept
@@ -122,7 +120,6 @@ def _long_ago(known: Status) -> str:
 
 
 def played(report: PlayoutReport | None) -> str:
-    """Say what the playout adds and takes out, ms, and how many setpoints came too late for it; empty for None."""
     if report is None:
         return ""
     return (
@@ -132,20 +129,19 @@ def played(report: PlayoutReport | None) -> str:
 
 
 def refused(not_granted: Iterable[str]) -> dict[str, str]:
-    """Return what the kernel refused, by configuration key; each value is the whole text of the refusal."""
+    """Return the kernel's refusals by configuration key."""
     return {re.split("[ :]", each, maxsplit=1)[0]: each for each in not_granted}
 
 
 def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
-    """Return a force at the roller as torque at the handle's shaft, in brackets; empty where either value is None."""
+    """Return a force at the roller as torque at the handle's shaft, in brackets."""
     if force_N is None or roller_radius_mm is None:
         return ""
     return f" ({force_N * roller_radius_mm:.1f} mNm)"
 
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
-    """Return the beliefs that act, except those named in `but`, in one line: name, value, deviation and
-    unit of each."""
+    """Return the beliefs that act in one line."""
     return ", ".join(
         f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
         for name, it in belief.items()
@@ -154,7 +150,7 @@ def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> s
 
 
 def _core(build: str, colour: Colour) -> list[str]:
-    """Return lines on the core's build, and what an interpreted one costs; empty where an older daemon does not say."""
+    """Return lines on the core's build; none for an older daemon."""
     if build in ("", "compiled"):
         return _said("core      ", build, str)
     return [f"core      {colour.yellow(build)}", *_explained(COST, REMEDY, str)]
@@ -170,8 +166,6 @@ def _counts(report: LinkReport | SetpointReport, names: tuple[str, ...]) -> str:
 
 
 def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
-    """Return lines on the source `name`: state, delay, jitter, losses, clock, restarts, then cause and remedy of what
-    is wrong."""
     paint = {"holds": colour.green, "refused": colour.yellow}.get(source.state, str)
     delay, behind = source.delay_us, source.clock_behind_ms
     words = {"holds": "holds the brake", "refused": "refused", "stale": f"silent for {source.silent_ms * 1e-3:.1f} s"}
@@ -192,7 +186,7 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
 
 
 def _way(way: WayReport | None, colour: Colour) -> list[str]:
-    """Return lines on the delay from a setpoint's stamp to its force, part by part, against its budget."""
+    """Return lines on the delay from a setpoint's stamp to its force, part by part."""
     if way is None or way.to_duty_us.max == 0.0:
         return []
     to_duty, total_ms = way.to_duty_us, way.total_ms
@@ -228,7 +222,6 @@ def _said(label: str, text: str | int | None, paint: Callable[[str], str]) -> li
 
 
 def _rate(name: str, group: RateReport, colour: Colour) -> str:
-    """Return a line on how the loop `name` keeps its rate: its grade, Hz, lateness, us, and counts of late runs."""
     paint = {"warning": colour.yellow, "error": colour.red}.get(group.grade, str)
     lateness = group.lateness_us
     return (
@@ -243,14 +236,13 @@ def _late_ticks(blamed: Mapping[str, int]) -> list[str]:
 
 
 def firmware(client: Client) -> Outcome:
-    """Report the daemon's link; the keys of `--json` are those of `link` in the status."""
+    """Report the daemon's link, with the keys of `link` in the status."""
     result = client.request("status")
     known = understood(result, Status).link
     return Outcome(result["link"], folded(firmware_text(known, Colour(sys.stdout))))
 
 
 def firmware_text(link: LinkReport, colour: Colour) -> str:
-    """Return the link's report as some ten labelled lines; an unknown value shows as `-`, or "not known yet"."""
     paint = colour.green if link.state == "RUNNING" else colour.yellow
     last = f", the last: {link.last_loss}" if link.last_loss else ""
     ours, theirs = link.daemon_schema, link.firmware_schema
@@ -284,8 +276,7 @@ def _round_trip(known: RoundTripReport | None) -> str:
 
 
 def _quality(link: LinkReport) -> str:
-    """Say what share of Drives was unanswered and of frames damaged in the last second, and how many messages found the
-    wire full."""
+    """Say how many Drives were unanswered, frames damaged and messages held up in the last second."""
     if link.unanswered_share is None or link.damaged_share is None:
         return "not known yet"
     return (
@@ -295,8 +286,6 @@ def _quality(link: LinkReport) -> str:
 
 
 def _clock(known: ClockReport | None) -> str:
-    """Say how the device's clock fits the host's: drift, ppm, offset, s, how far the fit is off, us, and over how many
-    windows."""
     if known is None:
         return "not known yet: a fit takes some seconds"
     return (

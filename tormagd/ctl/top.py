@@ -1,4 +1,4 @@
-"""`tormagctl top`: what the daemon does, live in a terminal. It changes nothing."""
+"""`tormagctl top`: what the daemon does, live in a terminal."""
 
 import contextlib
 import select
@@ -22,13 +22,13 @@ from tormagd_client.wire import Pending, understood
 
 REDRAW_S = 0.2
 ASK_S = 1.0
-"Period of asking for the status; sooner where a code shows that is not explained yet."
+"The status is asked for sooner if a code appears that is not explained yet."
 KEPT = 1_000
-"Snapshots kept, of 20 s: shorter limits would come and go too fast to be read."
+"Snapshots of 20 s: shorter limits would come and go too fast to be read."
 
 
 def top(client: Client) -> Outcome:
-    """Draw the daemon's state until `q`, Ctrl-C or SIGTERM; the terminal is restored then."""
+    """Draw the daemon's state until `q`, Ctrl-C or SIGTERM."""
     console = Console(highlight=False)
     if not (is_terminal(sys.stdin) and console.is_terminal) or console.is_dumb_terminal:
         raise usage_error("top needs a terminal that can be drawn on", "tormagctl status, with --json for a script")
@@ -40,7 +40,7 @@ def top(client: Client) -> Outcome:
         Live(console=console, screen=True, auto_refresh=False) as live,
     ):
         terminal.callback(termios.tcsetattr, sys.stdin, termios.TCSADRAIN, termios.tcgetattr(sys.stdin))
-        tty.setcbreak(sys.stdin)  # keys are read as they are struck, and not shown
+        tty.setcbreak(sys.stdin)  # keys are read when pressed, without echo
         while not is_interrupted():
             live.update(screen(watcher.look(), *console.size), refresh=True)
             if select.select([sys.stdin], [], [], REDRAW_S)[0] and sys.stdin.read(1) in ("q", ""):
@@ -50,7 +50,7 @@ def top(client: Client) -> Outcome:
 
 
 class Watcher:
-    """Gathers telemetry and status for the screen; waits for the daemon only when made, for the first status."""
+    """Gathers telemetry and status for the screen; waits only for the first status."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -61,7 +61,7 @@ class Watcher:
         self._ask_s = self._heard_s = time.monotonic()
 
     def look(self) -> Seen:
-        """Take what has arrived and return what is known by now, without waiting; asks for the status now and then."""
+        """Return what has arrived by now, and ask for the status from time to time."""
         now_s = time.monotonic()
         try:
             arrived = self._client.telemetry()
@@ -75,8 +75,6 @@ class Watcher:
         return Seen(self._telemetry, self._status, self._explained, now_s - self._heard_s)
 
     def _ask(self, now_s: float, codes: set[str]) -> None:
-        """Take the answer to the last request, if it has come, and ask again after ASK_S, or for a code not explained
-        yet."""
         result = None if self._asked is None else self._client.answer(self._asked)
         if result is not None:
             self._status = understood(result, Status)

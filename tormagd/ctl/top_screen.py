@@ -17,13 +17,13 @@ from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 
 COLUMN_NS = 100_000_000
-"Time that one character of a sparkline stands for."
+"One character of a sparkline."
 STANDARD_ROWS = 24
-"A terminal of this many rows has sparklines of one row; sparklines share any further rows."
+"With these rows sparklines are one row high; they share any further rows."
 LABEL, VALUE, ENDS = 10, 10, 12
-"Characters of a row's name, of its newest value with the unit, and of the ends of its scale."
+"Characters of a row's name, of its newest value, and of the ends of its scale."
 NARROW = 60
-"Width in characters below which the ends of the scales are left out."
+"Narrower terminals show no ends of the scales."
 SILENT_S = 0.5
 EIGHTHS = " ▁▂▃▄▅▆▇█"
 STATE_STYLES = {"ENABLED": "black on green", "PAUSED": "black on yellow", "FAULT": "bold white on red"}
@@ -31,8 +31,7 @@ GRADE_STYLES = {"warning": "yellow", "error": "red"}
 
 
 class Seen(NamedTuple):
-    """What is known: telemetry, the oldest first, the newest status, an explanation of each code, and the silence
-    since, s."""
+    """What is known: telemetry from the oldest on, the newest status, explanations by code, the silence."""
 
     telemetry: Sequence[Telemetry]
     status: Status
@@ -41,8 +40,7 @@ class Seen(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A row with a sparkline. Curves with the same `scale` share one, no narrower than `least`; `of_column` joins
-    values."""
+    """A row with a sparkline. Curves with the same `scale` share one, at least `least` wide."""
 
     label: str
     unit: str
@@ -65,7 +63,6 @@ CURVES = (
 
 
 def screen(seen: Seen, width: int, height: int) -> RenderableType:
-    """Return the whole screen: state, curves, loops and link, then faults and limits with remedies."""
     more = max(height - STANDARD_ROWS, 0) // len(CURVES)
     wide = width - 2
     head, curves = _head(seen, wide), _curves(seen, wide, max(more, 1), is_apart=more > 0)
@@ -80,7 +77,6 @@ def _below_each_other(*parts: RenderableType) -> RenderableType:
 
 
 def _head(seen: Seen, width: int) -> Text:
-    """Return the first line: state, whether homed and busy, the force as torque in mNm, scene, uptime and version."""
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state, is_silent = printable(newest.operating_state), seen.silent_s > SILENT_S
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
@@ -106,7 +102,7 @@ def _head(seen: Seen, width: int) -> Text:
 
 
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
-    """Return a row for each of CURVES: name, newest value, sparkline of `rows` lines, and the ends of its scale."""
+    """Return a row for each of CURVES."""
     ends_wide = ENDS if width >= NARROW else 0
     count = max(width - LABEL - VALUE - ends_wide - 3, 8)
     table = _grid(LABEL, VALUE, count, *([ends_wide] if ends_wide else []))
@@ -137,7 +133,6 @@ def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
 
 
 def _grid(*widths: int, is_cut: bool = True) -> Table:
-    """Return a table with columns of these widths; longer text is cut, or wrapped without `is_cut`."""
     table = Table.grid(padding=(0, 1, 0, 0))
     for width in widths:
         table.add_column(width=width, no_wrap=is_cut, overflow="ellipsis")
@@ -145,8 +140,6 @@ def _grid(*widths: int, is_cut: bool = True) -> Table:
 
 
 def _timing(status: Status, width: int) -> Table:
-    """Return rows on how loops keep time, the link, setpoints, playout, what the kernel refused,
-    following and belief."""
     table = _grid(LABEL, width - LABEL - 1)
     for name in ("control", "inference", "search"):
         group = status.rates.get(name)
@@ -180,7 +173,7 @@ def _timing(status: Status, width: int) -> Table:
 
 
 def _codes(seen: Seen, width: int) -> Table:
-    """Return rows of the newest faults, then of limits that held in the telemetry kept, the longest first."""
+    """Return rows of the newest faults, then of recent limits, the longest first."""
     newest = seen.telemetry[-1] if seen.telemetry else seen.status
     times = Counter(code for each in seen.telemetry for code in each.limits)
     table = _grid(LABEL, width - LABEL - 1, is_cut=False)
@@ -209,8 +202,7 @@ def columns(
     period_ns: int,
     of_column: Callable[[list[float]], float],
 ) -> list[float | None]:
-    """Return a value for each of the newest `count` periods, the oldest first: `of_column` of what fell into it, else
-    None."""
+    """Return `of_column` of the values in each of the newest `count` periods, the oldest first."""
     if not times_ns:
         return [None] * count
     first = times_ns[-1] // period_ns - count + 1
@@ -223,8 +215,7 @@ def columns(
 
 
 def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
-    """Return the least and the greatest known value, widened to `least` apart so that noise does not look like a
-    signal."""
+    """Return the range of known values, at least `least` wide, so that noise does not look like a signal."""
     known = [value for value in values if value is not None]
     if not known:
         return 0.0, least
@@ -234,8 +225,7 @@ def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
 
 
 def sparkline(values: Sequence[float | None], low: float, high: float, rows: int) -> list[str]:
-    """Return `rows` lines of bars, the top line first, with a character for each value: `low` is one eighth of one,
-    `high` all rows."""
+    """Return `rows` lines of bars, the top line first, with a character for each value."""
     steps = len(EIGHTHS) - 1
     full = rows * steps
     eighths = [

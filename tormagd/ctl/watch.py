@@ -14,20 +14,17 @@ from tormagd_client.messages import Description, Explained, Status
 from tormagd_client.wire import Pending, understood
 
 LOOK_S = 0.1
-"Period of asking for the status, which is new every 20 ms and takes 5 ms to read."
 LAST_ANSWER_S = 1.0
-"Longest wait for the last status: the daemon has answered all the time."
 ARRIVAL_S = 0.5
-"By then the last setpoint has arrived, even where an answer overtook it."
+"By then the last setpoint has arrived, even if an answer overtook it."
 MIN_TAKEN = 0.9
-"Share of the setpoints that has to be taken; the first ones may be refused while their clock is not known."
+"The first setpoints may be refused while their clock is not known."
 SPOILING = ("RANGE", "F_MAX")
-"Limits that mean another force than asked. F_MIN is not among them: 0 N asks for what the device gives at least."
+"These mean another force than asked. F_MIN is not among them: 0 N asks for the device's least force."
 
 
 class Fate(msgspec.Struct, frozen=True):
-    """What became of the setpoints: how many were taken, the share of looks that saw them rendered, and
-    what held them."""
+    """How many setpoints were taken, how often they were seen rendered, and what held them back."""
 
     accepted: int
     rendered_share: float | None
@@ -35,7 +32,7 @@ class Fate(msgspec.Struct, frozen=True):
 
 
 def require_range(known: Description, least_N: float, most_N: float) -> None:
-    """Raise CommandError (REFUSED) unless the daemon's scene allows forces from `least_N` to `most_N`; else return."""
+    """Raise CommandError unless the daemon's scene allows forces from `least_N` to `most_N`."""
     try:
         force = msgspec.convert(known.scene["force"], dict[str, Any])
         allowed = msgspec.convert((force["least_N"], force["most_N"]), tuple[float, float])
@@ -57,8 +54,7 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 
 
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
-    """Return why the setpoints of `source` are not rendered, as an error (REFUSED) that the caller may raise; None
-    while they are."""
+    """Return why the setpoints of `source` are not rendered, as an error."""
     require_no_fault(status, "the device is in FAULT", "tormagctl arm")
     if status.operating_state != "ENABLED":
         return CommandError(
@@ -92,12 +88,12 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
 
 
 class StatusWatch:
-    """Looks at the daemon's status while one source's setpoints are sent; waits only when made, and in `finish`."""
+    """Looks at the daemon's status while one source's setpoints are sent."""
 
     def __init__(self, client: Client, source: str) -> None:
         self._client, self._source = client, source
         before = client.status()
-        held_back(before, source)  # it may go on to be enabled, but not in FAULT
+        held_back(before, source)  # it may be enabled later, unless it is in FAULT
         self._before = _accepted(before, source)
         self._asked: Pending | None = None
         self._look_s: float | None = None
@@ -107,7 +103,7 @@ class StatusWatch:
         self._limits: dict[str, None] = {}
 
     def look(self) -> None:
-        """Take a status that has arrived, or ask for one after LOOK_S, without waiting; call it between setpoints."""
+        """Take a status that has arrived, or ask for one, without waiting."""
         now_s = time.monotonic()
         if self._look_s is None:  # an answer may overtake the first setpoint
             self._look_s = now_s + LOOK_S
@@ -125,13 +121,13 @@ class StatusWatch:
             self._rendered += 1
         elif self._held is None or held.code != self._held.code:
             write_line(f"tormagctl send: not rendered: {held.message}\n  next: {held.hint}", sys.stderr)
-        # what comes before the first force that is rendered is waiting, as for tormagctl enable
+        # before the first rendered force it was waiting, as for tormagctl enable
         if held is not None and self._rendered:
             self._spoilt = held
         self._held = held
 
     def finish(self, sent: int) -> Fate:
-        """Wait up to ARRIVAL_S until the daemon has taken all `sent` setpoints, and return what became of them."""
+        """Wait until the daemon has taken all `sent` setpoints, and return what became of them."""
         until_s = time.monotonic() + ARRIVAL_S
         while True:
             status = self._client.status(LAST_ANSWER_S)

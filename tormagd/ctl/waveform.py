@@ -15,11 +15,11 @@ from tormagd_client.printable import in_short
 
 
 class WaveformError(ValueError):
-    """A shape that cannot be sent: names the option, its value and what is allowed."""
+    """A shape that cannot be sent."""
 
 
 class Sample(NamedTuple):
-    """What is asked at one moment; None for a displacement or rate that is not told."""
+    """What is asked at one moment; displacement and rate may be unknown."""
 
     force_N: float
     displacement_mm: float | None = None
@@ -27,8 +27,7 @@ class Sample(NamedTuple):
 
 
 class Waveform(NamedTuple):
-    """A force over time: `at(t_s)` for 0..`duration_s`, from `least_N` to `most_N`; a shape without end lasts
-    infinity."""
+    """A force over time: `at(t_s)` for 0..`duration_s`, which may be infinite."""
 
     duration_s: float
     at: Callable[[float], Sample]
@@ -37,14 +36,12 @@ class Waveform(NamedTuple):
 
 
 def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
-    """Return straight lines from `start_N` on: each leg is its duration, s, and the force at its end, N."""
+    """Return straight lines from `start_N` on; each leg is its duration, s, and the force at its end, N."""
     times_s = [0.0, *accumulate(lasts_s for lasts_s, _ in legs)]
     return _lines(times_s, [start_N, *(force_N for _, force_N in legs)])
 
 
 def _lines(times_s: Sequence[float], forces_N: Sequence[float], *others: Sequence[float] | None) -> Waveform:
-    """Return straight lines between samples of force at `times_s`, s, which is to begin with 0."""
-
     def at(t_s: float) -> Sample:
         right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
         share = (t_s - times_s[right - 1]) / (times_s[right] - times_s[right - 1])
@@ -62,7 +59,6 @@ SHAPES = ("step", "sine", "ramp", "pulse")
 
 
 def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s: float) -> Waveform:
-    """Return one of SHAPES between two forces, N, over `duration_s`."""
     for label, value in (("from-N", from_N), ("to-N", to_N)):
         if not 0.0 <= value <= MAX_FORCE_N:
             raise WaveformError(f"--{label} = {value:g}: allowed is 0..{MAX_FORCE_N:g} N")
@@ -88,16 +84,13 @@ def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s
 
 
 def beat(phase: float) -> float:
-    """Return one synthetic heart beat, 0..1, at `phase` 0..1: a systolic bell, and a lower one for the reflected
-    wave."""
+    """Return one synthetic heart beat, 0..1, at `phase` 0..1: a systolic bell and a reflected wave."""
     bells = math.exp(-(((phase - 0.25) / 0.09) ** 2)) + 0.35 * math.exp(-(((phase - 0.55) / 0.12) ** 2))
-    # the second bell adds 0.06 % to the first one's top
+    # the second bell adds 0.06 % to the peak of the first
     return min(1.0, bells)
 
 
 def read_csv(path: Path) -> Waveform:
-    """Read a file of forces, N, into a waveform of straight lines between its rows, with time, s, from
-    the first row."""
     table = read_forces(path)
     start_s = table["t_s"][0]
     times_s = array("d", (time_s - start_s for time_s in table["t_s"]))

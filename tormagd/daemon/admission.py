@@ -10,8 +10,8 @@ import logging
 import socket
 import struct
 import time
-from collections import Counter, deque
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -21,23 +21,16 @@ from zmq.utils import z85
 
 from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.arrivals import Arrivals
-from tormagd.daemon.door import Door
+from tormagd.daemon.door import door, let_in
 from tormagd.daemon.tally import Peer, Tally, shown
 from tormagd.keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
 
-CONNECTIONS = 200
-CONNECTIONS_PER_PEER = 160
-"Connections allowed to one endpoint, and to one address or process. For one more, another is cut off."
-CLOSING = 8
-"Connections that were cut off and are not closed yet; while there are so many, nobody is let in."
-TOLD_S = 60.0
-"How often a process that makes too many connections is named in the log."
+CONNECTIONS, CLOSING = 200, 8
+"""Connections allowed to one endpoint: for one more, one of the address or process that has most is cut off."""
 SHUT_NS = 100_000_000
 "How long nobody is let in to an endpoint at which somebody said too much."
-UPDATE_NS = 100_000
-"For how long events are handled in one slice."
 GUARDED = {
     zmq.ZAP_ENFORCE_DOMAIN: 1,
     zmq.HANDSHAKE_IVL: 2_000,
@@ -48,10 +41,8 @@ GUARDED = {
     zmq.TCP_KEEPALIVE_CNT: 4,
 }
 "Options of a guarded socket; times are in ms and s."
-LEFT, READ = 16, 65_536
-"Reads of what a peer that is cut off has sent, and bytes of each."
-AT_ONCE = 8
-"Events taken in one slice at most."
+AT_ONCE = 4
+"Events of one socket taken in one slice at most."
 WATCHED = (
     zmq.EVENT_LISTENING
     | zmq.EVENT_ACCEPTED
@@ -93,23 +84,13 @@ class _Connections:
         "How many open connections of an address were let in, or not, when libzmq asked about their keys."
         self.failed: str | None = None
         "Why the handshake failed of the connection that is closed next, as libzmq does at once; None: it did not fail."
-        self.heard: set[int] = set()
-        "Connections by which a message has come."
         self.cut: dict[int, str] = {}
         "Addresses of connections that were cut off and are not closed yet."
-        self.door: Door
+        self.door: tuple[int, int, int]
+        self.is_open = False
+        "Whether libzmq may accept a connection, the next that comes."
         self.shut_ns = 0
         "Until then, of the monotonic clock, nobody more is let in."
-
-    def crowded(self, address: str) -> int | None:
-        """Return the connection to cut off, now that one of `address` has come; None where there is room."""
-        of = Counter(self.addresses.values())
-        if of[address] <= CONNECTIONS_PER_PEER:
-            if len(self.addresses) <= CONNECTIONS:
-                return None
-            address = of.most_common(1)[0][0]
-        theirs = [descriptor for descriptor, each in self.addresses.items() if each == address]
-        return next((descriptor for descriptor in theirs if descriptor not in self.heard), theirs[-1])
 
 
 class Admission:
@@ -124,8 +105,10 @@ class Admission:
         self._zap = context.socket(zmq.ROUTER)
         self._zap.linger = 0
         self._zap.bind("inproc://zeromq.zap.01")
-        self._parts = deque([(self._zap, self._admit)])
-        self._crowds = Allowance(1.0 / TOLD_S, 1.0)
+        self._parts: list[tuple[zmq.Socket[bytes], Callable[[], None]]] = [(self._zap, self._admit)]
+        self._crowds = Allowance(1.0 / 60.0, 1.0)
+        self.heard: set[tuple[str, int]] = set()
+        "Endpoints and connections by which a message has come."
         arrivals.watch(self._zap)
 
     def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
@@ -144,30 +127,19 @@ class Admission:
         self._parts.append((known.monitor, partial(self._watch, known)))
         self._arrivals.watch(known.monitor)
 
-    def bound(self, name: str) -> None:
-        """Bound the connections of the endpoint `name` from now on."""
-        self._watch(self._endpoints[name])
-
-    def hear(self, name: str, descriptor: int) -> None:
-        """Note that a message has come by the connection `descriptor` of the endpoint `name`."""
-        self._endpoints[name].heard.add(descriptor)
-
     def update(self) -> bool:
-        """Handle waiting events, AT_ONCE of each socket, for about UPDATE_NS; return False where there are none."""
-        # in turn: who knocks at one endpoint without pause must not keep everybody from the others
-        until_ns, is_done = time.monotonic_ns() + UPDATE_NS, False
-        for known in self._endpoints.values():
-            if len(known.cut) < CLOSING and until_ns > known.shut_ns:
-                known.door.open()
-        for _ in range(len(self._parts)):
-            self._parts.rotate()
-            events, handle = self._parts[0]
-            if self._arrivals.has(events):
+        """Handle AT_ONCE waiting events of each socket; return False where none waits."""
+        for number in range(AT_ONCE):
+            busy = [handle for events, handle in self._parts if self._arrivals.has(events)]
+            for handle in busy:
                 handle()
-                is_done = True
-                if time.monotonic_ns() > until_ns:
-                    break
-        return is_done
+            for known in self._endpoints.values():
+                if not known.is_open and len(known.cut) < CLOSING and time.monotonic_ns() > known.shut_ns:
+                    known.is_open = True
+                    let_in(*known.door)
+            if not busy:
+                return number > 0
+        return True
 
     def close(self) -> None:
         """Stop watching the connections."""
@@ -214,67 +186,57 @@ class Admission:
                 _end(descriptor, address)
 
     def _admit(self) -> None:
-        """Answer libzmq's waiting questions about keys (ZAP, RFC 27), AT_ONCE at most."""
-        for _ in range(AT_ONCE):
-            if not self._arrivals.has(self._zap):
-                return
-            frames = self._zap.recv_multipart(zmq.NOBLOCK)
-            # only libzmq asks here, and only of guarded sockets: the mechanism is CURVE
-            envelope, (version, request, domain, address, _, _, key) = frames[:2], frames[2:]
-            name, public = domain.decode(), z85.encode(key).decode()
-            is_admitted = self._is_admitted(name, address.decode(errors="replace"), public)
-            status, text = (b"200", b"OK") if is_admitted else (b"400", b"")
-            self._zap.send_multipart([*envelope, version, request, status, text, public.encode(), b""])
-            self._arrivals.touch(self._zap)
-
-    def _is_admitted(self, name: str, address: str, public: str) -> bool:
-        """Tell whether the key `public` may use the endpoint `name`; count one that may not, with the reason."""
-        known = self._endpoints[name]
-        if self.has_role(public, MAY[name]):
-            known.admitted[address] += 1
-            return True
-        known.refused[address] += 1
-        listed = self.allowed.get(public)
-        reason = "key not listed" if listed is None else f"role not allowed: {', '.join(sorted(listed.roles))}"
-        self.refusals.add(name, Peer(address, public), reason)
-        return False
+        """Answer one of libzmq's questions about keys (ZAP, RFC 27), which must wait, and count a refusal."""
+        frames = self._zap.recv_multipart(zmq.NOBLOCK)
+        # only libzmq asks here, and only of guarded sockets: the mechanism is CURVE
+        envelope, (version, request, domain, where, _, _, key) = frames[:2], frames[2:]
+        name, address, public = domain.decode(), where.decode(errors="replace"), z85.encode(key).decode()
+        known, listed = self._endpoints[name], self.allowed.get(public)
+        is_admitted = self.has_role(public, MAY[name])
+        (known.admitted if is_admitted else known.refused)[address] += 1
+        if not is_admitted:
+            reason = "key not listed" if listed is None else f"role not allowed: {', '.join(sorted(listed.roles))}"
+            self.refusals.add(name, Peer(address, public), reason)
+        status, text = (b"200", b"OK") if is_admitted else (b"400", b"")
+        self._zap.send_multipart([*envelope, version, request, status, text, public.encode(), b""])
+        self._arrivals.touch(self._zap)
 
     def _watch(self, known: _Connections) -> None:
-        """Handle the waiting events of one endpoint's monitor, AT_ONCE at most: connected, closed, handshake failed."""
-        for _ in range(AT_ONCE):
-            if not self._arrivals.has(known.monitor):
-                return
-            event = zmq.utils.monitor.recv_monitor_message(known.monitor, zmq.NOBLOCK)
-            kind, value = event["event"], event["value"]
-            if kind == zmq.EVENT_LISTENING:
-                known.door = Door(value)
-            elif kind == zmq.EVENT_ACCEPTED:
-                known.door.is_open = False
-                self._accepted(known, value)
-            elif kind == zmq.EVENT_ACCEPT_FAILED:
-                known.door.is_open = False
-            elif kind == zmq.EVENT_DISCONNECTED:
-                self._arrivals.touch(self._zap)  # a question about its key may have come just now: it is counted once
+        """Handle one event of an endpoint's monitor, which must wait: connected, closed, or the handshake failed."""
+        event = zmq.utils.monitor.recv_monitor_message(known.monitor, zmq.NOBLOCK)
+        kind, value = event["event"], event["value"]
+        if kind == zmq.EVENT_LISTENING:
+            known.door, known.is_open = door(value), False
+        elif kind == zmq.EVENT_ACCEPTED:
+            self._accepted(known, value)
+        elif kind == zmq.EVENT_ACCEPT_FAILED:
+            known.is_open = False
+        elif kind == zmq.EVENT_DISCONNECTED:
+            self._arrivals.touch(self._zap)
+            while self._arrivals.has(self._zap):  # a question about its key may still wait: it is counted once
                 self._admit()
-                self._disconnected(known, value)
-            elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
-                known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
-            else:
-                known.failed = PLAIN if known.is_guarded else "left in the handshake"
+            self._disconnected(known, value)
+        elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+            known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
+        else:
+            known.failed = PLAIN if known.is_guarded else "left in the handshake"
 
     def _accepted(self, known: _Connections, descriptor: int) -> None:
         """Note a new connection and its address."""
-        address = known.addresses[descriptor] = _address(descriptor)
-        cut = known.crowded(address)
-        if cut is None:
+        known.is_open = False
+        known.addresses[descriptor] = _address(descriptor)
+        if len(known.addresses) <= CONNECTIONS:
             return
-        address = known.cut[cut] = known.addresses.pop(cut)
+        address = Counter(known.addresses.values()).most_common(1)[0][0]
+        theirs = [each for each in known.addresses if known.addresses[each] == address]
+        cut = next((each for each in theirs if (known.name, each) not in self.heard), theirs[-1])
+        known.cut[cut] = known.addresses.pop(cut)
         _end(cut, address)
         if self._crowds.grants(Peer(address), time.monotonic()):
             log.warning(
-                "%s makes more connections to %s than %d, or than the %d of all: what is beyond is cut off; "
-                "next: end it, or let it use one socket for all its messages",
-                *(shown(address), known.name, CONNECTIONS_PER_PEER, CONNECTIONS),
+                "%s makes more connections to %s than the %d that are allowed in all; next: end it, or let it use one "
+                "socket for all its messages",
+                *(shown(address), known.name, CONNECTIONS),
             )
 
     def _disconnected(self, known: _Connections, descriptor: int) -> None:
@@ -282,7 +244,7 @@ class Admission:
         one too many."""
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
-        known.heard.discard(descriptor)
+        self.heard.discard((known.name, descriptor))
         if descriptor in known.cut:
             address, failed = known.cut.pop(descriptor), "too many connections"
         elif failed in (None, PLAIN) and not address:  # a quick one: answered, and gone before its address was read
@@ -312,9 +274,7 @@ def _end(descriptor: int, address: str) -> None:
     with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
         if _address(descriptor) == address:
             connection.shutdown(socket.SHUT_RDWR)
-            for _ in range(LEFT):
-                if not connection.recv(READ, socket.MSG_DONTWAIT):
-                    return
+            connection.recv(1_048_576, socket.MSG_DONTWAIT)
 
 
 @contextlib.contextmanager

@@ -18,30 +18,27 @@ from tormagd.safety.operating_state import (
 PATIENCE_S = 2.0
 "How long a device that neither homes nor opens may refuse the next command."
 MOVES_S = 15.0
-"Longest homing or opening: any longer is a fault."
+"Any homing or opening that takes longer is a fault."
 WAITS = frozenset({"busy", "device_latched", "not_homed", "not_fresh"})
-"Codes of refusals that end by themselves once the command before has been carried out."
+"Refusals that end by themselves once the previous command has been carried out."
 
 
 class Arming:
-    """Progress of one `arm`: gives each command that leads to ENABLED once, as soon as the state allows it."""
+    """Progress of one `arm`: gives each command that leads to ENABLED once. It ends with a refusal at every fault that
+    was not latched when it began: a person clears only faults that they have seen."""
 
     def __init__(self, now_s: float, faults: tuple[Fault, ...]) -> None:
-        """Begin at `now_s`."""
         self.given: tuple[str, ...] = ()
         self.is_over = False
         self.refusal: RefusedError | None = None
-        "Why the arming ended before ENABLED; None while it goes on, and in ENABLED."
         self._faults = faults
         self._given_s = self._moved_s = now_s
 
     def end(self, refusal: RefusedError | None = None) -> None:
-        """End the arming, with the reason where it failed; None where the force follows now."""
         if not self.is_over:
             self.is_over, self.refusal = True, refusal
 
     def advance(self, now_s: float, safety: SafetyState, present: Conditions, give: Callable[[str], None]) -> None:
-        """Give the next command by calling `give`, once its time has come; end in ENABLED or at a refusal."""
         if self.is_over:
             return
         try:
@@ -65,7 +62,6 @@ class Arming:
             raise RefusedError("fault", f"a fault came while arming: {', '.join(news)}", "tormagctl status")
 
     def _attempt(self, now_s: float, command: Event, give: Callable[[str], None]) -> None:
-        """Give `command` and note it in `given`."""
         try:
             if command in self.given:
                 raise RefusedError("busy", f"{command} was taken, and has not come to its end", "tormagctl status")
@@ -79,7 +75,6 @@ class Arming:
 
 
 def _next(safety: SafetyState, present: Conditions) -> Event:
-    """Return the next command towards ENABLED; `clear-fault` where only the device has latched a fault."""
     if present.device_latched and safety.operating_state is OperatingState.DISABLED:
         return Event.CLEAR_FAULT
     return next_commands(safety, present.homed)[0]

@@ -1,7 +1,7 @@
 """One beat: what the daemon does in every control period, phase by phase, and where the time went.
 
-The kernel's timer is all that wakes the event loop while the daemon runs. What arrives between two beats, from the
-device or from a socket, waits for the next.
+While the daemon runs, only the kernel's timer wakes the event loop. What arrives between two beats, from the device or
+from a socket, waits for the next beat.
 """
 
 import logging
@@ -13,17 +13,16 @@ from typing import NamedTuple
 from tormagd.daemon.rate_group import Histogram
 
 KERNEL = "kernel"
-"The part to blame where nothing of ours ran: the thread was not given the processor, or was stopped."
+"Blamed if nothing of ours ran: the thread did not get the processor, or was stopped."
 NEWS_NS = 10_000_000_000
-"At most one log line about late beats in this time."
 COUNTED = 7
-"The times of every seventh beat are kept: no period of anything else."
+"Only every seventh beat's times are kept: nothing else has that period."
 
 log = logging.getLogger(__name__)
 
 
 class Beat(NamedTuple):
-    """When a beat was due and when it began, ns of the monotonic clock. It stands for `merged` missed ones too."""
+    """When a beat was due and when it began, on the monotonic clock. It includes `merged` missed ones."""
 
     due_ns: int
     start_ns: int
@@ -31,11 +30,11 @@ class Beat(NamedTuple):
 
 
 Part = tuple[str, Callable[[Beat], object]]
-"A part of a beat, with its name. It returns False where there was nothing to do."
+"The function returns False if it had nothing to do."
 
 
 class Delay(NamedTuple):
-    """Delay of a late beat: from when it was due until it drove the device, ns."""
+    """Delay of a late beat, from when it was due until it drove the device. `culprit` took most of it: `share_ns`."""
 
     took_ns: int
     culprit: str
@@ -43,7 +42,8 @@ class Delay(NamedTuple):
 
 
 class Phases:
-    """Runs the parts of every beat: all phases in order, then one of the slices, which take turns."""
+    """Runs the parts of every beat: all phases in order, then one of the slices, which take turns. An exception ends
+    only its own part."""
 
     def __init__(
         self,
@@ -51,7 +51,6 @@ class Phases:
         clock_ns: Callable[[], int] = monotonic_ns,
         cpu_ns: Callable[[], int] = thread_time_ns,
     ) -> None:
-        """Begin with no parts."""
         self._stall_ns, self._clock_ns, self._cpu_ns = stall_ns, clock_ns, cpu_ns
         self._phases: list[Part] = []
         self._slices: list[Part] = []
@@ -61,25 +60,21 @@ class Phases:
         self._ran: list[tuple[str, int, int]] = []
         self._last_ran: list[tuple[str, int, int]] = []
         self.spent: dict[str, Histogram] = {}
-        "How long each phase and slice took, by name."
         self._errors: dict[str, str] = {}
         self.blamed: Counter[str] = Counter()
-        "How many late beats each part is to blame for."
         self._late, self._worst = 0, Delay(0, "", 0)
         self._tell_ns = clock_ns()
 
     def begin(self, phases: list[Part], slices: list[Part]) -> None:
-        """Set the phases and slices of every beat from now on, each name with its function, and empty `spent`."""
         self._phases, self._slices = phases, slices
         self.spent = {name: Histogram() for name, _ in (*phases, *slices)}
 
     def run(self, due_ns: int, merged: int) -> None:
-        """Run one beat that was due at `due_ns` of the monotonic clock, and stands for `merged` missed ones, too."""
         beat = Beat(due_ns, self._clock_ns(), merged)
         self._last_ran, self._ran = self._ran, []
         for name, phase in self._phases:
             self._run(name, phase, beat)
-        # after a quiet slice one slice is asked; after a busy one all, until one has something to do
+        # after a quiet slice one slice is asked; after a busy one all are, until one has something to do
         for _ in range(len(self._slices) if self._is_busy else 1):
             self._turn = (self._turn + 1) % len(self._slices)
             self._is_busy = self._run(*self._slices[self._turn], beat)
@@ -91,7 +86,6 @@ class Phases:
                 self.spent[name].add(end_ns * 1e-9, (end_ns - start_ns) * 1e-3)
 
     def on_time(self) -> None:
-        """Note that the device was driven in time: processor time for the next `blame` counts from now."""
         self._cpu_before_ns = self._cpu_ns()
 
     def ran_ns(self) -> int:
@@ -120,7 +114,6 @@ class Phases:
         return delay
 
     def tell(self) -> None:
-        """Log the number of late beats and the worst of them since the last line, at most once in NEWS_NS."""
         now_ns = self._clock_ns()
         if self._late and now_ns >= self._tell_ns:
             took_ns, culprit, share_ns = self._worst
@@ -133,14 +126,12 @@ class Phases:
             self._tell_ns = now_ns + NEWS_NS
 
     def _run(self, name: str, part: Callable[[Beat], object], beat: Beat) -> bool:
-        """Run one part and keep its times; return False, and keep none, where it returned False: it had
-        nothing to do."""
         start_ns = self._clock_ns()
         try:
             is_done = part(beat) is not False
         except Exception as error:
             is_done = True
-            if str(error) != self._errors.get(name):  # the first is news, the same one again is not
+            if str(error) != self._errors.get(name):  # only the first of equal errors is news
                 self._errors[name] = str(error)
                 log.error("the beat goes on without %r, which failed: report the trace", name, exc_info=error)
         if is_done:

@@ -1,4 +1,4 @@
-"""Processes beside the daemon's: each runs a module of its own, and talks in packets over the socket it is given."""
+"""Processes beside the daemon: each runs a module of its own and exchanges packets over a socket."""
 
 import select
 import socket
@@ -6,11 +6,10 @@ import subprocess
 import sys
 
 MAX_PACKET = 65_536
-"Bytes in one packet that is received, at most."
 
 
 def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
-    """Start `python -m module DESCRIPTOR`, with the socket `its_end` as that descriptor, and return the process."""
+    """Start `python -m module DESCRIPTOR` with `its_end` as that descriptor."""
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
     # a session of its own: signals to our process group must not end it before us
@@ -18,7 +17,7 @@ def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes
 
 
 class Beside:
-    """Our end of a process that runs `module`, and of the packet socket to it. Sends never wait."""
+    """Our end of a process that runs `module`, and of the packet socket to it."""
 
     def __init__(self, module: str) -> None:
         self.socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -26,11 +25,9 @@ class Beside:
         with its:
             self.process = start_beside(module, its)
         self.is_gone = False
-        "Whether the process was found to have ended, or this end is closed."
 
     def send(self, data: bytes) -> bool:
-        """Send one packet without waiting, and return whether the socket took it, which does not say that
-        it was read."""
+        """Send one packet without waiting, and return whether the socket took it."""
         try:
             self.socket.send(data)
         except ConnectionError:
@@ -40,8 +37,6 @@ class Beside:
         return not self.is_gone
 
     def receive(self, wait_s: float = 0.0) -> bytes | None:
-        """Return the next packet, after waiting for it up to `wait_s`; None where none came or the process
-        has ended."""
         try:
             if wait_s:
                 select.select([self.socket], [], [], wait_s)

@@ -25,7 +25,7 @@ from tormagd.config import Config
 from tormagd.control.core import Planner, Stepper
 from tormagd.daemon.beside import Beside
 from tormagd.hardware.connection import Connection
-from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
+from tormagd.keeping import KEEPER, REQUEST, Begin, End, Part, Said, Write, Written
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.messages import BlackBoxReport, TickRecord
 
@@ -38,7 +38,8 @@ AFTER_FAULT_S = 2.0
 BUFFER_BYTES = 4_000_000
 "Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
 LEAVING_S = 2.0
-MAX_ASKED = 8
+MAX_REQUESTED, MAX_ASKED = 8, 28
+"Boxes that somebody asked for and that are still to be written, at most; and all that wait for the keeper."
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +90,7 @@ class BlackBox:
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._connection: Connection | None = None
         self._asked: deque[Write] = deque(maxlen=MAX_ASKED)
+        self._requested: set[str] = set()
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with a snapshot of both states, which are those before the first tick."""
@@ -136,6 +138,12 @@ class BlackBox:
         now_ns = time.time_ns()
         stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000))
         name = f"{stamp}.{now_ns // 1_000_000 % 1_000:03d}Z-{reason}.mcap"
+        if reason == REQUEST:
+            if len(self._requested) >= MAX_REQUESTED:
+                raise RefusedError(
+                    "busy", f"{MAX_REQUESTED} black boxes are still to be written", "ask again in a few seconds"
+                )
+            self._requested.add(name)
         self._refusal = ""
         self._asked.append(Write(name, reason, after_s, details))
         self._send_requests()
@@ -147,6 +155,7 @@ class BlackBox:
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
+            self._requested.discard(answer.name)
             if answer.refusal:
                 log.error(
                     "the black box %s was not written: %s; next: make room in [black_box] folder, or name another",

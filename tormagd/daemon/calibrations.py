@@ -1,4 +1,4 @@
-"""The calibration of the device that answers: read by its serial number, and the core is built anew with it."""
+"""The calibration of the connected device: it is read by serial number."""
 
 import asyncio
 import logging
@@ -15,17 +15,16 @@ log = logging.getLogger(__name__)
 
 
 class Made(NamedTuple):
-    """What a device is to run by: the configuration with its calibration, and the core; None: the one that runs."""
+    """What a device is to run by. `core` is None if the running one fits, `file` is empty without a calibration."""
 
     config: Config
     core: Core | None
     file: str
-    "The calibration's; empty without one."
     refusal: str
 
 
 class Calibrations:
-    """Puts the calibration of each device that answers into force, from `folder`; None: none is read."""
+    """Puts the calibration of each connected device into force, from `folder` if there is one."""
 
     def __init__(self, folder: Path | None, configured: Config, take: Callable[[Config, Core], None]) -> None:
         self.configured = configured
@@ -35,11 +34,11 @@ class Calibrations:
         self._file = self._refusal = ""
 
     def is_awaited(self, serial_number: int | None) -> bool:
-        """Tell whether the device with this serial number may not be driven yet: its calibration is not in force."""
+        """Tell whether this device must wait for its calibration."""
         return self._folder is not None and serial_number not in (None, self._of)
 
     def look(self, serial_number: int | None, running: Config, *, is_idle: bool) -> None:
-        """Bring the connected device's calibration into force, step by step, while the device `is_idle`."""
+        """Bring the device's calibration into force, step by step, while it `is_idle`."""
         if not is_idle or serial_number is None or self._folder is None or serial_number == self._of:
             return
         # the scene may have changed while the device was away
@@ -54,15 +53,12 @@ class Calibrations:
             self._note(serial_number, self._making[1])
 
     def read_again(self) -> None:
-        """Read the device's calibration again, and run by it once the device is idle."""
         self._of = self._making = None
 
     def report(self) -> CalibrationReport:
-        """Return the file in force, why none is, and the folder; empty without."""
         return CalibrationReport(file=self._file, refusal=self._refusal, folder=str(self._folder or ""))
 
     def _note(self, serial_number: int, making: "asyncio.Future[Made]") -> None:
-        """Put a finished calibration into force: call `take` with its core, if there is a new one, and log the file."""
         refusal_before = self._refusal
         try:
             made = making.result()
@@ -79,7 +75,6 @@ class Calibrations:
 
 
 def _make(path: Path, serial_number: int, configured: Config, running: Config) -> Made:
-    """Return what the device `serial_number` is to run by."""
     try:
         config = load_calibration(path, configured, serial_number)
     except ConfigError as error:

@@ -1,4 +1,4 @@
-"""Causes of faults and limits, in the figures of the moment at which they came up."""
+"""Causes of faults and limits, with figures from the moment at which they came up."""
 
 import logging
 import math
@@ -14,39 +14,34 @@ from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd_client.messages import Explained, StallReport
 
 WAITED_SHARE = 0.1
-"A host that kept the control loop waiting for more of the last second is to blame for a silence, not device or cable."
+"If the host kept the control loop waiting for more of the last second, it caused the silence: not device or cable."
 SILENCES = {
     *("LINK_LOST", "MEASUREMENT_STALE", "SENSE_STALE", "STATUS_STALE", "LINK_DEGRADED", "DEVICE_COMMAND_TIMEOUT"),
     "DEVICE_SILENT",
 }
-"Faults and limits of messages that do not come, or come late."
 
 log = logging.getLogger(__name__)
 
 
 class Causes:
-    """Remembers how the control loop was kept waiting, and the cause of each latched fault in figures."""
-
     def __init__(self, device: Device) -> None:
         self._device = device
         self.stall: StallReport | None = None
-        "The newest stall of the control loop; None before the first."
         self._told: dict[Fault, Explanation] = {}
         self._waits: deque[tuple[float, float]] = deque(maxlen=1_000)
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:
-        """Set `stall` where the step that just ran has taken its own delay for a stall; else change nothing."""
+        """Keep as `stall` the delay of the step that just ran, if the step counts it as a stall."""
         sight, known, stall_ms = stepper.measure.sight, self.stall, round(stepper.measure.sight.stall_s * 1e3, 1)
         if sight.stalled_s == stepper.time_s and (known is None or known.ms != stall_ms):
             self.stall = StallReport(stall_ms, delay.culprit)
 
     def note_wait(self, now_s: float, wait_s: float) -> None:
-        """Note that the control loop was not given the processor for the last `wait_s`, or since the last such wait."""
         last_s = self._waits[-1][0] if self._waits else -math.inf
         self._waits.append((now_s, min(wait_s, now_s - last_s)))
 
     def host(self, now_s: float) -> str:
-        """Say how long this host kept the control loop waiting; empty for WAITED_SHARE of the last second or less."""
+        """Say how long this host kept the control loop waiting; empty if that is WAITED_SHARE or less."""
         waits_s = [min(wait_s, at_s + 1.0 - now_s) for at_s, wait_s in self._waits if now_s - at_s < 1.0]
         if sum(waits_s) <= WAITED_SHARE:
             return ""
@@ -56,7 +51,6 @@ class Causes:
         )
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
-        """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes."""
         figures = {} if measurement is None else _figures(stepper, measurement)
         causes = {fault: f"{FAULTS[fault].cause}: {figure}" for fault, figure in figures.items()}
         opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
@@ -74,7 +68,6 @@ class Causes:
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
-        """Return each fault with its cause and its remedy, in the order of `faults`."""
         return _explained(faults, {**FAULTS, **self._told})
 
     def of_limits(
@@ -85,8 +78,6 @@ class Causes:
         measurement: Measurement | None,
         now_s: float,
     ) -> tuple[Explained, ...]:
-        """Return each limit with its cause, in figures where there are any, and its remedy; in the order of
-        `limits`."""
         told = {
             Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered",
             Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}",
@@ -107,7 +98,7 @@ class Causes:
 
 
 def _blamed(known: dict[Any, Explanation], host: str, stall: Explanation) -> dict[Any, Explanation]:
-    """Return `known`; where `host` is not empty, SILENCES begin their cause with it and have the remedy of `stall`."""
+    """Return `known`; if `host` is not empty, it begins the cause of each of SILENCES, with the remedy of `stall`."""
     if not host:
         return known
     silences = {code: row for code, row in known.items() if code in SILENCES}

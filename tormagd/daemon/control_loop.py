@@ -1,7 +1,6 @@
 """The control loop, a phase of every beat: step on the newest measurement and plan, and drive."""
 
 import logging
-import math
 import time
 
 from tormagd.assembly.journal import Journal
@@ -16,29 +15,24 @@ from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, RefusedError, reason
 
 REPEATED_S = 1.0
-"How often a command that changes nothing is logged."
 
 log = logging.getLogger(__name__)
 
 
 class ControlLoop:
-    """The control loop: each period, step the core on the newest measurement and drive the device."""
-
     def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
         self.stepper, self._connection, self._journal = stepper, connection, journal
         self.output: Duty | None = None
         self.used: Plan | None = None
         self.measurement: Measurement | None = None
-        "Measurement that the last step was given, as `used` is its plan; None without a device."
+        "What the last step was given, as is `used`."
         self.timing = RateGroup("control", period_ns)
         self.arming: Arming | None = None
-        "What the newest `arm` has done; None before the first."
         self._known_faults: tuple[Fault, ...] = ()
         self._told: dict[str, tuple[float, int]] = {}
 
     def drive(self, beat: Beat, plan: Plan) -> None:
-        """Step the core along `plan` with the newest measurement, and send its output to the device."""
-        now_s = time.monotonic()  # now, not when the beat began: a stall within the beat counts, too
+        now_s = time.monotonic()  # not the beat's start: a stall within the beat counts, too
         self.used, self.measurement = plan, self._connection.measurement
         self._journal.stepped()
         output = self.output = self.stepper.step(now_s, self.measurement, plan)
@@ -49,13 +43,13 @@ class ControlLoop:
         self.timing.record(beat.due_ns, beat.start_ns, time.monotonic_ns(), beat.merged)
 
     def command(self, name: str, conditions: Conditions) -> None:
-        """Carry out an operator's command, note it in the journal, and log it if it was taken."""
+        """Carry out an operator's command, which ends an arming under way."""
         if self.arming is not None:
             self.arming.end(RefusedError("overtaken", f"{name} came before it was armed", "tormagctl arm"))
         self._give(name, conditions)
 
     def arm(self, conditions: Conditions) -> None:
-        """Begin an arming, or go on with the one under way, and give its next command if its time has come."""
+        """Begin or continue an arming, and give its next command if its time has come."""
         if self.arming is None or self.arming.is_over:
             self.arming = Arming(time.monotonic(), self.stepper.safety.faults)
         self.go_on_arming(conditions)
@@ -63,7 +57,6 @@ class ControlLoop:
             raise self.arming.refusal
 
     def go_on_arming(self, conditions: Conditions) -> None:
-        """Give the next command of an arming under way, if its time has come; else do nothing."""
         arming = self.arming
         if arming is None or arming.is_over:
             return
@@ -72,8 +65,6 @@ class ControlLoop:
             log.warning("arm: %s; next: %s", arming.refusal.message, arming.refusal.hint)
 
     def _give(self, name: str, conditions: Conditions) -> None:
-        """Give an operator's command to the core under `conditions`, note it in the journal, and log it if taken, one
-        that changes nothing every REPEATED_S."""
         now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
             self.stepper.command(name, now_s, conditions)
@@ -81,7 +72,7 @@ class ControlLoop:
             self._journal.commanded(name, now_s, conditions, is_refused=True)
             raise
         self._journal.commanded(name, now_s, conditions, is_refused=False)
-        told_s, count = self._told.get(name, (-math.inf, 0))
+        told_s, count = self._told.get(name, (-REPEATED_S, 0))
         if source is self.stepper.safety.operating_state and now_s - told_s < REPEATED_S:
             self._told[name] = told_s, count + 1
             return
@@ -89,17 +80,14 @@ class ControlLoop:
         log.info("%s: %s%s", name, reason(name, source), f"; {count} times more before" if count else "")
 
     def latch(self, fault: Fault) -> None:
-        """Latch a fault that was found outside the step, and note it in the journal."""
         self._journal.latched(fault)
         self.stepper.latch(fault)
 
     def lose_link(self) -> None:
-        """Tell the core that the link to the device broke, and note it in the journal."""
         self._journal.lost_link()
         self.stepper.lose_link()
 
     def new_faults(self) -> tuple[Fault, ...]:
-        """Return the faults latched since the last call; at the first call, all that are latched."""
         faults, known = self.stepper.safety.faults, self._known_faults
         self._known_faults = faults
         return tuple(fault for fault in faults if fault not in known)

@@ -1,4 +1,4 @@
-"""The daemon put together: one thread, one event loop, and one beat a period that runs the three loops."""
+"""The daemon put together: one thread, one event loop, one beat a period."""
 
 import asyncio
 import contextlib
@@ -40,11 +40,10 @@ from tormagd_client.endpoints import ConfigError
 
 NS = 1_000_000_000
 OPENING_LOOK_S = 0.02
-"How often the end of the opening is looked for: Status comes as often."
 SWITCH_S = 1e-4
-"For so long another thread may keep the interpreter's lock while this one waits for it; Python's own is 5 ms."
+"How long another thread may keep the interpreter's lock from this one; Python's own value is 5 ms."
 LONGEST_RETRACT_S = 10.0
-"A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
+"The firmware needs 3 s for a full stroke; if it cannot retract, it reports that itself."
 NAMED_S = 0.5
 "By then a gap that does not open is a fault, and in the log."
 
@@ -52,7 +51,7 @@ log = logging.getLogger(__name__)
 
 
 class Daemon:
-    """The daemon: runs one scene on one device until it is told to end. Create it inside the event loop."""
+    """Runs one scene on one device until it is told to end. Create it inside the event loop."""
 
     def __init__(
         self,
@@ -66,7 +65,6 @@ class Daemon:
         beside: SearchProcess | None = None,
         config_file: str | None = None,
     ) -> None:
-        """Bind the endpoints and put the loops together; the device is opened in `run`."""
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
@@ -129,7 +127,6 @@ class Daemon:
         self._ended = asyncio.Event()
 
     def _profiles_of(self, core: Core) -> Profiles:
-        """Return the profiles for a core's insert and model; without a folder they keep nothing."""
         folder, bounds = state_folder(core.config.device.profiles, "profiles"), device_bounds(core.config.trim)
         known = core.scene.insert.name, core.model, bounds, gains_of(core.config)
         of_insert = None if folder is None else ProfileFolder(folder, *known)
@@ -170,7 +167,7 @@ class Daemon:
         log.info("tormagd has ended")
 
     def _beat(self, heartbeat: Heartbeat) -> None:
-        if beats := heartbeat.beats():  # none at a spurious wake-up
+        if beats := heartbeat.beats():
             self._phases.run(heartbeat.due_ns, beats - 1)
 
     def _receive(self, beat: Beat) -> None:
@@ -189,7 +186,6 @@ class Daemon:
         self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
 
     def _drive(self, beat: Beat) -> None:
-        """Drive the device along the newest plan."""
         control, timing = self._control, self._control.timing
         control.drive(beat, self._inference.planner.planned)
         if timing.delay_ns > timing.period_ns:
@@ -199,13 +195,12 @@ class Daemon:
             self._phases.on_time()
         if faults := control.new_faults():
             self._causes.tell(faults, control.stepper, control.measurement)
-            with contextlib.suppress(RefusedError):  # where none is kept
+            with contextlib.suppress(RefusedError):
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
 
     async def _build(self, scene: str) -> Core:
-        """Build the core of another scene at the running rates, in another thread; wait for a profile that is being
-        written."""
-        # in a thread: no beat waits for it
+        """Build the core of another scene at the running rates."""
+        # in a thread, so that no beat waits
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
         if core.element.is_beside or self._inference.beside is not None:
             raise ConfigError(f"scene {core.scene.name}: a search beside the plans begins with the daemon: restart it")
@@ -216,7 +211,7 @@ class Daemon:
         self._control.command("use-scene", self._telemetry.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
-        """Replace the running core by `core`, made for `scene`, as `_run_core` does."""
+        """Run `core`, made for `scene`; if model and insert are the same, keep what was learned."""
         before, learned = self._core, self._inference.planner.believe.learned()
         self._calibrations.configured = msgspec.structs.replace(self._calibrations.configured, scene=scene)
         self._run_core(msgspec.structs.replace(self._config, scene=scene), core)
@@ -224,7 +219,6 @@ class Daemon:
             self._inference.teach(learned)
 
     def _run_core(self, config: Config, core: Core) -> None:
-        """Replace the running core by `core`, made of `config`, between two beats."""
         control, inference, now_s = self._control, self._inference, time.monotonic()
         safety, stepper, planner = control.stepper.safety, core.stepper(now_s), core.planner(now_s)
         stepper.safety = safety
@@ -243,8 +237,7 @@ class Daemon:
         self._reloading.add_done_callback(asyncio.Task.result)
 
     async def _reload(self) -> None:
-        """Read keys and configuration again, and take over what may change while control runs."""
-        # in threads: no beat waits for a file
+        """Read keys and configuration again."""
         try:
             if self._keys is None:
                 log.info("no list of keys to read again: there is no endpoints.curve")
@@ -269,8 +262,7 @@ class Daemon:
             log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     async def _open_gap(self) -> None:
-        """Command the device to open, and wait until it is not busy, LONGEST_RETRACT_S at most, while the
-        beat goes on."""
+        """Open the gap, and wait for it up to LONGEST_RETRACT_S while the beat goes on."""
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S

@@ -7,49 +7,32 @@ epoll has to be told of it anew is in /proc/self/fdinfo (`proc(5)`).
 
 import contextlib
 import ctypes
-import os
 import platform
 import re
 import select
 import struct
-import time
 from pathlib import Path
 
-PATIENCE_S = 1.0
-"libzmq's thread watches a new socket within this time."
 _EVENT = struct.Struct("=IQ" if platform.machine() == "x86_64" else "@IQ")
 "`struct epoll_event`, which is packed on x86-64 only."
-_MOD = 3
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-class Door:
-    """The listening socket `descriptor` of libzmq. Raises OSError where no epoll set is seen to watch it."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor, self.is_open = descriptor, False
-        until_s = time.monotonic() + PATIENCE_S
-        while (place := _place(descriptor)) is None:
-            if time.monotonic() > until_s:
-                raise OSError("connections cannot be bounded: /proc/self/fdinfo names no epoll set; mount /proc")
-            time.sleep(1e-4)
-        self._epoll, self._data = place
-
-    def open(self) -> None:
-        """Let libzmq accept one connection, the one that waits or comes next, unless it may already."""
-        if not self.is_open:
-            self.is_open = True
-            event = _EVENT.pack(select.EPOLLIN | select.EPOLLONESHOT, self._data)
-            if _libc.epoll_ctl(self._epoll, _MOD, self._descriptor, event):
-                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+def door(listening: int) -> tuple[int, int, int]:
+    """Return what `let_in` takes: the epoll set in which the descriptor `listening` is watched, itself,
+    its data there."""
+    entry = re.compile(rf"^tfd: +{listening} +events: +(\w+) +data: +(\w+)", re.MULTILINE)
+    for _ in range(1_000):  # libzmq's thread takes up a new socket in its own time
+        for path in Path("/proc/self/fdinfo").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+                found = entry.search(path.read_text(encoding="ascii"))
+                if found and int(found[1], 16) & select.EPOLLIN:
+                    return int(path.name), listening, int(found[2], 16)
+    raise OSError("connections cannot be bounded: /proc/self/fdinfo names no epoll set; mount /proc")
 
 
-def _place(descriptor: int) -> tuple[int, int] | None:
-    """Return the epoll set in which `descriptor` is watched for what comes, and its data there; None where in none."""
-    entry = re.compile(rf"^tfd: +{descriptor} +events: +(\w+) +data: +(\w+)", re.MULTILINE)
-    for path in Path("/proc/self/fdinfo").iterdir():
-        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-            found = entry.search(path.read_text(encoding="ascii"))
-            if found and int(found[1], 16) & select.EPOLLIN:
-                return int(path.name), int(found[2], 16)
-    return None
+def let_in(epoll: int, listening: int, data: int) -> None:
+    """Let libzmq accept one connection, the one that waits or comes next."""
+    # 3: EPOLL_CTL_MOD
+    if _libc.epoll_ctl(epoll, 3, listening, _EVENT.pack(select.EPOLLIN | select.EPOLLONESHOT, data)):
+        raise OSError(ctypes.get_errno(), "epoll_ctl")

@@ -5,11 +5,11 @@ and control goes on. `admission` decides who may connect, `allowance` how much e
 """
 
 import contextlib
+import logging
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import cache
 from typing import Any
 
 import zmq
@@ -25,8 +25,7 @@ from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.daemon.tally import Peer, Tally
 from tormagd.keys import KeyRing
 from tormagd.safety.operating_state import RefusedError
-from tormagd_client.endpoints import ENDPOINTS, Endpoints
-from tormagd_client.keys import fingerprint
+from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.messages import (
     VERSION,
     ErrorReply,
@@ -54,10 +53,8 @@ UNSENT: dict[int, int] = {zmq.SUB: 1, zmq.XPUB: 100, zmq.ROUTER: 16}
 "Messages for one peer that wait in libzmq; what is more is dropped."
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. One that says more is cut off, and may connect again."
-HEARD_NS = 100_000
-"For how long subscribers are heard in one beat, at each socket."
 TAKEN, TAKEN_NS = 64, 80_000
-"Requests taken from the socket in one beat at most, and for how long."
+"Requests taken from the socket in one beat at most, and for how long; subscribers are heard as long at each socket."
 HOPS, LONGEST_ROUTING_ID = 16, 255
 "Parts of an envelope, and bytes of each, at most."
 FIRSTS_PER_S, FIRST_BURST = 100.0, 100.0
@@ -69,7 +66,7 @@ OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
 
-_fingerprint = cache(fingerprint)
+log = logging.getLogger(__name__)
 Answer = Callable[[Request], Any]
 "Returns the result, as plain data or packed already, or raises RefusedError."
 
@@ -85,7 +82,7 @@ class Endpoint:
         keys: KeyRing | None = None,
     ) -> None:
         self._context = context(io_priority)
-        self._files: list[SocketFile] = []
+        self._files: list[tuple[SocketFile, zmq.Socket[bytes], str, str]] = []
         self._guarded = {name for name in ENDPOINTS if endpoints.is_guarded(name)}
         self.inbox = SetpointInbox(sources)
         self.arrivals = Arrivals()
@@ -133,7 +130,7 @@ class Endpoint:
                 self._drops.add("setpoint", peer, OFF_THE_LIST)
             else:
                 data = b"" if frame.more else frame.bytes
-                key = peer.key and _fingerprint(peer.key)
+                key = self.admission.allowed[peer.key].fingerprint if peer.key else ""
                 is_newer = self.inbox.take(data, now_s, realtime_ns, key) or is_newer
         return self.inbox.hand_on(time.monotonic()) or is_newer
 
@@ -151,11 +148,11 @@ class Endpoint:
         self.arrivals.touch(self._recording)
 
     def hear(self) -> None:
-        """Read what subscribers say, for HEARD_NS at each socket; cut off those that say too much."""
+        """Read what subscribers say, for TAKEN_NS at each socket; cut off those that say too much."""
         for name, subscribed in (("telemetry", self._telemetry), ("recording", self._recording)):
             if not self.arrivals.has(subscribed):  # asked once: with each question libzmq takes in more
                 continue
-            until_ns, cut = time.monotonic_ns() + HEARD_NS, set()
+            until_ns, cut = time.monotonic_ns() + TAKEN_NS, set()
             with contextlib.suppress(zmq.Again):
                 while time.monotonic_ns() < until_ns:
                     frame = subscribed.recv(zmq.NOBLOCK, copy=False)
@@ -179,15 +176,12 @@ class Endpoint:
             waiting = self._next_request()
             if waiting is None:
                 continue
-            is_dropped = False
-            if may_go_first(waiting.data) and self._is_answered_first(waiting, answer):
-                if not self._firsts.grants(waiting.peer, time.monotonic()):
-                    is_dropped = True
-                    self.admission.cut_off("control", waiting.connection)
-                    if _is_made(waiting.envelope[0]):
-                        self._cut_off.append(waiting.envelope[0])
-            else:
+            if not (may_go_first(waiting.data) and self._is_answered_first(waiting, answer)):
                 is_dropped = not self.requests.put(waiting)
+            elif is_dropped := not self._firsts.grants(waiting.peer, time.monotonic()):
+                self.admission.cut_off("control", waiting.connection)
+                if _is_made(waiting.envelope[0]):
+                    self._cut_off.append(waiting.envelope[0])
             if is_dropped:
                 self._drops.add("control", waiting.peer, TOO_MUCH)
             if time.monotonic_ns() >= until_ns:
@@ -203,9 +197,17 @@ class Endpoint:
         return most
 
     def tell(self, now_s: float) -> None:
-        """Log the newly refused and dropped messages, a line of each at most in 10 s."""
+        """Log the newly refused and dropped messages, a line of each in 10 s; bind sockets again that were removed."""
         self._drops.tell(now_s)
         self.admission.refusals.tell(now_s)
+        for gone in [each for each in self._files if each[0].is_gone()]:
+            self._files.remove(gone)
+            gone[0].close()
+            try:
+                self._listen(*gone[1:])
+                log.warning("the socket of endpoints.%s was removed: it is bound again", gone[2])
+            except OSError as error:
+                log.error("a socket was removed: %s; next: restart tormagd", error)
 
     def report(self) -> PeersReport:
         """Return the connections of each endpoint, and since the start the peers refused and the messages dropped."""
@@ -220,13 +222,12 @@ class Endpoint:
     def close(self) -> None:
         """Close all sockets and remove their files, without waiting for anybody."""
         self.admission.close()
-        for file in self._files:
+        for file, *_ in self._files:
             file.close()
         self._context.destroy(linger=0)
 
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
-        """Return a new socket of this `kind`, guarded where `endpoints` says so, bound to `address`, with bounded
-        queues."""
+        """Return a new socket of this `kind`, guarded where `endpoints` says so, bound, with bounded queues."""
         made = self._context.socket(kind)
         size, unread = UNREAD[name]
         options = {zmq.LINGER: 0, zmq.BACKLOG: 512, zmq.MAXMSGSIZE: size, zmq.SNDHWM: UNSENT[kind], zmq.RCVHWM: unread}
@@ -234,45 +235,47 @@ class Endpoint:
             options[zmq.XPUB_VERBOSER] = 1  # each subscription is passed on, not only the first of a topic
         for option, value in options.items():
             made.setsockopt(option, value)
+        self.admission.guard(made, name, name in self._guarded)
+        self._listen(made, name, address)
+        return made
+
+    def _listen(self, made: "zmq.Socket[bytes]", name: str, address: str) -> None:
+        """Bind a socket to `address`, once more where it was bound before."""
         path = ipc_path(address)
         try:
-            self.admission.guard(made, name, name in self._guarded)
             if path is not None:
                 file = SocketFile(path)
-                self._files.append(file)
+                self._files.append((file, made, name, address))
                 made.setsockopt(zmq.USE_FD, file.listener.detach())
             made.bind(address)
-            self.admission.bound(name)
+            self.admission.update()
         except zmq.ZMQError as error:
             raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}; name another") from error
-        except OSError as error:
+        except (OSError, ConfigError) as error:
             raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
-        return made
 
     def _sender(self, frame: zmq.Frame, name: str) -> tuple[Peer, int]:
         """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection."""
         connection = int(frame.get(zmq.SRCFD))
-        self.admission.hear(name, connection)
+        self.admission.heard.add((name, connection))
         key = str(frame.get("User-Id")) if name in self._guarded else ""
         return Peer(str(frame.get("Peer-Address")), key), connection
 
     def _next_request(self) -> Waiting | None:
         """Read the next message; None for a further part of a message read before, which is dropped."""
-        envelope = [] if self._is_in_parts_of_request else [self._control.recv(zmq.NOBLOCK)]
-        if not envelope or envelope[0] in self._cut_off:
-            self._is_in_parts_of_request = self._control.recv(zmq.NOBLOCK, copy=False).more
+        client = b"" if self._is_in_parts_of_request else self._control.recv(zmq.NOBLOCK)
+        part = self._control.recv(zmq.NOBLOCK, copy=False)
+        if not client or client in self._cut_off:
+            self._is_in_parts_of_request = part.more
             return None
         hops: list[bytes] = []
-        part = self._control.recv(zmq.NOBLOCK, copy=False)
         while part.more and hops[-1:] != [b""] and len(hops) < HOPS and len(part) <= LONGEST_ROUTING_ID:
             hops.append(part.bytes)
             part = self._control.recv(zmq.NOBLOCK, copy=False)
         self._is_in_parts_of_request = part.more
-        data = b""
-        if hops[-1:] == [b""] or all(map(_is_made, hops)):
-            envelope += hops
-            data = b"" if part.more else part.bytes
-        return Waiting(envelope, data, *self._sender(part, "control"), self.requests.opens)
+        is_one = not part.more and (hops[-1:] == [b""] or all(map(_is_made, hops)))
+        data = part.bytes if is_one else b""
+        return Waiting([client, *hops], data, *self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
         """Carry out and answer a `stop` or `disable`, and return True, also where it was refused."""

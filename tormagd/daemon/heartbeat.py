@@ -1,4 +1,4 @@
-"""The heartbeat: a kernel timer that the event loop watches. asyncio's own timers round to a millisecond."""
+"""The heartbeat: a kernel timer, because asyncio's own timers round to a millisecond."""
 
 import ctypes
 import os
@@ -10,12 +10,12 @@ _ITIMERSPEC = struct.Struct("@4l")
 "Interval and first beat, each in seconds and nanoseconds."
 _NS = 1_000_000_000
 
-# os.timerfd_create exists from Python 3.13 on
+# os.timerfd_create needs Python 3.13
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Heartbeat:
-    """A periodic timer of the kernel on CLOCK_MONOTONIC (timerfd), which the event loop watches."""
+    """A periodic timer on CLOCK_MONOTONIC (timerfd)."""
 
     def __init__(self, period_ns: int) -> None:
         self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
@@ -25,7 +25,6 @@ class Heartbeat:
             )
         self.period_ns = period_ns
         self.due_ns = time.monotonic_ns()
-        "When the newest beat was due."
         setting = _ITIMERSPEC.pack(*divmod(period_ns, _NS), *divmod(self.due_ns + period_ns, _NS))
         if _libc.timerfd_settime(self._fd, _TFD_TIMER_ABSTIME, setting, None) < 0:
             raise OSError(
@@ -33,11 +32,10 @@ class Heartbeat:
             )
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable at each beat."""
         return self._fd
 
     def beats(self) -> int:
-        """Return the number of beats due since the last call: 0 if none is, more than 1 if some were missed."""
+        """Return the number of beats due since the last call."""
         try:
             expirations: int = struct.unpack("=Q", os.read(self._fd, 8))[0]
         except BlockingIOError:
@@ -46,5 +44,4 @@ class Heartbeat:
         return expirations
 
     def close(self) -> None:
-        """Close the timer's descriptor."""
         os.close(self._fd)

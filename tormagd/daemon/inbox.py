@@ -1,10 +1,8 @@
 """The inbox: chooses the setpoint to plan for among those of several publishers, and hands it on when it is due.
 
-Each message is judged once, by its `Source`: newer, in time, evenly sent. The inbox decides whether that source may
-hold the brake. A source does until it is stale, one of higher priority sends, or an operator gives the brake away.
-With `sources.playout_ms` a setpoint waits until that long after its stamp, so that its way's jitter goes.
-
-No sockets and no clock: times are arguments.
+Each message is judged once, by its `Source`. A source holds the brake until it is stale, one of higher priority sends,
+or an operator gives the brake away. With `sources.playout_ms` every setpoint waits until that long after its stamp,
+which removes the jitter of its way. Times are arguments.
 """
 
 import logging
@@ -22,26 +20,23 @@ from tormagd.scenes.scene import Scene
 from tormagd_client.messages import MessageError, PlayoutReport, Setpoint, SetpointReport, decode
 
 SOURCES = 16
-"Publishers that are kept apart; one more is refused until an old one has been silent."
+"One more publisher is refused until another has fallen silent."
 SILENT_S = 1.0
-"A source that was silent this long makes room for another; one that was refused is named for so long."
+"After this silence a source makes room for another."
 LONGEST_REFUSAL = 200
-"Characters kept of the last refusal."
 REPORTED = 6
-"Sources that are reported in full, the newest ones: an answer has to stay under its limit."
+"An answer has limited length: the newest sources are reported in full."
 NEWS, NEWS_S = 4, 1.0
-"Lines for the log that wait, and how long each waits after the one before."
 MAX_WAITING = 1_024
-"Setpoints that wait at most, the newest: what one publisher may send in the longest playout."
+"What one publisher may send in the longest playout."
 
 EQUAL_SOURCES = Sources()
-"None goes before another, and nothing is held back."
 
 log = logging.getLogger(__name__)
 
 
 class Taken(NamedTuple):
-    """A setpoint that was taken, with its source, its `seq`, and when its publisher meant it, `stamp_s`."""
+    """An accepted setpoint, and when its publisher meant it, `stamp_s`."""
 
     setpoint: TimedSetpoint
     source: str
@@ -50,19 +45,17 @@ class Taken(NamedTuple):
 
 
 class SetpointInbox:
-    """Chooses the setpoint to plan for, `newest`: the newest valid one of the `holder` of the brake, once it is due."""
+    """Chooses the newest valid setpoint of the `holder` of the brake, once it is due."""
 
     def __init__(self, sources: Sources = EQUAL_SOURCES) -> None:
         self.has_way = True
-        "Whether the scene's element is a brake, whose handle goes either way, and no pad."
+        "A brake's handle goes either way, a pad's does not."
         self.accepted = self.refused = self.dropped = 0
         self.last_refusal: str | None = None
         self.holder = ""
-        "The source that holds the brake; empty before the first."
         self.in_force: Taken | None = None
-        "The setpoint to follow, the newest that is due; None before the first."
+        "The newest setpoint that is due."
         self.sources = sources
-        """Who goes before whom, and how long setpoints wait."""
         self._needs = Needs()
         self._number, self._is_given = 0, False
         """`_number` grows with every change of the publisher, also of the process behind one source: a ramp leads from
@@ -73,17 +66,16 @@ class SetpointInbox:
         self._played = self._late = 0
         self._held_s = self._jitter_s = 0.0
         self._other, self._other_s = "", -SILENT_S
-        "The source that was refused last, because another holds the brake, and when."
+        "The source last refused because another one holds the brake, and when."
         self._news: deque[str] = deque(maxlen=NEWS)
         self._told_s = -NEWS_S
         self._turn = 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int, key: str = "") -> bool:
-        """Decode and judge one message, and count it; return True if another setpoint is in force after it."""
+        """Take one message; return True if another setpoint is in force after it."""
         try:
             setpoint = decode(data, Setpoint)
-            allowed = self.sources.keys.get(setpoint.source, (key,))
-            if key not in allowed:
+            if key not in (allowed := self.sources.keys.get(setpoint.source, (key,))):
                 raise MessageError(
                     f"source {setpoint.source!r} from the key {key}: allowed by sources.keys is {', '.join(allowed)}"
                 )
@@ -115,7 +107,7 @@ class SetpointInbox:
         return self._follow(source, now_s)
 
     def give(self, name: str, now_s: float) -> None:
-        """Make the source `name` the holder of the brake, as an operator's choice."""
+        """Give the brake to the source `name`, as an operator's choice."""
         source = self._sources.get(name)
         if source is None:
             known = ", ".join(sorted(self._sources)) or "none"
@@ -134,37 +126,34 @@ class SetpointInbox:
         return None if self.in_force is None else self.in_force.setpoint
 
     def hand_on(self, now_s: float) -> bool:
-        """Put the newest setpoint that is due in force; return True where that is another one."""
+        """Put the newest setpoint that is due in force."""
         before = self.in_force
         while self._waiting and self._waiting[0].setpoint.stamp_s <= now_s:
             self.in_force = self._waiting.popleft()
         return self.in_force is not before
 
     def passed_over(self) -> tuple[str, int] | None:
-        """Return source and newest `seq` of the source last refused because another one holds the brake."""
+        """Return the source last refused because another one holds the brake, and its newest `seq`."""
         other = self._sources.get(self._other)
         return None if other is None or self._other_s <= -SILENT_S else (self._other, other.setpoint.seq)
 
     def begin_scene(self, scene: Scene) -> None:
-        """Judge by the needs of `scene` from now on, and forget the newest setpoint and those that wait."""
         self._forget()
         self.has_way, self._needs = scene.element == "torque", needs_of(scene)
 
     def withdraw(self, reason: str) -> None:
-        """Forget the setpoint to plan for, if there is one, and those that wait; count it as refused for `reason`."""
+        """Forget all setpoints, and count one as refused for `reason`."""
         if self.in_force is not None:
             self._forget()
             self._refuse(reason)
 
     def tell(self, now_s: float) -> None:
-        """Log one waiting line, of a new holder or of a wrong clock; at most one in NEWS_S."""
         if self._news and now_s - self._told_s >= NEWS_S:
             self._told_s = now_s
             log.warning("%s", self._news.popleft())
 
     def told(self, now_s: float) -> dict[Limit, Explanation]:
-        """Return explanations of the limits about sources, as things are now, whether the limits are in
-        force or not."""
+        """Return explanations of the limits about sources, also of those that are not in force."""
         holder = self._sources.get(self.holder)
         if holder is None:
             return {}
@@ -172,7 +161,6 @@ class SetpointInbox:
         return why | holder.found
 
     def refresh(self, now_s: float) -> None:
-        """Update the reported figures of the playout, and those of one source, the next in turn."""
         if self._sources:
             self._turn += 1
             if self.sources.playout_ms > 0.0:
@@ -182,8 +170,6 @@ class SetpointInbox:
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
 
     def report(self, now_s: float) -> SetpointReport:
-        """Return counts, the last refusal, and each source's `seq`, with REPORTED full reports: the holder's, and those
-        of the newest others."""
         newest = sorted(self._sources, key=lambda name: (name != self.holder, -self._sources[name].heard_s))
         reported = {name: "holds" if name == self.holder else "refused" for name in newest[:REPORTED]}
         playout_ms = self.sources.playout_ms
@@ -207,7 +193,7 @@ class SetpointInbox:
         )
 
     def _follow(self, source: Source, now_s: float) -> bool:
-        """Let the source's newest setpoint wait until it is due; return True if another one is in force after it."""
+        """Let the source's newest setpoint wait until it is due."""
         setpoint, playout_s, wall = source.setpoint, self.sources.playout_ms * 1e-3, source.setpoint.contact
         is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
         others = (Limit.OTHER_SOURCE,) if is_contested else ()
@@ -239,7 +225,6 @@ class SetpointInbox:
         return self.hand_on(now_s)
 
     def _hand_over(self, name: str, why: str) -> None:
-        """Make the source `name` the holder; queue a log line that says `why`, and begin a ramp."""
         if self.holder:
             self._news.append(f"source {name!r} holds the brake instead of {self.holder!r}: {why}")
             self._number += 1
@@ -260,7 +245,7 @@ class SetpointInbox:
         self._waiting.clear()
 
     def _add(self, setpoint: Setpoint, now_s: float) -> Source:
-        """Add the source of `setpoint`, and return it."""
+        """Add the source of `setpoint`, in the place of a silent or unlisted one."""
         name = setpoint.source
         if len(self._sources) >= SOURCES:
             others = [source for other, source in self._sources.items() if other != self.holder]
@@ -276,8 +261,6 @@ class SetpointInbox:
         return source
 
     def _why_stale(self, holder: Source, now_s: float) -> Explanation:
-        """Return why a setpoint of the `holder` is stale: it has fallen silent, its messages come late, or they wait
-        too long."""
         name, silent_ms = self.holder, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
@@ -300,8 +283,6 @@ class SetpointInbox:
         )
 
     def _why_other(self, holder: Source, now_s: float) -> Explanation:
-        """Return why setpoints compete: two publishers of the holder's name, or else the source that was passed over
-        last."""
         if holder.sequence.is_doubled(now_s):
             return Explanation(
                 f"two publishers call themselves {self.holder!r}, or one repeats itself: one of them is followed",
@@ -314,7 +295,7 @@ class SetpointInbox:
 
 
 def _refuse_way(setpoint: Setpoint) -> None:
-    """Raise MessageError for a setpoint with `withdraw_cf` or `contact`: the element is a pad."""
+    """Raise MessageError for a setpoint that only a brake can follow: the element is a pad."""
     for name in ("withdraw_cf", "contact"):
         if getattr(setpoint, name) is not None:
             raise MessageError(f"{name}: allowed is servo_cf alone, as the scene's element is a pad")

@@ -1,4 +1,4 @@
-"""The inference loop, a phase of every beat: plan for a setpoint that has come, and `inference_hz` times a second."""
+"""The inference loop, a phase of every beat: plans for each new setpoint, and at least at its own rate."""
 
 import logging
 import time
@@ -16,13 +16,13 @@ from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.search_process import SearchProcess
 
 PLAN_ERRORS = (ValueError, ArithmeticError, RuntimeError)
-"Errors by which a plan fails: DomainError, and those of NumPy."
+"DomainError and the errors of NumPy."
 
 log = logging.getLogger(__name__)
 
 
 class InferenceLoop:
-    """The inference loop: plans for the inbox's newest setpoint, and calls `on_failure` for a plan that failed."""
+    """Plans for the inbox's newest setpoint, and calls `on_failure` if a plan failed."""
 
     def __init__(
         self,
@@ -35,7 +35,6 @@ class InferenceLoop:
         clock_ns: Callable[[], int] = time.monotonic_ns,
         beside: SearchProcess | None = None,
     ) -> None:
-        """`beside` is the search that runs in a process of its own; None where plans search by themselves."""
         self.planner, self._inbox, self._clock_ns, self._journal = planner, inbox, clock_ns, journal
         self._on_failure, self._failure = on_failure, ""
         self.beside: Final = beside
@@ -43,18 +42,14 @@ class InferenceLoop:
         self._due_ns = 0
 
     def teach(self, learned: Learned) -> None:
-        """Replace what is known of the device by `learned`, and note it in the journal."""
         self._journal.taught(learned)
         self.planner.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word that the device has changed, or that its sensor is wrong; note it in the journal."""
         self._journal.confirmed(wrong)
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
-        """Plan for the inbox's newest setpoint if one has come (`is_asked`) or if a plan is due, as
-        `planner.planned`."""
         period_ns = self.timing.period_ns
         # counted from when beats are due, not when they begin: lateness does not lower the rate
         if not is_asked and beat.due_ns < self._due_ns:
@@ -73,12 +68,12 @@ class InferenceLoop:
         if beside is not None:
             beside.ask(self.planner.question)
         self.timing.record(beat.due_ns, start_ns, self._clock_ns())
-        # what was missed is not made up for
+        # missed plans are not made up for
         is_regular = not is_asked and beat.due_ns - self._due_ns < period_ns
         self._due_ns = period_ns + (self._due_ns if is_regular else beat.due_ns)
 
     def foresee(self, _beat: Beat) -> bool:
-        """Make the forecast for the next plans, if one is due; return False where none is."""
+        """Make the forecast for the next plans; return False if none is due."""
         try:
             is_made = self.planner.foresee()
         except PLAN_ERRORS as error:
@@ -89,9 +84,7 @@ class InferenceLoop:
         return is_made
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
-        """Reset the planner at `now_s` after a plan or forecast that failed, withdraw the setpoint, and call
-        `on_failure`."""
-        if str(error) != self._failure:  # the first failure is news, the same one again is not
+        if str(error) != self._failure:  # only the first of equal failures is news
             self._failure = str(error)
             log.error(
                 "the gap opens: none could be planned for %s; report the trace", self._inbox.newest, exc_info=error

@@ -1,4 +1,4 @@
-"""`tormagd`: understands its command line, and starts the daemon."""
+"""`tormagd`: reads its command line, and starts the daemon."""
 
 import signal
 import sys
@@ -18,7 +18,6 @@ SIGHUP reads keys and configuration again."""
 
 
 def parser() -> Parser:
-    """Return the parser of `tormagd`'s command line: --config, --scene, --check and --version."""
     made = Parser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
     made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
     made.add_argument("--scene", metavar="NAME", help="scene or scene file instead of the configuration's")
@@ -28,7 +27,6 @@ def parser() -> Parser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run `tormagd` with `arguments`, None: those of the process; return the exit code."""
     write_in_any_encoding()
     try:
         options = parser().parse_args(arguments)
@@ -39,8 +37,8 @@ def main(arguments: list[str] | None = None) -> int:
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may end the process
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        load_config(options.config)  # a refusal comes before the rest is loaded, which takes a moment
-        # here, not above: the signal is set first
+        load_config(options.config)  # refused before the rest is loaded, which takes a moment
+        # imported after the signal is set
         from tormagd.daemon.start import start
 
         return start(options)

@@ -1,4 +1,4 @@
-"""How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
+"""How well one rate group keeps its time."""
 
 import math
 from collections import deque
@@ -9,20 +9,20 @@ from msgspec.structs import asdict
 from tormagd_client.messages import ExecReport, LatenessReport, RateReport
 
 WARNING_PERIODS: Final = 1.0
-"A run that ends later than this after it was due has overrun: the next one was due already."
+"A run that ends later has overrun: the next one was due already."
 ERROR_PERIODS: Final = 10.0
-"This late it is a stall; at 1 kHz a fifth of the time after which the firmware opens the gap."
+"A run that ends later is a stall; at 1 kHz, a fifth of the time after which the firmware opens the gap."
 HORIZON_NS: Final = 5_000_000_000
 "Percentiles cover the last one to two of these."
 SHARES: Final = (0.5, 0.99, 0.999)
-_EXACT: Final = 64  # bins of one microsecond each; beyond, 32 bins for each doubling: 3% resolution
+_EXACT: Final = 64  # bins of 1 us; above, 32 bins for each doubling: 3 % resolution
 _DOUBLINGS: Final = 20
 _BINS: Final = _EXACT + 32 * _DOUBLINGS
 
 
 @final
 class Histogram:
-    """Counts durations, us, in bins, over one to two horizons (HORIZON_NS)."""
+    """Counts durations in bins, over one to two horizons."""
 
     def __init__(self) -> None:
         self._now = [0] * _BINS
@@ -30,12 +30,11 @@ class Histogram:
         self._max_now = self._max_before = 0.0
         self._turned_s = -math.inf
         self.report: ExecReport
-        "p50, p99, p99.9 (upper edges of their bins) and the largest, us; all 0 while nothing was added."
+        "Percentiles are upper edges of their bins."
         self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
-        """Count one duration, us, that ended at `now_s`; a negative one, a clock's grain, counts as 0, and
-        so does NaN."""
+        """Count one duration that ended at `now_s`; negative ones, a clock's grain, and NaN count as 0."""
         if now_s - self._turned_s > HORIZON_NS * 1e-9:
             self._turned_s = now_s
             self._before, self._now = self._now, [0] * _BINS
@@ -45,7 +44,6 @@ class Histogram:
             self._max_now = value_us
 
     def refresh(self) -> None:
-        """Compute `report` anew from what is counted: p50, p99, p99.9 and the largest, us; 0 while nothing is."""
         most = round(max(self._max_now, self._max_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []
@@ -58,7 +56,6 @@ class Histogram:
 
 
 def _bin(value_us: float) -> int:
-    """Return the bin of a duration, us, from 0; what is longer than the last bin falls into that."""
     whole = int(value_us) if value_us > 0.0 else 0
     if whole < _EXACT:
         return whole
@@ -67,7 +64,6 @@ def _bin(value_us: float) -> int:
 
 
 def _upper_edge(index: int) -> int:
-    """Return the upper edge, us, of a bin."""
     if index < _EXACT:
         return index + 1
     shift, part = divmod(index - _EXACT, 32)
@@ -75,8 +71,6 @@ def _upper_edge(index: int) -> int:
 
 
 class _Mark(NamedTuple):
-    """The counts of a rate group at the beginning of a horizon."""
-
     time_ns: int
     runs: int
     overruns: int
@@ -85,8 +79,6 @@ class _Mark(NamedTuple):
 
 @final
 class RateGroup:
-    """The timing of one periodic activity: counts, lateness and execution time of its runs."""
-
     def __init__(self, name: str, period_ns: int) -> None:
         self.name = name
         self.period_ns = period_ns
@@ -95,18 +87,17 @@ class RateGroup:
         self.overruns = 0
         self.stalls = 0
         self.delay_ns = 0
-        "Time from when the newest run, or the first one it stands for, was due until it ended."
+        "From when the newest run, with the missed ones before it, was due until it ended."
         self.lateness_us = 0.0
         self.exec_us = 0.0
         self.lateness = Histogram()
         self.exec = Histogram()
         self._worst_us = 0.0
-        # the beginnings of the last two horizons: rate and grade cover the time of the percentiles
+        # one for each horizon: rate and grade cover the time of the percentiles
         self._marks: deque[_Mark] = deque(maxlen=2)
         self._newest_ns = 0
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
-        """Count one run that was due, began and ended at these times, and stands for `merged` missed ones, too."""
         if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
             self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
         self.lateness_us = (start_ns - due_ns) * 1e-3
@@ -124,8 +115,7 @@ class RateGroup:
                 self.stalls += 1
 
     def report(self) -> RateReport:
-        """Return counts and worst lateness since the start, and rate, grade and percentiles over one to two
-        horizons."""
+        """Return counts and worst lateness since the start; rate, grade and percentiles over one to two horizons."""
         since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
         hz, grade = 0.0, "good"
         if self._newest_ns > since.time_ns:

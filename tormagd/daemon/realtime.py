@@ -12,17 +12,16 @@ from tormagd.config import RealTime
 from tormagd.slices import ask_for_slices
 
 OPEN_FILES = 1_024
-"Open files that the daemon needs: about 50 of its own, its four endpoints' connections (`admission`), and a reserve."
+"About 50 of the daemon's own, its endpoints' connections (`admission`), and a reserve."
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _LATENCY = Path("/dev/cpu_dma_latency")
-"""While it is open, no processor sleeps so deep that waking takes longer than what was written, us (the kernel's
+"""While it is open, no processor sleeps so deeply that waking takes longer than the us written to it (the kernel's
 Documentation/power/pm_qos_interface)."""
 
 log = logging.getLogger(__name__)
 
 
 def raise_open_files() -> None:
-    """Raise the soft limit of open files to the hard one."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < OPEN_FILES:
         raise OSError(
@@ -32,7 +31,7 @@ def raise_open_files() -> None:
 
 
 def prepare(settings: RealTime) -> list[str]:
-    """Ask the kernel for these settings, for this thread and process; return and log what it refused, a line each."""
+    """Ask the kernel for these settings; return what it refused, a line each."""
     refused = []
     if settings.cpus:
         try:
@@ -60,11 +59,11 @@ def prepare(settings: RealTime) -> list[str]:
 
 
 def priority_of_threads() -> int:
-    """Return the FIFO priority that threads begun by this one may take: one below its own, or its own if that is 1."""
+    """Return the FIFO priority for threads begun by this one: one below its own, 1 at least, 0 without FIFO."""
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return 0
     priority = max(os.sched_getparam(0).sched_priority - 1, os.sched_get_priority_min(os.SCHED_FIFO))
-    # tried, because libzmq ends the process where it is refused
+    # tried in a thread, because libzmq ends the process if it is refused
     with ThreadPoolExecutor(1) as pool:
         try:
             pool.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(priority)).result()
@@ -78,6 +77,6 @@ def priority_of_threads() -> int:
 
 
 def freeze_garbage() -> None:
-    """Collect garbage, then exempt all living objects from collection: a full one takes tens of milliseconds."""
+    """Exempt all living objects from garbage collection: a full one takes tens of milliseconds."""
     gc.collect()
     gc.freeze()

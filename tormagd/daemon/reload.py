@@ -9,12 +9,11 @@ from tormagd.config import Config
 from tormagd_client.printable import require
 
 LIVE = "realtime.watchdog_ms", "sources."
-"""Keys, or how they begin, that nothing but the loop that looks at them knows. From all others something was built at
-the start."""
+"Keys, or how they begin; from all others something was built at the start."
 
 
 class Reread(NamedTuple):
-    """The configuration in force after a reload, the keys taken over, and the keys that wait for a restart."""
+    """The configuration after a reload, the keys taken over, and the keys that wait for a restart."""
 
     config: Config
     taken: tuple[str, ...]
@@ -22,7 +21,7 @@ class Reread(NamedTuple):
 
 
 def reread(running: Config, read: Config) -> Reread:
-    """Return `running` with the keys in LIVE taken from `read`, which may change while control runs."""
+    """Return `running` with the keys in LIVE taken from `read`."""
     timeout_ms, watchdog_ms = running.device.command_timeout_ms, read.realtime.watchdog_ms
     require(
         watchdog_ms > timeout_ms,
@@ -41,7 +40,6 @@ def reread(running: Config, read: Config) -> Reread:
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:
-    """Yield the paths of the keys whose values differ between two nested tables, sorted within each table."""
     for name in sorted(before.keys() | after.keys()):
         old, new = before.get(name), after.get(name)
         if isinstance(old, dict) and isinstance(new, dict):

@@ -23,11 +23,9 @@ class SceneChange:
     ) -> None:
         self._build, self._require, self._take = build, require, take
         self.newest: SceneReport | None = None
-        "Report on the newest change; None before the first."
         self._changing: asyncio.Task[None] | None = None
 
     def begin(self, scene: object) -> None:
-        """Begin to change to `scene`, a name or a path, in a task of its own; `newest` says how it ends."""
         if not isinstance(scene, str) or not 0 < len(scene) <= LONGEST_NAME:
             raise RefusedError(
                 "bad_scene", f"args.scene is no text of 1..{LONGEST_NAME} characters", "tormagctl scene list"
@@ -41,8 +39,6 @@ class SceneChange:
         self._changing.add_done_callback(asyncio.Task.result)
 
     async def _change(self, scene: str) -> None:
-        """Build the core and put it in place, if the device is still not in use; note in `newest` and log
-        how it ended."""
         error = None
         try:
             core = await self._build(scene)

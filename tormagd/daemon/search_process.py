@@ -1,8 +1,8 @@
-"""The search for the field in a process of its own, where it takes longer than a plan has.
+"""The search for the field in a process of its own, if it takes longer than a plan has.
 
-The process runs `python -m tormagd.daemon.search_process FD`, and answers one question after another over a packet
-socket. The daemon never waits: a plan takes the newest answer. It asks the next question once the last is answered and
-a period has passed. Both ends belong to one installation and one parent, so packets are pickled.
+The process answers one question after another over a packet socket. The daemon never waits: a plan takes the newest
+answer. It asks the next question once the last is answered and a period has passed. Both ends belong to one
+installation and one parent, so packets are pickled.
 """
 
 import logging
@@ -41,7 +41,6 @@ class SearchProcess:
             )
 
     def answer(self) -> Answer | None:
-        """Return the answer that has come since the last call; None where none has, or the process has ended."""
         data = None if self._is_idle else self._beside.receive()
         if data is None:
             return None
@@ -54,7 +53,7 @@ class SearchProcess:
         return None
 
     def ask(self, question: Question | None) -> None:
-        """Send `question` to the search, unless it is None, another is open, or the next is not due yet."""
+        """Send `question` to the search if it is idle and the next question is due."""
         if self._beside.is_gone and not self._is_told:
             self._is_told = True
             log.error("the search beside the plans has ended; next: start the daemon again")
@@ -62,20 +61,18 @@ class SearchProcess:
         if question is None or not self._is_idle or now_ns < self._due_ns + period_ns:
             return
         self._due_ns += period_ns
-        if now_ns - self._due_ns > period_ns:  # what was missed is not made up for
+        if now_ns - self._due_ns > period_ns:  # missed questions are not made up for
             self._due_ns = now_ns
         self._asked_ns = now_ns
         self._is_idle = not self._beside.send(pickle.dumps(question))
 
     def close(self) -> None:
-        """Close the socket, kill the process and wait for its end."""
         self._beside.close()
         self._beside.process.kill()
         self._beside.process.wait()
 
 
 def main() -> None:
-    """Answer questions that come in over a socket until its other end is closed."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd signals the whole service, and the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:
         config, scene, models = pickle.loads(asked.recv(MAX_PACKET))

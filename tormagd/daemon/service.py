@@ -8,14 +8,12 @@ from tormagd.hardware.link import LinkState
 
 READY = "READY=1"
 EXTENSION_S = 30.0
-"Before it is ready, a daemon that lives is given so much longer to start, each time it says so."
+"Each notice of a daemon that is not ready yet gives it so much longer to start."
 _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
-"Nobody can be silent behind a port that is not open, and starting the daemon again would not bring one."
+"Nothing answers behind a port that is not open, and a restart of the daemon would not help."
 
 
 class Service:
-    """What systemd is to be told of the daemon: ready, status, alive. No socket, no clock: `notify` sends it."""
-
     def __init__(self) -> None:
         self.is_ready = False
         "Whether a device has been identified; from then on systemd's watchdog runs."
@@ -35,7 +33,6 @@ class Service:
         return now_s - self._heard_s < limit_s
 
     def news(self, is_alive: bool, link: LinkState, status: str) -> list[str]:
-        """Return the messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives."""
         messages = []
         if not self.is_ready and link is LinkState.RUNNING:
             self.is_ready = True
@@ -53,10 +50,9 @@ class Service:
 def status_line(
     link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
 ) -> str:
-    """Return one line for `systemctl status`: the operating state with its faults, or else with the scene."""
     told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
     if link is not LinkState.RUNNING:
-        # a text of the device or the kernel may have several lines; the status must be one
+        # texts of the device or the kernel may have several lines
         why = " ".join(f"{cause}; {remedy}".split())
         return f"{told}; waiting for the device ({link}): {why}"
     if faults:

@@ -7,18 +7,22 @@ import socket
 import stat
 from pathlib import Path
 
+from tormagd.keys import require_own
+
 
 class SocketFile:
-    """A listening socket bound to `path`, which one process has at a time. Raises OSError saying what is in the way."""
+    """A listening socket bound to `path`, which one process has at a time. Raises OSError saying what is in the way,
+    and ConfigError where others may write to its folder."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._lock_path = path, path.with_name(f"{path.name}.lock")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
         except OSError as error:
             raise OSError(
                 f"the directory {path.parent} cannot be made: {error.filename}: {error.strerror}; name another"
             ) from error
+        require_own(path.parent)
         self._lock = _locked(self._lock_path)
         try:
             self.listener = _listening(path)
@@ -27,10 +31,14 @@ class SocketFile:
             raise
         self._identity = _identity(path)
 
+    def is_gone(self) -> bool:
+        """Tell whether the socket's path was removed, or something else was put in its place."""
+        return _identity(self._path) != self._identity
+
     def close(self) -> None:
         """Close the socket, and remove its path and its lock, unless others have been put in their place."""
         self.listener.close()
-        if self._identity is not None and _identity(self._path) == self._identity:
+        if self._identity is not None and not self.is_gone():
             with contextlib.suppress(OSError):
                 self._path.unlink()
         self._unlock()
@@ -82,6 +90,11 @@ def _lock(path: Path, descriptor: int) -> None:
     except BlockingIOError as error:
         raise OSError(
             f"already running, pid {content or 'not known'}; end it, or name other addresses in [endpoints]"
+        ) from error
+    except OSError as error:
+        raise OSError(
+            f"{path} cannot be locked: {error.strerror}: its file system may have no locks; "
+            "name a folder of another, as /run or /tmp is"
         ) from error
 
 

@@ -1,12 +1,10 @@
 """One publisher of setpoints: which of its messages count, how old they are, and how evenly they come.
 
-No number keeps a publisher out. A message that does not follow the newest may be the first of a new run, which shows
-itself in a few messages. A message's lateness, our time less its stamp, is the offset of its clock plus the time on the
-way. None arrives before it was sent, those of one publisher do not overtake each other, and clocks drift slowly. So the
-least lateness is the offset plus the constant part of the way, and what is above is delay. From one side these two
-cannot be told apart: up to MAX_WAY_S counts as the way.
-
-No I/O and no clock: times are arguments.
+A message that does not follow the newest may be the first of a new run; a few messages show whether it is. A message's
+lateness, our time less its stamp, is the offset of its clock plus the time on the way. Messages of one publisher do not
+overtake each other, and clocks drift slowly. So the least lateness is the offset plus the constant part of the way, and
+what exceeds it is delay. From one side these two cannot be told apart: up to MAX_WAY_S counts as the way. Times are
+arguments.
 """
 
 import math
@@ -26,78 +24,66 @@ from tormagd.scenes.scene import Scene
 from tormagd_client.messages import ClockReport, MessageError, Setpoint, SourceReport
 
 LONGEST_JUMP = 1_000
-"Steps by which `seq` may run ahead at once: more of them missing is no loss, it is another run, or a wrong number."
+"A jump of `seq` by more steps is no loss: it is another run or a wrong number."
 RUN = 3
-"So many messages in a row, each newer than the one before, are a run of their own."
 STRAYS_S = 1.0
-"RUN strays within this time, with messages of the run between them, are a second publisher of the same name."
+"RUN strays within this time are a second publisher of the same name."
 
 FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
-"ns in what publishers send instead."
+"ns in each unit that publishers send by mistake."
 FAR_S = 86_400.0
-"Stamps of such another unit are years away; nearer ones are of a clock. No setpoint is older than this."
+"Stamps in a wrong unit are years away from our clock. No setpoint is older than this."
 LOOKED_AT, MIN_S = 8, 0.005
-"Messages, and time, that it takes to see how fast far stamps run."
 SLOW = 0.03
-"Share of our clock's rate: no clock runs so slow, also one that was never set."
 
 MAX_WAY_S = 0.2
-"""A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take."""
+"A least lateness up to this is the way's: half of the delay allowed from sensor to force."
 MAX_LATE_S = 1.0
-"""A least lateness between the two may be either: the clock is corrected by it, and the limits of sources count it as
-the way."""
+"""Between MAX_WAY_S and this, the least lateness may be either: it corrects the clock, and the limits count it as the
+way."""
 AHEAD_S = 0.05
-"A stamp may be this far ahead before its clock has shown itself; a clock that is further off than this is wrong."
+"A clock that is further ahead of ours is wrong."
 SETTLED_S = 0.2
-"A new publisher's clock is believed to be wrong once its stamps have said so for this long: a backlog is drained."
+"A backlog drains in this time, before a new publisher's clock counts as wrong."
 STEP_S = 0.005
-"Stamps of one publisher that run back by more than this prove that its clock was set back."
+"If stamps run back by more than this, the clock was set back."
 DRIFT = 500e-6
-"No clock drifts faster, and no faster rise of the envelope is taken for drift."
 FORGOTTEN_S = 5.0
 "After a longer silence the clock may have been set by any amount."
 JITTER_SHARE = 1.0 / 16.0
-"Of each new difference, as in RFC 3550."
 MAX_DRIFT_PPM = 100.0
-"A clock that drifts faster than quartz does is named."
+"Quartz drifts less."
 NEVER_SET_NS = 946_684_800 * 10**9
-"The year 2000, in which nobody publishes: a clock that begins in 1970 has not been set."
+"The year 2000: a clock that starts in 1970 has not been set."
 SURE_WINDOWS = 20
-"Half seconds that a clock's line needs before its scatter says how sure its slope is."
 STEP_NAMED_S = 60.0
-"A clock that was set is named for so long."
 
 WINDOW_S, MIN_MESSAGES = 1.0, 4
-"Least time and least messages that are judged together."
 MAX_LOST = 0.05
 SPREAD_S = 0.02
-"By more than this from message to message a delay shows in the force: what the slope carries over is 50 ms."
+"A delay that varies more shows in the force: the slope bridges 50 ms."
 SLACK = 1.25
-"A publisher's own timer may be so much slower than it is meant to be."
 PLAYOUT_STEP_MS = 10
-"A playout that is told as a remedy is rounded up to this."
 
 
 class Order(Enum):
-    """How a message stands to those taken before it."""
-
     NEWER = "newer"
     RESTARTED = "restarted"
-    "The first of a new run: the publisher says so by a `session` above every earlier one."
+    "The first of a new run, announced by a `session` above every earlier one."
     REPLACED = "replaced"
-    "The first of a new run that does not say so."
+    "The first of a new run that was not announced."
     STRAY = "stray"
-    "Old, repeated, of a run that is over, or of one that has not shown itself yet."
+    "Old, repeated, or from another run."
 
 
 @final
 class Sequence:
-    """Follows a publisher's count `seq` through restarts. `session` is None where the publisher states none."""
+    """Follows a publisher's count `seq` through restarts. `session` is None if the publisher sends none."""
 
     def __init__(self, session: int | None, seq: int) -> None:
         self.session, self.seq = session, seq
         self.lost = self.missing = 0
-        "Messages missing in `seq`, of all and before the newest, counted where the publisher counts by ones."
+        "Missing messages in all, and just before the newest; only counted if `seq` goes up by ones."
         self.restarts = 0
         self._latest_session = session
         self._step = 0
@@ -105,7 +91,6 @@ class Sequence:
         self._strays, self._strays_since_s = 0, 0.0
 
     def order(self, now_s: float, session: int | None, seq: int, *, is_over: bool) -> Order:
-        """Judge one message by its numbers, and follow it unless it is a stray."""
         if session == self.session and seq > self.seq:
             step = seq - self.seq
             known = self._step
@@ -131,11 +116,9 @@ class Sequence:
         return Order.STRAY
 
     def is_doubled(self, now_s: float) -> bool:
-        """Tell whether two publishers seem to use this name at once: RUN strays or more within STRAYS_S."""
         return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
 
     def _begin(self, session: int | None, seq: int, order: Order) -> Order:
-        """Follow a new run from this message, count a restart, and return `order`."""
         self.session, self.seq, self._step = session, seq, 0
         self._in_row = self._strays = self.missing = 0
         self.restarts += 1
@@ -148,22 +131,18 @@ class SourceClock:
 
     def __init__(self) -> None:
         self.offset_s = 0.0
-        "How far the clock is behind ours, s, as far as it can be told."
+        "The clock's lag behind ours."
         self.way_s = 0.0
-        "The constant part of the way, as far as it can be told."
         self.jitter_s = 0.0
-        "How much the delay varies from message to message: RFC 3550's interarrival jitter."
+        "RFC 3550's interarrival jitter."
         self.steps = 0
-        "How often the clock was seen to be set."
         self.stepped_s = 0.0
-        "By how much the clock was set last, forward positive."
+        "Forward positive."
         self.stepped_at_s = -math.inf
-        "When the clock was last seen to be set; -inf before."
         self._lateness_s = self._leaked_s = 0.0
         self._heard_s: float | None = None
         self._settles_s: float | None = None
         self.line = DeviceClock()
-        "The line through the last half minute, or since the clock was set."
 
     @property
     def is_settled(self) -> bool:
@@ -178,7 +157,7 @@ class SourceClock:
         return self.offset_s if 0.0 < self.offset_s < MAX_LATE_S and not self.steps else 0.0
 
     def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
-        """Take the message that came at `now_s`, and return its delay, s."""
+        """Take a message, and return its delay, s."""
         if self._heard_s is None:
             self._begin(now_s, lateness_s)
         else:
@@ -192,7 +171,6 @@ class SourceClock:
         return max(lateness_s - self.offset_s, 0.0)
 
     def wrong(self, now_s: float, stamp_ns: int, fit: ClockReport | None) -> str:
-        """Return what is wrong with the clock, by its newest stamp and its line `fit`; empty where nothing is."""
         causes = []
         if self.is_wrong and stamp_ns < NEVER_SET_NS:
             causes.append(f"it was never set (it says {time.gmtime(stamp_ns * 1e-9).tm_year}), and is corrected")
@@ -211,7 +189,6 @@ class SourceClock:
         return "; ".join(causes)
 
     def _begin(self, now_s: float, lateness_s: float) -> None:
-        """Begin with nothing known but this lateness, and a new line; the counts of steps stay."""
         self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
         self._settles_s = now_s + SETTLED_S
         self.line = DeviceClock()
@@ -219,13 +196,11 @@ class SourceClock:
             self._settle()
 
     def _settle(self) -> None:
-        """Count the offset as known; one that a way can take becomes the constant part of the way."""
         self._settles_s = None
         if 0.0 < self.offset_s <= MAX_WAY_S:
             self.offset_s, self.way_s = 0.0, self.offset_s
 
     def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
-        """Update offset, way and jitter from a message that came `gap_s` after the last, both on our clock."""
         rise_s = lateness_s - self._lateness_s
         if not is_continued or gap_s > FORGOTTEN_S:
             above_s = lateness_s - self.offset_s - self.way_s
@@ -233,7 +208,7 @@ class SourceClock:
                 self._begin(now_s, lateness_s)
                 return
         elif rise_s > gap_s + STEP_S:
-            # sent later but stamped earlier, which no delay explains. The way is taken to be as before
+            # sent later but stamped earlier, which no delay explains: the way is taken to be as before
             self.offset_s += rise_s
             self._set(now_s, -rise_s)
         else:
@@ -246,7 +221,7 @@ class SourceClock:
             self._fall(now_s, fall_s)
 
     def _fall(self, now_s: float, fall_s: float) -> None:
-        """Lower offset and way by `fall_s`, not negative: the message was less late than both of them together."""
+        """Lower offset and way together by `fall_s`: the message was less late than both allow."""
         granted_s = min(fall_s, self._leaked_s)
         self.offset_s -= granted_s
         self._leaked_s -= granted_s
@@ -259,21 +234,19 @@ class SourceClock:
             self._set(now_s, ahead_s)
 
     def _set(self, now_s: float, by_s: float) -> None:
-        """Count that the clock was set by `by_s`, forward positive, and begin its line anew."""
         self.steps += 1
         self.stepped_s, self.stepped_at_s = by_s, now_s
         self.line = DeviceClock()
 
 
 class Needs(NamedTuple):
-    """What the scene wants of a publisher: how many setpoints a second, and how old they may be when they come."""
+    """The setpoints per second that a scene needs, and how old they may be on arrival."""
 
     setpoint_hz: float = 1.0 / SLOPE_S
     delay_s: float = MAX_LATE_S
 
 
 def needs_of(scene: Scene) -> Needs:
-    """Return what a scene needs of its publisher."""
     stated = UNSET if scene.signal is None else scene.signal.setpoint_hz
     delay_ms = scene.budget.delay_ms
     return Needs(
@@ -284,7 +257,7 @@ def needs_of(scene: Scene) -> Needs:
 
 @final
 class Source:
-    """One publisher. `judge` takes its messages; the newest is `setpoint`, meant at `stamp_s` on our clock."""
+    """One publisher: its newest setpoint was meant at `stamp_s` on our clock."""
 
     def __init__(self, setpoint: Setpoint) -> None:
         self.setpoint = setpoint
@@ -299,13 +272,12 @@ class Source:
         self._begun = Order.NEWER
         self._unit = ""
         self._far, self._far_s, self._far_ns = 0, 0.0, 0
-        "Messages with far stamps that are looked at; arrival and stamp of the first."
         self._began_s: float | None = None
         self._sent_s = 0.0
         self._window: list[tuple[int, float, float]] = []
 
     def judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int, playout_s: float, needs: Needs) -> Order:
-        """Judge a message, and make it the newest of its source unless it is a stray, or a MessageError refuses it."""
+        """Judge a message, and keep it as the newest unless it is a stray."""
         order = Order.NEWER
         if self.heard_s > -math.inf:
             is_over = self.is_stale(now_s)
@@ -333,11 +305,10 @@ class Source:
         return order
 
     def is_stale(self, now_s: float) -> bool:
-        """Tell whether the newest setpoint is no longer valid at `now_s`; True also before the first one was taken."""
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def refresh(self, now_s: float) -> bool:
-        """Update the percentiles of `delays`, and `cause` and `remedy`; return True if something is newly wrong."""
+        """Update the report; return True if something is newly wrong."""
         self.delays.refresh()
         self._fit = self.clock.line.fit()
         self.cause = self.remedy = ""
@@ -352,7 +323,6 @@ class Source:
         return self._is_named and not was_named
 
     def report(self, now_s: float, state: str) -> SourceReport:
-        """Return its report, with `state` while its newest setpoint is valid, and the figures of the last `refresh`."""
         clock, sequence, is_known = self.clock, self.sequence, self.clock.is_settled and self.stamp_s > -math.inf
         return SourceReport(
             state="stale" if self.is_stale(now_s) else state,
@@ -373,7 +343,7 @@ class Source:
         )
 
     def _require_ns(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
-        """Raise MessageError where the stamps do not count ns, or where this is not known yet."""
+        """Raise MessageError if the stamps do not count ns, or if that is not known yet."""
         stamp_ns = setpoint.stamp_ns
         if abs(realtime_ns - stamp_ns) < FAR_S * 1e9:
             self._unit, self._far = "ns", 0
@@ -398,7 +368,6 @@ class Source:
         )
 
     def _note_manner(self, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
-        """Note how the newest setpoint came, and judge the window that it fills."""
         sent_s, missing = now_s - delay_s, self.sequence.missing
         spacing_s, self._sent_s = (sent_s - self._sent_s) / (1 + missing), sent_s
         if self._began_s is None:
@@ -410,7 +379,6 @@ class Source:
             self._began_s, self._window = now_s, []
 
     def _judged(self, playout_s: float, needs: Needs) -> dict[Limit, Explanation]:
-        """Return what is wrong in a full window, with cause and remedy; empty where nothing is."""
         lost, received, hidden_s = sum([each[0] for each in self._window]), len(self._window), self.clock.hidden_s
         late_s = [each[2] for each in self._window]
         found = {}

@@ -1,4 +1,4 @@
-"""Starting the daemon: builds the core as configured and runs the daemon, or prints what would run."""
+"""Starting the daemon, or printing what would run."""
 
 import argparse
 import sys
@@ -25,7 +25,6 @@ from tormagd_client.printable import printable
 
 
 def start(options: argparse.Namespace) -> int:
-    """Build the core and run the daemon as the command line and its configuration say; return the exit code."""
     try:
         config = _configured(options)
         keys = KeyRing(config.endpoints) if any(map(config.endpoints.is_guarded, ENDPOINTS)) else None
@@ -44,8 +43,6 @@ def start(options: argparse.Namespace) -> int:
 
 
 def _configured(options: argparse.Namespace) -> Config:
-    """Return the file's configuration, or the defaults, with the command line's scene in place of its own, if there is
-    one."""
     config = load_config(options.config)
     if options.scene is not None:
         config = msgspec.structs.replace(config, scene=options.scene)
@@ -59,7 +56,7 @@ async def _run(
     keys: KeyRing | None,
     options: argparse.Namespace,
 ) -> None:
-    """Start the processes of black box and search, make this thread a real-time one, and run the daemon to its end."""
+    """Start the processes beside it, make this thread a real-time one, and run the daemon to its end."""
     raise_open_files()
     # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
@@ -72,8 +69,7 @@ async def _run(
 
 
 def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
-    """Return what `--check` prints, a JSON object with `config`, `scene`, `derived`, which follows from both, and
-    `backends`."""
+    """Return what `--check` prints, as JSON."""
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
         "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),

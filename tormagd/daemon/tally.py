@@ -7,13 +7,12 @@ from typing import NamedTuple
 from tormagd_client.messages import PeerReport
 
 NEWS_S = 10.0
-"At most one log line in this time."
 
 log = logging.getLogger(__name__)
 
 
 class Peer(NamedTuple):
-    """A peer: its host, or the process at a local socket, as libzmq names it; and its key, empty without one."""
+    """A peer: its host or local process, as libzmq names it, and its key if it has one."""
 
     address: str
     key: str = ""
@@ -29,20 +28,17 @@ class Tally:
         self._newest = "", Peer(""), ""
 
     def add(self, endpoint: str, peer: Peer, reason: str) -> None:
-        """Count one more refusal of `peer` at `endpoint` for `reason`, which becomes the newest."""
         newest = endpoint, peer, reason
         self._in_a_row = self._in_a_row + 1 if newest == self._newest else 1
         self._newest = newest
         self.total += 1
 
     def report(self) -> tuple[PeerReport, ...]:
-        """Return the newest refusal, key and address as people know them; empty before the first."""
         endpoint, peer, reason = self._newest
         key = peer.key and self._name(peer.key)
         return (PeerReport(endpoint, shown(peer.address), key, reason, self._in_a_row),) if self.total else ()
 
     def tell(self, now_s: float) -> None:
-        """Log the number of refusals since the last line, and the newest, as a warning; at most one line in NEWS_S."""
         if self.total > self._told and now_s >= self._tell_s:
             (it,) = self.report()
             newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
@@ -51,7 +47,7 @@ class Tally:
 
 
 def shown(address: str) -> str:
-    """Return a peer's address, as libzmq names it, for people: the host, or `process N of user N`."""
+    """Return libzmq's address of a peer for people: the host, or `process N of user N`."""
     if address.startswith("localhost:"):
         _, user, _, process = address.split(":")
         return f"process {process} of user {user}"

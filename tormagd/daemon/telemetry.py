@@ -20,7 +20,6 @@ def tick_record(
     exec_us: float,
     number: int = 0,
 ) -> TickRecord:
-    """Return the record of one control tick, number `number`, along `plan`."""
     measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
     is_placed = measured is not None and measured.is_homed
     link = None if measurement is None else measurement.link
@@ -100,7 +99,7 @@ def _names(bits: Switches | DeviceFault) -> tuple[str, ...]:
 
 
 def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...]:
-    """Return the limits that hold the force back, the plan's before the step's; none while the device is not driven."""
+    """Return the limits that hold the force back; none while the device is not driven."""
     return tuple(dict.fromkeys((*plan.limits, *output.limits))) if safety.is_driven else ()
 
 
@@ -115,7 +114,6 @@ def snapshot(
     verdict: Verdict | None = None,
     mark: Mark | None = None,
 ) -> Telemetry:
-    """Return the telemetry message `sequence` of the newest `tick`."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
     return Telemetry(

@@ -34,6 +34,7 @@ from tormagd.daemon.topics import Topics
 from tormagd.daemon.way import Way
 from tormagd.following import Following
 from tormagd.hardware.connection import Connection
+from tormagd.keeping import REQUEST
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd_client.messages import (
     MAX_MARK_CHARACTERS,
@@ -51,24 +52,19 @@ from tormagd_client.messages import (
 )
 
 MAX_TICKS = 100
-"Ticks in one recording message at most."
 REQUESTS = 16
-"Requests answered in a telemetry period at most: a client that asks on and on must not keep a `stop` waiting."
+"Answered in a telemetry period: a client that keeps asking must not keep a `stop` waiting."
 TELL_S = 0.1
-"How often systemd, log and black box are seen to."
 REFRESHED = 2
-"Histograms whose percentiles are made anew each time."
 FORGETS_S = 5.0
-"After this time an error in following a force counts a third (1/e)."
+"After this time a tracking error counts 1/e."
 PORTRAIT_STEP = 5
-"Every fifth point of the portrait is told: it is smooth."
+"The portrait is smooth: every fifth point will do."
 
 log = logging.getLogger(__name__)
 
 
 class TelemetryLoop:
-    """The telemetry loop: publishes what the control and inference loops do, and answers requests."""
-
     def __init__(
         self,
         config: Config,
@@ -109,17 +105,14 @@ class TelemetryLoop:
         self.run_scene(config, core, profiles)
 
     def run_scene(self, config: Config, core: Core, profiles: Profiles) -> None:
-        """Publish and report on `core` from now on, with its configuration and profiles."""
         self.config = config
-        "Replaced by a reload, which changes only keys that are looked at each time they are used."
+        "A reload replaces it, with changes only in keys that are looked up at each use."
         self._core, self.topics.core, self._profiles = core, core, profiles
         self._following = Following(1.0 / config.rates.telemetry_hz, FORGETS_S)
         self._status: msgspec.Raw | None = None
         self._reported_s = -math.inf
 
     def record(self, _beat: Beat) -> None:
-        """Keep the record of the control tick that just ran, for recording and black box; before the first
-        do nothing."""
         control = self._control
         if control.output is None or control.used is None:
             return
@@ -141,7 +134,6 @@ class TelemetryLoop:
         self._box.ticked(record, control.stepper, self._inference.planner)
 
     def publish(self, beat: Beat) -> bool:
-        """Publish the snapshot and the ticks of a telemetry period; return False where none is due."""
         if self._left > 0 or not self._ticks:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
@@ -156,9 +148,8 @@ class TelemetryLoop:
             tick.handle_mm,
             tick.handle_rate_mm_s,
         )
-        # requests that wait now are answered with this snapshot; later ones wait for the next
+        # requests that wait now are answered with this snapshot, later ones with the next
         self._status, self._answers = None, min(endpoint.requests.count, REQUESTS)
-        # no snapshot is packed without a listener
         if connections["telemetry"] or self._answers:
             self._newest = self._snapshot(start_ns * 1e-9)
             endpoint.publish(self._newest)
@@ -169,7 +160,6 @@ class TelemetryLoop:
         return True
 
     def _look_at_device(self) -> None:
-        """Let calibrations and profiles look at the connected device."""
         serial_number, is_driven = self._connection.serial_number, self._control.stepper.safety.is_driven
         change = self._scene_change.newest
         is_idle = not (is_driven or self.is_busy()) and (change is None or change.is_over)
@@ -178,13 +168,12 @@ class TelemetryLoop:
         self._profiles.look(None if is_awaited else serial_number, is_driven)
 
     def _publish_ticks(self) -> None:
-        """Publish the kept ticks if a peer listens to the recording, and drop them in any case."""
         if self._endpoint.admission.connections()["recording"]:
             self._endpoint.publish_ticks(self._ticks)
         self._ticks = []
 
     def tell(self, _beat: Beat) -> bool:
-        """Every TELL_S, feed log, systemd and black box, and go on arming; return False where it is not time."""
+        """Feed log, systemd and black box, and continue an arming; return False if it is not time."""
         now_s = time.monotonic()
         if now_s - self._told_s < TELL_S:
             return False
@@ -201,14 +190,11 @@ class TelemetryLoop:
         return True
 
     def serve(self, _beat: Beat) -> bool:
-        """Answer requests that waited at the last snapshot, for a limited time; return False where none was
-        answered."""
         answered = self._endpoint.serve(self._answer, self._answers)
         self._answers = self._answers - answered if answered else 0
         return answered > 0
 
     def keep(self, reason: str, after_s: float) -> Path:
-        """Ask for a black box that also holds the next `after_s`, and return the path it will have."""
         link = self._connection.report()
         details = {
             "firmware": link.firmware or "",
@@ -218,7 +204,6 @@ class TelemetryLoop:
         return self._box.write(reason, after_s, details)
 
     def conditions(self) -> Conditions:
-        """Return the conditions, as they are now, on which a command is taken or refused."""
         control, doubted = self._control, self._inference.planner.believe.sensor.is_doubted
         found = conditions(
             time.monotonic(), self.config, self._connection, control.stepper, control.output, sensor_doubted=doubted
@@ -231,7 +216,6 @@ class TelemetryLoop:
         return is_busy(connection.measurement, connection.pending, self._control.stepper, self._control.output)
 
     def is_open(self) -> bool | None:
-        """Tell whether the gap is open; None without a device."""
         measurement = self._connection.measurement
         return None if measurement is None else is_open(measurement, self._is_homed())
 
@@ -253,7 +237,6 @@ class TelemetryLoop:
         )
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
-        """Tell systemd what is new: readiness, which is logged, the status line, and that the daemon lives."""
         connection, safety, service = self._connection, self._control.stepper.safety, self._service
         plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
         is_alive = service.is_alive(
@@ -278,24 +261,19 @@ class TelemetryLoop:
             notify(message)
 
     def _in_turn(self) -> Iterator[Histogram]:
-        """Yield all histograms of rates, way and phases, again and again, without end."""
         while True:
             for group in self._groups:
                 yield from (group.lateness, group.exec)
             yield from (self._way.to_duty, *self._phases.spent.values())
 
     def _answer(self, request: Request) -> Any:
-        """Return the result of a request: for `status` and `describe` a report, for any other what
-        `command` returns."""
         if request.command == "status":
-            # built once for everybody who asks in this period
             if self._status is None:
                 self._status = msgspec.Raw(msgspec.msgpack.encode(self._build_status(self._newest)))
             return self._status
         return self._describe() if request.command == "describe" else self.command(request)
 
     def _describe(self) -> Description:
-        """Return what does not change from tick to tick."""
         link, portrait, device = self._connection.report(), self._core.portrait, self._inference.planner.believe.device
         scaled_mm_s = device.scale * self._core.gap_speed_mm_s
         return Description(
@@ -315,7 +293,7 @@ class TelemetryLoop:
         )
 
     def command(self, request: Request) -> dict[str, Any]:
-        """Carry out a request that is no question, and return its result as plain data."""
+        """Carry out a request that changes something."""
         self._status, self._reported_s = None, -math.inf
         if request.command == "take":
             return self._give(request.args.get("source"))
@@ -324,7 +302,7 @@ class TelemetryLoop:
         if request.command == "mark":
             return self._add_mark(request.args.get("text"))
         if request.command == "blackbox":
-            return {"file": str(self.keep("REQUEST", 0.0))}
+            return {"file": str(self.keep(REQUEST, 0.0))}
         if request.command == "arm":
             self._control.arm(self.conditions())
         elif request.command == "use-scene":
@@ -338,8 +316,6 @@ class TelemetryLoop:
         }
 
     def _add_mark(self, text: object) -> dict[str, Any]:
-        """Put a mark with this text into telemetry, and so into recordings; return it as plain data: `t_ns`
-        and `text`."""
         if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= MAX_MARK_CHARACTERS:
             allowed = f"allowed are 1..{MAX_MARK_CHARACTERS} printable characters"
             raise RefusedError("bad_mark", f"args.text = {str(text)[:80]!r}: {allowed}", "tormagctl mark TEXT")
@@ -348,7 +324,6 @@ class TelemetryLoop:
         return msgspec.to_builtins(self._mark)  # type: ignore[no-any-return]
 
     def _confirm(self, what: object) -> dict[str, Any]:
-        """Take the operator's word on what is wrong, "device" or "sensor"; log it and return `{"confirmed": what}`."""
         try:
             wrong = msgspec.convert(what, Disputed)
         except msgspec.ValidationError as error:
@@ -367,7 +342,6 @@ class TelemetryLoop:
         return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
-        """Give the brake to the source of this name, log it, and return its name and that of the holder before."""
         if not isinstance(source, str):
             raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
         inbox = self._endpoint.inbox
@@ -377,12 +351,10 @@ class TelemetryLoop:
         return {"source": source, "instead_of": before}
 
     def _build_status(self, newest: Telemetry) -> Status:
-        """Return the answer to `status`: the snapshot `newest`, states as they are now, reports, causes and
-        remedies."""
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device
-        # these may have changed since the snapshot, by a command or a homing that a client waits for
+        # a command or a homing may have changed these since the snapshot
         is_homed_ = self._is_homed()
         known = msgspec.structs.asdict(newest) | {
             "operating_state": str(safety.operating_state),
@@ -432,7 +404,6 @@ class TelemetryLoop:
         )
 
     def _arm_report(self) -> ArmReport | None:
-        """Return the report on the newest arming: commands given, whether it is over, and why it failed."""
         arming = self._control.arming
         if arming is None:
             return None
@@ -441,7 +412,7 @@ class TelemetryLoop:
         return ArmReport(given=arming.given, is_over=arming.is_over, error=ended)
 
     def _slowly_changing(self, now_s: float) -> dict[str, Any]:
-        """Return the reports that take most of a status' time, by the names of its fields."""
+        """Return the reports that take most of the time; made anew every TELL_S."""
         if now_s - self._reported_s >= TELL_S or self._connection.state is not self._reported_state:
             self._reported_s, self._reported_state = now_s, self._connection.state
             link = self._connection.report()

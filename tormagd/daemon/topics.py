@@ -17,14 +17,11 @@ NS = 1_000_000_000
 
 
 class Topics:
-    """Publishes the topics `motion` and `verdict` as a phase of every beat, and makes both for snapshots, too."""
-
     def __init__(
         self, config: Config, core: Core, control: ControlLoop, inference: InferenceLoop, endpoint: Endpoint
     ) -> None:
         self._control, self._inference, self._endpoint = control, inference, endpoint
         self.core = core
-        "Core of the running scene."
         self._push_sign = float(config.handle.push_sign)
         self._period_ns = NS // min(config.rates.motion_hz, config.rates.control_hz)
         self._due_ns, self._sensed_s = 0, 0.0
@@ -32,29 +29,24 @@ class Topics:
         self._passed_over: tuple[str, int] | None = None
 
     def publish(self, beat: Beat) -> bool:
-        """Publish a verdict where one is new, and the handle's motion where it is due; return False where
-        neither was."""
         listeners = self._endpoint.listeners
         is_said = listeners.has(VERDICT_TOPIC) and self._publish_verdicts()
         return (listeners.has(MOTION_TOPIC) and self._publish_motion(beat)) or is_said
 
     def handle(self) -> tuple[float, float] | None:
-        """Return the handle's place, mm, and rate, mm/s, positive pushing on; None without a device."""
+        """Return the handle's place, mm, and rate, mm/s, positive pushing on."""
         measured = self._control.stepper.measured
         return None if measured is None else place_and_rate(measured, self._push_sign)
 
     def verdict(self) -> Verdict | None:
-        """Return the verdict on the newest setpoint, as things are now; None without a setpoint."""
         in_force = self._endpoint.inbox.in_force
         return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
 
     def _publish_motion(self, beat: Beat) -> bool:
-        """Publish the handle's newest motion; return False where it is not due, not sensed anew, or without
-        a device."""
         measured = self._control.stepper.measured
         if beat.due_ns < self._due_ns or measured is None or measured.sensed_s == self._sensed_s:
             return False
-        # what was missed is not made up for
+        # missed ones are not made up for
         self._due_ns = self._period_ns + (beat.due_ns if beat.due_ns - self._due_ns > self._period_ns else self._due_ns)
         self._sensed_s = measured.sensed_s
         heard_ns = time.time_ns() - round(NS * (time.monotonic() - measured.sensed_s))
@@ -66,9 +58,9 @@ class Topics:
         return True
 
     def _publish_verdicts(self) -> bool:
-        """Publish the verdict on the setpoint in force, and on one refused because another source holds the brake."""
+        """Publish the verdict on the setpoint in force, and on one of another source that was passed over."""
         in_force, is_said = self._endpoint.inbox.in_force, False
-        # a setpoint is a new object, even where its source begins its numbers anew
+        # by identity: a source may begin its numbers anew
         if in_force is not None and in_force is not self._judged:
             self._judged, is_said = in_force, True
             verdict = self._verdict(in_force.source, in_force.seq, self._judge())
@@ -81,7 +73,6 @@ class Topics:
         return is_said
 
     def _judge(self) -> Judged:
-        """Return the judgement on the newest setpoint, by the newest plan and the measured gap."""
         planner, stepper, core = self._inference.planner, self._control.stepper, self.core
         measured, believe, force = stepper.measured, planner.believe, core.scene.force
         return judged(

@@ -10,16 +10,13 @@ from tormagd.safety.operating_state import OperatingState
 
 RENDERED, ARRIVES, CANNOT = "rendered", "arrives", "cannot"
 HOLDING = frozenset({Limit.RANGE, Limit.STANDBY, Limit.F_MIN, Limit.F_MAX})
-"Limits that keep a force from coming, as CEILING and MODEL_RANGE may; the others only make it late."
+"These keep a force from coming, as CEILING and MODEL_RANGE may; the others only delay it."
 FORGOTTEN = frozenset({Limit.STALE, Limit.OTHER_SOURCE})
-"Limits that say why a setpoint is no longer followed."
 FIELD = "field_mT"
-"Name of the feature that keeps a force away where a plan is held inside the model's range."
+"If this feature is outside the model's range, the force is out of reach."
 
 
 class Judged(NamedTuple):
-    """A judgement on a setpoint: rendered, arrives or cannot."""
-
     outcome: str
     arrives_ms: float | None
     why: tuple[str, ...] = ()
@@ -37,8 +34,6 @@ def judged(
     tolerance_N: float,
     release_N_s: float,
 ) -> Judged:
-    """Return the judgement on the setpoint that `plan` was made for: RENDERED, ARRIVES in some time, or CANNOT, and
-    why."""
     asked_N = plan.setpoint_N
     if state is not OperatingState.ENABLED or gap_mm is None:
         return Judged(CANNOT, None, (str(state),))
@@ -59,7 +54,7 @@ def judged(
 
 
 def _holds(limit: Limit, plan: Plan, aim_mm: float) -> bool:
-    """Tell whether `limit` keeps the gap from its aim `aim_mm` for good, and not only on the way there."""
+    """Tell whether `limit` keeps the gap from `aim_mm` for good, and not only on the way there."""
     if limit is Limit.CEILING:
         return aim_mm < plan.min_gap_mm
     if limit is Limit.F_MIN:

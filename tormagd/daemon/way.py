@@ -1,8 +1,8 @@
 """The delay from the sensor on the patient's side to the force at the handle, in parts, against a budget.
 
 The first part is from the stamp, by the corrected clock of its source, to the first duty that follows it. The second is
-from a Drive to its State, by the link. The third is the believed lag of the carriages. Delay before the stamp, as of
-the sensor's filters, cannot be seen here.
+from a Drive to its State, by the link. The third is the believed lag of the carriages. Delay before the stamp, such as
+that of the sensor's filters, cannot be seen here.
 """
 
 import math
@@ -15,19 +15,15 @@ from tormagd.scenes.scene import Budget
 from tormagd_client.messages import WayReport
 
 BUDGET_MS = 400.0
-"Delay above which a task becomes slower and its contacts harder; of scenes that do not state `budget.delay_ms`."
+"A longer delay slows a task down and hardens its contacts."
 
 
 class Way:
-    """Measures the delay from a setpoint's stamp to the first duty that follows it. Give it each control tick."""
-
     def __init__(self) -> None:
         self.to_duty = Histogram()
         self._stamp_s = -math.inf
 
     def ticked(self, now_s: float, used: Plan, playout_s: float) -> None:
-        """Count in `to_duty` the delay of a setpoint at its first control tick, at `now_s`, along the plan `used` for
-        it."""
         stamp_s = used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
@@ -35,7 +31,6 @@ class Way:
                 self.to_duty.add(now_s, (now_s - stamp_s + playout_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float, budget: Budget) -> WayReport:
-        """Return the parts of the delay from sensor to force, and their sum; the sum is None until all are known."""
         to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
             total_ms = round((to_duty_us.p99 + device_us) * 1e-3 + carriages_ms, 2)

@@ -1,7 +1,8 @@
 """A folder of recordings: segments named by when they begin, kept within a budget of size and age.
 
-A segment's name alone says its age and its mark, so pruning decides alike in every process, also after a kill. Pruning
-takes the oldest segment first. It spares a segment that is marked, is being written, or has another form of name.
+Names, file times and sizes alone decide what is pruned, so it is alike in every process, also after a kill. The oldest
+segment goes first. A segment is spared that is marked, is being written, or has another form of name. The present time
+decides nothing: how old a segment is, the newest one says, as far back as the segments follow each other.
 """
 
 import contextlib
@@ -23,6 +24,8 @@ MARKED = ".marked"
 "Follows the time in a marked segment's name. Black boxes have another form: their keeper deletes them."
 BEFORE_MARK_S = 60.0
 "A segment younger than this is marked together with the one before."
+LONGEST_PAUSE_S = 3 * 86_400.0
+"""Where a segment seems to last longer, or to follow the one before later, a clock may have been set."""
 _NAME = re.compile(rf"(\d{{4}}-\d\d-\d\dT\d\d-\d\d-\d\d)(\.\d{{3}}Z)?({re.escape(MARKED)})?\.mcap")
 _FORM = "%Y-%m-%dT%H-%M-%S"
 
@@ -39,12 +42,13 @@ class Budget(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """One recording in a folder; `began_s` is in seconds since 1970, None where the name does not say when."""
+    """One recording in a folder: when it began, as its name says, and was last written, both s since 1970."""
 
     path: Path
     began_s: float | None
     bytes: int
     is_marked: bool
+    ended_s: float
 
 
 def segment_of(path: Path) -> Segment | None:
@@ -56,7 +60,8 @@ def segment_of(path: Path) -> Segment | None:
             began = datetime.strptime(named[1], _FORM).replace(tzinfo=UTC)
             began_s = began.timestamp() + float((named[2] or "0")[:4])
     with contextlib.suppress(OSError):
-        return Segment(path, began_s, path.lstat().st_size, named is not None and named[3] is not None)
+        known = path.lstat()
+        return Segment(path, began_s, known.st_size, named is not None and named[3] is not None, known.st_mtime)
     return None
 
 
@@ -83,9 +88,9 @@ class RecordingFolder:
         self.path, self.budget, self._clock = path, budget, clock
 
     def segments(self) -> list[Segment]:
-        """List the folder's recordings by age, the oldest first; those whose name says no time come before all."""
+        """List the folder's recordings, the last written last; those whose name says no time come before all."""
         found = [each for path in self.path.glob("*.mcap") if (each := segment_of(path)) is not None]
-        return sorted(found, key=lambda each: (each.began_s or 0.0, each.path.name))
+        return sorted(found, key=lambda each: (each.ended_s if each.began_s else 0.0, each.path.name))
 
     def new(self) -> Path:
         """Prune until a whole segment has room, and return the path for a new one, named by the present time."""
@@ -116,12 +121,23 @@ class RecordingFolder:
         """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return
         those deleted."""
         left, gone = self.segments(), []
+        old = self._too_old(left)
         for segment in list(left):
-            is_old = segment.began_s is not None and self._clock() - segment.began_s > self.budget.most_s
-            if (is_old or self._over(left, coming_bytes)) and self._delete(segment):
+            if (segment in old or self._over(left, coming_bytes)) and self._delete(segment):
                 left.remove(segment)
                 gone.append(segment)
         return gone
+
+    def _too_old(self, segments: list[Segment]) -> list[Segment]:
+        """Return the segments that were last written longer than the budget's age before the newest."""
+        old = []
+        for segment, later in zip(segments[-2::-1], segments[:0:-1], strict=True):
+            began_s = later.began_s or 0.0
+            if max(abs(began_s - segment.ended_s), abs(later.ended_s - began_s)) > LONGEST_PAUSE_S:
+                break
+            if segments[-1].ended_s - segment.ended_s > self.budget.most_s:
+                old.append(segment)
+        return old
 
     def mark_around(self, segment: Path) -> Path:
         """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return its new path."""

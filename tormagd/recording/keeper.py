@@ -17,16 +17,16 @@ from pathlib import Path
 
 import msgspec
 
-from tormagd.keeping import Begin, End, Part, Said, Write, Written
+from tormagd.keeping import REQUEST, Begin, End, Part, Said, Write, Written
 from tormagd.output import write_line
 
 KEPT_S = 30.0
 MAX_BYTES = 48_000_000
 """The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB."""
 MAX_FILES = 20
-"The oldest file is deleted when there are more."
+"The oldest file of a fault is deleted when there are more, and likewise of a request."
 MAX_PACKET = 4_000_000
-MAX_DUE = 8
+MAX_DUE = 28
 "How many files may wait to be written; more are refused."
 LOOK_S = 0.05
 "Period of looking whether a file is due."
@@ -65,6 +65,7 @@ class Keeper:
         self._begun = Begin("", {})
         self._due: list[tuple[float, Write]] = []
         self._writing: threading.Thread | None = None
+        self._written: deque[str] = deque(maxlen=2 * MAX_FILES)
 
     def run(self) -> None:
         """Keep and write black boxes until the daemon ends, then write all that is still due, and return."""
@@ -115,11 +116,12 @@ class Keeper:
                 self._begun, self._ring = said, Ring()
             case Write() if len(self._due) < MAX_DUE:
                 self._due.append((time.monotonic() + said.after_s, said))
+                self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
             case Write():
                 self._answer(Written(said.name, f"{said.name}: {MAX_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
-        """Write one black box of `parts`, delete the oldest files beyond MAX_FILES, and answer the daemon."""
+        """Write one black box of `parts`, delete the oldest of its kind beyond MAX_FILES, and answer the daemon."""
         from tormagd.recording.black_box import write_black_box
 
         with contextlib.suppress(OSError):
@@ -131,7 +133,12 @@ class Keeper:
             folder.mkdir(mode=0o750, parents=True, exist_ok=True)
             details = {**begun.header, **write.details, "reason": write.reason}
             write_black_box(folder / write.name, details, parts)
-            for old in sorted(folder.glob("*Z-*.mcap"))[:-MAX_FILES]:
+            is_request = write.reason == REQUEST
+            alike = [each for each in folder.glob("*Z-*.mcap") if each.match(f"*-{REQUEST}.mcap") is is_request]
+            # a name is a clock's word: what this daemon has written is newer than the rest
+            self._written.append(write.name)
+            alike.sort(key=lambda each: (each.name in self._written, each.name == write.name, each.name))
+            for old in alike[:-MAX_FILES]:
                 old.unlink()
         except (OSError, ValueError, TypeError, KeyError, msgspec.MsgspecError) as error:
             refusal = f"{folder / write.name}: {getattr(error, 'strerror', None) or error!r}"

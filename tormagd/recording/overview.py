@@ -1,8 +1,8 @@
 """A recording's overview: what pictures, pages and reports show of its whole length, in bounded memory.
 
-Time is cut into stretches of equal width. Where there are too many, their width doubles. Each stretch holds the least
-and the greatest value of each quantity. The recorder writes the overview at the end of its file. A reader of a file
-without one makes it from the messages, by the same steps.
+Time is cut into stretches of equal width. If there are too many, their width doubles. Each stretch holds the least and
+the greatest value of each quantity. The recorder writes the overview at the end of its file. For a file without one, a
+reader makes it from the messages in the same way.
 """
 
 import math
@@ -27,24 +27,22 @@ QUANTITIES = (
     "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "gap_setpoint_mm", "left_duty", "right_duty", "field_mT",
 )  # fmt: skip
 KINDS = ("operating_state", "limits", "faults")
-"Fields that hold codes."
 BREAK_S = 0.1
-"Between messages further apart than this, nothing is known."
+"Between messages further apart, nothing is known."
 BREAK_NS = round(BREAK_S * 1e9)
 FIRST_WIDTH_NS = 1_000_000
 MAX_STRETCHES = 1_500
 MAX_SPANS = 1_000
-"Bound on the spans of one code: beyond it, those nearest to each other become one."
+"Beyond these, the nearest spans of one code are joined."
 MAX_CODES, MAX_MARKS = 66, 1_000
-"Bounds on the codes of one kind and on the marks of a recording."
 MAX_BYTES = 2_000_000
 CODE = re.compile(r"[A-Za-z0-9_.:?-]{1,64}")
 ODD = re.compile(r"[^A-Za-z0-9_.:?-]")
 OTHER = "OTHER"
-"Stands for codes of one kind beyond MAX_CODES."
+"Stands for codes beyond MAX_CODES."
 _LOOK_NS = round(PERIOD_S * 1e9)
 LATE_US = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1_000.0, 2_000.0, 5_000.0)
-"Where one bar of the lateness histogram ends and the next begins."
+"Bounds of the bars of the lateness histogram."
 
 
 Word = Annotated[str, Meta(max_length=4_096)]
@@ -53,8 +51,6 @@ Code = Annotated[str, Meta(pattern=rf"\A{CODE.pattern}\Z")]
 
 
 class Glance(TypedDict, total=False):
-    """The fields that an overview reads from a control tick or a snapshot."""
-
     setpoint_cf: float | None
     governed_cf: float | None
     measured_cf: float | None
@@ -78,8 +74,6 @@ class Glance(TypedDict, total=False):
 
 
 class Curves(msgspec.Struct, frozen=True):
-    """Least and greatest value of each quantity in every stretch that has a message, as bytes."""
-
     stretches: bytes
     low: dict[str, bytes]
     high: dict[str, bytes]
@@ -95,16 +89,14 @@ class Series(msgspec.Struct, frozen=True):
 
 
 class Codes(msgspec.Struct, frozen=True):
-    """When a code was present: spans from..to in ns since the start; `held_ns` is the exact total, spans may be
-    joined."""
+    """When a code was present, ns since the start; spans may be joined, `held_ns` is the exact total."""
 
     spans_ns: Annotated[list[tuple[int, int]], Meta(max_length=MAX_SPANS)]
     held_ns: int
 
 
 class Overview(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole recording in bounded size; times are ns since 1970 (`start_ns`, `end_ns`, marks), else ns since
-    `start_ns`."""
+    """A whole recording in bounded size. Its start, end and marks are timed since 1970, the rest since `start_ns`."""
 
     start_ns: int
     end_ns: int
@@ -117,7 +109,7 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     "By kind, then by code in the order of their first appearance."
     following: FollowingReport | None
     followed_s: float
-    "Time over which it was followed; `following` is None where that is too short."
+    "`following` is None if this is too short."
     late_counts: Annotated[list[int], Meta(min_length=len(LATE_US) + 1, max_length=len(LATE_US) + 1)]
     marks: Annotated[list[Mark], Meta(max_length=MAX_MARKS)]
 
@@ -126,12 +118,11 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return (self.end_ns - self.start_ns) * 1e-9
 
     def require_messages(self) -> None:
-        """Raise ValueError where the recording has neither ticks nor snapshots."""
         if not self.ticks and not self.snapshots:
             raise ValueError("the recording has no messages: was the daemon running?")
 
     def series(self, name: str) -> Series | None:
-        """Return the quantity `name`, one of QUANTITIES, from the ticks or else from the snapshots."""
+        """Return one of QUANTITIES, from the ticks or else from the snapshots."""
         for curves in (self.of_ticks, self.of_snapshots):
             if name in curves.low:
                 low, high = _numbers(curves.low[name]), _numbers(curves.high[name])
@@ -141,18 +132,15 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
-        """Return, by code of this kind, the spans in which the code was present: from and to, seconds since
-        the start."""
+        """Return the spans of each code of this kind, seconds since the start."""
         known = self.codes.get(kind, {})
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
     def packed(self) -> bytes:
-        """Encode the overview in msgpack, as it stands in a recording."""
         return msgspec.msgpack.encode(self)
 
 
 def unpacked(data: bytes) -> Overview:
-    """Decode an overview that `Overview.packed` made."""
     if len(data) > MAX_BYTES:
         raise ValueError(f"an overview of {len(data)} bytes: allowed is {MAX_BYTES}")
     try:
@@ -170,8 +158,6 @@ def unpacked(data: bytes) -> Overview:
 
 
 class OverviewBuilder:
-    """Builds an overview message by message, in bounded memory."""
-
     def __init__(self) -> None:
         self._start_ns: int | None = None
         self._end_ns = 0
@@ -183,7 +169,7 @@ class OverviewBuilder:
         self._marks: list[Mark] = []
 
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
-        """Add one message, a control tick or a snapshot, in the order of writing; `t_ns` is since 1970."""
+        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970."""
         if self._start_ns is None:
             self._start_ns = self._end_ns = t_ns
         since_ns = t_ns - self._start_ns
@@ -197,12 +183,11 @@ class OverviewBuilder:
         if late_us is not None:
             self._late[bisect_right(LATE_US, late_us)] += 1
         mark = message.get("mark")
-        # every snapshot tells the newest, also one from before
+        # every snapshot has the newest mark, even one from before
         if mark and mark.t_ns >= self._start_ns and len(self._marks) < MAX_MARKS and self._marks[-1:] != [mark]:
             self._marks.append(mark)
 
     def made(self) -> Overview:
-        """Return the overview of what was added; all times are 0 where nothing was."""
         width_ns = max(each.width_ns for each in self._stretches.values())
         for each in self._stretches.values():
             each.widen(width_ns)
@@ -225,7 +210,7 @@ class OverviewBuilder:
 
 
 def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """Return the QUANTITIES of a tick or a snapshot in their order; None for what is missing or no number."""
+    """Return the QUANTITIES of a tick or a snapshot; None for what is missing or no number."""
     get = message.get
     gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
     if gap_mm is None and left_mm is not None and right_mm is not None:
@@ -249,8 +234,7 @@ def _number(value: object) -> float | None:
 
 
 def codes_in(told: object) -> tuple[str, ...]:
-    """Return the codes in a field's value, a text, or a list or tuple of texts; empty for anything
-    else, such as None."""
+    """Return the codes in a field's value, a text or several."""
     words = (told,) if isinstance(told, str) else told if isinstance(told, tuple | list) else ()
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 
@@ -260,12 +244,9 @@ def _numbers(data: bytes) -> Floats:
 
 
 class _Followed(Following):
-    """How well the force of one kind of message was followed, looked at every PERIOD_S."""
-
     _number = 0
 
     def add(self, since_ns: int, asked_N: float | None, measured_N: float | None, message: Mapping[str, Any]) -> None:
-        """Look at a message where the next look is due, one in each PERIOD_S; pass it over where none is."""
         number = since_ns // _LOOK_NS
         if number == self._number:
             return
@@ -278,7 +259,7 @@ class _Followed(Following):
 
 
 class _Stretches:
-    """The least and greatest values of one kind of message, stretch by stretch; all stretches are `width_ns` wide."""
+    """The least and greatest values of one kind of message, in stretches of `width_ns`."""
 
     def __init__(self) -> None:
         self.width_ns = FIRST_WIDTH_NS
@@ -287,9 +268,8 @@ class _Stretches:
         self._high = [array("f") for _ in QUANTITIES]
 
     def add(self, since_ns: int, values: Iterable[float | None]) -> None:
-        """Add one value of each of QUANTITIES, in their order, to the stretch of `since_ns`."""
         number = since_ns // self.width_ns
-        # a clock that was set back does not set the curve back
+        # a clock that was set back must not set the curve back
         if not self._numbers or number > self._numbers[-1]:
             if len(self._numbers) >= MAX_STRETCHES:
                 self.widen(2 * self.width_ns)
@@ -307,7 +287,6 @@ class _Stretches:
                     high[-1] = value
 
     def widen(self, width_ns: int) -> None:
-        """Merge stretches to the width `width_ns`, and keep it for those to come."""
         ratio, self.width_ns = width_ns // self.width_ns, width_ns
         if ratio == 1 or not self._numbers:
             return
@@ -320,7 +299,7 @@ class _Stretches:
                 sides[i] = array("f", [of(side[a:b]) for a, b in zip(firsts, ends, strict=True)])
 
     def made(self) -> Curves:
-        """Return the curves as bytes, of every quantity; a stretch without a value of a quantity has NaN."""
+        """Return the curves as bytes; a stretch without a value has NaN."""
         sides: tuple[dict[str, bytes], dict[str, bytes]] = ({}, {})
         for known, arrays in zip(sides, (self._low, self._high), strict=True):
             for name, side in zip(QUANTITIES, arrays, strict=True):
@@ -330,7 +309,7 @@ class _Stretches:
 
 
 def _joined(spans: list[list[int]]) -> list[list[int]]:
-    """Return the spans with those joined that have the smaller gaps between them, about half; the last stays alone."""
+    """Join about half of the spans, across the smaller gaps."""
     gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
     near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
     for span, gap_ns in zip(spans[1:-1], gaps, strict=True):
@@ -342,14 +321,11 @@ def _joined(spans: list[list[int]]) -> list[list[int]]:
 
 
 class _Held:
-    """When one code was present, while it is counted."""
-
     def __init__(self) -> None:
         self.spans: list[list[int]] = []
         self.ns = 0
 
     def hold(self, from_ns: int, to_ns: int) -> None:
-        """Add a span, or extend the last one where it reaches `from_ns`; beyond MAX_SPANS the nearest are joined."""
         if self.spans and from_ns <= self.spans[-1][1] <= to_ns:
             self.ns += to_ns - self.spans[-1][1]
             self.spans[-1][1] = to_ns
@@ -361,15 +337,13 @@ class _Held:
 
 
 class _Codes:
-    """The codes of one kind of message, and when each was present."""
-
     def __init__(self) -> None:
         self._known: dict[str, dict[str, _Held]] = {kind: {} for kind in KINDS}
         self._now: list[tuple[str, str]] = []
         self._now_ns = self._step_ns = 0
 
     def add(self, since_ns: int, message: Mapping[str, Any]) -> None:
-        """Hold the last message's codes up to this one, or, over a break, for one usual step; then take this one's."""
+        """Hold the last message's codes up to this one, or over a break for one usual step; then take this one's."""
         passed_ns = since_ns - self._now_ns
         if 0 < passed_ns <= BREAK_NS:
             self._step_ns = passed_ns
@@ -378,8 +352,6 @@ class _Codes:
         self._now_ns = since_ns
 
     def _hold(self, for_ns: int) -> None:
-        """Let the last message's codes hold for `for_ns` from that message on; new ones from MAX_CODES on count as
-        OTHER."""
         for kind, code in self._now:
             known = self._known[kind]
             is_kept = code in known or len(known) < MAX_CODES - 1
@@ -387,7 +359,7 @@ class _Codes:
             held.hold(self._now_ns, self._now_ns + for_ns)
 
     def made(self) -> dict[str, dict[str, Codes]]:
-        """Hold the last message's codes for one usual step, forget them, and return all spans by kind and code."""
+        """Hold the last codes for one usual step, and return all spans by kind and code."""
         self._hold(self._step_ns)
         self._now = []
         return {

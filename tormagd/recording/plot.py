@@ -16,19 +16,19 @@ from tormagd.recording.overview import BREAK_S, Overview, Series
 
 FORMATS = (".png", ".svg", ".pdf")
 
-# Okabe and Ito's palette, which stays apart for colour-blind eyes; red is kept for faults
+# Okabe and Ito's palette, for colour-blind eyes; red is kept for faults
 BLACK, BLUE, ORANGE, SKY, GREEN, PINK = "#222222", "#0072b2", "#e69f00", "#56b4e9", "#009e73", "#cc79a7"
 RED, GREY = "#d32f2f", "#9e9e9e"
 STATE_COLOURS = {"DISABLED": "#d0d0d0", "ENABLED": GREEN, "PAUSED": SKY, "FAULT": RED}
 LIMIT_COLOURS = (ORANGE, PINK, BLUE, "#8d6e63", "#7e57c2", "#f0c419")
 LINES = {
-    # measured lies under what was wanted: it is the noisy one, and the eye compares the two edges
+    # measured lies below wanted: it is the noisy one
     "force": (
         ("measured_cf", "measured", ORANGE, "-", 1.3),
         ("governed_cf", "governed (what the device can do)", BLUE, "-", 1.5),
         ("setpoint_cf", "asked", BLACK, "--", 1.3),
     ),
-    # both carriages do nearly the same, as do wish and measurement: the upper line is thin, so that the lower one shows
+    # both carriages do nearly the same: the upper line is thin, so that the lower one shows
     "gap": (("gap_mm", "measured", SKY, "-", 2.6), ("gap_setpoint_mm", "wanted", BLACK, "-", 0.7)),
     "duty": (("left_duty", "left", SKY, "-", 2.6), ("right_duty", "right", BLACK, "-", 0.7)),
 }
@@ -39,14 +39,13 @@ rcParams["text.parse_math"] = False
 "A name with a dollar in it is no formula."
 
 WIDE_IN = 12.0
-"Width of a picture, inches."
 
 Spans = dict[str, list[tuple[float, float]]]
-"By code, the stretches of time it was there, seconds from the start."
+"By code, from and to in seconds since the start."
 
 
 def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
-    """Draw a recording as four panels over one time axis: force, gap, duty, and lanes for state, limits and faults."""
+    """Draw a recording as four panels over one time axis: force, gap, duty, and lanes for codes."""
     overview.require_messages()
     states, limits, faults = (overview.spans_s(kind) for kind in ("operating_state", "limits", "faults"))
     lanes = bool(states) + len(limits) + max(1, len(faults))
@@ -56,7 +55,7 @@ def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
     )
     fig = Figure(figsize=(WIDE_IN, 7.6 + 0.25 * lanes))
     heights = (4.2, 2.2, 1.6, 0.3 + 0.3 * lanes)
-    # stated, not found: matplotlib would draw all of it once more to find it
+    # computed here: matplotlib would draw everything once more to find it
     place = _place(fig.get_figheight(), headline.count("\n") + 1, longest)
     force, gap, duty, lane = fig.subplots(4, 1, sharex=True, height_ratios=heights, gridspec_kw=place)
 
@@ -92,7 +91,6 @@ def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
 
 
 def _place(high_in: float, lines: int, longest: int) -> dict[str, float]:
-    """Return where the four panels are in a figure of WIDE_IN by `high_in`, inches, by matplotlib's names."""
     left_in, top_in, bottom_in, between_in = max(0.9, 0.25 + 0.078 * longest), 0.45 + 0.24 * lines, 0.6, 0.34
     panel_in = (high_in - top_in - bottom_in - 3.0 * between_in) / 4.0
     return {
@@ -105,24 +103,21 @@ def _place(high_in: float, lines: int, longest: int) -> dict[str, float]:
 
 
 def picture(drawn: Figure, form: str) -> bytes:
-    """Return the figure as the bytes of an image file of this form, such as "png"."""
     made = io.BytesIO()
     drawn.savefig(made, format=form, dpi=110)
     return made.getvalue()
 
 
 def save_plot(drawn: Figure, path: Path) -> None:
-    """Write the figure to `path`, in place of a file that is there, whole or not at all."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
     data = picture(drawn, path.suffix[1:].lower())
-    # a full disk leaves neither half a picture nor takes the one that was there
+    # on a full disk the old picture stays
     with in_place_of(path) as unfinished:
         unfinished.write_bytes(data)
 
 
 def _headline(overview: Overview, title: str, notes: Sequence[str]) -> str:
-    """Return the headline: `title` with the faults' codes, or "no fault", on the first line."""
     names = ", ".join(overview.spans_s("faults"))
     how = in_words(overview.following)
     followed = [f"followed {how} (sensor noise included)"] if how else []
@@ -132,8 +127,6 @@ def _headline(overview: Overview, title: str, notes: Sequence[str]) -> str:
 
 
 def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float) -> None:
-    """Draw a quantity as one line from each stretch's least value to its greatest and on to the next;
-    nothing for None."""
     if data is None:
         return
     # from the least to the greatest of each stretch, and on to the next
@@ -151,7 +144,6 @@ def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, 
 
 
 def _dress(axes: Axes, label: str, quantity: str) -> None:
-    """Style a panel with `label` at its y axis, and give it a legend above."""
     axes.set_ylabel(label)
     axes.grid(axis="both", color="#e6e6e6", linewidth=0.7)
     axes.set_axisbelow(True)
@@ -163,7 +155,7 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
 
 
 def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults: Spans) -> None:
-    """Draw one lane for the operating state and one for each limit and fault, below each other, and name them."""
+    """Draw one lane for the operating state and one for each limit and fault."""
     held_s = {name: codes.held_ns * 1e-9 for name, codes in overview.codes["limits"].items()}
     shares = {name: 100.0 * held_s[name] / max(overview.duration_s, 1e-3) for name in limits}
     rows: list[tuple[str, list[tuple[str, Spans, str]]]] = [
@@ -177,7 +169,6 @@ def _lanes(axes: Axes, overview: Overview, states: Spans, limits: Spans, faults:
     for row, (_, parts) in enumerate(rows):
         for name, of, colour in parts:
             spans = of[name]
-            # a moment in hours shows, too
             axes.broken_barh([(a, b - a) for a, b in spans], (row - 0.38, 0.76), color=colour, linewidth=0.5)
             if row == 0 and states:
                 _name_spans(axes, name, spans, row)

@@ -1,7 +1,7 @@
 """Reading a recording: its overview, some seconds of it, or message by message.
 
-`mcap` takes the file apart. A file costs no more memory and time than its size explains. A record has at most
-MAX_RECORD_BYTES, and so has a chunk unpacked; all chunks together have MAX_RATIO times the file's bytes.
+`mcap` parses the file. A file costs no more memory and time than its size explains: a record, or a chunk unpacked, has
+at most MAX_RECORD_BYTES, and all chunks together MAX_RATIO times the file's bytes.
 """
 
 import contextlib
@@ -39,28 +39,28 @@ MAX_FILE_BYTES = 1 << 40
 MAX_RECORD_BYTES = 8_000_000
 "A black box's largest message has half of this."
 MAX_RATIO, FREE_BYTES = 100, 16_000_000
-"All chunks unpack to at most MAX_RATIO times what was read of the file, plus FREE_BYTES."
+"All chunks unpack to at most MAX_RATIO times the bytes read, plus FREE_BYTES."
 MAX_WINDOW_BYTES = 1 << 24
 DATA_END_BYTES = 13
 BLOCK_BYTES = 1 << 20
 MAX_INDEX = 1_000_000
-"Bound on the chunks of one file: some days of them."
+"Chunks of one file: some days."
 MAX_SEEN = 400_000
-"Bound on the messages read at once: at 4 kHz more than a minute."
+"Messages read at once: at 4 kHz more than a minute."
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
     McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
     msgspec.MsgspecError,
 )  # fmt: skip
-"""What damage raises; MemoryError where a damaged length asks for more than there is."""
+"What damage raises: MemoryError if a damaged length asks for more than there is."
 
 
 class RecordingError(ValueError):
-    """A file that is not a readable recording: the text names the file and what is wrong with it."""
+    """A file that is not a readable recording; the text names the file and what is wrong."""
 
 
 class Seen(NamedTuple):
-    """A control tick or a snapshot: its time in ns since 1970, which of the two, and the fields that were wanted."""
+    """A control tick or a snapshot, with the fields that were wanted; its time is ns since 1970."""
 
     t_ns: int
     is_tick: bool
@@ -69,7 +69,6 @@ class Seen(NamedTuple):
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open the file in `path` for reading, as a context."""
     try:
         require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file:
@@ -80,7 +79,7 @@ def opened(path: Path) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def readable(name: str) -> Iterator[None]:
-    """Turn any of UNREADABLE raised within this context into a RecordingError that calls the file `name`."""
+    """Turn any of UNREADABLE into a RecordingError that names the file."""
     try:
         yield
     except RecordingError:
@@ -90,13 +89,12 @@ def readable(name: str) -> Iterator[None]:
 
 
 class _Bounded:
-    """A file that an MCAP reader reads: `left` bytes of it until somebody allows more."""
+    """A file for an MCAP reader, which may read `left` more bytes."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self.left = file, MAX_RECORD_BYTES
 
     def read(self, size: int) -> bytes:
-        """Read `size` bytes."""
         self.left -= size
         if self.left < 0:
             raise ValueError(f"a record of over {MAX_RECORD_BYTES} bytes")
@@ -107,7 +105,7 @@ class _Bounded:
 
 
 def _records(file: BinaryIO, *, has_magic: bool = False) -> Iterator[McapRecord]:
-    """Yield the records from where `file` stands to the end, chunks packed."""
+    """Yield the records to the end, chunks packed."""
     stream = _Bounded(file)
     reader = StreamReader(stream, skip_magic=not has_magic, emit_chunks=True)  # type: ignore[arg-type]
     for record in reader.records:
@@ -116,7 +114,6 @@ def _records(file: BinaryIO, *, has_magic: bool = False) -> Iterator[McapRecord]
 
 
 def _within(chunk: Chunk) -> list[McapRecord]:
-    """Return the records in a chunk."""
     size = chunk.uncompressed_size
     if size > MAX_RECORD_BYTES or chunk.compression not in ("zstd", ""):
         raise ValueError(f"a chunk of {size} bytes ({chunk.compression[:20]!r}): allowed is zstd, {MAX_RECORD_BYTES}")
@@ -130,8 +127,7 @@ def _within(chunk: Chunk) -> list[McapRecord]:
 def scan(
     file: BinaryIO, name: str, take: Callable[[McapRecord, int], None], message: Callable[[Message], None]
 ) -> bool:
-    """Read an MCAP file from byte 0: each message goes to `message`, other records, and behind which byte each is, to
-    `take`."""
+    """Read an MCAP file: each message goes to `message`, other records and where they begin to `take`."""
     at, size = MAGIC_SIZE, 0
     with readable(name):
         try:
@@ -157,7 +153,6 @@ def scan(
 
 
 def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
-    """Read the record of this kind behind byte `at`."""
     file.seek(at)
     record = next(_records(file))
     if not isinstance(record, kind):
@@ -166,7 +161,6 @@ def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
 
 
 def _end(file: BinaryIO) -> tuple[Footer | None, int]:
-    """Return the footer of a file, None for one cut short or without a summary, and the byte at which it begins."""
     at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
     file.seek(at)
     footer = _at(file, at, Footer) if file.read().endswith(MCAP0_MAGIC) else None
@@ -174,7 +168,7 @@ def _end(file: BinaryIO) -> tuple[Footer | None, int]:
 
 
 def damage_in(file: BinaryIO) -> str:
-    """Say in words which CRC of a whole MCAP file is wrong; empty for none, and for a file cut short."""
+    """Say which CRC of a whole MCAP file is wrong; empty for none, and for a file cut short."""
     try:
         footer, at = _end(file)
         if footer is None:
@@ -202,7 +196,7 @@ def _crc(file: BinaryIO, first: int, end: int) -> int:
 
 
 class Place(NamedTuple):
-    """Where a chunk is: its messages' times in ns since 1970, and the byte behind which it is."""
+    """Where a chunk begins in the file, and its messages' times, ns since 1970."""
 
     from_ns: int
     to_ns: int
@@ -210,17 +204,16 @@ class Place(NamedTuple):
 
 
 class Contents:
-    """Collects what a file's records tell: topics, metadata, and places of chunks, in the file's order."""
+    """Collects topics, metadata, and places of chunks, in the file's order."""
 
     def __init__(self) -> None:
         self._topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
         self.is_complete = True
-        "False where the recorder was killed or the disk was full: messages up to then are there."
+        "False if the recorder was killed or the disk was full: earlier messages are there."
 
     def take(self, record: McapRecord, at: int) -> None:
-        """Note what a record behind byte `at` tells: a channel's topic, tormagd's metadata, or a chunk's place."""
         if isinstance(record, Channel):
             self._topics[record.id] = record.topic
         elif isinstance(record, Metadata) and record.name == ABOUT:
@@ -229,8 +222,7 @@ class Contents:
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
     def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Message], None]:
-        """Return a function of one message, which hands each tick and snapshot to `each`, decoded as the
-        type `wanted`."""
+        """Return a function that hands each tick and snapshot to `each`, decoded as `wanted`."""
         decoder = msgspec.json.Decoder(wanted)
 
         def message(sent: Message) -> None:
@@ -241,14 +233,12 @@ class Contents:
         return message
 
     def require(self, name: str) -> None:
-        """Raise RecordingError, naming the file `name`, where the file has neither telemetry nor ticks."""
         if set(self._topics.values()).isdisjoint(TOPICS):
             raise RecordingError(
                 f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
             )
 
     def described(self, name: str, kind: Any) -> Any:
-        """Return the metadata value `name`, which is JSON, decoded as the type `kind` by msgspec."""
         try:
             return msgspec.json.decode(self.metadata[name], type=kind)
         except (KeyError, msgspec.MsgspecError, RecursionError):
@@ -256,8 +246,7 @@ class Contents:
 
 
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Read the recording in an open `file` at byte 0, which errors call `name`: each tick and snapshot
-    goes to `each`."""
+    """Read an open recording: each tick and snapshot goes to `each`."""
     found = Contents()
     is_whole = scan(file, name, found.take, found.reading(wanted, each))
     found.require(name)
@@ -266,13 +255,13 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
 
 
 def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
-    """Read the recording in `path`: each tick and snapshot, decoded as the type `wanted`, goes to `each`."""
+    """Read the recording in `path`: each tick and snapshot, decoded as `wanted`, goes to `each`."""
     with opened(path) as file:
         return read_open(file, str(path), wanted, each)
 
 
 class RecordingFile:
-    """A recording on the disk, of any length: its `overview`, `metadata`, `is_complete`, and any seconds of it."""
+    """A recording of any length on the disk."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -291,11 +280,10 @@ class RecordingFile:
             *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
             *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
         ]
-        "What whoever looks at it has to know, in words."
+        "What its reader has to know, in words."
 
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
-        """Return the ticks and snapshots from `from_ns` to `to_ns`, both included, in the file's order, decoded as
-        `wanted`."""
+        """Return the ticks and snapshots from `from_ns` to `to_ns`, inclusive, in the file's order."""
         found: list[Seen] = []
 
         def keep(seen: Seen) -> None:
@@ -315,7 +303,7 @@ class RecordingFile:
 
 
 def summary_of(path: Path) -> tuple[Contents, Overview] | None:
-    """Read contents and overview from the end of the file in `path`, without its messages."""
+    """Read contents and overview from the end of the file, if they are there."""
     found, told, overview_at = Contents(), [], 0
     with opened(path) as file, readable(str(path)):
         footer, _ = _end(file)

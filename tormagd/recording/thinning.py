@@ -1,18 +1,17 @@
-"""Fewer ticks where nothing happens: all of them around a fault or a mark, one of every N elsewhere."""
+"""Fewer ticks where nothing happens: all around a fault or a mark, one of every N elsewhere."""
 
 from collections import deque
 from typing import Any
 
 AROUND_S = 10.0
-"All ticks are kept this long before and after a fault or a mark."
 AROUND_NS = round(AROUND_S * 1e9)
 
 Tick = tuple[int, dict[str, Any]]
-"Its time, ns since 1970, and its message."
+"Time, ns since 1970, and message."
 
 
 class Thinning:
-    """Keeps one tick of `every`, and all within AROUND_S of a fault or a mark. With 1 all are kept and none waits."""
+    """Keeps one tick of `every`, and all within AROUND_S of a fault or a mark."""
 
     def __init__(self, every: int) -> None:
         self.every = every
@@ -22,11 +21,10 @@ class Thinning:
         self._faults: Any = ()
 
     def happened(self, t_ns: int) -> None:
-        """Keep all ticks from AROUND_S before to AROUND_S after `t_ns`, ns since 1970."""
         self._full_to_ns = max(self._full_to_ns, t_ns + AROUND_NS)
 
     def take(self, tick: Tick) -> list[Tick]:
-        """Add a tick, and return the ticks to be written now, in their order; often none."""
+        """Add a tick, and return the ticks to be written now, often none."""
         if self.every == 1:
             return [tick]
         t_ns, message = tick
@@ -43,7 +41,7 @@ class Thinning:
         return given
 
     def rest(self, every: int) -> list[Tick]:
-        """Return one of `every` of the ticks that wait, in their order, and forget them all; 1 returns all."""
+        """Return one of `every` waiting ticks, and forget them all."""
         given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
         self._waiting.clear()
         return given

@@ -14,7 +14,7 @@ MAX_BATCH_BYTES = 4_000_000  # 20 ms at 4 kHz with 100 columns is under 1 MB
 MAX_COLUMNS = 256
 MAX_TIME_NS = 2**63
 QUEUE = 10_000
-"Batches that may wait for a slow listener: over three minutes."
+"Over three minutes for a slow listener."
 
 Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 
@@ -45,8 +45,7 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
 def listening(
     context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
 ) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket to `address`, for telemetry or ticks whose messages begin with `topic`,
-    and return it."""
+    """Connect a new SUB socket for telemetry or ticks."""
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
@@ -59,7 +58,6 @@ _DECODER = msgspec.msgpack.Decoder(TickBatch)
 
 
 def decode_ticks(data: bytes) -> TickBatch:
-    """Decode a batch of ticks from msgpack, and check it as TickBatch does."""
     if len(data) > MAX_BATCH_BYTES:
         raise MessageError(f"tick batch of {len(data)} bytes: allowed is {MAX_BATCH_BYTES}")
     try:

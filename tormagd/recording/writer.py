@@ -1,8 +1,8 @@
 """Writing a recording: MCAP with JSON messages and JSON schemas, compressed with zstd.
 
-Channel `/telemetry` has the daemon's snapshots as published, `/ticks` one message for every control tick. The files
-open in Foxglove and PlotJuggler as they are. A value that is not known is left out of its message: viewers read only
-plain schemas, in which a number cannot be null. An overview stands at the end.
+Channel `/telemetry` has the daemon's snapshots as published, `/ticks` one message for every control tick. Foxglove and
+PlotJuggler open the files. Unknown values are left out: viewers read only plain schemas, in which a number cannot be
+null. An overview stands at the end.
 """
 
 import contextlib
@@ -27,28 +27,25 @@ from tormagd.recording.ticks import TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry, TickRecord
 
 ABOUT = "tormagd"
-"Name of the metadata records that say what is recorded."
 CUT = "cut_by"
-"Key in the metadata: why the recording ended early."
+"Metadata key: why the recording ended early."
 THINNED = "thinned"
-"Key in the metadata: which ticks are there, where not all are."
+"Metadata key: which ticks are there, if not all."
 OVERVIEW = "overview 2"
-"Name of the attachment that holds the overview; 2 since it counts handle and limits in how well a force is followed."
+"Version 2 counts handle and limits in how well a force is followed."
 TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC = "/ticks"
 NUMBER_COLUMN = "tick"
-"Column of the control tick's number; a missing number is a lost tick."
+"A missing number is a lost tick."
 CHUNK_NS = 500_000_000
-"Time that one chunk spans, lost where the recorder is killed."
+"Lost if the recorder is killed."
 MIN_FREE_BYTES = 16_000_000
-"A recording ends before the disk is full: the last chunk needs room, and the index, which grows with the file."
+"A recording ends before the disk is full: the last chunk and the index need room."
 INDEX_SHARE = 64
-"The index is at most 1/INDEX_SHARE of the file."
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
-    """Say in a sentence why the disk of `path` has no room for `needed_bytes` and MIN_FREE_BYTES; empty
-    where it has."""
+    """Say why a disk has no room for `needed_bytes`; empty if it has."""
     free, least = shutil.disk_usage(path.parent).free, MIN_FREE_BYTES + needed_bytes
     if free >= least:
         return ""
@@ -56,7 +53,7 @@ def disk_room(path: Path, needed_bytes: int) -> str:
 
 
 class RecordingWriter:
-    """Writes an MCAP recording, or in a folder several one after the other, until `close`; also a context manager."""
+    """Writes an MCAP recording, or in a folder several one after the other, until `close`."""
 
     def __init__(
         self,
@@ -77,11 +74,11 @@ class RecordingWriter:
         self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
     def _begin(self, path: Path) -> None:
-        """Open a new file in `path`, lock it against pruning, and write its head and metadata."""
+        """Begin a new file, locked against pruning."""
         self.path = path
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody takes it away while it is written
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._overview = OverviewBuilder()
         self._mcap = begun(self._file, self._about)
         self._file.flush()
@@ -90,7 +87,7 @@ class RecordingWriter:
         self._begin_ns = self._chunk_ns = 0
 
     def _rotate(self, folder: RecordingFolder) -> None:
-        """End the file and go on in a new one, where size or length are over the budget."""
+        """End the file and begin a new one if size or length are over the budget."""
         if not folder.is_due(self._file.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
             return
         try:
@@ -101,7 +98,6 @@ class RecordingWriter:
         self._begin(path)
 
     def _give_up(self, reason: str) -> NoReturn:
-        """End the file in order, with `reason` in its metadata, and raise OSError with ENOSPC and that reason."""
         self.describe({CUT: reason})
         self._end()
         raise OSError(errno.ENOSPC, reason)
@@ -112,7 +108,6 @@ class RecordingWriter:
         self._mcap.add_metadata(ABOUT, metadata)
 
     def telemetry(self, message: Telemetry) -> None:
-        """Write one snapshot, without values that are not known, and count missing `seq`."""
         if self._last_seq is not None and message.seq > self._last_seq + 1:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
@@ -123,16 +118,16 @@ class RecordingWriter:
         self._add(self._telemetry_channel, message.t_ns, msgspec.json.encode(known), self.telemetry_count)
         self._overview.add(message.t_ns, False, known | {"mark": mark})
         self.telemetry_count += 1
-        # every snapshot tells the newest mark, also one from before
+        # every snapshot has the newest mark, even one from before
         if mark is not None and mark != before and mark.t_ns >= self._begin_ns and self._folder is not None:
             self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message, thinned, and count missing numbers in NUMBER_COLUMN, which may be absent."""
+        """Write each row as one message, thinned, and count missing ticks."""
         number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
         for row in batch.rows:
             t_ns = row[0]
-            assert isinstance(t_ns, int)  # TickBatch has checked it
+            assert isinstance(t_ns, int)
             if number_at is not None and isinstance(number := row[number_at], int):
                 if self._last_tick is not None and number > self._last_tick + 1:
                     self.ticks_lost += number - self._last_tick - 1
@@ -145,13 +140,11 @@ class RecordingWriter:
             self._rotate(self._folder)
 
     def close(self) -> None:
-        """Write waiting ticks, overview and index, and close the file; do nothing where it is closed."""
         if not self._file.closed:
             self._write(self._thinning.rest(self._thinning.every))
             self._end()
 
     def _end(self) -> None:
-        """Write overview and index, and close the file, whatever fails."""
         with self._file:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", self._overview.made().packed())
@@ -164,7 +157,7 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if isinstance(error, OSError):
-            with contextlib.suppress(OSError):  # behind a chunk that was cut, an index would make the file unreadable
+            with contextlib.suppress(OSError):  # after a chunk that was cut, an index would make the file unreadable
                 self._file.close()
         else:
             self.close()
@@ -174,15 +167,12 @@ class RecordingWriter:
             self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
 
     def _channel_of(self, message: dict[str, Value]) -> int:
-        """Return the tick channel whose schema `message` obeys: TICK_SCHEMA, or for other columns and types, none."""
         fits = all(TICK_KINDS.get(name) == _KINDS[type(value)] for name, value in message.items())
         if fits not in self._tick_channels:
             self._tick_channels[fits] = registered(self._mcap, TICKS_TOPIC, TICK_SCHEMA if fits else OTHER_SCHEMA)
         return self._tick_channels[fits]
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
-        """Write a message of JSON in `data`; first begin a new chunk where `t_ns` is over CHUNK_NS from its chunk's
-        first."""
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             index_bytes = self._file.tell() // INDEX_SHARE
@@ -195,7 +185,6 @@ class RecordingWriter:
 
 
 def begun(file: BinaryIO, about: dict[str, str]) -> Writer:
-    """Begin an MCAP file whose CRCs cover all of it, with `about` as metadata of what is recorded."""
     mcap = Writer(file, enable_data_crcs=True)
     mcap.start(profile="", library=f"tormagd {__version__}")
     mcap.add_metadata(ABOUT, about)
@@ -203,19 +192,18 @@ def begun(file: BinaryIO, about: dict[str, str]) -> Writer:
 
 
 def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
-    """Register `schema` and a channel of JSON messages under `topic` in the file that `mcap` writes."""
     schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=msgspec.json.encode(schema))
     return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the JSON schema of a message type without `$ref`, `anyOf` and tuples, which viewers do not read."""
+    """Return the JSON schema of a message without `$ref`, `anyOf` and tuples, which viewers do not read."""
     (schema,), definitions = msgspec.json.schema_components([message], ref_template="{name}")
     return {"title": f"tormagd.{message.__name__}", **_plain(schema, definitions)}
 
 
 def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
-    """Return a schema without references and alternatives: the first option that is not null, a tuple's first type."""
+    """Return the first option that is not null, and a tuple's first type."""
     if "$ref" in schema:
         return _plain(definitions[schema["$ref"]], definitions)
     if "anyOf" in schema:
@@ -232,8 +220,8 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
 
 
 def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Value]:
-    """Return a tick's row as a message: its values by column, without those that are None, NaN or infinite."""
-    # as _known, without a call for each of some sixty values, a thousand times a second
+    """Return a tick's row as a message, without values that are None, NaN or infinite."""
+    # inlines _known: some sixty values a thousand times a second
     return {
         name: value
         for name, value in zip(columns, row, strict=True)
@@ -242,7 +230,6 @@ def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Valu
 
 
 def _tick_schema() -> dict[str, Any]:
-    """Return the JSON schema of a tick message, an object with the columns of this version's daemon."""
     (schema,), definitions = msgspec.json.schema_components([TickRecord], ref_template="{name}")
     items = map(_plain, definitions[schema["$ref"]]["prefixItems"], repeat(definitions))
     columns = dict(zip(TickRecord.__struct_fields__, items, strict=True))
@@ -253,12 +240,10 @@ def _tick_schema() -> dict[str, Any]:
 _KINDS = {bool: "boolean", str: "string", tuple: "array", int: "number", float: "number"}
 TICK_SCHEMA = _tick_schema()
 TICK_KINDS = {name: kind["type"] for name, kind in TICK_SCHEMA["properties"].items()}
-"By name, the JSON type of each column that this version's daemon publishes."
 OTHER_SCHEMA = {"title": "tormagd.OtherTick", "type": "object"}
 
 
 def _known(value: Any) -> Any:
-    """Return plain data without what is not known; None where `value` itself is not."""
     if isinstance(value, dict):
         return {name: known for name, inner in value.items() if (known := _known(inner)) is not None}
     if isinstance(value, list | tuple):

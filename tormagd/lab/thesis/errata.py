@@ -83,20 +83,21 @@ def _chapter_2() -> list[Row]:
         (
             "Eq. 7",
             "a(s) without a unit",
-            f"In mT mm it gives {1e3 * closed_Tm / 0.004:.0f} mT at the shaft for 45 mm, {1e3 * open_Tm / 0.004:.0f} "
-            f"for 95 mm; the text: up to 800. The appendix's power law is at most {100 * apart:.1f}% off it between.",
+            f"In mT mm it gives {1e3 * closed_Tm / 0.004:.0f} mT at the shaft for 45 mm and "
+            f"{1e3 * open_Tm / 0.004:.0f} for 95 mm (text: up to 800), within {100 * apart:.1f}% of the "
+            "appendix's power law.",
             "mT mm, on 45..95 mm only",
         ),
         (
             "Eq. 6 with Eq. 4",
             "b = a(s) / R for every insert",
-            f"With one friction MRE-10-10 would span {soft_range_N:.2f} N and MRE-10-40 {strong_range_N:.2f} N; "
-            f"measured were {soft.force_range.measured_N} and {strong.force_range.measured_N} N.",
+            f"MRE-10-10 would span {soft_range_N:.2f} N and MRE-10-40 {strong_range_N:.2f} N; measured were "
+            f"{soft.force_range.measured_N} and {strong.force_range.measured_N} N.",
             "b = (mu_r / 4) a / R",
         ),
         (
             "Eq. 28 and Eq. 33",
-            "the magnetic term with opposite signs, times mu0 mu_r and divided by it",
+            "opposite signs of the magnetic term, mu0 mu_r above and below",
             f"At 45 mm (277.3 kPa, mu_r 4, mu_d 0.2) Eq. 33 gives {Brake.as_built(SAMPLE, eq7).most_N:.2f} N, Eq. 28 "
             f"{_eq_28(closed_Tm):.2f} N. Figure 2.5 has {FIGURE_2_5_N[1]} N.",
             "Eq. 33",
@@ -105,20 +106,20 @@ def _chapter_2() -> list[Row]:
             "Eq. 30 and Eq. 31",
             "no 1/2 in the body force of the first, no thickness in the second",
             f"The appendices have both. As printed lambda1 at 45 mm is {_literal_stretch(closed_Tm):.3f}, not "
-            f"{1.0 + stretch_minus_one(closed_Tm, SAMPLE, TORMAG):.3f}. Either way t is a bare number of metres.",
+            f"{1.0 + stretch_minus_one(closed_Tm, SAMPLE, TORMAG):.3f}.",
             "the appendix's form; t as a body-force weight",
         ),
         (
-            "Section 2.3.8, of figure 2.5",
-            "increasing the shear modulus increases the force range",
-            f"By Eq. 33 (mu_r 4, mu_d 0.2) it falls from {soft_N:.2f} N at 80 kPa to {stiff_N:.2f} N at 280 kPa.",
+            "Section 2.3.8",
+            "a greater shear modulus increases the range",
+            f"By Eq. 33 it falls from {soft_N:.2f} N at 80 kPa to {stiff_N:.2f} N at 280 kPa.",
             "Eq. 33; friction per matrix",
         ),
         (
             "Figure 2.5 and table 2.4",
-            f"{FIGURE_2_5_N[0]}..{FIGURE_2_5_N[1]} N, and an estimated range of {best_N} N",
-            f"Both are MRE-50-40; the first is a range of {span_N:.2f} N, {100 * (1 - span_N / best_N):.0f}% less.",
-            "neither; friction is fitted to the measured ranges",
+            f"{FIGURE_2_5_N[0]}..{FIGURE_2_5_N[1]} N, and a range of {best_N} N",
+            f"Both are MRE-50-40; the first spans {span_N:.2f} N, {100 * (1 - span_N / best_N):.0f}% less.",
+            "neither; friction is fitted",
         ),
         (
             "Table 2.4, error columns",
@@ -130,13 +131,13 @@ def _chapter_2() -> list[Row]:
         ),
         (
             "Section 2.4.2.2",
-            "mean differences of 0.17 N for the most and 0.066 N for the least force",
-            f"A range is off by at most their sum, 0.236 N; table 2.4 is off by {np.mean(errors_N):.2f} N in the mean.",
+            "mean differences of 0.17 N (most force) and 0.066 N (least)",
+            f"Their sum is 0.236 N; table 2.4 is off by {np.mean(errors_N):.2f} N in the mean.",
             "table 2.4",
         ),
         (
             "Abstract and section 2.4.2.3",
-            "range increased by 248%, 288%, 190% (1.57, 2.45, 2.52 N) from 10% to 40% iron",
+            "increases of 248%, 288%, 190% (1.57, 2.45, 2.52 N) from 10% to 40% iron",
             f"These are ratios: {'; '.join(growth)}.",
             "ratios",
         ),
@@ -149,9 +150,9 @@ def _chapter_2() -> list[Row]:
         (
             "Eq. 35",
             "s_max of Eq. 7 is the design's largest gap",
-            f"With 200 mm the field at 45 mm grows {stretched / closed_Tm:.1f}-fold, to {stretched / 0.004:.1f} T at "
-            f"the shaft (lambda1 {_literal_stretch(stretched, appendix=True):.2f}): distance makes no magnet stronger.",
-            "the power law for gaps beyond 95 mm",
+            f"With 200 mm the field at 45 mm would be {stretched / closed_Tm:.1f} times as strong, "
+            f"{stretched / 0.004:.1f} T (lambda1 {_literal_stretch(stretched, appendix=True):.2f}).",
+            "the power law beyond 95 mm",
         ),
     ]
 
@@ -169,8 +170,8 @@ def _eq_25() -> Row:
     return (
         "Eq. 25",
         "T is the nominal stress",
-        f"With Lambda = F F^T it is the true one. Radially at 45 mm (lambda1 = {radial:.3f}): {true_kPa:.0f} kPa; the "
-        f"energy's derivative, per undeformed area, is {nominal_kPa:.0f} kPa.",
+        f"With Lambda = F F^T it is the true one: radially at 45 mm (lambda1 = {radial:.3f}) {true_kPa:.0f} kPa, the "
+        f"nominal one {nominal_kPa:.0f} kPa.",
         "Eq. 25 as the true stress",
     )
 
@@ -184,20 +185,20 @@ def _chapter_3() -> list[Row]:
         (
             "Table 3.2 and section 3.4",
             "use case 1 (least force 0) s_max 85..87 mm, use case 2 (0.5 N) 138..200 mm",
-            "A smaller least force needs a larger s_max, as the text says.",
+            "A smaller least force needs a larger s_max.",
             "the regions of the text and of appendix B",
         ),
         (
             "Section 3.4 and Eq. 40",
-            "a shell of 9 mm from R_o = 15 mm with R_i = 6 mm; R_o > 6.5 mm for a shell of 0.5 mm",
-            "R_i is 4 mm elsewhere: the shell is 11 mm, and the bound leaves 2.5 mm.",
+            "R_i = 6 mm: a shell of 9 mm at R_o = 15 mm; R_o > 6.5 mm for one of 0.5 mm",
+            "R_i is 4 mm elsewhere: the shells are 11 and 2.5 mm.",
             "R_i = 4 mm and Eq. 40 as printed",
         ),
         (
             "Eq. 40-42 and appendix B",
             "R_o 6.5..45, t 0.5..50, s_max 45..200 mm",
-            f"The code searches R_o 8..15, t 10..50, s_max 50..200 mm. {len(outside)} of {len(lines)} starts lie "
-            f"outside ({', '.join(outside)} mm); {at_bound} of {len(lines)} optima sit at its R_o = 15 mm.",
+            f"The code searches R_o 8..15, t 10..50, s_max 50..200 mm. {len(outside)} of {len(lines)} starts are "
+            f"outside ({', '.join(outside)} mm); {at_bound} of {len(lines)} optima are at its R_o = 15 mm.",
             "Eq. 40-42",
         ),
     ]
@@ -212,20 +213,20 @@ def _appendices() -> list[Row]:
         (
             "Appendix A and B, field",
             "a = 0.44 s^(-1.3/6 mu_r) in A and, in B, at s_max; s^-1.3/6*mu_r at s_min",
-            f"At 45 mm (mu_r {APPENDIX_MU_R}) {exponent_T:.1f} T at the shaft, and {sixth_T:.2f} T; the magnets give "
-            "up to 0.8 T.",
+            f"At 45 mm (mu_r {APPENDIX_MU_R}) {exponent_T:.1f} and {sixth_T:.2f} T at the shaft; the magnets give up "
+            "to 0.8 T.",
             f"0.44 gap^-1.3 mu_r / 4: {used_T:.2f} T",
         ),
         (
             "Appendix B, traction at s_min",
             "zeta = 2 pi t mu_r mu_d / lambda1",
-            f"mu_r stands for R_i^2: {APPENDIX_MU_R / 0.004**2:,.0f} times too large, at one of four gaps only.",
+            f"mu_r is in the place of R_i^2: {APPENDIX_MU_R / 0.004**2:,.0f} times too large.",
             "R_i^2 (Eq. 34)",
         ),
         (
             "Appendix A, gap speed",
             "sdot = 0.12",
-            f"This is the rise time; the speed is {1 / 0.12:.2f} mm/s, as in B. Rates in A are {1 / 0.12**2:.0f} times "
+            f"This is the rise time. The speed is {1 / 0.12:.2f} mm/s, as in B; A's rates are {1 / 0.12**2:.0f} times "
             "too small.",
             "1 mm / 0.12 s",
         ),
@@ -239,8 +240,7 @@ def _appendices() -> list[Row]:
         (
             "Appendix B, cost",
             "Eq. 39 has four corners, each with force and rate",
-            "The code has the two upper ones, which moves no minimum, and the force alone at the closed gap, which "
-            "leaves the largest rate free.",
+            "The code has only the two upper ones, and at the closed gap only the force, so the largest rate is free.",
             "Eq. 39",
         ),
     ]
@@ -250,15 +250,15 @@ def _chapter_4() -> list[Row]:
     return [
         (
             "Abstract and section 4.3",
-            "3.64 mT as mean error in one, as maximum in the other; 1.14 mT = 3.2%, 3.64 mT = 4.4%",
-            f"Of one full scale they cannot both be: {1.14 / 0.032:.0f} and {3.64 / 0.044:.0f} mT.",
+            "3.64 mT as mean error and as maximum; 1.14 mT = 3.2%, 3.64 mT = 4.4%",
+            f"These are of two full scales, {1.14 / 0.032:.0f} and {3.64 / 0.044:.0f} mT.",
             "mean 1.14 mT, maximum 3.64 mT",
         ),
         (
             "Section 4.3",
             "83 Hz",
-            f"1 / (4 + 8 ms) = {1 / 0.012:.0f} Hz: mean plus one deviation, not the slowest solve.",
-            "a least rate, to be kept by every solve",
+            f"1 / (4 + 8 ms) = {1 / 0.012:.0f} Hz is mean plus one deviation, not the slowest solve.",
+            "the least rate of every solve",
         ),
     ]
 

@@ -48,9 +48,9 @@ def table_2_5() -> Json:
         ],
         "gap_resolution_mm": GAP_RESOLUTION_MM,
         "implied_gap_resolution_mm": [min(steps), max(steps)],
-        "note": "As the thesis meant it, an insert serves a task where its measured range (table 2.4) is as wide as "
-        "the task's. Strictly the least force counts too: a passive brake does not reach 0 N. Resolution is the force "
-        "of one gap step where the insert is steepest within the task's range. Forces are the simulated device's.",
+        "note": "As the thesis meant it, an insert serves a task if its measured range (table 2.4) is as wide as the "
+        "task's. Strictly the least force counts too, and a passive brake does not reach 0 N. Resolution is the force "
+        "of one gap step where the insert is steepest. Forces are the simulated device's.",
     }
 
 
