@@ -24,8 +24,8 @@ FOLDER = ROOT / "docs" / "evidence"
 README = "README.md"
 HEADER = """# Evidence
 
-Written by `make evidence`, on simulated devices. *Measured*: the part judges nothing. `python tools/evidence.py NAME`
-repeats one.
+`make evidence` measures this on simulated devices; `python tools/evidence.py NAME` repeats a part. *Measured* parts
+have no verdict.
 
 | part | command | version, day | held | figures |
 | --- | --- | --- | --- | --- |

@@ -19,7 +19,6 @@ from tormagd import config
 from tormagd.ctl import main as ctl
 from tormagd.daemon import main as daemon
 from tormagd.hardware import can_backend, serial_backend
-from tormagd.lab.pages import table
 from tormagd.simulation import __main__ as simulation
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
@@ -29,15 +28,14 @@ BACKENDS = {
 }
 _CONFIGURATION_HEAD = """# Configuration: every key
 
-Written by `python tools/reference_pages.py` from the types that refuse a wrong one.
-[Configure](../guides/configure.md) says how they are used, `tormagd --check --config FILE` what is in force.
+`python tools/reference_pages.py` writes this page from the types. See [configure](../guides/configure.md);
+`tormagd --check --config FILE` prints what is in force. Brackets hold the default and what is allowed.
 """
 _COMMANDS_HEAD = """# Commands: every option
 
-Written by `python tools/reference_pages.py` from the argument parsers; `--help`, the man pages and completion come from
-the same.
+`python tools/reference_pages.py` writes this page from the argument parsers.
 """
-BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "to {}", "lt": "under {}"}
+BOUNDS = {"ge": "{}", "gt": "over {}", "le": "to {}", "lt": "under {}"}
 
 
 def main() -> int:
@@ -51,7 +49,7 @@ def configuration_page() -> str:
     for heading, kind in (*tables(config.Config, ""), *BACKENDS.items()):
         says = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
         parts.append(f"## {heading or 'At the top'}\n\n{says}\n")
-        parts.append(table(("key", "default", "allowed", "what and why"), keys(kind)))
+        parts.append("".join(f"- {name} ({default}; {allowed}): {why}\n" for name, default, allowed, why in keys(kind)))
     return "\n".join(parts)
 
 
@@ -79,12 +77,12 @@ def commands_page() -> str:
     for parser in (daemon.parser(), ctl.parser(), simulation.parser(), conformance.parser()):
         parts.append(f"## {parser.prog}\n\n{parser.description}\n")
         shared = _options(parser)
-        parts.append(table(("option", "what"), shared))
+        parts.append("\n".join(shared) + "\n")
         for name, command in subparsers(parser):
             own = [row for row in _options(command) if row not in shared]
             parts.append(f"### {parser.prog} {name}\n\n{command.description}\n")
             if own:
-                parts.append(table(("option", "what"), own))
+                parts.append("\n".join(own) + "\n")
     return "\n".join(parts)
 
 
@@ -94,10 +92,10 @@ def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.
             yield from action.choices.items()
 
 
-def _options(parser: argparse.ArgumentParser) -> list[tuple[str, ...]]:
+def _options(parser: argparse.ArgumentParser) -> list[str]:
     formatter = parser._get_formatter()
     return [
-        (f"`{_called(action, formatter)}`".replace("|", "\\|"), _says(action))
+        f"- `{_called(action, formatter)}`{_says(action)}"
         for action in parser._actions
         if not isinstance(action, argparse._SubParsersAction | argparse._HelpAction)
     ]
@@ -115,12 +113,12 @@ def _called(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
 
 def _says(action: argparse.Action) -> str:
     says = (action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%")
-    return says.replace("|", "\\|") or "-"
+    return says and f": {says}"
 
 
 def _default(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
-        return "-"
+        return "required"
     value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
     # TOML writes as JSON does, except for a table
     return "`{}`" if isinstance(value, dict) else f"`{msgspec.json.encode(value).decode()}`"
@@ -139,8 +137,8 @@ def _allowed(hint: Any) -> str:
         for name, text in BOUNDS.items()
         if getattr(meta, name) is not None
     ]
-    words = {int: "whole number", float: "number", str: "text", bool: "true, false"}
-    return " ".join((words.get(inner, "table"), *bounds))
+    words = {int: "whole", float: "", str: "text", bool: "true or false"}
+    return " ".join((words.get(inner, "table"), *bounds)).strip()
 
 
 def _field_docs(kind: type[msgspec.Struct]) -> dict[str, str]:

@@ -29,8 +29,8 @@ HELD = {"named": "named", "safe": "ended safe", "in_time": "reacted in their sta
 
 _STATES_HEAD = """# Operating states, faults and limits
 
-Look up a state, a fault or a limit, and what to do. Beyond this process: [safety](safety.md). What each fault comes to:
-the [fault matrix](fault-matrix.md). `python tools/safety_pages.py` writes this page from the daemon's own tables.
+`python tools/safety_pages.py` writes this page from the daemon's own tables. See also [safety](safety.md) and the
+[fault matrix](fault-matrix.md).
 
 """
 _MATRIX_HEAD = """# Fault matrix
@@ -66,7 +66,7 @@ def risk_rows(record: dict[str, Any]) -> list[Row]:
 
 
 def states_page() -> str:
-    return "".join((_STATES_HEAD, _diagram(), _transitions(), _guards(), _faults(), _limits())).rstrip() + "\n"
+    return "".join((_STATES_HEAD, _transitions(), _guards(), _faults(), _limits())).rstrip() + "\n"
 
 
 def matrix_page(record: dict[str, Any]) -> str:
@@ -96,15 +96,6 @@ def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
     return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "no command"
 
 
-def _diagram() -> str:
-    edges: dict[tuple[OperatingState, OperatingState], list[str]] = {}
-    for row in ROWS:
-        if isinstance(row, Transition):
-            edges.setdefault((row.source, row.target), []).append(str(row.event))
-    lines = [f"    {source} --> {target}: {', '.join(events)}" for (source, target), events in edges.items()]
-    return "\n".join(("```mermaid", "stateDiagram-v2", f"    [*] --> {OperatingState.DISABLED}", *lines, "```", "", ""))
-
-
 def _transitions() -> str:
     known = {(row.event, row.source): row for row in ROWS}
     rows = []
@@ -115,9 +106,9 @@ def _transitions() -> str:
         asked = "-" if row.request is DeviceRequest.NONE else str(row.request)
         rows.append((f"*{event}*" if event is Event.FAULT else f"`{event}`", *leads, guards, asked))
     return (
-        "## Events\n\nWhere an event leads, or what it is refused with. Without a device every command is refused "
-        "with `not_connected`, but `stop`, and `use-scene` while DISABLED.\n\n"
-        + table(("event", *OperatingState, "guards, in their order", "device is asked"), rows)
+        "## Events\n\nThe table gives the next state or the refusal. Without a device every command is refused with "
+        "`not_connected`, except `stop`, and `use-scene` while DISABLED.\n\n"
+        + table(("event", *OperatingState, "guards, in order", "request"), rows)
         + "\n"
     )
 
@@ -130,8 +121,8 @@ def _guards() -> str:
     guards = [guard for row in ROWS if isinstance(row, Transition) for guard in row.guards]
     rows = [(f"`{guard.code}`", guard.wants, guard.remedy) for guard in dict.fromkeys(guards)]
     return (
-        "## Guards\n\nA command is refused with the first that does not hold.\n\n"
-        + table(("refused as", "wants that", "otherwise"), rows)
+        "## Guards\n\nThe first guard that does not hold refuses the command.\n\n"
+        + table(("refused as", "condition", "remedy"), rows)
         + "\n"
     )
 
@@ -139,9 +130,9 @@ def _guards() -> str:
 def _faults() -> str:
     stay = ", ".join(f"`{fault}`" for fault in Fault if "home" not in FAULTS[fault].clears)
     return (
-        "## Faults\n\nLatched until `clear-fault`, and then `home`; no homing is wanted after "
-        f"{stay}. Several at once are named in this order, causes first. *By* counts from when the fault shows: 50 ms "
-        "are the device's own timeout, and control at 500 Hz adds up to 4 ms.\n\n"
+        "## Faults\n\nA fault stays latched until `clear-fault`. Then the device has to home, except after "
+        f"{stay}. Several faults are listed in this order, causes first. *By* is the time from the first sign of the "
+        "fault; control at 500 Hz adds up to 4 ms.\n\n"
         + _codes("fault", {fault: FAULTS[fault] for fault in Fault})
         + "\n"
     )
@@ -149,7 +140,7 @@ def _faults() -> str:
 
 def _limits() -> str:
     limits = {limit: LIMITS[limit] for limit in Limit}
-    return "## Limits\n\nThey come and go by themselves.\n\n" + _codes("limit", limits)
+    return "## Limits\n\nLimits come and go by themselves.\n\n" + _codes("limit", limits)
 
 
 def _codes(kind: str, codes: Mapping[Any, Explanation]) -> str:

@@ -26,23 +26,23 @@ class Device(Strict, frozen=True):
     """Where the firmware is. `backend` names an entry point of the group `tormagd.backends`."""
 
     backend: str = "serial"
-    "How the device is reached: `serial`, `can`, or an installed plugin's. A USB serial line is what most have."
+    "`serial`, `can`, or the name of an installed plugin."
     port: str = "/dev/tormag"
-    "Path of the serial port; with the backend `can`, the channel: `can0`, or an adapter's path."
+    "Path of the serial port, or the CAN channel: `can0`, or an adapter's path."
     options: dict[str, Any] = msgspec.field(default_factory=dict)
-    "The backend's own settings; what they are and may be is the backend's to say."
+    "The backend's own settings."
     profiles: str = ""
-    """Folder for the profiles: what each device has shown of itself. Without one it is the service's,
-    $STATE_DIRECTORY/profiles. Where there is none nothing is kept."""
+    """Folder for what is learned of each device. Empty: $STATE_DIRECTORY/profiles of the service; outside a service
+    nothing is kept."""
     calibrations: str = ""
-    """Folder of what `tormagctl commission` found: a device's SERIAL.toml goes before [motor], [position] and [trim].
-    Without one it is the service's, $STATE_DIRECTORY/calibrations."""
+    """Folder of what `tormagctl commission` found. A device's SERIAL.toml overrides [motor], [position] and [trim].
+    Empty: $STATE_DIRECTORY/calibrations of the service."""
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
-    "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
+    "The firmware's own timeout, stated here for checks."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0
-    "Oldest device state the controller accepts while it drives; from some milliseconds on it only holds the gap."
+    "The controller drives on no older device state, and holds the gap after some milliseconds."
     retract_mm_s: Annotated[float, Meta(ge=0.1, le=100.0)] = 15.0
-    "What the firmware does without us: how fast a carriage opens, stated here for scenes to be checked against."
+    "The speed at which the firmware opens a carriage, stated here for the checks of scenes."
 
     def __post_init__(self) -> None:
         is_usable = self.port.isprintable() and self.port != ""
@@ -50,15 +50,14 @@ class Device(Strict, frozen=True):
 
 
 class Sources(Strict, frozen=True):
-    """Who may hold the brake before whom, who may send under which name, and how long setpoints are held back."""
+    """Who may hold the brake, under which name, and how long setpoints are held back."""
 
     priority: tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...] = ()
-    "Names of sources. Each takes the brake over from those after it, and from all that are not listed."
+    "Names of sources. Each takes the brake from later ones and from all unlisted ones."
     keys: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
-    """Fingerprints of the keys that may send as a source, by its name. Any key that may publish may send under a name
-    that is not listed."""
+    """Fingerprints of the keys that may send under a source's name. Any publishing key may use an unlisted name."""
     playout_ms: Annotated[float, Meta(ge=0.0, le=MAX_PLAYOUT_MS)] = 0.0
-    "Setpoints are followed so long after their stamps, as evenly as they were stamped. 0: as soon as they come."
+    "Delay from a setpoint's stamp until it is followed; evens out jitter. 0: at once."
 
     def __post_init__(self) -> None:
         names = self.priority
@@ -81,7 +80,7 @@ class Handle(Strict, frozen=True):
     """The handle of the brake."""
 
     push_sign: Annotated[int, Meta(ge=-1, le=1)] = 1
-    "1 where pushing on moves the handle to greater places of its encoder, else -1."
+    "1 if pushing on increases the encoder's position, else -1."
 
     def __post_init__(self) -> None:
         require(self.push_sign != 0, "handle.push_sign", self.push_sign, "1 or -1")
@@ -91,145 +90,141 @@ class Rates(Strict, frozen=True):
     """How often each rate group runs, Hz."""
 
     control_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 1_000
-    "Ticks: the position loop's gains are for it, and a serial line and a CAN bus carry it."
+    "Control ticks; the default gains are for 1000."
     inference_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 500
-    "Plans that are made at the least; a setpoint is planned for in the next tick. Below 83 the thesis was faster."
+    "The least rate of plans; each setpoint is planned in the next tick."
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
-    "Messages: as often as an eye sees, and no load."
+    "Telemetry messages."
     motion_hz: Annotated[int, Meta(ge=1, le=4_000)] = 500
-    "Of the topic `motion`, for whoever subscribes; no more than `control_hz`."
+    "Messages of the topic `motion`, at most `control_hz`."
     of_scene: bool = False
-    """Whether the daemon runs at the rates of its scene in place of these two, control at 500 Hz at the least. Where a
-    file states neither, it does."""
+    """Whether the scene's rates replace `control_hz` and `inference_hz`, with control at 500 Hz or more. True where a
+    file states none of the three."""
 
 
 class RealTime(Strict, frozen=True):
-    """Each of these is optional; one that the kernel refuses stands in `status` until a start is granted it."""
+    """Optional requests to the kernel. `status` lists those it refused at the start."""
 
     fifo_priority: Annotated[int, Meta(ge=0, le=90)] = 0
-    "Of SCHED_FIFO; 0 asks for none, because only a machine that is set up for it allows one."
+    "SCHED_FIFO priority; 0 asks for none."
     lock_memory: bool = False
-    "Whether no page may be swapped out: it keeps all of the daemon in memory."
+    "Whether all of the daemon stays in memory."
     cpus: tuple[Annotated[int, Meta(ge=0, le=4095)], ...] = ()
-    "Processors for the control thread; none named: any."
+    "Processors for the control thread; empty: any."
     keep_awake: bool = False
-    "Idle processors do not sleep while the daemon runs: they wake up at once, and take the power for it."
+    "Whether idle processors stay awake while the daemon runs, which takes power."
     watchdog_ms: Annotated[float, Meta(ge=100.0, le=60_000.0)] = 500.0
-    "Without a plan or, while the link runs, a device state for this long, systemd's watchdog is no longer fed."
+    "systemd's watchdog is fed only while plans, and device states on a running link, are younger."
 
 
 class Motor(Strict, frozen=True):
     """The DC motor and lead screw the controller believes in (37D class, 70:1); see `control/move/motor.py`."""
 
     supply_V: Annotated[float, Meta(ge=3.0, le=60.0)] = 12.0
-    "What full duty puts on the motor: its rated voltage."
+    "Motor voltage at full duty."
     resistance_ohm: Annotated[float, Meta(ge=0.05, le=100.0)] = 2.2
-    "Of the armature: 12 V over the stall current of 5.5 A."
+    "Armature resistance: 12 V / 5.5 A at stall."
     inductance_mH: Annotated[float, Meta(ge=0.01, le=100.0)] = 1.5
-    "Of the armature; with the resistance the motor's fastest time constant, 0.7 ms."
+    "Armature inductance."
     back_emf_V_s: Annotated[float, Meta(ge=1e-4, le=1.0)] = 0.011
-    "V at 1 rad/s of the motor, and N m at 1 A: what its no-load speed at 12 V comes to."
+    "V s/rad and N m/A, from the no-load speed."
     inertia_kg_m2: Annotated[float, Meta(ge=1e-9, le=1e-2)] = 8e-7
-    "Of the rotor; gears and screw add little behind the gears."
+    "Rotor inertia; gears and screw add little."
     gear_ratio: Annotated[float, Meta(ge=1.0, le=1_000.0)] = 70.0
-    "Turns of the motor to one of the screw."
+    "Motor turns per screw turn."
     screw_lead_mm: Annotated[float, Meta(ge=0.2, le=50.0)] = 8.0
-    "A carriage's way in one turn of the screw."
+    "Travel per screw turn."
     gear_efficiency: Annotated[float, Meta(gt=0.1, le=1.0)] = 0.7
-    "What the gears leave of the torque."
+    "Share of the torque that the gears pass on."
     coulomb_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
-    "Voltage that just overcomes the dry friction of gearbox and screw."
+    "Voltage that overcomes dry friction in gearbox and screw."
     pull_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
-    """Voltage that the magnets' pull takes besides at a gap of 45 mm, to open. A pull of 50 to 80 N, a screw with an
-    efficiency of 0.65, the gears and R / Ke make 0.40 to 0.64 V."""
+    """Extra voltage against the magnets' pull when opening from a gap of 45 mm: 0.40 to 0.64 V at a pull of 50 to 80 N
+    and a screw efficiency of 0.65."""
 
 
 class Position(Strict, frozen=True):
-    """The carriage position loop: PID with filtered derivative, back-calculation and feed-forward.
-
-    The gains come from `tormag-lab tune-position`.
-    """
+    """The carriage position loop, a PID with feed-forward; `tormag-lab tune-position` finds its gains."""
 
     proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 3.6
-    "Duty for 1 mm of error: the most that keeps 6 dB and 45 degrees at every corner of the motor's parameters."
+    "Proportional gain, duty/mm: the most that keeps 6 dB and 45 degrees at every corner of the motor's parameters."
     integral_time_s: Annotated[float, Meta(ge=0.005, le=100.0)] = 0.1
-    "Shorter, and stiction makes the carriages hunt by a count."
+    "Integral time; if shorter, stiction makes the carriages hunt by a count."
     derivative_time_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
-    "Near the motor's mechanical time constant of 15 ms, which it makes up for."
+    "Derivative time, near the motor's mechanical time constant, 15 ms."
     derivative_filter_s: Annotated[float, Meta(ge=1e-4, le=0.1)] = 0.003
-    "Takes the encoder's steps out of the derivative."
+    "Filters encoder steps out of the derivative."
     back_calculation_s: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.1
-    "In which the integral lets go once the duty is limited: as fast as it winds up."
+    "Anti-windup time of the integral."
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
-    "Extra proportional action on the skew between the carriages, as a multiple of the carriage's own."
+    "Gain on the skew between the carriages, as a multiple of `proportional_per_mm`."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
-    "How fast the gap may change: both carriages together, less than motors on a full supply reach."
+    "Greatest speed of the gap, both carriages together."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
-    """From rest; with speed it falls along the motors' torque-speed line. Carriages that show more are asked for up to
-    twice as much."""
+    """Greatest acceleration of the gap from rest; it falls with speed, and rises up to twofold for carriages that
+    show more."""
     duty_limit: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
-    "The most that a motor is given; less spares it, and makes the gap slower."
+    "Greatest duty; less spares the motor and slows the gap."
 
 
 class Trim(Strict, frozen=True):
-    """What the force sensor may correct of the force model: a device's scale within bounds, its offset at a speed."""
+    """How far the force sensor may correct the force model."""
 
     time_s: Annotated[float, Meta(ge=0.05, le=1_000.0)] = 0.5
-    "In which the force's offset is learned anew in the long run; a new device shows itself sooner."
+    "Time in which the offset is learned; a new device is learned sooner."
     least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
-    "Of a device's force over the model's; what is below is not corrected, and the limit `TRIM` says so."
+    "Least ratio of the device's force to the model's; beyond it the limit `TRIM` shows."
     most: Annotated[float, Meta(ge=1.0, le=5.0)] = 2.0
-    "The same for what is above. No device is taken for stronger, so its greatest force rests on this."
+    "Greatest ratio. No device counts as stronger, so the force ceiling depends on it."
     least_offset_N: Annotated[float, Meta(ge=-2.0, le=0.0)] = -0.2
-    "Of a device's force at speed: another field law and what relaxes look like -0.15 N at most."
+    "Least offset of the force."
     most_offset_N: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.3
-    "The same for what is above; more is the sensor's zero."
+    "Greatest offset; more counts as the sensor's zero."
 
 
 class Limits(Strict, frozen=True):
-    """What counts as a fault, and what only as a warning."""
+    """Bounds of faults and warnings."""
 
     skew_warning_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.2
-    "Carriages further apart than usual: the limit `SKEW`."
+    "Distance between the carriages that shows the limit `SKEW`."
     skew_fault_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
-    "The fault `SKEW`: before the firmware's own, at 2 mm."
+    "The same for the fault `SKEW`; the firmware's own is at 2 mm."
     following_error_mm: Annotated[float, Meta(gt=0.0, le=50.0)] = 3.0
-    "How far the gap may be from its reference for a moment."
+    "Distance from gap to reference that may last `following_time_s`."
     no_motion_duty: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.35
-    "A carriage driven harder than this must move: it is well above what friction and the magnets hold."
+    "A carriage driven harder must move within `no_motion_time_s`."
     no_motion_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.06
-    "For how long it may not: a motor that turns shows hundreds of counts by then."
+    "Time before the fault `NO_MOTION`."
     following_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.25
-    "For how long, before it is the fault `FOLLOWING_ERROR`."
+    "Time before the fault `FOLLOWING_ERROR`."
     low_confidence: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
-    "Below it the limit `LOW_CONFIDENCE` says that the model was asked outside its training."
+    "Confidence below which the limit `LOW_CONFIDENCE` shows."
 
 
 class BlackBox(Strict, frozen=True):
-    """What is kept of the last half minute, to be written on a fault."""
+    """The last half minute, written on a fault."""
 
     folder: str = ""
-    """For the files; without one that of the service ($STATE_DIRECTORY/blackbox), and where there is none nothing is
-    kept."""
+    """Folder of the files. Empty: $STATE_DIRECTORY/blackbox of the service; outside a service nothing is kept."""
 
 
 class Recordings(Strict, frozen=True):
     """What `tormagctl record` keeps in a folder."""
 
     folder: str = "/var/lib/tormag/recordings"
-    "Where `tormagctl recordings` looks."
+    "Default of `tormagctl recordings`."
     segment_MB: Annotated[float, Meta(ge=0.1, le=100_000.0)] = 250.0
-    "A recording in a folder goes on in a new file then,"
+    "Size at which a recording continues in a new file."
     segment_minutes: Annotated[float, Meta(ge=0.01, le=1_440.0)] = 10.0
-    "or after so long."
+    "The same for time."
     most_MB: Annotated[float, Meta(gt=0.0, le=1e8)] = 20_000.0
-    "The folder's budget: the oldest unmarked go first."
+    "The folder's budget; the oldest unmarked files go first."
     most_days: Annotated[float, Meta(gt=0.0, le=36_500.0)] = 30.0
-    "The same for age, before the newest; what is before a pause of over three days goes by `most_MB` alone."
+    "The same for age before the newest. Before a pause of over three days only `most_MB` counts."
     free_MB: Annotated[float, Meta(ge=1.0, le=1e8)] = 500.0
-    "Stays free on that disk, for black boxes and profiles."
+    "Space that stays free on that disk."
     one_tick_of: Annotated[int, Meta(ge=1, le=1_000)] = 1
-    "Of so many ticks one is recorded, and all within 10 s of a fault or a mark."
+    "Records one of so many ticks, and all within 10 s of a fault or mark."
 
     def __post_init__(self) -> None:
         require(
@@ -241,10 +236,10 @@ class Recordings(Strict, frozen=True):
 
 
 class Config(Strict, frozen=True):
-    """Everything `tormagd` can be told."""
+    """Top-level keys."""
 
     scene: Annotated[str, Meta(max_length=4_096)] = "coronary"
-    "A scene file, or the name of a shipped one."
+    "Scene file, or name of a shipped scene."
     device: Device = msgspec.field(default_factory=Device)
     endpoints: Endpoints = msgspec.field(default_factory=Endpoints)
     sources: Sources = msgspec.field(default_factory=Sources)

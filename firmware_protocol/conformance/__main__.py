@@ -186,27 +186,29 @@ def _is_agreed(line: str) -> bool:
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="python -m firmware_protocol.conformance",
-        description="Plays the host against a device and says what of firmware_protocol/README.md it does not keep. "
-        "The device's motors move; the gap is left open. Exit code 0: all checks passed, 1: not all, 2: not begun.",
+        description="Checks a device against firmware_protocol/README.md. Its motors move; the gap is left open. "
+        "Exit code 0: all checks passed, 1: not all, 2: not begun.",
     )
     made.add_argument(
         "line",
         nargs="?",
         metavar="PORT|CHANNEL",
-        help="a serial port by its path, a CAN bus as INTERFACE:CHANNEL: socketcan:can0, slcan:/dev/ttyACM0, "
-        "tormagsim:PATH of the simulated device",
+        help="path of a serial port, or INTERFACE:CHANNEL of a CAN bus: socketcan:can0, slcan:/dev/ttyACM0, "
+        "tormagsim:PATH",
     )
-    made.add_argument("--yes", action="store_true", help="the motors may move: do not ask")
-    made.add_argument("--json", action="store_true", help="results on stdout as JSON, what is going on on stderr")
-    made.add_argument("--only", action="append", default=[], metavar="CHECK", help="may be repeated; and left_open")
-    made.add_argument("--list", action="store_true", help="print the checks that every line has, and end")
+    made.add_argument("--yes", action="store_true", help="let the motors move without asking")
+    made.add_argument("--json", action="store_true", help="JSON on stdout, progress on stderr")
+    made.add_argument(
+        "--only", action="append", default=[], metavar="CHECK", help="run only this and left_open; may be repeated"
+    )
+    made.add_argument("--list", action="store_true", help="list the checks of every line")
     made.add_argument("--baud", type=int, default=1_000_000, metavar="N", help="of a serial port; default 1000000")
     made.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="of a CAN bus; default 1000000")
     made.add_argument("--node", type=int, choices=range(16), default=1, metavar="N", help="on a CAN bus; default 1")
     made.add_argument(
         "--reset",
         metavar="COMMAND",
-        help="resets the device: called with the word warm (memory kept) or cold (supply off and on); the line stays",
+        help="resets the device, given warm (memory kept) or cold (supply off and on); the line stays",
     )
     made.add_argument("--uptime", type=_positive, metavar="S", help="how long the device's clock has run")
     made.add_argument(

@@ -128,8 +128,8 @@ def in_words(kind: Any) -> str:
 
 def rows(heading: str) -> list[tuple[str, str, str]]:
     (section,) = re.findall(rf"^### {heading}\n(.*?)(?=^##|\Z)", PAGE, re.DOTALL | re.MULTILINE)
-    found = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+) \|$", section, re.MULTILINE)
-    assert len(found) == section.count("\n|") - 2 + section.startswith("|"), f"{heading}: a row that is none"
+    found = re.findall(r"^- `(\w+)` \((.+?)\): (.+)$", section, re.MULTILINE)
+    assert len(found) == section.count("\n- "), f"{heading}: a row that is none"
     return found
 
 

@@ -1,6 +1,7 @@
 """The pages that are made of tables and of evidence are up to date."""
 
 import json
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from risk.named_tests import named_tests
 from risk.page import page as risk_page, red_rows
 
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
-from tormagd.safety.operating_state import ROWS, Refusal
+from tormagd.safety.operating_state import ROWS, OperatingState, Refusal
 from tormagd.scenes.scene import load_scene
 
 RECORD = json.loads(safety_pages.EVIDENCE.read_text(encoding="utf-8"))
@@ -46,9 +47,10 @@ def test_the_page_of_states_has_every_code_and_every_event() -> None:
     for code, row in (*FAULTS.items(), *LIMITS.items()):
         assert f"| `{code}` | {row.cause} | {row.reaction} |" in page
     assert [code for code in (*Fault, *Limit) if f"`{code}`" not in page] == []
-    for transition in ROWS:
-        if not isinstance(transition, Refusal):
-            assert f"    {transition.source} --> {transition.target}: " in page
+    leads = {event: row.split(" | ") for event, row in re.findall(r"^\| [`*](.+?)[`*] \| (.+)$", page, re.MULTILINE)}
+    for row in ROWS:
+        expected = f"`{row.code}`" if isinstance(row, Refusal) else row.target
+        assert dict(zip(OperatingState, leads[row.event], strict=False))[row.source] == expected
 
 
 def test_the_evidence_is_of_the_matrix_that_there_is() -> None:

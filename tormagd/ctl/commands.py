@@ -80,11 +80,11 @@ ABOVE_ZERO = Within(1e-3, 1e6)
 
 SHARED = (
     option("--config", type=Path, metavar="FILE", help="the daemon's configuration"),
-    option("--endpoint", metavar="URL", help="the control endpoint; ipc://DIR/control stands for all in DIR"),
-    option("--key", metavar="FILE", help=f"the .key_secret to show at a tcp:// endpoint ({KEY})"),
+    option("--endpoint", metavar="URL", help="the control endpoint; ipc://DIR/control means all four in DIR"),
+    option("--key", metavar="FILE", help=f"the .key_secret for tcp:// ({KEY})"),
     option("--server-key", metavar="FILE", help=f"the daemon's .key ({SERVER_KEY})"),
     option("--json", action="store_true", help="one JSON object on stdout"),
-    option("--wait", type=ABOVE_ZERO, metavar="S", help="longest wait for the daemon (1)"),
+    option("--wait", type=ABOVE_ZERO, metavar="S", help="wait this long for the daemon (1)"),
 )
 "Before or after any command."
 USUAL = {"config": None, "endpoint": None, "key": None, "server_key": None, "json": False, "wait": 1.0}
@@ -104,7 +104,7 @@ def _waiting(usual_s: float) -> tuple[Option, ...]:
             metavar="S",
             help=f"wait this long ({usual_s:g})",
         ),
-        option("--no-wait", dest="is_waiting", action="store_false", help="do not wait until it is done"),
+        option("--no-wait", dest="is_waiting", action="store_false", help="do not wait"),
     )
 
 
@@ -116,37 +116,35 @@ def _open_gap(help_text: str) -> Command:
 COMMANDS = {
     "status": Command("what the daemon is doing", "status.status", ("client",)),
     "top": Command(
-        "the same live in this terminal: force, gap, field, timing, and what holds the force back; q ends",
+        "status live in this terminal; q ends",
         "top.top",
         ("client",),
     ),
-    "firmware": Command(
-        "who is at the other end of the wire, and how well the wire carries", "status.firmware", ("client",)
-    ),
-    "ports": Command("where a device could be connected, and who holds what is there", "ports.ports", ("config",)),
+    "firmware": Command("the connected device and the quality of the link", "status.firmware", ("client",)),
+    "ports": Command("ports where a device may be, and the programs that hold them", "ports.ports", ("config",)),
     "arm": Command(
-        "clear faults, home and enable, whatever is needed, each said; the force begins along a ramp",
+        "clear faults, home and enable as needed; the force ramps up",
         "operate.arm",
         ("client",),
         _waiting(30.0)[:1],
     ),
-    "enable": _operate("start rendering force along a ramp (homed and fresh measurements needed)"),
-    "disable": _open_gap("open the gap, then drives off; waits until it is open"),
+    "enable": _operate("start rendering force along a ramp"),
+    "disable": _open_gap("open the gap and turn the drives off"),
     "pause": _operate("hold the gap where it is"),
-    "resume": _operate("go on after pause"),
-    "stop": _open_gap("open the gap and latch; waits until it is open; latched until arm"),
-    "clear-fault": _operate("forget latched faults; stays disabled"),
+    "resume": _operate("continue after pause"),
+    "stop": _open_gap("open the gap and latch until arm"),
+    "clear-fault": _operate("clear latched faults; the device stays disabled"),
     "take": Command(
-        "give the brake to another source; the force goes to its setpoints along a ramp",
+        "give the brake to another source; the force ramps to its setpoints",
         "operate.take",
         ("client",),
         (option("source", type=source, metavar="SOURCE", help="as tormagctl status names it"),),
     ),
     "confirm": Command(
-        "say who is right where the limit DEVICE_OR_SENSOR asks: the device has changed, or the sensor is wrong",
+        "settle the limit DEVICE_OR_SENSOR: the device changed, or the sensor is wrong",
         "operate.confirm",
         ("client",),
-        (option("what", choices=("device", "sensor"), help="device: it is learned anew; sensor: it is not believed"),),
+        (option("what", choices=("device", "sensor"), help="device: learn it anew; sensor: do not believe it"),),
     ),
     "home": Command(
         "find the home switches of both carriages",
@@ -155,7 +153,7 @@ COMMANDS = {
         _waiting(30.0),
     ),
     "send": Command(
-        "publish setpoints (a synthetic shape, or a CSV file t_s,force_N); done if they were rendered",
+        "publish setpoints: a synthetic shape or a CSV file t_s,force_N",
         "send.send",
         ("endpoints", "wait_s"),
         (
@@ -168,9 +166,7 @@ COMMANDS = {
                 metavar="HZ",
                 help="setpoints per second (500)",
             ),
-            option(
-                "--duration", dest="duration_s", type=ABOVE_ZERO, metavar="S", help="seconds (10, or the file's length)"
-            ),
+            option("--duration", dest="duration_s", type=ABOVE_ZERO, metavar="S", help="length (10, or the file's)"),
             option("--from-N", dest="from_N", type=number, default=1.4, metavar="N", help="lower force (1.4)"),
             option("--to-N", dest="to_N", type=number, default=1.7, metavar="N", help="upper force (1.7)"),
             option(
@@ -194,13 +190,13 @@ COMMANDS = {
                 type=Within(0.0, 1_000.0, " ms"),
                 default=0.0,
                 metavar="MS",
-                help="each setpoint carries what follows it so long (0)",
+                help="length of the preview (0)",
             ),
             option(
                 "--blind",
                 dest="is_blind",
                 action="store_true",
-                help="do not ask the daemon what becomes of them, with a key that may only publish",
+                help="do not ask the daemon for the outcome; for a key that may only publish",
             ),
         ),
     ),
@@ -210,7 +206,7 @@ COMMANDS = {
         ("config", "endpoints", "wait_s"),
         (
             option(
-                "path", type=Path, metavar="FILE.mcap|DIR", help="a folder: files named by the time, within its budget"
+                "path", type=Path, metavar="FILE.mcap|DIR", help="in a folder: files named by time, within its budget"
             ),
             option(
                 "--duration",
@@ -223,30 +219,29 @@ COMMANDS = {
         ),
     ),
     "mark": Command(
-        "put an event into telemetry and recordings, and keep what is recorded there",
+        "put an event into telemetry and recordings; its segment is kept",
         "recordings.mark",
         ("client",),
-        (option("text", metavar="TEXT", help="what happened, in 1..200 characters"),),
+        (option("text", metavar="TEXT", help="1..200 characters"),),
     ),
     "recordings": Command(
-        "list a folder of recordings, prune it to its budget, keep one (mark), or copy one with its SHA-256 (export)",
+        "list or prune a folder of recordings, mark one to keep, or export one with its SHA-256",
         "recordings.recordings",
         ("config",),
         (
             option("action", choices=("list", "prune", "mark", "export")),
-            option("path", type=Path, nargs="?", metavar="DIR|FILE.mcap", help="without, [recordings] folder"),
-            option("--to", dest="target", type=Path, metavar="DIR|FILE.mcap", help="export: where the copy goes"),
+            option("path", type=Path, nargs="?", metavar="DIR|FILE.mcap", help="default: [recordings] folder"),
+            option("--to", dest="target", type=Path, metavar="DIR|FILE.mcap", help="export: target"),
         ),
     ),
     "blackbox": Command(
-        "have the daemon write the last half minute, as it does by itself on a fault",
+        "have the daemon write the last half minute, as on a fault",
         "black_box.black_box",
         ("client",),
         (option("copy", type=Path, nargs="?", metavar="FILE.mcap", help="copy it to this file"),),
     ),
     "replay": Command(
-        "run a black box again: the core over what it was given, bit for bit; with --set or --fault the simulator "
-        "instead of the device",
+        "run a black box again bit for bit, or with --set or --fault on the simulator",
         "replay.replay",
         ("config_file",),
         (
@@ -257,7 +252,7 @@ COMMANDS = {
                 type=number,
                 default=0.0,
                 metavar="S",
-                help="begin at the snapshot before this (0)",
+                help="start at the last snapshot before this (0)",
             ),
             option(
                 "--set",
@@ -265,57 +260,57 @@ COMMANDS = {
                 action="append",
                 default=[],
                 metavar="KEY=VALUE",
-                help="what would have happened with this in the configuration, as in limits.skew_fault_mm=2",
+                help="change the configuration, as in limits.skew_fault_mm=2",
             ),
-            option("--plant", default="sample_1", metavar="P", help="of the simulator (sample_1)"),
+            option("--plant", default="sample_1", metavar="P", help="simulated device (sample_1)"),
             option(
                 "--fault",
                 dest="faults",
                 action="append",
                 default=[],
                 metavar="NAME[@S]",
-                help="of the simulated device, as tormagd.simulation --fault has them, S from the file's first tick",
+                help="as of tormagd.simulation --fault; S counts from the first tick",
             ),
         ),
     ),
     "calibrate": Command(
-        "guided: let the daemon learn its device, sweep an insert into a model file, or motors into a log",
+        "guided: learn the device, sweep an insert into a model file, or log the motors",
         "calibrate.calibrate",
         ("config", "endpoints", "wait_s"),
         (
-            option("--device", action="store_true", help="what this device shows of itself becomes its profile"),
-            option("--insert", metavar="NAME", help="the insert that is fitted, such as MRE-50-40"),
+            option("--device", action="store_true", help="learn the device into its profile"),
+            option("--insert", metavar="NAME", help="the fitted insert, such as MRE-50-40"),
             option("--motors", action="store_true", help="record a motor log instead"),
             option("--out", type=Path, metavar="FILE", help="MODEL.safetensors, or LOG.csv"),
-            option("--csv", type=Path, metavar="FILE", help="write the training data too"),
+            option("--csv", type=Path, metavar="FILE", help="also write the training data"),
             option(
                 "--rates",
                 dest="rates_N_s",
                 type=rates,
                 default=(0.1, 0.2, 0.4, 0.2, 0.1, 0.4),
                 metavar="N/s,...",
-                help="of the sweeps, at least three (0.1,0.2,0.4,0.2,0.1,0.4)",
+                help="at least three (0.1,0.2,0.4,0.2,0.1,0.4)",
             ),
-            option("--law", dest="by_law", action="store_true", help="fit the law of the brake, which takes no torch"),
-            option("--side", choices=("left", "right"), default="left", help="whose log to write (left)"),
+            option("--law", dest="by_law", action="store_true", help="fit the brake's law, without torch"),
+            option("--side", choices=("left", "right"), default="left", help="motor to log (left)"),
             option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),
         ),
     ),
     "commission": Command(
-        "guided: judge this device row by row, in a page and a file; then let the daemon begin from what it showed",
+        "guided: judge this device on a page, and write its calibration",
         "commission.commission",
         ("endpoints", "wait_s"),
         (
-            option("folder", type=Path, metavar="FOLDER", help="for the page and the findings, by serial number"),
-            option("--resume", dest="is_resumed", action="store_true", help="go on after the steps that are done"),
+            option("folder", type=Path, metavar="FOLDER", help="for page and findings, by serial number"),
+            option("--resume", dest="is_resumed", action="store_true", help="skip finished steps"),
             option(
                 "--weight-N",
                 dest="weight_N",
                 type=Within(0.05, 50.0, " N"),
                 metavar="N",
-                help="a weight to hang from the force sensor, which gives its gain",
+                help="weight to hang from the force sensor, for its gain",
             ),
-            option("--conformance", type=Path, metavar="FILE", help="what the conformance kit printed with --json"),
+            option("--conformance", type=Path, metavar="FILE", help="output of the conformance kit with --json"),
             option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),
         ),
     ),
@@ -329,7 +324,7 @@ COMMANDS = {
         ),
     ),
     "report": Command(
-        "one page to keep of a recording, or of two side by side",
+        "one page of a recording, or of two side by side",
         "report.report",
         (),
         (
@@ -338,55 +333,54 @@ COMMANDS = {
         ),
     ),
     "dashboard": Command(
-        "a page for the browser on this machine: the daemon live, or a recording to scrub through",
+        "a page for this machine's browser: the live daemon or a recording",
         "dashboard.dashboard",
         ("endpoints", "wait_s"),
         (
-            option("path", type=Path, nargs="?", metavar="FILE.mcap", help="the recording; live without"),
-            option("--port", type=port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: one that is free"),
+            option("path", type=Path, nargs="?", metavar="FILE.mcap", help="recording; default: live"),
+            option("--port", type=port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: a free one"),
         ),
     ),
     "metrics": Command(
-        "what status says, for Prometheus: printed once, or served with --port",
+        "status for Prometheus, printed once or served with --port",
         "metrics.metrics",
         ("endpoints", "wait_s"),
-        (option("--port", type=port, metavar="N", help="of 127.0.0.1, for Prometheus to scrape"),),
+        (option("--port", type=port, metavar="N", help="of 127.0.0.1"),),
     ),
     "scene": Command(
-        "list the scenes; show, check, explain or make one (default: the configuration's); or have the daemon use it",
+        "list scenes; show, check, explain, make or use one (default: the configuration's)",
         "scene.scene",
         ("config", "config_file", "endpoints", "wait_s"),
         (
             option(
                 "action",
                 choices=("list", "show", "check", "explain", "new", "use"),
-                help="check: does the daemon take it, and what does the device give of it. explain: how it may be "
-                "served, how exactly, at what cost. new: write one, asking for what the task needs. "
-                "use: change to it, while disabled",
+                help="check: whether daemon and device can serve it. explain: ways to serve it, with error and cost. "
+                "new: ask for the task and write one. use: change to it while disabled",
             ),
             option("name", nargs="?", metavar="NAME|FILE"),
-            option("--force", type=Path, metavar="FORCE.csv", help="new: propose a scene for this recorded force"),
-            option("--column", metavar="NAME", help="new: which column of it (force_N)"),
-            option("--scale", type=Within(-1e6, 1e6), metavar="K", help="new: newtons for each unit of the column (1)"),
-            option("--offset", type=Within(-1e6, 1e6), dest="offset_N", metavar="N", help="new: newtons at its 0 (0)"),
-            option("--insert", metavar="NAME", help="new: this insert (the softest that renders it all)"),
+            option("--force", type=Path, metavar="FORCE.csv", help="new: from this recorded force"),
+            option("--column", metavar="NAME", help="new: its column (force_N)"),
+            option("--scale", type=Within(-1e6, 1e6), metavar="K", help="new: newtons per unit (1)"),
+            option("--offset", type=Within(-1e6, 1e6), dest="offset_N", metavar="N", help="new: newtons at 0 (0)"),
+            option("--insert", metavar="NAME", help="new: insert (the softest that renders it all)"),
             option(
                 "--share",
                 type=ABOVE_ZERO,
                 metavar="S",
-                help="check: the most exact way that takes at most this of a processor",
+                help="check: most exact way within this share of a processor",
             ),
             option(
                 "--tolerance",
                 type=ABOVE_ZERO,
                 dest="tolerance_N",
                 metavar="N",
-                help="check: the cheapest way whose RMS error, N, is at most this. new: the RMS error to state",
+                help="check: cheapest way within this RMS error. new: RMS error to state",
             ),
-            option("--out", "-o", type=Path, metavar="FILE.toml", help="check: write the scene served so, a new file"),
             option(
-                "--plant", metavar="P", help="check, new: this simulated device has to give it, as tormag-lab twin's"
+                "--out", "-o", type=Path, metavar="FILE.toml", help="check: write the scene served so to a new file"
             ),
+            option("--plant", metavar="P", help="check, new: simulated device, such as tormag-lab twin's"),
         ),
     ),
     "keys": Command(
@@ -395,36 +389,40 @@ COMMANDS = {
         (),
         (
             option("action", choices=("generate", "show")),
-            option("path", type=Path, metavar="DIR|FILE", help="where the keys are made; whose fingerprint is shown"),
+            option("path", type=Path, metavar="DIR|FILE", help="generate: folder; show: file"),
             *(
                 option(
-                    f"--{role}", action="append", default=[], metavar="NAME", help=f"also a client, listed for {role}"
+                    f"--{role}",
+                    action="append",
+                    default=[],
+                    metavar="NAME",
+                    help=f"also make a client listed for {role}",
                 )
                 for role in ROLES
             ),
             option(
                 "--client",
                 metavar="NAME",
-                help="a client's pair alone, made on its own machine: send NAME.key to the daemon's",
+                help="make only a client's pair, on its machine; send NAME.key to the daemon's",
             ),
         ),
         has_daemon=False,
     ),
     "doctor": Command(
-        "what on this machine would hurt real time or access, each with its remedy",
+        "what hurts real time or access here, with remedies",
         "doctor.doctor",
         ("config", "config_file", "endpoints", "wait_s"),
-        (option("--measure", action="store_true", help="also which rates it holds, measured in about 6 s"),),
+        (option("--measure", action="store_true", help="also measure the possible rates, about 6 s"),),
     ),
     "guide": Command(
-        "print a guide, or list them: the documentation comes with the package",
+        "print or list the guides",
         "guide.guide",
         (),
         (option("name", nargs="?", metavar="NAME"),),
         has_daemon=False,
     ),
     "completion": Command(
-        "print what a shell needs to complete commands, options and files",
+        "print a shell's completion script",
         "completion.completion",
         ("parser",),
         (option("shell", choices=SHELLS),),

@@ -19,8 +19,8 @@ SIGHUP reads keys and configuration again."""
 
 def parser() -> Parser:
     made = Parser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
-    made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
-    made.add_argument("--scene", metavar="NAME", help="this scene, or scene file, in place of the configuration's")
+    made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
+    made.add_argument("--scene", metavar="NAME", help="scene or scene file instead of the configuration's")
     made.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
     made.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
     return made

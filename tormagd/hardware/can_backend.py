@@ -42,16 +42,16 @@ ABSENT = {
 
 
 class CanOptions(Strict, frozen=True):
-    """`[device.options]` of a CAN bus."""
+    """Options of a CAN bus."""
 
     interface: str
-    "The python-can interface."
+    "python-can interface."
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
-    "socketcan takes it from the kernel (`ip link`)."
+    "Bit rate; socketcan takes the kernel's (`ip link`)."
     node: Annotated[int, Meta(ge=0, le=15)] = 1
-    "The device's node number on the bus."
+    "The device's node number."
     baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
-    "Of the serial port that an adapter is behind."
+    "Rate of an adapter's serial port."
 
 
 class CanBackend:

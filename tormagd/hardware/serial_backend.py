@@ -25,10 +25,10 @@ _REFUSALS = {
 
 
 class SerialOptions(Strict, frozen=True):
-    """`[device.options]` of a serial port."""
+    """Options of a serial port."""
 
     baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
-    "Carries control at 1 kHz with room to spare; a USB device of its own takes no notice of it."
+    "The default carries control at 1 kHz; a native USB device ignores it."
 
 
 def open_serial(device: Device, options: SerialOptions) -> SerialPort:

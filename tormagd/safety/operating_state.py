@@ -214,36 +214,36 @@ CLEAR: Final = "tormagctl clear-fault"
 CONNECTED = Guard("not_connected", "the device is connected", _not_connected, "check port, cable and supply")
 NOT_BUSY = Guard(
     "busy",
-    "the device neither homes nor opens, and its calibration is in force",
+    "the device neither homes nor opens, and its calibration is loaded",
     _busy,
     "wait until is_busy is false",
 )
-NOT_LATCHED = Guard("device_latched", "the device has latched nothing", _latched, CLEAR)
+NOT_LATCHED = Guard("device_latched", "the device has latched no fault", _latched, CLEAR)
 READY: tuple[Guard, ...] = (
     CONNECTED,
     NOT_LATCHED._replace(remedy=ARM),
     NOT_BUSY,
-    Guard("not_homed", "it has homed since the last fault that took positions away", _lost, ARM),
+    Guard("not_homed", "it has homed since a fault last lost its position", _lost, ARM),
     Guard("not_homed", "the device is homed", _unhomed, ARM),
-    Guard("not_fresh", "State, Sense and Status are fresh", _stale, "look at the link in tormagctl status"),
+    Guard("not_fresh", "State, Sense and Status are fresh", _stale, "check the link in tormagctl status"),
     Guard(
         "sensor_doubted",
         "the force sensor is believed",
         _doubted,
-        "check sensor, cable and zero, then turn the handle for a second: it is judged while friction slides",
+        "check sensor, cable and zero, then turn the handle for a second",
     ),
-    Guard("skewed", "the carriages are no further apart than `limits.skew_fault_mm`", _apart, "tormagctl home"),
+    Guard("skewed", "the carriages are at most `limits.skew_fault_mm` apart", _apart, "tormagctl home"),
     Guard(
         "link_degraded",
-        "the round trip is one that the position loop bears",
+        "the position loop bears the round trip",
         _slow,
-        "look at the round trip in tormagctl firmware; tormagctl doctor finds a USB adapter's latency timer",
+        "check the round trip in tormagctl firmware, and a USB adapter's latency timer in tormagctl doctor",
     ),
     Guard(
         "clock",
-        "the device's clock is off by less than the fault CLOCK says",
+        "the device's clock is not off enough for the fault CLOCK",
         _wrong_clock,
-        "check the firmware's timer and its clock source",
+        "check the firmware's timer and clock source",
     ),
 )
 "What must hold before anything is driven."

@@ -91,14 +91,14 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
     doors = made.add_mutually_exclusive_group(required=True)
-    doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal, its path printed first")
-    doors.add_argument("--slcan", action="store_true", help="CAN adapter on a pseudo-terminal, its path printed first")
+    doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal; prints its path")
+    doors.add_argument("--slcan", action="store_true", help="CAN adapter on a pseudo-terminal; prints its path")
     doors.add_argument(
         "--can",
         nargs="?",
         const="",
         metavar="PATH",
-        help="CAN bus for python-can's interface tormagsim, its channel printed first",
+        help="CAN bus for python-can's interface tormagsim; prints its channel",
     )
     made.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
     made.add_argument("--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing")
@@ -125,10 +125,9 @@ def parser() -> argparse.ArgumentParser:
         "--firmware",
         choices=FIRMWARES,
         default="python",
-        help="c compiles and runs the firmware's own C sources, qemu runs them on an emulated Cortex-M4; "
-        "default python, which needs neither",
+        help="c: the firmware's C sources; qemu: the same on an emulated Cortex-M4; default python",
     )
-    made.add_argument("--truth", type=Path, metavar="FILE.csv", help="record what no sensor sees, 1000 rows a second")
+    made.add_argument("--truth", type=Path, metavar="FILE.csv", help="record the true state, 1000 rows a second")
     return made
 
 

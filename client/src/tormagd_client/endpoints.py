@@ -25,38 +25,38 @@ class Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Curve(Strict, frozen=True):
-    """Key files. The daemon has `server_secret` and a folder of public keys for each role, a client the last two keys.
+    """Key files. The daemon takes `server_secret` and a folder of public keys for each role, a client the last two.
 
-    A folder that is not named is the one of its role's name beside `server_secret`.
+    An empty folder key means the folder of the role's name beside `server_secret`.
     """
 
     server_secret: str = ""
-    "The daemon's own pair, `server.key_secret`, which `tormagctl keys generate` makes."
+    "The daemon's key pair, `server.key_secret`."
     publish: str = ""
-    "Who may send setpoints, and nothing else."
+    "Keys that may only send setpoints."
     operate: str = ""
-    "Who may give commands, and look."
+    "Keys that may command and look."
     observe: str = ""
-    "Who may look: telemetry, recording, `status`."
+    "Keys that may look: telemetry, recording, `status`."
     also_local: bool = False
-    "Whether `ipc://` and loopback demand keys, too."
+    "Whether `ipc://` and loopback also demand keys."
     client_secret: str = ""
-    "What `tormagctl` shows."
+    "The client's key pair."
     server_public: str = ""
-    "The daemon that `tormagctl` believes; by default the `.key` beside `server_secret`."
+    "The daemon's public key; by default the `.key` beside `server_secret`."
 
 
 class Endpoints(Strict, frozen=True):
-    """ZeroMQ addresses. Only `ipc://` and loopback are open; any other address is refused without CURVE keys."""
+    """ZeroMQ addresses. Any but `ipc://` and loopback need CURVE keys."""
 
     setpoint: str = f"ipc://{DEFAULT_RUN_DIR}/setpoint"
-    "Where publishers connect; in the service's own folder, as all four are."
+    "Setpoints from publishers."
     telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
-    "Where whoever looks subscribes."
+    "Telemetry to subscribers."
     control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
-    "Where commands are given."
+    "Commands."
     recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
-    "Where the recorder hears every control tick."
+    "Every control tick, for the recorder."
     curve: Curve | None = None
     "Keys, for who connects from elsewhere."
 
