@@ -27,6 +27,7 @@ from tormagd.keys import KeyRing
 from tormagd.safety.operating_state import RefusedError
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.messages import (
+    MAX_MESSAGE_BYTES,
     VERSION,
     ErrorReply,
     MessageError,
@@ -46,11 +47,12 @@ DRAIN = 32
 "Setpoints read in one beat at most; more wait for the next, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
-UNREAD = {"setpoint": (4_096, 32), "telemetry": (512, 2), "recording": (512, 2), "control": (8_192, 16)}
-"""Bytes of a message at most, and messages of one peer that wait in libzmq; more wait with the peer. libzmq works off
-all subscriptions that wait in this thread: a thousand would make a tick late (`tools/endure.py siege`)."""
-UNSENT: dict[int, int] = {zmq.SUB: 1, zmq.XPUB: 100, zmq.ROUTER: 16}
-"Messages for one peer that wait in libzmq; what is more is dropped."
+QUEUES: dict[int, tuple[int, int, int]] = {
+    zmq.SUB: (MAX_MESSAGE_BYTES, 10, 1),
+    zmq.ROUTER: (MAX_MESSAGE_BYTES, 10, 16),
+    zmq.XPUB: (512, 2, 100),
+}
+"""By kind of socket: bytes of a message at most, and messages that wait in libzmq, of one peer and for it."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. One that says more is cut off, and may connect again."
 TAKEN, TAKEN_NS = 64, 80_000
@@ -229,8 +231,8 @@ class Endpoint:
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
         """Return a new socket of this `kind`, guarded where `endpoints` says so, bound, with bounded queues."""
         made = self._context.socket(kind)
-        size, unread = UNREAD[name]
-        options = {zmq.LINGER: 0, zmq.BACKLOG: 512, zmq.MAXMSGSIZE: size, zmq.SNDHWM: UNSENT[kind], zmq.RCVHWM: unread}
+        size, unread, unsent = QUEUES[kind]
+        options = {zmq.LINGER: 0, zmq.BACKLOG: 512, zmq.MAXMSGSIZE: size, zmq.RCVHWM: unread, zmq.SNDHWM: unsent}
         if kind == zmq.XPUB:
             options[zmq.XPUB_VERBOSER] = 1  # each subscription is passed on, not only the first of a topic
         for option, value in options.items():
@@ -273,9 +275,9 @@ class Endpoint:
             hops.append(part.bytes)
             part = self._control.recv(zmq.NOBLOCK, copy=False)
         self._is_in_parts_of_request = part.more
-        is_one = not part.more and (hops[-1:] == [b""] or all(map(_is_made, hops)))
-        data = part.bytes if is_one else b""
-        return Waiting([client, *hops], data, *self._sender(part, "control"), self.requests.opens)
+        envelope = hops if hops[-1:] == [b""] or all(map(_is_made, hops)) else None
+        data = b"" if part.more or envelope is None else part.bytes
+        return Waiting([client, *(envelope or ())], data, *self._sender(part, "control"), self.requests.opens)
 
     def _is_answered_first(self, waiting: Waiting, answer: Answer) -> bool:
         """Carry out and answer a `stop` or `disable`, and return True, also where it was refused."""
