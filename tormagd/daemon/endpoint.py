@@ -47,12 +47,13 @@ DRAIN = 32
 "Setpoints read in one beat at most; more wait for the next, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
-QUEUES: dict[int, tuple[int, int, int]] = {
-    zmq.SUB: (MAX_MESSAGE_BYTES, 10, 1),
-    zmq.ROUTER: (MAX_MESSAGE_BYTES, 10, 16),
-    zmq.XPUB: (512, 2, 100),
+OPTIONS: dict[int, dict[int, int]] = {
+    zmq.SUB: {zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.RCVHWM: 10},
+    zmq.ROUTER: {zmq.MAXMSGSIZE: MAX_MESSAGE_BYTES, zmq.RCVHWM: 10, zmq.SNDHWM: 16},
+    # each subscription is passed on, not only the first of a topic
+    zmq.XPUB: {zmq.MAXMSGSIZE: 512, zmq.RCVHWM: 2, zmq.SNDHWM: 100, zmq.XPUB_VERBOSER: 1},
 }
-"""By kind of socket: bytes of a message at most, and messages that wait in libzmq, of one peer and for it."""
+"""Of each kind of socket: bytes of a message, and messages that wait in libzmq, of one peer and for it."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. One that says more is cut off, and may connect again."
 TAKEN, TAKEN_NS = 64, 80_000
@@ -231,11 +232,7 @@ class Endpoint:
     def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
         """Return a new socket of this `kind`, guarded where `endpoints` says so, bound, with bounded queues."""
         made = self._context.socket(kind)
-        size, unread, unsent = QUEUES[kind]
-        options = {zmq.LINGER: 0, zmq.BACKLOG: 512, zmq.MAXMSGSIZE: size, zmq.RCVHWM: unread, zmq.SNDHWM: unsent}
-        if kind == zmq.XPUB:
-            options[zmq.XPUB_VERBOSER] = 1  # each subscription is passed on, not only the first of a topic
-        for option, value in options.items():
+        for option, value in ({zmq.LINGER: 0, zmq.BACKLOG: 512} | OPTIONS[kind]).items():
             made.setsockopt(option, value)
         self.admission.guard(made, name, name in self._guarded)
         self._listen(made, name, address)
