@@ -124,9 +124,8 @@ def test_a_room_imports_only_what_stands_left_of_it():
 
 
 def test_what_draws_takes_matplotlib_from_one_place():
-    imports = re.compile(r"^ *(from|import) matplotlib\b", re.MULTILINE)
-    paths = [path for path in (*sources(), *TOOLS.rglob("*.py")) if imports.search(path.read_text(encoding="utf-8"))]
-    assert paths == [ROOT / "tormagd/drawing.py"]
+    for path in (*sources(), *TOOLS.rglob("*.py")):
+        assert path.name == "drawing.py" or not re.search(r"^ *(from|import) matplotlib", path.read_text("utf-8"), re.M)
 
 
 @pytest.mark.parametrize("here", TOOL_ROOMS)

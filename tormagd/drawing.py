@@ -7,8 +7,7 @@ import os
 from contextlib import chdir, nullcontext
 from pathlib import Path
 
-os.environ.pop("MPLBACKEND", None)
-os.environ["MATPLOTLIBRC"] = os.devnull
+os.environ |= {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
 # a file in the present folder goes before that
 with chdir("/") if Path("matplotlibrc").exists() else nullcontext():
     from matplotlib import rcParams as rcParams

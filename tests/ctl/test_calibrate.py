@@ -39,11 +39,9 @@ from tormagd.model.displacement import MOVING_MM_S, Turn
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
-from tormagd_client.endpoints import Endpoints
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)
@@ -329,13 +327,16 @@ def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_mo
 
 
 def test_a_fit_is_the_commands_result_and_is_told(tmp_path, monkeypatch):
-    metrics = {"judged_r2": 0.99, "judged_mae_N": 0.012, "most_mae_N": 0.02, "noise_mae_N": 0.003}
-    fitted = {"model": "m", "insert": INSERT, "created": "today", "rows": 7, "metrics": metrics}
-    monkeypatch.setattr(ctl_calibrate, "_ask_fitter", lambda *arguments: fitted)
-    for name in ("Client", "known_of", "armed", "write_sweeps"):
-        monkeypatch.setattr(ctl_calibrate, name, MagicMock())
-    about = Config(), Endpoints(), load_scene("pulse"), INSERT, tmp_path / "m.safetensors"
-    outcome = ctl_calibrate.calibrate_insert(*about, None, (), False, 1.0)
+    fitted = {
+        **{"model": "m", "insert": INSERT, "created": "today", "rows": 7},
+        "metrics": {"judged_r2": 0.99, "judged_mae_N": 0.012, "most_mae_N": 0.02, "noise_mae_N": 0.003},
+    }
+    stand_ins = {name: MagicMock() for name in ("Client", "known_of", "armed", "write_sweeps")}
+    for name, stand_in in {**stand_ins, "_ask_fitter": lambda *_: fitted}.items():
+        monkeypatch.setattr(ctl_calibrate, name, stand_in)
+    outcome = ctl_calibrate.calibrate_insert(
+        MagicMock(), MagicMock(), MagicMock(), INSERT, tmp_path / "m.safetensors", None, (), False, 1.0
+    )
     assert (outcome.result, "mean error 12.0 mN (allowed 20.0" in outcome.text) == (fitted, True)
 
 

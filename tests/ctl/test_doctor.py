@@ -136,12 +136,13 @@ def told(good, fake_daemon, status_with):
     """With a caller and a file that allow everything."""
 
     def found(not_granted=(), realtime=REALTIME.realtime, **changes):
-        known = fake_daemon.answers["describe"]()["result"]
-        known |= {"configuration": msgspec.to_builtins(Config(realtime=realtime)), "configuration_file": "/a.toml"}
+        known = fake_daemon.answers["describe"]()["result"] | {
+            **{"configuration": msgspec.to_builtins(Config(realtime=realtime)), "configuration_file": "/a.toml"}
+        }
         fake_daemon.answers["describe"] = lambda: {"ok": True, "result": known}
         fake_daemon.says(not_granted=list(not_granted), **changes)
-        running = checks.running(in_folder(str(fake_daemon.directory)), 5.0)
-        return {each["name"]: each for each in judged(REALTIME, Machine(good), None, running).result["checks"]}
+        outcome = judged(REALTIME, Machine(good), None, checks.running(in_folder(str(fake_daemon.directory)), 5.0))
+        return {each["name"]: each for each in outcome.result["checks"]}
 
     return found
 
@@ -165,17 +166,22 @@ def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
         "tormagd 0 runs by /a.toml",
         "granted: realtime.fifo_priority = 50",
     )
-    unset = told(realtime=RealTime())
-    assert unset["memlock"]["remedy"] == "set realtime.lock_memory = true in /a.toml and start it again"
+    assert told(realtime=RealTime())["memlock"]["remedy"] == (
+        "set realtime.lock_memory = true in /a.toml and start it again"
+    )
 
 
-def test_a_daemon_s_device_and_build_are_what_it_says(told, status_with):
+def test_a_daemon_s_device_and_build_are_what_it_says(told, status_with, machine):
+    machine.process(4242, "python", "/dev/ttyUSB0")  # so it is called where its interpreter's path has a space
     link = status_with()["link"] | {"state": "BACK_OFF", "cause": "no such port", "remedy": "plug it in"}
-    found = told(link=link, build="interpreted: no C compiler", calibration={"refusal": "serial_number = 8"})
+    found = told(
+        link=link, build="interpreted: no C compiler", calibration={"refusal": "serial_number = 8"}, process_id=4242
+    )
     assert (found["device port"]["found"], found["device port"]["remedy"]) == (
         "/dev/tormag: BACK_OFF: no such port",
         "plug it in",
     )
+    assert (found["port holder"]["verdict"], found["port holder"]["found"]) == ("ok", "tormagd (process 4242)")
     assert (found["build"]["verdict"], found["build"]["found"]) == ("warn", "interpreted: no C compiler")
     assert (found["calibration"]["verdict"], found["calibration"]["found"]) == ("warn", "serial_number = 8")
 
@@ -217,13 +223,6 @@ def test_a_run_directory_that_others_may_write_to_is_found(good):
 def test_a_port_that_is_not_there_is_missed(good):
     (good / "dev/ttyUSB0").unlink()
     assert "does not exist" in checks.port(Config(), Machine(good)).found
-
-
-@pytest.mark.parametrize("name", ["tormagd", "python", "sh"])  # short, spaced and long paths of an interpreter
-def test_the_daemon_that_answers_holds_its_port_by_whatever_name(good, machine, told, name):
-    machine.process(4242, name, "/dev/ttyUSB0")
-    holder = told(process_id=4242)["port holder"]
-    assert (holder["verdict"], holder["found"]) == ("ok", "tormagd (process 4242)")
 
 
 @pytest.mark.parametrize(("daemon_id", "remedy"), [(1, "end it, or"), (None, "end it, unless it is the daemon, or")])

@@ -34,6 +34,12 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl, file):
     drawn = ctl("--json", "plot", str(file), "-o", str(picture)).ended(0).result
     assert (drawn["ticks"], drawn["tracking_rms_N"]) == (result["ticks"], pytest.approx(0.1 / 2**0.5, rel=0.1))
     assert picture.read_bytes().startswith(b"\x89PNG")
+    # whatever other programs are told
+    (tmp_path / "matplotlibrc").write_bytes(b"text.usetex: True\n\xff")
+    for backend in ("module://matplotlib_inline.backend_inline", "unknown"):
+        told = ("env", f"MPLBACKEND={backend}", "MATPLOTLIBRC=.", sys.executable, "-m", "tormagd.ctl.main")
+        subprocess.run([*told, "plot", str(file), "-o", "b.png"], cwd=tmp_path, check=True, timeout=60)
+        assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
     file.write_bytes(file.read_bytes()[:-40])
     assert "cut short: its recorder did not end it" in ctl("plot", str(file), "-o", str(picture)).ended(0).out
     assert "no overview: still written, not ended by" in ctl("recordings", "list", str(file.parent)).ended(0).out

@@ -73,8 +73,10 @@ def rig(core: Core) -> Rig:
 
 
 def names(part: Part) -> list[str]:
-    entries = msgspec.msgpack.decode(part.entries)
-    return [each if isinstance(each, str) else each[0] if isinstance(each[0], str) else "tick" for each in entries]
+    return [
+        each if isinstance(each, str) else each[0] if isinstance(each[0], str) else "tick"
+        for each in msgspec.msgpack.decode(part.entries)
+    ]
 
 
 def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) -> None:

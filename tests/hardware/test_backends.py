@@ -229,12 +229,13 @@ UP = "sudo ip link set can7 up type can bitrate 1000000 restart-ms 100"
 def test_an_interface_that_is_not_there_says_how_it_comes(
     monkeypatch: pytest.MonkeyPatch, interface: str, number: int, said: str, remedy: str
 ) -> None:
-    monkeypatch.setattr(can, "Bus", Mock(side_effect=OSError(number, os.strerror(number))))
+    monkeypatch.setattr(can, "Bus", bus := Mock(side_effect=OSError(number, os.strerror(number))))
     with pytest.raises(BackendError, match=f"^{interface} can7: cannot be opened: {said}$") as caught:
         opened(Device(backend="can", options={"interface": interface}, port="can7"))
     assert caught.value.remedy == remedy
-    usual = {"interface": interface, "channel": "can7", "bitrate": 1_000_000, "ignore_config": True}
-    assert can.Bus.call_args.kwargs == usual | OF_INTERFACE[interface]
+    assert bus.call_args.kwargs == OF_INTERFACE[interface] | {
+        **{"interface": interface, "channel": "can7", "bitrate": 1_000_000, "ignore_config": True}
+    }
 
 
 # -- behind an adapter on a serial line ----------------------------------------------------------------------------

@@ -52,20 +52,18 @@ def dated(path: Path, now_s: float) -> Path:
 
 def of_days(folder: Path, now_s: float, *days: float) -> list[Path]:
     """Recordings without content, so many days from `now_s`, by a clock that says so."""
-    times_s = [now_s + day * DAY_S for day in days]
-    return [dated(folder / time.strftime("%Y-%m-%dT%H-%M-%S.mcap", time.gmtime(at_s)), at_s) for at_s in times_s]
+    return [
+        dated(folder / time.strftime("%Y-%m-%dT%H-%M-%S.mcap", time.gmtime(at_s)), at_s)
+        for at_s in (now_s + day * DAY_S for day in days)
+    ]
 
 
 @pytest.mark.parametrize("wrong_days", [40, -40, -20_774])
 def test_no_clock_takes_a_recording_away(tmp_path: Path, wrong_days: int) -> None:
-    clock = Clock()
-    folder = RecordingFolder(tmp_path, BUDGET, clock)
-    made = of_days(tmp_path, clock.now_s, *range(-29, 0))
-    clock.now_s += wrong_days * DAY_S
-    made += [folder.new(), *of_days(tmp_path, clock.now_s, 0.1, 0.2, 0.3)]
-    clock.now_s -= wrong_days * DAY_S
-    made += of_days(tmp_path, clock.now_s, 0.5, 1)
-    dated(made[29], clock.now_s)  # begun then, and written until the clock was set
+    now_s, wrong_s = START_NS * 1e-9, START_NS * 1e-9 + wrong_days * DAY_S
+    folder = RecordingFolder(tmp_path, BUDGET, lambda: wrong_s)
+    made = [*of_days(tmp_path, now_s, *range(-29, 0)), *of_days(tmp_path, wrong_s, 0.1, 0.2, 0.3)]
+    dated(folder.new(), now_s)  # begun by that clock, and written until it was set
     assert folder.prune() == []
     made[3].write_bytes(bytes(BUDGET.most_bytes))
     assert made[0] in [each.path for each in folder.prune(1)]

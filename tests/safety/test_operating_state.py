@@ -30,7 +30,7 @@ from tormagd.safety.operating_state import (
 READY = Conditions(connected=True, fresh=True, homed=True, busy=False, device_latched=False)
 NEED_NO_DEVICE = ("stop", "use-scene")
 DISABLED, ENABLED, PAUSED, FAULT = OperatingState
-FAULTED = latch(SafetyState(), (Fault.DEVICE_OVERCURRENT,))
+FAULTED, SKEWED = (latch(SafetyState(), (fault,)) for fault in (Fault.DEVICE_OVERCURRENT, Fault.SKEW))
 
 conditions = st.builds(
     Conditions,
@@ -327,6 +327,77 @@ def test_the_next_commands_of_each_fault_are_taken_and_arm_it(fault: Fault) -> N
         if name == "home":
             is_homed, state = True, homed_again(state, is_homed=False)
     assert (state.operating_state, next_commands(state, is_homed)) == (OperatingState.ENABLED, ())
+
+
+FORCE = ("enable", "resume", "arm")
+WISHED = {
+    **dict.fromkeys(FORCE, (ENABLED,)),
+    **dict.fromkeys(("disable", "home", "use-scene"), (DISABLED,)),
+    "pause": (PAUSED, DISABLED),  # nothing follows a setpoint
+    "stop": (FAULT,),
+    "clear-fault": (DISABLED, ENABLED, PAUSED),
+}
+"""The states in which a command's wish is fulfilled."""
+AMISS: dict[str, dict[str, bool | float]] = {
+    "": {},
+    "not_homed": {"homed": False},
+    "device_latched": {"device_latched": True, "homed": False},
+    "not_connected": {"connected": False},
+    "busy": {"busy": True},
+    "not_fresh": {"fresh": False},
+    "sensor_doubted": {"sensor_doubted": True},
+    "skewed": {"apart_mm": 2.0, "most_apart_mm": 1.0},
+    "link_degraded": {"round_trip_s": 0.2, "most_round_trip_s": 0.1},
+    "clock": {"clock_drift": 0.2, "most_clock_drift": 0.1},
+}
+"""What is amiss with a device, by the code of the refusal that it leads to."""
+
+
+class Person:
+    """Gives commands to a device that does at once what it is asked for, and follows the hints of refusals, two at
+    most."""
+
+    def __init__(self, state: SafetyState, present: Conditions) -> None:
+        self.state, self.present, self.hints = state, present, list[str]()
+
+    def give(self, name: str) -> None:
+        self.state = command(self.state, name, 0.0, self.present)
+        if self.state.request is DeviceRequest.HOME:
+            self.state = homed_again(self.state, is_homed=False)
+            self.present = self.present.replaced(homed=True, apart_mm=0.0)
+        elif self.state.request is DeviceRequest.CLEAR:
+            self.present = self.present.replaced(device_latched=False)
+
+    def wish(self, name: str) -> None:
+        try:
+            for each in next_commands(self.state, self.present.homed) if name == "arm" else (name,):
+                self.give(each)
+        except RefusedError as error:
+            if error.hint == "nothing to do":
+                return
+            self.hints.append(error.hint.removeprefix("tormagctl "))
+            assert len(self.hints) <= 2, self.hints
+            if self.hints[-1] in WISHED:
+                self.wish(self.hints[-1])
+            else:
+                self.present = self.present.replaced(**{key: getattr(READY, key) for key in AMISS[error.code]})
+            self.wish(name)
+
+
+@pytest.mark.parametrize("amiss", AMISS)
+@pytest.mark.parametrize(
+    "state",
+    [SafetyState(), SafetyState(ENABLED), SafetyState(PAUSED), SafetyState(needs_homing=True), FAULTED, SKEWED],
+)
+@pytest.mark.parametrize("name", WISHED)
+def test_two_hints_lead_to_what_was_wished_and_none_arms_without_a_wish(
+    name: str, state: SafetyState, amiss: str
+) -> None:
+    # a device that is lost while it is driven is in FAULT at once
+    person = Person(state, READY.replaced(**AMISS["" if state.is_driven and amiss == "not_connected" else amiss]))
+    person.wish(name)
+    assert person.state.operating_state in WISHED[name], person.hints
+    assert name in FORCE or not set(FORCE) & set(person.hints)
 
 
 @pytest.mark.parametrize(

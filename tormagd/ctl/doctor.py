@@ -153,23 +153,28 @@ def of_daemon(known: Running, machine: Machine) -> tuple[Finding, ...]:
                 Finding(name, Severity.OK, f"granted: realtime.{key} = {msgspec.json.encode(value).decode()}")
             )
         elif usual:
-            to_do = f"set realtime.{key} = {usual} in {file} and start it again"
-            findings.append(Finding(name, Severity.WARN, f"realtime.{key} is not set", to_do))
+            findings.append(
+                Finding(
+                    name,
+                    Severity.WARN,
+                    f"realtime.{key} is not set",
+                    f"set realtime.{key} = {usual} in {file} and start it again",
+                )
+            )
     device = f"{link.port}: {link.state}{link.cause and f': {link.cause}'}"
-    is_there = link.state == "RUNNING"
-    findings.append(_finding("device port", is_there, device, link.remedy or "tormagctl firmware", Severity.FAIL))
-    findings.append(port_holder(known.config, machine, status.process_id))
-    calibration = status.calibration
-    found = calibration.refusal or calibration.file or "none: the device runs by the configuration"
-    findings.append(_finding("calibration", not calibration.refusal, found, RECOMMISSION))
-    return tuple(findings)
+    found = status.calibration.refusal or status.calibration.file or "none: the device runs by the configuration"
+    return (
+        *findings,
+        _finding("device port", link.state == "RUNNING", device, link.remedy or "tormagctl firmware", Severity.FAIL),
+        port_holder(known.config, machine, status.process_id),
+        _finding("calibration", not status.calibration.refusal, found, RECOMMISSION),
+    )
 
 
 def _in_force(known: Running) -> Config:
     """Return a daemon's configuration without the wishes that the kernel refused."""
     config, lacking = known.config, refused(known.status.not_granted)
-    nothing = {"lock_memory": False, "fifo_priority": 0}
-    kept = {key: value for key, value in nothing.items() if f"realtime.{key}" in lacking}
+    kept = {key: value for key, value in (("lock_memory", False), ("fifo_priority", 0)) if f"realtime.{key}" in lacking}
     return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, **kept))
 
 
@@ -383,8 +388,12 @@ def port(config: Config, machine: Machine) -> Finding:
     name = config.device.port
     if not name.startswith("/"):
         is_there = machine.path(f"/sys/class/net/{name}").exists()
-        found = f"{'' if is_there else 'no '}network interface {name}"
-        return _finding("device port", is_there, found, f"sudo ip link set {name} up type can, if it is one")
+        return _finding(
+            "device port",
+            is_there,
+            f"{'' if is_there else 'no '}network interface {name}",
+            f"sudo ip link set {name} up type can, if it is one",
+        )
     target = machine.resolved(name)
     shown = name if target == name else f"{name} ({target})"
     path = machine.path(target)
@@ -410,13 +419,16 @@ def port_holder(config: Config, machine: Machine, daemon_id: int | None = None) 
     name = config.device.port
     target = machine.resolved(name)
     holders = machine.holders([target])[0][target] if name.startswith("/") else []
-    if target.startswith("/dev/pts/"):  # the maker of a pseudo-terminal has it open as well
-        locking = machine.lock_owners(target)
-        holders = [(pid, comm) for pid, comm in holders if pid in locking]
+    if target.startswith("/dev/pts/"):  # whoever made a pseudo-terminal has it open as well
+        holders = [each for each in holders if each[0] in machine.lock_owners(target)]
     found = ", ".join(f"{comm} (process {pid})" for pid, comm in holders if pid != daemon_id)
-    remedy = f"end it{'' if daemon_id else ', unless it is the daemon'}, or give tormagd another port"
-    nobody = f"tormagd (process {daemon_id})" if holders else "nobody that this user may see"
-    return _finding("port holder", not found, found or nobody, remedy, Severity.FAIL)
+    return _finding(
+        "port holder",
+        not found,
+        found or (f"tormagd (process {daemon_id})" if holders else "nobody that this user may see"),
+        f"end it{'' if daemon_id else ', unless it is the daemon'}, or give tormagd another port",
+        Severity.FAIL,
+    )
 
 
 def usb_latency(config: Config, machine: Machine) -> Finding:

@@ -17,8 +17,7 @@ from tormagd_client.blocking import Client
 def mark(client: Client, text: str) -> Outcome:
     """Put an event into telemetry, and so into every recording; a folder's present segment is then kept
     from pruning."""
-    result = client.request("mark", text=text)
-    return Outcome(result, f"marked: {text}")
+    return Outcome(client.request("mark", text=text), f"marked: {text}")
 
 
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:

@@ -77,8 +77,9 @@ def use_scene(client: "Client", name: str) -> Outcome:
     if change.error is not None:
         raise CommandError(Exit.REFUSED, change.error.code, change.error.cause, change.error.remedy)
     result = {"scene": state.scene, "fingerprint": state.scene_fingerprint, "is_homed": state.is_homed}
-    text = f"scene {state.scene} runs until the daemon is started anew; nothing moves before tormagctl arm"
-    return Outcome(result, text)
+    return Outcome(
+        result, f"scene {state.scene} runs until the daemon is started anew; nothing moves before tormagctl arm"
+    )
 
 
 def list_scenes() -> Outcome:

@@ -27,8 +27,9 @@ class Causes:
     def __init__(self, device: Device) -> None:
         self._device = device
         self.stall: StallReport | None = None
-        self._told: dict[Fault, Explanation] = {}
-        self._waits: deque[tuple[float, float]] = deque(maxlen=1_000)
+        "The newest stall of the control loop; None before the first."
+        self._told: dict[str, Explained] = {}
+        self._waits = deque([(-math.inf, 0.0)], maxlen=1_000)
 
     def note_stall(self, stepper: Stepper, delay: Delay) -> None:
         """Keep as `stall` the delay of the step that just ran, if the step counts it as a stall."""
@@ -37,8 +38,8 @@ class Causes:
             self.stall = StallReport(stall_ms, delay.culprit)
 
     def note_wait(self, now_s: float, wait_s: float) -> None:
-        last_s = self._waits[-1][0] if self._waits else -math.inf
-        self._waits.append((now_s, min(wait_s, now_s - last_s)))
+        """Note that the control loop was not given the processor for the last `wait_s`, or since the last such wait."""
+        self._waits.append((now_s, min(wait_s, now_s - self._waits[-1][0])))
 
     def host(self, now_s: float) -> str:
         """Say how long this host kept the control loop waiting; empty if that is WAITED_SHARE or less."""
@@ -51,24 +52,18 @@ class Causes:
         )
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
-        figures = {} if measurement is None else _figures(stepper, measurement)
-        causes = {fault: f"{FAULTS[fault].cause}: {figure}" for fault, figure in figures.items()}
-        opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
-        causes[Fault.HOST_STALL] = f"{self._stood_still()}; {opened}"
-        if measurement is not None:
-            silent_ms, behind_ms = (stepper.time_s - measurement.received_s) * 1e3, measurement.delay_s * 1e3
-            causes[Fault.MEASUREMENT_STALE] = (
-                f"the device had sent no new state for {silent_ms:.0f} ms"
-                if silent_ms > behind_ms
-                else f"the device was {behind_ms:.0f} ms behind with the commands that it obeyed"
-            )
-        told = {fault: FAULTS[fault]._replace(cause=causes.get(fault, FAULTS[fault].cause)) for fault in faults}
-        self._told |= _blamed(told, self.host(stepper.time_s), FAULTS[Fault.HOST_STALL])
+        """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes."""
+        causes, host = {} if measurement is None else _causes(stepper, measurement), self.host(stepper.time_s)
+        causes[Fault.HOST_STALL] = (
+            f"{self._stood_still()}; the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
+        )
+        self._told |= {fault: _explained(fault, FAULTS, causes, host) for fault in faults}
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
-        return _explained(faults, {**FAULTS, **self._told})
+        """Return each fault with its cause and its remedy, in the order of `faults`."""
+        return tuple(self._told.get(fault) or _explained(fault, FAULTS, {}, "") for fault in faults)
 
     def of_limits(
         self,
@@ -85,31 +80,19 @@ class Causes:
         if measurement is not None:
             told[Limit.LINK_DEGRADED] = f"{LIMITS[Limit.LINK_DEGRADED].cause}: {measurement.link}"
             told[Limit.CLOCK] = f"{LIMITS[Limit.CLOCK].cause}: {measurement.link.clock_drift:+.1%}"
-        known = {
-            **LIMITS,
-            **{limit: LIMITS[limit]._replace(cause=cause) for limit, cause in told.items()},
-            **of_sources,
-        }
-        return _explained(limits, _blamed(known, self.host(now_s), LIMITS[Limit.HOST_STALL]))
+        known, host = {**LIMITS, **of_sources}, self.host(now_s)
+        return tuple(_explained(limit, known, told, host) for limit in limits)
 
     def _stood_still(self) -> str:
         stall = self.stall
         return "" if stall is None else f"the control loop stood still for {stall.ms:.0f} ms ({stall.culprit})"
 
 
-def _blamed(known: dict[Any, Explanation], host: str, stall: Explanation) -> dict[Any, Explanation]:
-    """Return `known`; if `host` is not empty, it begins the cause of each of SILENCES, with the remedy of `stall`."""
-    if not host:
-        return known
-    silences = {code: row for code, row in known.items() if code in SILENCES}
-    return known | {
-        code: row._replace(cause=f"{host}; {row.cause}", remedy=stall.remedy) for code, row in silences.items()
-    }
-
-
-def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
+def _causes(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
+    """Return the causes, with figures, of those faults that have any now; the others are no keys."""
     leap, homing, opening = stepper.measure.leap, stepper.homing, stepper.opening
-    return {
+    silent_ms, behind_ms = (stepper.time_s - measurement.received_s) * 1e3, measurement.delay_s * 1e3
+    figures = {
         Fault.SENSE_STALE: f"for {(stepper.time_s - measurement.sensed_s) * 1e3:.0f} ms",
         Fault.STATUS_STALE: f"for {(stepper.time_s - measurement.reported_s) * 1e3:.0f} ms",
         Fault.LINK_DEGRADED: str(measurement.link),
@@ -120,7 +103,17 @@ def _figures(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
         **dict.fromkeys(homing.faults, str(homing)),
         **dict.fromkeys(opening.faults, str(opening)),
     }
+    return {
+        **{fault: f"{FAULTS[fault].cause}: {figure}" for fault, figure in figures.items()},
+        Fault.MEASUREMENT_STALE: f"the device had sent no new state for {silent_ms:.0f} ms"
+        if silent_ms > behind_ms
+        else f"the device was {behind_ms:.0f} ms behind with the commands that it obeyed",
+    }
 
 
-def _explained(codes: Iterable[str], table: Mapping[Any, Explanation]) -> tuple[Explained, ...]:
-    return tuple(Explained(str(code), table[code].cause, table[code].remedy) for code in codes)
+def _explained(code: str, table: Mapping[Any, Explanation], told: Mapping[Any, str], host: str) -> Explained:
+    """Return a code with its cause and remedy from `table`; a cause in `told` goes before."""
+    cause = told.get(code, table[code].cause)
+    if host and code in SILENCES:
+        return Explained(str(code), f"{host}; {cause}", table["HOST_STALL"].remedy)
+    return Explained(str(code), cause, table[code].remedy)

@@ -172,8 +172,7 @@ class Daemon:
 
     def _receive(self, beat: Beat) -> None:
         period_ns = self._control.timing.period_ns
-        late_ns = beat.start_ns - beat.due_ns + beat.merged * period_ns
-        if late_ns > period_ns:
+        if (late_ns := beat.start_ns - beat.due_ns + beat.merged * period_ns) > period_ns:
             self._causes.note_wait(beat.start_ns * 1e-9, (late_ns - self._phases.ran_ns()) * 1e-9)
         self._connection.receive(time.monotonic())
         self._endpoint.arrivals.look()

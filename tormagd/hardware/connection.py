@@ -123,7 +123,6 @@ class Connection:
             # only the first failure is news
             log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
             self._wait(now_s, LinkState.BACK_OFF, str(error), error.remedy)
-            self._notice()
             return
         self._remedy = ""
         self._link = DeviceLink(now_s)
@@ -239,12 +238,8 @@ class Connection:
             sent.append(self._stream.sent)
 
     def _lose(self, now_s: float, cause: str, remedy: str) -> None:
-        """End the conversation for `cause`, close the port, and wait in LOST until it is opened again."""
-        assert self._link is not None, "only an open port can be lost"
-        self._link.lose(cause)
-        self._remedy = remedy
-        self._notice()
-        self._unfinished = self._link.pending
+        """End the conversation as lost for `cause`, close the port, and wait in LOST until it is opened again."""
+        self._unfinished = self.pending
         self._release()
         self._wait(now_s, LinkState.LOST, cause, remedy)
 
@@ -256,10 +251,11 @@ class Connection:
         self._backend = self._link = self._stream = None
 
     def _wait(self, now_s: float, state: LinkState, cause: str, remedy: str) -> None:
-        """Wait in `state` before opening the port again, twice as long each time, up to LONGEST_BACK_OFF_S."""
+        """Wait in `state` before the port is opened again, twice as long each time, to LONGEST_BACK_OFF_S; tell it."""
         self._waiting, self._cause, self._remedy = state, cause, remedy
         self._reopen_s = now_s + self._back_off_s
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
+        self._notice()
 
     def _notice(self) -> None:
         before, state = self._seen, self.state

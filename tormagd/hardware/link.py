@@ -199,10 +199,6 @@ class DeviceLink:
             self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
             self._measurement = None
 
-    def lose(self, cause: str) -> None:
-        self.state = LinkState.LOST
-        self.cause = cause
-
     def _change_state(self, now_s: float) -> None:
         """Identify a device anew after a reset or a replacement, or enter LOST or UNANSWERED."""
         # one tick later, so that the core has seen the measurement that shows the break, and names it better

@@ -11,7 +11,7 @@ import fcntl
 import re
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -57,8 +57,7 @@ def segment_of(path: Path) -> Segment | None:
     began_s = None
     with contextlib.suppress(ValueError):  # such as the 13th month
         if named is not None:
-            began = datetime.strptime(named[1], _FORM).replace(tzinfo=UTC)
-            began_s = began.timestamp() + float((named[2] or "0")[:4])
+            began_s = datetime.strptime(f"{named[1]}{named[2] or '.000Z'}", f"{_FORM}.%f%z").timestamp()
     with contextlib.suppress(OSError):
         known = path.lstat()
         return Segment(path, began_s, known.st_size, named is not None and named[3] is not None, known.st_mtime)
@@ -121,23 +120,22 @@ class RecordingFolder:
         """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return
         those deleted."""
         left, gone = self.segments(), []
-        old = self._too_old(left)
+        old = list(self._too_old(left))
         for segment in list(left):
             if (segment in old or self._over(left, coming_bytes)) and self._delete(segment):
                 left.remove(segment)
                 gone.append(segment)
         return gone
 
-    def _too_old(self, segments: list[Segment]) -> list[Segment]:
-        """Return the segments that were last written longer than the budget's age before the newest."""
-        old = []
+    def _too_old(self, segments: list[Segment]) -> Iterator[Segment]:
+        """Yield the segments that were last written longer than the budget's age before the newest, the
+        newest first."""
         for segment, later in zip(segments[-2::-1], segments[:0:-1], strict=True):
             began_s = later.began_s or 0.0
             if max(abs(began_s - segment.ended_s), abs(later.ended_s - began_s)) > LONGEST_PAUSE_S:
-                break
+                return
             if segments[-1].ended_s - segment.ended_s > self.budget.most_s:
-                old.append(segment)
-        return old
+                yield segment
 
     def mark_around(self, segment: Path) -> Path:
         """Mark a segment, and the one before where this one began under BEFORE_MARK_S ago; return its new path."""

@@ -133,11 +133,10 @@ class Keeper:
             folder.mkdir(mode=0o750, parents=True, exist_ok=True)
             details = {**begun.header, **write.details, "reason": write.reason}
             write_black_box(folder / write.name, details, parts)
-            is_request = write.reason == REQUEST
-            alike = [each for each in folder.glob("*Z-*.mcap") if each.match(f"*-{REQUEST}.mcap") is is_request]
             # a name is a clock's word: what this daemon has written is newer than the rest
             self._written.append(write.name)
-            alike.sort(key=lambda each: (each.name in self._written, each.name == write.name, each.name))
+            known = sorted(folder.glob("*Z-*.mcap"), key=lambda each: (each.name in self._written, each.name))
+            alike = [each for each in known if each.match(f"*-{REQUEST}.mcap") is (write.reason == REQUEST)]
             for old in alike[:-MAX_FILES]:
                 old.unlink()
         except (OSError, ValueError, TypeError, KeyError, msgspec.MsgspecError) as error:
