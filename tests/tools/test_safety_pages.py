@@ -47,10 +47,12 @@ def test_the_page_of_states_has_every_code_and_every_event() -> None:
     for code, row in (*FAULTS.items(), *LIMITS.items()):
         assert f"| `{code}` | {row.cause} | {row.reaction} |" in page
     assert [code for code in (*Fault, *Limit) if f"`{code}`" not in page] == []
-    leads = {event: row.split(" | ") for event, row in re.findall(r"^\| [`*](.+?)[`*] \| (.+)$", page, re.MULTILINE)}
-    for row in ROWS:
-        expected = f"`{row.code}`" if isinstance(row, Refusal) else row.target
-        assert dict(zip(OperatingState, leads[row.event], strict=False))[row.source] == expected
+    leads = {
+        event: cells.split(" | ") for event, cells in re.findall(r"^\| [`*](.+?)[`*] \| (.+)$", page, re.MULTILINE)
+    }
+    for each in ROWS:
+        expected = f"`{each.code}`" if isinstance(each, Refusal) else each.target
+        assert dict(zip(OperatingState, leads[each.event], strict=False))[each.source] == expected
 
 
 def test_the_evidence_is_of_the_matrix_that_there_is() -> None:
