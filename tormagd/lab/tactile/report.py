@@ -114,7 +114,8 @@ def _pulse(pulse: Json) -> str:
         f"|dF/dB| >= 0.03 N/mT ({pulse['scored_share']:.1%} of the samples); elsewhere the force's counts. The thesis "
         f"measured {PULSE_MAE_MT} ± {PULSE_SD_MT} mT, at most {PULSE_MAX_MT} mT.\n\n"
         + table(columns, rows.values())
-        + "\nThe network alone drifts with [the pad's](tactile.md) relaxation. The other pads have constants drawn 3 to 15 % off.\n\n"
+        + "\nThe network alone drifts with [the pad's](tactile.md) relaxation. The other pads have "
+        "constants drawn 3 to 15 % off.\n\n"
         "![the pulse experiment](images/tactile_pulse.png)\n"
     )
 

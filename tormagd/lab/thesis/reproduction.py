@@ -236,8 +236,8 @@ def figure_2_7(tests: list[StepTest]) -> Json:
         "rows": rows,
         "ranges": ranges,
         "rpm": 20.0,
-        "note": "Simulated, sample 1 with each insert's values, 5 s a step, between 94.5 and 45.5 mm. The elastomer relaxes "
-        "and warms, so it stays below the force law.",
+        "note": "Simulated, sample 1 with each insert's values, 5 s a step, between 94.5 and 45.5 mm. The elastomer "
+        "relaxes and warms, so it stays below the force law.",
     }
 
 
@@ -259,8 +259,8 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
     return {
         "as_built": rows,
         "pulse": _pulse_cloud(gap_speeds_mm_s),
-        "note": "Gap speeds: the thesis's, the simulated device's in a step of 10 mm, the fastest. R_o 11, t 20, s_max 95 mm, "
-        "G0 300 kPa, mu_r 3.8, mu_d 0.2, power field law.",
+        "note": "Gap speeds: the thesis's, the simulated device's in a step of 10 mm, the fastest. R_o 11, t 20, "
+        "s_max 95 mm, G0 300 kPa, mu_r 3.8, mu_d 0.2, power field law.",
     }
 
 
