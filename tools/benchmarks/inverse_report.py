@@ -43,8 +43,8 @@ simulated element gives the force. *Force* is the plant's force at the answer mi
 - `thesis-linear`, the daemon's `thesis`, goes row by row in torch at 1 mT by the thesis's rule. `linear-argmin`
   looks at every row, `vectorised-argmin` at the whole grid at once.
 - `torch` is the network over the grid in torch, the k nearest, then interpolation. `nearest` is the same in NumPy.
-- `newton` is Newton's method from the last field, on the same network {speedup_vs_thesis_linear:.0f} times as fast as the
-  thesis's search.
+- `newton` is Newton's method from the last field, on the same network {speedup_vs_thesis_linear:.0f} times as fast
+  as the thesis's search.
 
 *Pareto* marks variants that no faster one equals in plant error, to an encoder count of the gap (about 0.02 mT).
 [The shipped networks](guides/insert.md#the-shipped-models) are others.

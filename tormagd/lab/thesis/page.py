@@ -211,8 +211,8 @@ def table_4_1(data: Json) -> str:
             )
         )
     return (
-        "## Table 4.1: the force network\n\nThe thesis's tuples are not public; ours come from a simulated pad. The "
-        f"error is that of the assumed sensor ({data['sensor_noise_N']} N, mean {data['random']['noise_mae_N']:.3f} N). "
+        "## Table 4.1: the force network\n\nThe thesis's tuples are not public; ours are simulated. The error "
+        f"is the assumed sensor's ({data['sensor_noise_N']} N, mean {data['random']['noise_mae_N']:.3f} N). "
         "On held-out rows ([more](learned_inverse.md)):\n\n"
         + table(("class", "thesis MAE, N", "ours", "thesis R2", "ours"), rows)
     )
