@@ -4,9 +4,7 @@ from enum import STRICT, IntEnum, IntFlag
 
 
 class DriveMode(IntEnum):
-    """OFF is a heartbeat that keeps replies coming; RUN asks for the duties. OFF after RUN makes the device open the
-    gap.
-    """
+    """RUN asks for the duties, OFF for replies alone. OFF after RUN makes the device open the gap."""
 
     OFF = 0
     RUN = 1
@@ -23,7 +21,7 @@ class DeviceMode(IntEnum):
 
 
 class Switches(IntFlag, boundary=STRICT):
-    """Bit mask: end switches that are closed, and whether the zero of the encoders is valid."""
+    """Bit mask: closed end switches, and whether the encoders have a zero."""
 
     LEFT_OPEN = 1
     RIGHT_OPEN = 2

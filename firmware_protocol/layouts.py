@@ -12,9 +12,7 @@ SCHEMA_HASH: Final = 0x4B3A3191
 
 @final
 class Retract(Value):
-    """Host -> Device. Open the gap at the device's bounded rate, then switch the drives off. Sent on event, repeated
-    until Status carries its nonce.
-    """
+    """Host -> Device. Open the gap at the device's bounded rate, then switch the drives off."""
 
     def __init__(self, nonce: int) -> None:
         # New for every command, equal in its repetitions: the device acts on a nonce once.
@@ -23,33 +21,29 @@ class Retract(Value):
 
 @final
 class Drive(Value):
-    """Host -> Device. Motor duties. Every 1 ms; each accepted one is answered by State and Sense. In RUN, 50 ms
-    without a valid one makes the device open the gap and latch COMMAND_TIMEOUT.
-    """
+    """Host -> Device. Motor duties. Every 1 ms."""
 
     def __init__(self, left_duty: float, right_duty: float, mode: DriveMode, counter: int) -> None:
         # Share of the supply voltage at the left motor; positive opens.
         self.left_duty: Final = left_duty
-        # Share of the supply voltage at the right motor; positive opens.
+        # As left_duty, at the right motor.
         self.right_duty: Final = right_duty
-        # OFF is a heartbeat that keeps replies coming; RUN asks for the duties. OFF after RUN makes the device open
-        # the gap.
+        # RUN asks for the duties, OFF for replies alone. OFF after RUN makes the device open the gap.
         self.mode: Final = mode
-        # One more for each Drive, modulo 256. A Drive whose counter did not change is not accepted.
+        # One more for each Drive, modulo 256.
         self.counter: Final = counter
 
 
 @final
 class State(Value):
-    """Device -> Host. Where the carriages are. Sent at once for each accepted Drive, so every 1 ms."""
+    """Device -> Host. Where the carriages are. Sent for each accepted Drive."""
 
     def __init__(self, left_position_mm: float, right_position_mm: float, device_time_s: float, counter: int) -> None:
         # Left screw relative to home (8 mm lead, 4480 counts a turn): 0 at the open end, negative towards closed.
-        # Counts modulo 2^16; the host unwraps.
         self.left_position_mm: Final = left_position_mm
         # Right screw relative to home, as the left.
         self.right_position_mm: Final = right_position_mm
-        # When the positions were latched, on the device's clock, modulo 0.65536 s.
+        # When the positions were latched, on the device's clock.
         self.device_time_s: Final = device_time_s
         # One more for each State, modulo 256.
         self.counter: Final = counter
@@ -57,29 +51,24 @@ class State(Value):
 
 @final
 class Sense(Value):
-    """Device -> Host. Currents, force and handle, sampled with the State it follows. Sent at once for each accepted
-    Drive, so every 1 ms.
-    """
+    """Device -> Host. Currents, force and handle, sampled with the State it follows. Sent for each accepted Drive."""
 
     def __init__(
         self, left_current_A: float, right_current_A: float, force_N: float, handle_position_mm: float
     ) -> None:
         # Left motor current; positive drives towards open.
         self.left_current_A: Final = left_current_A
-        # Right motor current; positive drives towards open.
+        # Right motor current, as the left.
         self.right_current_A: Final = right_current_A
         # Friction force at the roller, positive against a positive motion of the handle.
         self.force_N: Final = force_N
-        # Roller surface position: 16384 counts a turn at 20 mm radius, counts modulo 2^16 (four turns); the host
-        # unwraps.
+        # Roller surface position: 16384 counts a turn at 20 mm radius.
         self.handle_position_mm: Final = handle_position_mm
 
 
 @final
 class Clear(Value):
-    """Host -> Device. Clear latched faults whose cause is gone. Sent on event, repeated until Status carries its
-    nonce.
-    """
+    """Host -> Device. Clear latched faults whose cause is gone."""
 
     def __init__(self, nonce: int) -> None:
         # As in Retract.
@@ -88,9 +77,7 @@ class Clear(Value):
 
 @final
 class Home(Value):
-    """Host -> Device. Find the open end and zero the encoders there. Sent on event, repeated until Status carries
-    its nonce.
-    """
+    """Host -> Device. Find the open end and zero the encoders there."""
 
     def __init__(self, nonce: int) -> None:
         # As in Retract.
@@ -99,9 +86,7 @@ class Home(Value):
 
 @final
 class Status(Value):
-    """Device -> Host. What the device is doing and what is wrong. Every 20 ms on the device's own clock, host or no
-    host.
-    """
+    """Device -> Host. What the device is doing and what is wrong. Every 20 ms."""
 
     def __init__(
         self,
@@ -115,7 +100,7 @@ class Status(Value):
     ) -> None:
         # Operating mode of the device.
         self.mode: Final = mode
-        # Bit mask: end switches that are closed, and whether the zero of the encoders is valid.
+        # Bit mask: closed end switches, and whether the encoders have a zero.
         self.switches: Final = switches
         # Bit mask: latched faults.
         self.faults: Final = faults
@@ -131,13 +116,10 @@ class Status(Value):
 
 @final
 class Hello(Value):
-    """Host -> Device. First message of a host; answered by Identity. Every 50 ms until it is answered, every second
-    after that.
-    """
+    """Host -> Device. First message of a host; answered by Identity."""
 
     def __init__(self, schema_hash: int, protocol_version: int, nonce: int) -> None:
-        # First four bytes of the SHA-256 of this file's canonical layout, read as a big-endian number, as the host
-        # knows it; on the wire little-endian, as every number.
+        # Beginning of the SHA-256 of the canonical layout, as the host knows it.
         self.schema_hash: Final = schema_hash
         # Version of the rules around the messages: framing, timing, meaning.
         self.protocol_version: Final = protocol_version
@@ -147,9 +129,7 @@ class Hello(Value):
 
 @final
 class Identity(Value):
-    """Device -> Host. Answer to Hello. A device that was compiled from another schema latches SCHEMA_MISMATCH and
-    refuses Drive RUN.
-    """
+    """Device -> Host. Answer to Hello."""
 
     def __init__(self, schema_hash: int, firmware_major: int, firmware_minor: int, serial_number: int) -> None:
         # As in Hello, as the device knows it.

@@ -157,7 +157,7 @@ extern "C" {
 /**
  * Signals in message Retract.
  *
- * Open the gap at the device's bounded rate, then switch the drives off. Sent on event, repeated until Status carries its nonce.
+ * Open the gap at the device's bounded rate, then switch the drives off.
  *
  * All signal values are as on the CAN bus.
  */
@@ -175,7 +175,7 @@ struct tormag_retract_t {
 /**
  * Signals in message Drive.
  *
- * Motor duties. Every 1 ms; each accepted one is answered by State and Sense. In RUN, 50 ms without a valid one makes the device open the gap and latch COMMAND_TIMEOUT.
+ * Motor duties. Every 1 ms.
  *
  * All signal values are as on the CAN bus.
  */
@@ -190,7 +190,7 @@ struct tormag_drive_t {
     int16_t left_duty;
 
     /**
-     * Share of the supply voltage at the right motor; positive opens.
+     * As left_duty, at the right motor.
      *
      * Range: -10000..10000 (-1..1 -)
      * Scale: 0.0001
@@ -199,7 +199,7 @@ struct tormag_drive_t {
     int16_t right_duty;
 
     /**
-     * OFF is a heartbeat that keeps replies coming; RUN asks for the duties. OFF after RUN makes the device open the gap.
+     * RUN asks for the duties, OFF for replies alone. OFF after RUN makes the device open the gap.
      *
      * Range: 0..1 (0..1 -)
      * Scale: 1
@@ -208,7 +208,7 @@ struct tormag_drive_t {
     uint8_t mode;
 
     /**
-     * One more for each Drive, modulo 256. A Drive whose counter did not change is not accepted.
+     * One more for each Drive, modulo 256.
      *
      * Range: 0..255 (0..255 -)
      * Scale: 1
@@ -229,13 +229,13 @@ struct tormag_drive_t {
 /**
  * Signals in message State.
  *
- * Where the carriages are. Sent at once for each accepted Drive, so every 1 ms.
+ * Where the carriages are. Sent for each accepted Drive.
  *
  * All signal values are as on the CAN bus.
  */
 struct tormag_state_t {
     /**
-     * Left screw relative to home (8 mm lead, 4480 counts a turn): 0 at the open end, negative towards closed. Counts modulo 2^16; the host unwraps.
+     * Left screw relative to home (8 mm lead, 4480 counts a turn): 0 at the open end, negative towards closed.
      *
      * Range: -32768..32767 (-58.51429..58.5125 mm)
      * Scale: 0.0017857142857142857
@@ -253,7 +253,7 @@ struct tormag_state_t {
     int16_t right_position_mm;
 
     /**
-     * When the positions were latched, on the device's clock, modulo 0.65536 s.
+     * When the positions were latched, on the device's clock.
      *
      * Range: 0..65535 (0..0.65535 s)
      * Scale: 1e-05
@@ -283,7 +283,7 @@ struct tormag_state_t {
 /**
  * Signals in message Sense.
  *
- * Currents, force and handle, sampled with the State it follows. Sent at once for each accepted Drive, so every 1 ms.
+ * Currents, force and handle, sampled with the State it follows. Sent for each accepted Drive.
  *
  * All signal values are as on the CAN bus.
  */
@@ -298,7 +298,7 @@ struct tormag_sense_t {
     int16_t left_current_a;
 
     /**
-     * Right motor current; positive drives towards open.
+     * Right motor current, as the left.
      *
      * Range: -32768..32767 (-32.768..32.767 A)
      * Scale: 0.001
@@ -316,7 +316,7 @@ struct tormag_sense_t {
     int16_t force_n;
 
     /**
-     * Roller surface position: 16384 counts a turn at 20 mm radius, counts modulo 2^16 (four turns); the host unwraps.
+     * Roller surface position: 16384 counts a turn at 20 mm radius.
      *
      * Range: 0..65535 (0..502.64715 mm)
      * Scale: 0.007669903939428206
@@ -328,7 +328,7 @@ struct tormag_sense_t {
 /**
  * Signals in message Clear.
  *
- * Clear latched faults whose cause is gone. Sent on event, repeated until Status carries its nonce.
+ * Clear latched faults whose cause is gone.
  *
  * All signal values are as on the CAN bus.
  */
@@ -346,7 +346,7 @@ struct tormag_clear_t {
 /**
  * Signals in message Home.
  *
- * Find the open end and zero the encoders there. Sent on event, repeated until Status carries its nonce.
+ * Find the open end and zero the encoders there.
  *
  * All signal values are as on the CAN bus.
  */
@@ -364,7 +364,7 @@ struct tormag_home_t {
 /**
  * Signals in message Status.
  *
- * What the device is doing and what is wrong. Every 20 ms on the device's own clock, host or no host.
+ * What the device is doing and what is wrong. Every 20 ms.
  *
  * All signal values are as on the CAN bus.
  */
@@ -379,7 +379,7 @@ struct tormag_status_t {
     uint8_t mode;
 
     /**
-     * Bit mask: end switches that are closed, and whether the zero of the encoders is valid.
+     * Bit mask: closed end switches, and whether the encoders have a zero.
      *
      * Range: 0..31 (0..31 -)
      * Scale: 1
@@ -436,13 +436,13 @@ struct tormag_status_t {
 /**
  * Signals in message Hello.
  *
- * First message of a host; answered by Identity. Every 50 ms until it is answered, every second after that.
+ * First message of a host; answered by Identity.
  *
  * All signal values are as on the CAN bus.
  */
 struct tormag_hello_t {
     /**
-     * First four bytes of the SHA-256 of this file's canonical layout, read as a big-endian number, as the host knows it; on the wire little-endian, as every number.
+     * Beginning of the SHA-256 of the canonical layout, as the host knows it.
      *
      * Range: 0..4294967295 (0..4294967295 -)
      * Scale: 1
@@ -472,7 +472,7 @@ struct tormag_hello_t {
 /**
  * Signals in message Identity.
  *
- * Answer to Hello. A device that was compiled from another schema latches SCHEMA_MISMATCH and refuses Drive RUN.
+ * Answer to Hello.
  *
  * All signal values are as on the CAN bus.
  */

@@ -35,21 +35,19 @@ TEXT = """# Speed against accuracy of the inverse
 Written by `python tools/evidence.py inverse` with [all its figures](evidence/inverse.json); do not edit. All data are
 synthetic: {workload}. One process, one thread, garbage collector frozen ({environment}).
 
-A solve receives a state of the handle, a force and the last field, and returns a field. The *solver error* is the
-distance to the network's own nearest root. The *plant error* is the distance to the field at which the simulated
-element gives the force. *Force* is the plant's force at the answer minus the force asked.
+The *solver error* is the distance to the network's own nearest root, the *plant error* to the field at which the
+simulated element gives the force. *Force* is the plant's force at the answer minus the force asked.
 
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
 
-- `thesis-linear`, the daemon's `thesis`, goes row by row in torch at 1 mT, and stops within the network's mean error of
-  the force (the thesis's rule). `linear-argmin` looks at every row, `vectorised-argmin` at the whole grid at once.
+- `thesis-linear`, the daemon's `thesis`, goes row by row in torch at 1 mT by the thesis's rule. `linear-argmin`
+  looks at every row, `vectorised-argmin` at the whole grid at once.
 - `torch` is the network over the grid in torch, the k nearest, then interpolation. `nearest` is the same in NumPy.
-- `newton` is Newton's method from the last field. It needs a force that rises with the field, as the brake's does. On
-  the same network it is {speedup_vs_thesis_linear:.0f} times as fast as the thesis's search.
+- `newton` is Newton's method from the last field, on the same network {speedup_vs_thesis_linear:.0f} times as fast
+  as the thesis's search.
 
-*Pareto* marks variants that no faster one equals in plant error, to an encoder count of the gap (about 0.02 mT). Solver
-errors under 1e-6 mT are drawn as that. The networks were trained for this page; here are [the shipped
-ones](guides/insert.md#the-shipped-models).
+*Pareto* marks variants that no faster one equals in plant error, to an encoder count of the gap (about 0.02 mT).
+[The shipped networks](guides/insert.md#the-shipped-models) are others.
 
 ## All searches on {usual} units, and the Pareto variants of every size
 

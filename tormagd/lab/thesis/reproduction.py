@@ -110,7 +110,6 @@ def table_2_3() -> Json:
     return {
         "rows": rows,
         "max_error_g": max(row["max_error_g"] for row in rows),
-        "note": "That is rounding.",
     }
 
 
@@ -199,7 +198,7 @@ def figure_2_5() -> Json:
         "shear_modulus_kPa": moduli_kPa.tolist(),
         "thesis_working_point_N": list(FIGURE_2_5_N),
         "measured_earlier_N": list(FIGURE_2_5_MEASURED_N),
-        "note": "mu_r 4, G0 277 kPa, mu_d 0.2, 95 and 45 mm. The range grows with mu_r and falls with G0.",
+        "note": "mu_r 4, G0 277 kPa, mu_d 0.2, 95 and 45 mm.",
     }
 
 
@@ -237,8 +236,8 @@ def figure_2_7(tests: list[StepTest]) -> Json:
         "rows": rows,
         "ranges": ranges,
         "rpm": 20.0,
-        "note": "The simulated device (plant sample 1 with each insert's values) in virtual time, 5 s a step, between "
-        "94.5 and 45.5 mm. Its elastomer relaxes and warms, so it stays below the force law.",
+        "note": "Simulated, sample 1 with each insert's values, 5 s a step, between 94.5 and 45.5 mm. The elastomer "
+        "relaxes and warms, so it stays below the force law.",
     }
 
 
@@ -260,9 +259,8 @@ def phase_portrait(*gap_speeds_mm_s: float) -> Json:
     return {
         "as_built": rows,
         "pulse": _pulse_cloud(gap_speeds_mm_s),
-        "note": "Gap speeds: the thesis's, the simulated device's in a step of 10 mm (the thesis's future work 7), the "
-        "fastest. R_o 11, t 20, s_max 95 mm, G0 300 kPa, mu_r 3.8, "
-        "mu_d 0.2, power field law. The thesis's coverage is of regions drawn by hand around points it does not print.",
+        "note": "Gap speeds: the thesis's, the simulated device's in a step of 10 mm, the fastest. R_o 11, t 20, "
+        "s_max 95 mm, G0 300 kPa, mu_r 3.8, mu_d 0.2, power field law.",
     }
 
 
@@ -296,7 +294,7 @@ def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
         "insert": "MRE-50-40",
         "range_N": list(PULSE_N),
         "rows": rows,
-        "note": "Shape and rhythm of a measured photoplethysmogram (heartpy), scaled to newtons; not a measured force.",
+        "note": "A measured photoplethysmogram (heartpy), scaled to newtons; not a measured force.",
     }
 
 
@@ -374,8 +372,7 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
         "gap_speed_mm_s": {"trapezoid": GAP_SPEED_MM_S, "true": gap_speed_mm_s, "true_thesis_speed": GAP_SPEED_MM_S},
         "max_seconds": max(row["seconds"] for row in starts),
         "note": "R_i 4 mm, bounds of Eq. 40-42, G0 300 kPa, mu_r 3.8, mu_d 0.2, power field law. Use case 1 starts at "
-        "(0 N, 0 N/s), because no passive brake changes a zero force. A hundredth of a percent of coverage is given up "
-        "for the smallest elastomer.",
+        "(0 N, 0 N/s).",
     }
 
 

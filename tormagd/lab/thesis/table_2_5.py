@@ -50,7 +50,7 @@ def table_2_5() -> Json:
         "implied_gap_resolution_mm": [min(steps), max(steps)],
         "note": "As the thesis meant it, an insert serves a task if its measured range (table 2.4) is as wide as the "
         "task's. Strictly the least force counts too, and a passive brake does not reach 0 N. Resolution is the force "
-        "of one gap step where the insert is steepest. Forces are the simulated device's.",
+        "of the steepest gap step.",
     }
 
 
