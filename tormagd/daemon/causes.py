@@ -17,7 +17,7 @@ WAITED_SHARE = 0.1
 "If the host kept the control loop waiting for more of the last second, it caused the silence: not device or cable."
 SILENCES = {
     *("LINK_LOST", "MEASUREMENT_STALE", "SENSE_STALE", "STATUS_STALE", "LINK_DEGRADED", "DEVICE_COMMAND_TIMEOUT"),
-    "DEVICE_SILENT",
+    *("DEVICE_SILENT", "CLOCK"),
 }
 
 log = logging.getLogger(__name__)
