@@ -11,6 +11,7 @@ import platform
 import re
 import select
 import struct
+import time
 from pathlib import Path
 
 _EVENT = struct.Struct("=IQ" if platform.machine() == "x86_64" else "@IQ")
@@ -28,6 +29,7 @@ def door(listening: int) -> tuple[int, int, int]:
                 found = entry.search(path.read_text(encoding="ascii"))
                 if found and int(found[1], 16) & select.EPOLLIN:
                     return int(path.name), listening, int(found[2], 16)
+        time.sleep(0.001)  # with SCHED_FIFO it would wait for this thread
     raise OSError("connections cannot be bounded: /proc/self/fdinfo names no epoll set; mount /proc")
 
 
