@@ -42,7 +42,7 @@ class Tuning(NamedTuple):
 
 
 def corner_margins(config: Config, corners: Corners = Corners()) -> dict[str, float]:  # noqa: B008  # immutable
-    """Return the least margins of the position loop over every corner."""
+    """Return the least gain margin, dB, and phase margin, degrees, over all corners, and their number."""
     gain, phase = [], []
     factors = (1.0 - corners.share, 1.0 + corners.share)
     for chosen in itertools.product(factors, repeat=len(corners.parameters)):
@@ -62,7 +62,7 @@ def tunings(
     grid: Iterable[tuple[float, float, float]],
     corners: Corners = Corners(),  # noqa: B008  # immutable
 ) -> Iterator[Tuning]:
-    """Yield the largest robust proportional gain for every point of the grid that has one."""
+    """Yield the largest robust proportional gain of each grid point."""
     for derivative_s, filter_s, integral_s in grid:
         position = msgspec.structs.replace(
             config.position,

@@ -43,7 +43,7 @@ class CanStream:
         self._drives: deque[bytes] = deque(maxlen=ECHOES)
         self._synchronised = True
         self.received: list[tuple[int, bytes]] = []
-        """Frames since the bus was last read, UNREADABLE among them."""
+        """Frames of the newest read, UNREADABLE among them."""
         self.sent = UNREADABLE
 
     def pack(self, message: Message) -> tuple[int, bytes]:
@@ -63,7 +63,7 @@ class CanStream:
         return messages
 
     def unpack(self, identifier: int, data: bytes) -> Message | None:
-        """Return the message in a frame, or None for another node's, a host's, or one that does not decode."""
+        """Return this node's message in a frame, or None. Raises SecondHostError for another host's Drive."""
         if identifier & 0xF != self.node:
             return None
         self.received.append((identifier, data))

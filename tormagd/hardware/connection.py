@@ -116,7 +116,7 @@ class Connection:
         return self._unfinished if self._link is None else self._link.pending
 
     def open(self, now_s: float) -> None:
-        """Open the port and begin a conversation, which repeats an unfinished RETRACT."""
+        """Open the port and repeat an unfinished RETRACT; on failure, log it once and go to BACK_OFF."""
         try:
             self._backend = self._open_backend()
         except BackendError as error:
@@ -137,7 +137,7 @@ class Connection:
         self._notice()
 
     def receive(self, now_s: float) -> None:
-        """Read what the device has sent, and hand it to `traffic` and the conversation."""
+        """Hand what the device has sent to `traffic`, undecoded, and to the conversation."""
         backend, link = self._backend, self._link
         if backend is None or link is None:
             return

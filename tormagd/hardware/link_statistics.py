@@ -85,7 +85,7 @@ class RoundTrip:
             self._lead = None
 
     def status(self, drive_counter: int) -> None:
-        """Take the last Drive that the device accepted, and count the round trips since the last Status."""
+        """Count the round trips since the last Status if the last accepted Drive fits them; otherwise begin anew."""
         state, lead = self._state, self._lead
         if state is None:
             return
