@@ -420,7 +420,8 @@ def port_holder(config: Config, machine: Machine, daemon_id: int | None = None) 
     target = machine.resolved(name)
     holders = machine.holders([target])[0][target] if name.startswith("/") else []
     if target.startswith("/dev/pts/"):  # whoever made a pseudo-terminal has it open as well
-        holders = [each for each in holders if each[0] in machine.lock_owners(target)]
+        locking = machine.lock_owners(target)
+        holders = [each for each in holders if each[0] in locking]
     found = ", ".join(f"{comm} (process {pid})" for pid, comm in holders if pid != daemon_id)
     return _finding(
         "port holder",

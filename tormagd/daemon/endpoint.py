@@ -140,15 +140,11 @@ class Endpoint:
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
         """Send one message to all subscribers of telemetry, or to those of a topic, with the topic as its
         first part."""
-        with contextlib.suppress(zmq.Again):
-            self._telemetry.send_multipart([*topic, encode(message)], zmq.NOBLOCK)
-        self.arrivals.touch(self._telemetry)
+        self._send(self._telemetry, *topic, encode(message))
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
         """Send control ticks to all subscribers of the recording, a row each with the fields `columns`."""
-        with contextlib.suppress(zmq.Again):
-            self._recording.send(encode_ticks(rows, columns), zmq.NOBLOCK)
-        self.arrivals.touch(self._recording)
+        self._send(self._recording, encode_ticks(rows, columns))
 
     def hear(self) -> None:
         """Read what subscribers say, for TAKEN_NS at each socket; cut off those that say too much."""
@@ -252,6 +248,11 @@ class Endpoint:
             raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}; name another") from error
         except (OSError, ConfigError) as error:
             raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
+
+    def _send(self, to: "zmq.Socket[bytes]", *parts: bytes) -> None:
+        with contextlib.suppress(zmq.Again):
+            to.send_multipart(parts, zmq.NOBLOCK)
+        self.arrivals.touch(to)
 
     def _sender(self, frame: zmq.Frame, name: str) -> tuple[Peer, int]:
         """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection."""

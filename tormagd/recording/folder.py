@@ -120,7 +120,7 @@ class RecordingFolder:
         """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return
         those deleted."""
         left, gone = self.segments(), []
-        old = list(self._too_old(left))
+        old = set(self._too_old(left))
         for segment in list(left):
             if (segment in old or self._over(left, coming_bytes)) and self._delete(segment):
                 left.remove(segment)

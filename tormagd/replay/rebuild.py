@@ -51,12 +51,9 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
     lacking = [name for name in TickRecord.__struct_fields__ if name not in columns]
     if lacking:
         raise ReplayError(f"its ticks have no column {lacking[0]!r}: tormagd {header['version'][:20]!r} wrote it")
-    config = _intact(header, "config")
-    if isinstance(kept := config.get("recordings"), dict):
-        kept.pop("key", None)  # earlier versions sealed recordings with it
     try:
         return Recorded(
-            checked(config, Config),
+            checked(_intact(header, "config"), Config),
             checked(_intact(header, "scene"), Scene),
             header["model_sha256"],
             (Path(header["scene_folder"]), beside),
