@@ -21,13 +21,13 @@ from setuptools.command.build_ext import build_ext
 # the hot rooms, in the order data flows: whatever a setpoint, a tick or a plan runs, and the simulated device
 COMPILED = {
     "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
-    "tormagd/physics": ("friction", "relaxation"),
-    "tormagd/model": ("displacement", "force_curve"),
-    "tormagd/inverse": ("solution", "newton"),
+    "tormagd/element/physics": ("friction", "relaxation"),
+    "tormagd/element/model": ("displacement", "force_curve"),
+    "tormagd/element/inverse": ("solution", "newton"),
     "tormagd/hardware": (
         *("serial_port", "frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
     ),
-    "tormagd/safety": ("operating_state",),
+    "tormagd/control/safety": ("operating_state",),
     "tormagd/control": (
         *("filter", "interpolation", "field_of_gap", "records", "contact", "nominal", "sight", "plausible", "measure"),
         *("core",),
@@ -38,7 +38,7 @@ COMPILED = {
     "tormagd/control/ask": ("skill", "forecast", "path", "way", "governor"),
     "tormagd/control/aim": ("portrait", "floors", "aim"),
     "tormagd/control/move": ("motor", "pid", "reference", "homing", "opening", "watch", "actuator", "carriages"),
-    "tormagd/assembly": ("conditions", "journal"),
+    "tormagd/control/assembly": ("conditions", "journal"),
     "tormagd/simulation": (
         *("curve", "axis", "gap_field", "warmth", "element", "second_element", "tactile_pad"),
         *("pressed_pad", "hand", "plant", "motion", "firmware", "device"),

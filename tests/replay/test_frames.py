@@ -11,16 +11,16 @@ from mcap.reader import make_reader
 
 from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier, decode
 from firmware_protocol.framing import FrameDecoder
-from tormagd.assembly.build import Core
 from tormagd.config import Config, Limits
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Fault
 from tormagd.ctl.main import main
 from tormagd.ctl.replay import _instead
-from tormagd.recording.black_box import BlackBoxFile, read_black_box
-from tormagd.replay.__main__ import main as run
-from tormagd.replay.rebuild import ReplayError, rebuilt, recorded
-from tormagd.replay.rehearse import changed, rehearse, script
-from tormagd.replay.rerun import ticks_of
-from tormagd.safety.codes import Fault
+from tormagd.record.black_box import BlackBoxFile, read_black_box
+from tormagd.record.replay.__main__ import main as run
+from tormagd.record.replay.rebuild import ReplayError, rebuilt, recorded
+from tormagd.record.replay.rerun import ticks_of
+from tormagd.simulation.rehearse import changed, rehearse, script
 
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5
 "And the newest snapshot before it, one of two a second."

@@ -5,8 +5,8 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from firmware_protocol.codec import DeviceFault
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit, Position, device_faults
-from tormagd.safety.operating_state import (
+from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit, Position, device_faults
+from tormagd.control.safety.operating_state import (
     CLEARING_S,
     COMMANDS,
     LOST_POSITION,

@@ -19,16 +19,16 @@ from hypothesis import given, strategies as st
 import tormagd.control
 from tormagd.config import Position
 from tormagd.control.move.pid import Pid
-from tormagd.lab.design.force_law import radial_moment_for_force_Tm
-from tormagd.physics.brake_curve import BrakeCurve
-from tormagd.physics.errors import DomainError
-from tormagd.physics.force import (
+from tormagd.control.safety.codes import Limit
+from tormagd.element.physics.brake_curve import BrakeCurve
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.force import (
     Elastomer,
     Geometry,
     brake_force_N,
     max_radial_moment_Tm,
 )
-from tormagd.safety.codes import Limit
+from tormagd.lab.design.force_law import radial_moment_for_force_Tm
 
 EPISODES = 12
 

@@ -1,6 +1,6 @@
 """`tormagctl replay`: run a black box again, bit for bit, or with the simulator in place of the device.
 
-`python -m tormagd.replay` does it, in a process of its own.
+`python -m tormagd.record.replay` does it, in a process of its own.
 """
 
 from collections.abc import Sequence
@@ -9,8 +9,7 @@ from typing import Any
 
 import msgspec
 
-from tormagd.ctl.outcome import Exit, Outcome, usage_error
-from tormagd.ctl.process import answer_of
+from tormagd.ctl.outcome import Exit, Outcome, answer_of, usage_error
 
 LONGEST_S = 900.0
 "Half a minute takes some seconds, interpreted and simulated twice some minutes."
@@ -34,7 +33,7 @@ def replay(
     ]
     try:
         result: dict[str, Any] = msgspec.json.decode(
-            answer_of("tormagd.replay", [*arguments, "--", str(path)], LONGEST_S)
+            answer_of("tormagd.record.replay", [*arguments, "--", str(path)], LONGEST_S)
         )
     except TimeoutError as error:
         raise usage_error(f"{path}: {error}", "is it a black box?") from error

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from tormagd.assembly.journal import Journal
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import Planner
@@ -14,6 +13,7 @@ from tormagd.daemon.beat import Beat
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.search_process import SearchProcess
+from tormagd.record.journal import Journal
 
 PLAN_ERRORS = (ValueError, ArithmeticError, RuntimeError)
 "DomainError and the errors of NumPy."

@@ -15,7 +15,7 @@ from typing import Final, Literal, final
 from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.believe.strength import SURE, DeviceBounds, DeviceFit
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 
 Disputed = Literal["device", "sensor"]
 "What an operator may say in a dispute: the device has changed, or the sensor is wrong."
