@@ -30,8 +30,9 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
-from tormagd.control.safety.operating_state import COMMANDS, DeviceRequest, OperatingState, RefusedError
+from tormagd.control.safety.operating_state import COMMANDS, OperatingState, RefusedError
 from tormagd.daemon.arming import Arming
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import SerialDevice, VirtualDevice

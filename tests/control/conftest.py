@@ -14,11 +14,11 @@ from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.records import Duty, Handle, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault
-from tormagd.control.safety.operating_state import Conditions, DeviceRequest, OperatingState, RefusedError
+from tormagd.control.safety.operating_state import Conditions, OperatingState, RefusedError
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
 from tormagd.element.model.memory import NO_MEMORY
 from tormagd.element.model.model_file import ForceModel, load_model
-from tormagd.hardware.measurement import Measurement
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.scenes.scene import Scene
 
 MeasurementMaker = Callable[..., Measurement]

@@ -85,29 +85,7 @@ ours = [name for name in names if name.startswith(("tormagd.", "tormagd_client."
 print(*[name for name in ours if "__mypyc" not in name])
 print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
 """
-ROOMS = {
-    "assembly",
-    "bounded_file",
-    "command_line",
-    "config",
-    "control",
-    "daemon",
-    "exact",
-    "following",
-    "force_file",
-    "hardware",
-    "inverse",
-    "keeping",
-    "keys",
-    "model",
-    "named_file",
-    "output",
-    "physics",
-    "safety",
-    "scenes",
-    "slices",
-    "toml_file",
-}
+ROOMS = {"config", "control", "daemon", "element", "ground", "hardware", "record", "scenes"}
 LIBRARIES = (
     "can",
     "matplotlib",
@@ -141,8 +119,6 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
         "tormagd.element.model.force_curve",
         "tormagd.element.model.memory",
         "tormagd.element.model.model_file",
-        "tormagd.element.model.model_file",
-        "tormagd.element.model.model_file",
         "tormagd_client.endpoints",
         "tormagd_client.keys",
         "tormagd_client.messages",
@@ -155,7 +131,7 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
 # -- the log -----------------------------------------------------------------------------------------------------------
 
 
-SAY = "import logging, tormagd.ground.terminal as log; log.log_to_stderr(); logging.getLogger('room').warning('a\\x1b[2J')"
+SAY = "import logging, tormagd.ground.terminal as t; t.log_to_stderr(); logging.getLogger('room').warning('a\\x1b[2J')"
 
 
 @pytest.mark.parametrize(

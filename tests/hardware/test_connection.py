@@ -29,10 +29,10 @@ from firmware_protocol.codec import (
     period,
 )
 from tormagd.config import Device
-from tormagd.control.safety.operating_state import DeviceRequest
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import SILENT_S, LinkState
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd.record.journal import Journal
 from tormagd_client.messages import LinkReport
 

@@ -39,11 +39,12 @@ from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from tormagd.config import Config, Device
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.safety.codes import Fault, Limit
-from tormagd.control.safety.operating_state import DeviceRequest, OperatingState
+from tormagd.control.safety.operating_state import OperatingState
 from tormagd.hardware.backend import Backend, BackendError, choose
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd.simulation.can_device import DEVICE, CanDevice
 from tormagd.simulation.can_frame import CanFrame, from_socket, to_socket
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream

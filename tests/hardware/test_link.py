@@ -28,7 +28,6 @@ from firmware_protocol.codec import (
     encode,
     period,
 )
-from tormagd.control.safety.operating_state import DeviceRequest
 from tormagd.hardware.link import (
     FIRST_NONCE,
     GIVE_UP_S,
@@ -40,7 +39,7 @@ from tormagd.hardware.link import (
     LinkState,
 )
 from tormagd.hardware.link_quality import LinkQuality
-from tormagd.hardware.measurement import Measurement
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 US = Identity(SCHEMA_HASH, 1, 2, 77)
 POSITION_SPAN_MM = period(State, "left_position_mm")

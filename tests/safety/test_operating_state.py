@@ -13,7 +13,6 @@ from tormagd.control.safety.operating_state import (
     ROWS,
     TRANSITIONS,
     Conditions,
-    DeviceRequest,
     Event,
     OperatingState,
     Refusal,
@@ -26,6 +25,7 @@ from tormagd.control.safety.operating_state import (
     next_commands,
     reason,
 )
+from tormagd.hardware.measurement import DeviceRequest
 
 READY = Conditions(connected=True, fresh=True, homed=True, busy=False, device_latched=False)
 NEED_NO_DEVICE = ("stop", "use-scene")

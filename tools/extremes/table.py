@@ -48,7 +48,7 @@ from tormagd.control.nominal import FieldOfGap
 from tormagd.control.plausible import is_contradicted, is_outside, leap_between
 from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Fault
-from tormagd.control.safety.operating_state import Conditions, DeviceRequest, SafetyState, command
+from tormagd.control.safety.operating_state import Conditions, SafetyState, command
 from tormagd.control.sight import Sight
 from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, named
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
@@ -57,7 +57,7 @@ from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.link_statistics import DeviceClock
-from tormagd.hardware.measurement import Measurement
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
 "Periods of a tick and of a plan, and the longest tick of `Stepper`."

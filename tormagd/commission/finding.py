@@ -1,4 +1,4 @@
-"""A finding: one measured value of a device, its interval, what is allowed, and a remedy."""
+"""A finding: one measured value of a device, its interval by least squares, what is allowed, and a remedy."""
 
 import math
 

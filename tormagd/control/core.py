@@ -35,6 +35,8 @@ from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.scene import Scene
 
+PLAN_ERRORS: Final = (ValueError, ArithmeticError, RuntimeError)
+"What a plan may raise: DomainError and the errors of NumPy."
 _ENABLED: Final = OperatingState.ENABLED
 _PAUSED: Final = OperatingState.PAUSED
 

@@ -1,4 +1,4 @@
-"""Linear interpolation between tabulated points, on floats."""
+"""Linear interpolation between tabulated points, and a low-pass filter of first order, on floats."""
 
 from itertools import accumulate
 from typing import Final, final

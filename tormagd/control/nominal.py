@@ -1,4 +1,4 @@
-"""The nominal device: the model's force over the field for the handle's present or planned motion."""
+"""The nominal device: the field of a gap, and the model's force over the field for the handle's motion."""
 
 import math
 from typing import Final, final

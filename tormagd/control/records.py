@@ -10,8 +10,8 @@ from firmware_protocol.codec import DriveMode
 from firmware_protocol.value import Value
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.safety.codes import Limit
-from tormagd.control.safety.operating_state import DeviceRequest
 from tormagd.element.model.displacement import MOVING_MM_S, Turn
+from tormagd.hardware.measurement import DeviceRequest
 
 
 @final

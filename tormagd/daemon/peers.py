@@ -1,4 +1,4 @@
-"""Counts of peers that were refused, or whose messages were not read."""
+"""Peers: how many of their messages are read, and counts of what was refused or not read."""
 
 import logging
 from collections.abc import Callable

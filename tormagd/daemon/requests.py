@@ -1,4 +1,4 @@
-"""Requests that wait for an answer. Clients take turns; `stop` and `disable` overtake all that wait."""
+"""Which sockets hold messages, and requests that wait. Clients take turns; `stop` and `disable` overtake all."""
 
 import select
 from collections import deque

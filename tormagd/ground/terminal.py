@@ -1,4 +1,4 @@
-"""Lines on a standard stream that may be closed or full, or whose reader may have gone; the log; what a signal ends.
+"""Lines on a standard stream that may be closed or full, or whose reader has gone; the log; what a signal ends.
 
 A terminal obeys what is printed to it. So words of a file, a device or another process are made `printable` where they
 come in, and whatever else is not printable is escaped on output, except line ends and our own colours.

@@ -25,10 +25,9 @@ from firmware_protocol.codec import (
     Switches,
     period,
 )
-from tormagd.control.safety.operating_state import DeviceRequest
 from tormagd.hardware.link_quality import UNKNOWN_QUALITY, Counts, LinkQuality, LinkWatch
 from tormagd.hardware.link_statistics import DeviceClock, RoundTrip
-from tormagd.hardware.measurement import Measurement
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 REPEAT_S: Final = 0.05
 "After this time without an acknowledgement a Hello or a command is sent again."

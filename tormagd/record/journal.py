@@ -20,11 +20,12 @@ from tormagd.control.move.reference import Reference
 from tormagd.control.plausible import Leap
 from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Fault, Limit
-from tormagd.control.safety.operating_state import Conditions, DeviceRequest, OperatingState, SafetyState
+from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState
 from tormagd.element.inverse.solution import Answer, FieldSolution, Question, Reach
 from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd.record.keeper_messages import READ, WROTE
 from tormagd_client.messages import TickRecord
 

@@ -1,9 +1,11 @@
-"""What would have happened instead: the simulated device in place of the real one, in virtual time.
+"""`python -m tormagd.simulation.rehearse FILE`: a black box again, with the simulated device in place of the real one.
 
 Setpoints, commands and the handle's motion are a black box's; the configuration may be another. The simulator is not
 the recorded device, so it runs with the recorded configuration too, to compare with.
 """
 
+import logging
+import sys
 import tomllib
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -17,7 +19,9 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.ground.plain_values import InexactError
 from tormagd.record import journal
-from tormagd.record.replay.rebuild import ReplayError
+from tormagd.record.black_box import BlackBoxFile
+from tormagd.record.replay.__main__ import answered, asked
+from tormagd.record.replay.rebuild import Recorded, ReplayError, rebuilt
 from tormagd.record.replay.rerun import name_of, planned_for, ticks_of
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -187,3 +191,34 @@ def _hand(ticks: list[TickRecord]) -> RecordedHand:
             places.setdefault(tick.sensed_s - ticks[0].monotonic_s, tick.device_handle_mm)
     times_s = sorted(places) or [0.0]
     return RecordedHand(tuple(times_s), tuple(places.get(time_s, 0.0) for time_s in times_s))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = asked(__doc__ or "")
+    parser.add_argument("--set", dest="settings", action="append", default=[])
+    parser.add_argument("--plant", default="sample_1")
+    parser.add_argument("--fault", dest="faults", action="append", default=[])
+    options = parser.parse_args(arguments)
+
+    def run(known: Recorded, box: BlackBoxFile) -> dict[str, Any]:
+        todo = script(known.columns, box.entries)
+        config = changed(known.config, options.settings)
+        simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
+        instead = None
+        if options.settings:
+            instead = rehearse(rebuilt(known, config), config, todo, options.plant, options.faults)
+        return {
+            "plant": options.plant,
+            "faults": options.faults,
+            "settings": options.settings,
+            "recorded": msgspec.to_builtins(todo.recorded),
+            "simulated": msgspec.to_builtins(simulated),
+            "instead": msgspec.to_builtins(instead),
+        }
+
+    return answered(options, run)
+
+
+if __name__ == "__main__":
+    logging.disable()  # a replayed connection has no news
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""The phase portrait of a device: which forces its gaps give, and how fast a gap speed changes them."""
+"""The phase portrait of a device: which forces its gaps give, how fast a gap speed changes them, and the least gap."""
 
 from typing import Final, final
 

@@ -4,9 +4,9 @@ from tormagd.config import Config
 from tormagd.control.core import Stepper
 from tormagd.control.move.watch import SENSE_FAULT_S, STATUS_FAULT_S
 from tormagd.control.records import Duty, Measured
-from tormagd.control.safety.operating_state import Conditions, DeviceRequest
+from tormagd.control.safety.operating_state import Conditions
 from tormagd.hardware.connection import Connection
-from tormagd.hardware.measurement import Measurement
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 
 def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool:

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple, final
 
 from firmware_protocol.value import Value
 from tormagd.control.safety.codes import FAULTS, Fault, Position
+from tormagd.hardware.measurement import DeviceRequest
 
 CLEARING_S = 0.5
 "How long the device may take to report that a cleared fault is gone."
@@ -39,15 +40,6 @@ class Event(StrEnum):
     CLEAR_FAULT = "clear-fault"
     USE_SCENE = "use-scene"
     FAULT = "a fault shows"
-
-
-class DeviceRequest(StrEnum):
-    """A routine that the daemon asks the firmware for, once per request number."""
-
-    NONE = "none"
-    HOME = "home"
-    RETRACT = "retract"
-    CLEAR = "clear"
 
 
 class RefusedError(Exception):

@@ -1,8 +1,9 @@
 """The relaxation-aware model: a network for the force without memory, and Prony series for the stress's relaxation.
 
 F0 = NN(displacement, rate, field, CIP) is the force without memory. Its part without field and what the field adds
-relax by fractions of their own, with the same times (see `tormagd.element.physics.relaxation`). For an inverse, the memory is a
-shift. `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now, and any search finds the field for it.
+relax by fractions of their own, with the same times (see `tormagd.element.physics.relaxation`). For an inverse, the
+memory is a shift. `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now, and any search finds the
+field for it.
 """
 
 import functools

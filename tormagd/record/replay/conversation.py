@@ -10,7 +10,6 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, Identity, Message, 
 from firmware_protocol.framing import Frame, FramingStatistics
 from tormagd.config import Device
 from tormagd.control.records import Duty
-from tormagd.control.safety.operating_state import DeviceRequest
 from tormagd.ground.plain_values import first_difference, kinds, packed, plain
 from tormagd.hardware.backend import BackendError, LinkStatistics, Sent, Stream
 from tormagd.hardware.can_stream import CanStream, SecondHostError
@@ -18,7 +17,7 @@ from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import LinkState
 from tormagd.hardware.link_quality import Counts, LinkQuality
-from tormagd.hardware.measurement import Measurement
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 KNOWN = kinds(
     *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),

@@ -11,10 +11,10 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.control.assembly.build import Core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
+from tormagd.control.core import PLAN_ERRORS
 from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import RefusedError
-from tormagd.daemon.inference_loop import PLAN_ERRORS
 from tormagd.element.inverse.solution import Answer
 from tormagd.ground.plain_values import packed, plain, restore, restored
 from tormagd.hardware.link_quality import LinkQuality
