@@ -33,8 +33,8 @@ tr.red td.gap { background: #d32222; color: #fff; font-weight: bold; }
 a person who analyses the risk of a device. <strong>It certifies nothing</strong>: all evidence is of simulated
 devices.</p>
 <p>Written by <code>python tools/safety_pages.py</code> from the tables of <code>tormagd/control/safety</code>, the
-conformance kit, the test tree and the <a href="fault-matrix.html">fault matrix</a>. A row is red where a control, a code, a test or
-evidence is missing. Severity and probability are a person's, of <code>docs/risk.toml</code>.</p>
+conformance kit, the test tree and the <a href="fault-matrix.html">fault matrix</a>. A row is red where a control, a
+code, a test or evidence is missing. Severity and probability are a person's, of <code>docs/risk.toml</code>.</p>
 """
 
 
