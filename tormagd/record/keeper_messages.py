@@ -11,10 +11,11 @@ READ, WROTE = "read", "wrote"
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
-    """First message: the folder for black boxes, and the header of each."""
+    """First message: the folder for black boxes, and the header of each; `is_again` where a keeper has ended before."""
 
     folder: str
     header: dict[str, str]
+    is_again: bool = False
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
