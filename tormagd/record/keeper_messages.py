@@ -8,6 +8,8 @@ REQUEST = "REQUEST"
 "Reason of a black box that somebody asked for; any other is a fault's."
 READ, WROTE = "read", "wrote"
 "Entries of what passed between daemon and device: `[READ, time_s, raw, ...]`."
+MISSING = "missing"
+"An entry where others were lost."
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
