@@ -314,7 +314,9 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("hole_at", [0.2, 0.45, 0.7, 0.9])
 def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path: Path, hole_at: float) -> None:
-    data, places = bytearray(path.read_bytes()), summary_of(path)[0].places
+    data, summary = bytearray(path.read_bytes()), summary_of(path)
+    assert summary is not None
+    places = summary[0].places
     first = int(hole_at * places[-1].at)
     data[first : first + 4096] = bytes(4096)
     spoilt = tmp_path / "spoilt.mcap"

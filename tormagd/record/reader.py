@@ -107,9 +107,8 @@ class _Bounded:
 def _records(file: BinaryIO, *, has_magic: bool = False) -> Iterator[McapRecord]:
     """Yield the records to the end, chunks packed."""
     stream = _Bounded(file)
-    reader = StreamReader(  # type: ignore[arg-type]
-        stream, skip_magic=not has_magic, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES
-    )
+    limits: dict[str, Any] = {"emit_chunks": True, "record_size_limit": MAX_RECORD_BYTES}
+    reader = StreamReader(stream, skip_magic=not has_magic, **limits)  # type: ignore[arg-type]
     for record in reader.records:
         yield record
         stream.left = MAX_RECORD_BYTES
