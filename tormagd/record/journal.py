@@ -26,7 +26,7 @@ from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.keeper_messages import READ, WROTE
+from tormagd.record.keeper_messages import MISSING as MISSING, READ, WROTE
 from tormagd_client.messages import TickRecord
 
 FORMAT = 14
@@ -42,7 +42,7 @@ PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "te
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
 "A conversation began or ended. READ and WROTE are in `keeping`."
-STATE, MISSING = "state", "missing"
+STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."
 

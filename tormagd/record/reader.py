@@ -107,7 +107,8 @@ class _Bounded:
 def _records(file: BinaryIO, *, has_magic: bool = False) -> Iterator[McapRecord]:
     """Yield the records to the end, chunks packed."""
     stream = _Bounded(file)
-    reader = StreamReader(stream, skip_magic=not has_magic, emit_chunks=True)  # type: ignore[arg-type]
+    limits: dict[str, Any] = {"emit_chunks": True, "record_size_limit": MAX_RECORD_BYTES}
+    reader = StreamReader(stream, skip_magic=not has_magic, **limits)  # type: ignore[arg-type]
     for record in reader.records:
         yield record
         stream.left = MAX_RECORD_BYTES
@@ -125,31 +126,69 @@ def _within(chunk: Chunk) -> list[McapRecord]:
 
 
 def scan(
-    file: BinaryIO, name: str, take: Callable[[McapRecord, int], None], message: Callable[[Message], None]
+    file: BinaryIO,
+    name: str,
+    take: Callable[[McapRecord, int], None],
+    message: Callable[[Message], None],
+    lost: Callable[[str], None],
 ) -> bool:
-    """Read an MCAP file: each message goes to `message`, other records and where they begin to `take`."""
-    at, size = MAGIC_SIZE, 0
+    """Read an MCAP file: each message goes to `message`, other records and where they begin to `take`.
+
+    Damage goes to `lost`, and reading goes on with the next chunk. Returns False for a file that was cut short.
+    """
+    at, size, records = MAGIC_SIZE, 0, _records(file, has_magic=True)
     with readable(name):
-        try:
-            for record in _records(file, has_magic=True):
-                within = [record]
-                if isinstance(record, Chunk):
-                    take(record, at)
-                    size += record.uncompressed_size
-                    if size > MAX_RATIO * file.tell() + FREE_BYTES:
-                        raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
-                    within = _within(record)
-                for each in within:
-                    if isinstance(each, Message):
-                        message(each)
-                    else:
-                        take(each, at)
-                at = file.tell()
-        except EOFError:
-            return False
+        while True:
+            try:
+                record = next(records, None)
+                within = _within(record) if isinstance(record, Chunk) else [record]
+            except EOFError:
+                return False
+            except UNREADABLE as error:
+                following = next((place.at for place in _indexed(file) if place.at > at), 0)
+                if not (size or following):
+                    raise
+                lost(f"byte {at}: {str(error)[:80] or repr(error)}")
+                if not following:
+                    return False
+                at, records = file.seek(following), _records(file)
+                continue
+            if record is None:
+                break
+            if isinstance(record, Chunk):
+                take(record, at)
+                size += record.uncompressed_size
+                if size > MAX_RATIO * file.tell() + FREE_BYTES:
+                    raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
+            for each in within:
+                if isinstance(each, Message):
+                    message(each)
+                elif each is not None:
+                    take(each, at)
+            at = file.tell()
         if file.read(1):
             raise ValueError("it does not end as MCAP does")
     return True
+
+
+class Place(NamedTuple):
+    """Where a chunk begins in the file, and its messages' times, ns since 1970."""
+
+    from_ns: int
+    to_ns: int
+    at: int
+
+
+def _indexed(file: BinaryIO) -> list[Place]:
+    """List the chunks that the file's summary names, in their order; none where it is not there."""
+    places: list[Place] = []
+    with contextlib.suppress(*UNREADABLE):
+        footer, _ = _end(file)
+        file.seek(footer.summary_start if footer else 0, 0 if footer else 2)
+        for record in _records(file):
+            if isinstance(record, ChunkIndex) and len(places) < MAX_INDEX:
+                places.append(Place(record.message_start_time, record.message_end_time, record.chunk_start_offset))
+    return places
 
 
 def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
@@ -177,7 +216,10 @@ def damage_in(file: BinaryIO) -> str:
         data_crc = _at(file, data_end_at, DataEnd).data_section_crc
         if not data_crc:
             file.seek(0)
-            scan(file, file.name, lambda record, at: None, lambda message: None)
+            lost: list[str] = []
+            scan(file, file.name, lambda record, at: None, lambda message: None, lost.append)
+            if lost:
+                return lost[0]
         elif data_crc != _crc(file, 0, data_end_at):
             return "the CRC of its data is wrong"
         if footer.summary_crc not in (0, _crc(file, footer.summary_start, at + FOOTER_SIZE - 4)):
@@ -195,14 +237,6 @@ def _crc(file: BinaryIO, first: int, end: int) -> int:
     return crc
 
 
-class Place(NamedTuple):
-    """Where a chunk begins in the file, and its messages' times, ns since 1970."""
-
-    from_ns: int
-    to_ns: int
-    at: int
-
-
 class Contents:
     """Collects topics, metadata, and places of chunks, in the file's order."""
 
@@ -210,6 +244,7 @@ class Contents:
         self._topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
+        self.lost: list[str] = []
         self.is_complete = True
         "False if the recorder was killed or the disk was full: earlier messages are there."
 
@@ -248,7 +283,7 @@ class Contents:
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
     """Read an open recording: each tick and snapshot goes to `each`."""
     found = Contents()
-    is_whole = scan(file, name, found.take, found.reading(wanted, each))
+    is_whole = scan(file, name, found.take, found.reading(wanted, each), found.lost.append)
     found.require(name)
     found.is_complete = is_whole and CUT not in found.metadata
     return found
@@ -277,6 +312,11 @@ class RecordingFile:
         known = self.metadata
         self.notes = [
             *([f"damaged: {self.damage}"] if self.damage else []),
+            *(
+                [f"left out: {len(self._contents.lost)} damaged, {self._contents.lost[0]}"]
+                if self._contents.lost
+                else []
+            ),
             *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
             *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
         ]
