@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 from tormagd.ctl.outcome import CommandError
 from tormagd.ctl.watch import held_back
 from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
-from tormagd.ground.force_file import ForceFileError
+from tormagd.ground.table import TableError
 from tormagd_client.messages import Setpoint, Status
 
 
@@ -120,7 +120,7 @@ def test_any_bytes_are_a_waveform_or_refused(tmp_path_factory, data):
     file.write_bytes(b"t_s,force_N\n" + data)
     try:
         waveform = read_csv(file)
-    except ForceFileError:
+    except TableError:
         return
     assert 0.0 <= waveform.at(waveform.duration_s / 2).force_N <= 1_000.0
 

@@ -21,7 +21,8 @@ from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.element.model.model_file import ModelFileError, load_model
 from tormagd.ground.files import in_place_of, read_bounded
-from tormagd.ground.force_file import ForceFileError, read_forces
+from tormagd.ground.force_file import read_forces
+from tormagd.ground.table import TableError
 from tormagd.ground.toml_file import LONGEST_LINE, TomlError, toml_tables
 from tormagd.scenes.scene import load_scene
 from tormagd.scenes.signal import recorded
@@ -109,7 +110,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "key": _key,
     "profile": _profile,
 }
-REFUSALS = (ConfigError, PlantError, ModelFileError, ForceFileError, ProfileError)
+REFUSALS = (ConfigError, PlantError, ModelFileError, TableError, ProfileError)
 
 
 def make(name: str, folder: Path) -> Path:

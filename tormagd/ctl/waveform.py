@@ -3,7 +3,7 @@
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
@@ -90,8 +90,10 @@ def beat(phase: float) -> float:
     return min(1.0, bells)
 
 
-def read_csv(path: Path) -> Waveform:
-    table = read_forces(path)
-    start_s = table["t_s"][0]
-    times_s = array("d", (time_s - start_s for time_s in table["t_s"]))
-    return _lines(times_s, table["force_N"], *(table.get(name) for name in OPTIONAL_COLUMNS))
+def read_csv(path: Path, stated: Mapping[str, str] | None = None) -> tuple[Waveform, list[str]]:
+    """Return the forces of a file over time, and what was converted to read them."""
+    table = read_forces(path, stated or {})
+    values = table.values
+    start_s = values["time_s"][0]
+    times_s = array("d", (time_s - start_s for time_s in values["time_s"]))
+    return _lines(times_s, values["force_N"], *(values.get(name) for name in OPTIONAL_COLUMNS)), table.told

@@ -22,6 +22,8 @@ MAX_SOURCE_CHARACTERS = 64
 MAX_MARK_CHARACTERS = 200
 MAX_PREVIEW_SAMPLES = 256
 MIN_PREVIEW_DT_MS, MAX_PREVIEW_DT_MS = 0.1, 1_000.0  # no loop runs faster, and a closer one has a slope without measure
+AROUND_ZERO_N = 0.005  # a signal around zero goes so far below it, and is taken as 0
+NO_PUSH = "a brake cannot push"
 MAX_FORCE_N = 1_000.0  # no brake of this size can mean more; `ask` keeps to the scene's own range
 MAX_VALIDITY_MS = 60_000.0
 MAX_DISPLACEMENT_MM = 2.0  # since the handle last turned: friction is mobilised there, and more means nothing
@@ -39,6 +41,12 @@ def _require_within(key: str, value: float | None, least: float, most: float) ->
         require(False, key, value, f"{least:g}..{most:g}")
 
 
+def _require_force(key: str, force_N: float | None) -> None:
+    if not (force_N is None or -AROUND_ZERO_N <= force_N <= MAX_FORCE_N):
+        why = f"; {NO_PUSH}" if force_N < 0.0 else ""
+        require(False, key, force_N, f"0..{MAX_FORCE_N:g} N{why}")
+
+
 class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """An elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on."""
 
@@ -53,8 +61,9 @@ class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A force to render, from one publisher. `stamp_ns` is the publisher's CLOCK_REALTIME. Raises ValueError out of
-    range.
+    """A force to render, from one publisher. `stamp_ns` is the publisher's CLOCK_REALTIME.
+
+    A force down to -AROUND_ZERO_N means 0. Raises ValueError out of range.
     """
 
     v: int
@@ -78,11 +87,11 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         require(0 <= self.seq < 2**63, "seq", self.seq, "0..2^63-1")
         require(self.session is None or 0 <= self.session < 2**63, "session", self.session, "0..2^63-1")
         require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
-        require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
+        _require_force("servo_cf", self.servo_cf)
         require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
         _require_within("displacement_mm", self.displacement_mm, 0.0, MAX_DISPLACEMENT_MM)
         _require_within("rate_mm_s", self.rate_mm_s, -MAX_RATE_MM_S, MAX_RATE_MM_S)
-        _require_within("withdraw_cf", self.withdraw_cf, 0.0, MAX_FORCE_N)
+        _require_force("withdraw_cf", self.withdraw_cf)
         spacing = self.preview_dt_ms
         if self.preview_N is not None or spacing is not None:
             is_spacing = spacing is not None and MIN_PREVIEW_DT_MS <= spacing <= MAX_PREVIEW_DT_MS
@@ -91,8 +100,7 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
             require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)
             for index, force_N in enumerate(self.preview_N):
-                if not 0.0 <= force_N <= MAX_FORCE_N:
-                    raise ValueError(f"preview_N[{index}] = {force_N!r}: allowed is 0..{MAX_FORCE_N:g} N")
+                _require_force(f"preview_N[{index}]", force_N)
 
 
 class Tick(msgspec.Struct, frozen=True):
