@@ -71,7 +71,7 @@ GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
     ),
     "other names": (
         text(renamed({"rate": "omega", "field": "Hall", "force": "Zug"}, field=1e-3)),
-        ("--column", "rate_mm_s=omega", "--column", "field_mT=Hall:T", "--column", "force_N=Zug:N"),
+        ("--column", "rate_mm_s=omega:mm/s", "--column", "field_mT=Hall:T", "--column", "force_N=Zug:N"),
         "as it was",
     ),
     "time that begins anew with each cycle": (
@@ -126,19 +126,27 @@ def test_several_files_are_a_cycle_each_and_what_is_missing_is_said_and_drawn(tm
 
 
 RANDOM_SIGN = renamed(USUAL) | {"force_N": measured()["force"] * np.where(np.arange(600) % 3 == 0, -1.0, 1.0)}
+UNITS = {"rate": "v [mm/s]", "field": "B [mT]", "force": "F [N]"}
 REFUSED: dict[str, tuple[str, ...]] = {
-    "no force": (text(renamed({"rate": "rate", "field": "field"})), "no column is force_N (force, load, f)"),
-    "tesla, unsaid": (text(renamed({"rate": "v", "field": "B", "force": "F"}, field=1e-3)), "field_mT=B:T"),
-    "a strange unit": (text(renamed({"rate": "v", "field": "B", "force": "F [lbf]"})), "unit 'lbf' of force_N"),
-    "two of one": (text(renamed({"rate": "v", "field": "B", "force": "F", "x": "load"})), "'F' and 'load' may both"),
-    "no motion": (text(renamed({"field": "B", "force": "F"})), "no column is rate_mm_s"),
+    "no force": (text(renamed({"rate": "v_mm_s", "field": "B_mT"})), "no column is force_N (force, load, kraft, F)"),
+    "no unit": (text(renamed(UNITS | {"field": "B"}, field=1e-3)), "state --column field_mT=B:UNIT"),
+    "a unit of the file, and another": (
+        text(renamed(UNITS | {"force": "Zug [mN]"})),
+        "'Zug [mN]' is in mN by its file, not in N",
+        "--column",
+        "force_N=Zug:N",
+    ),
+    "a strange unit": (text(renamed(UNITS | {"force": "F [stone]"})), "'F [stone]' has the unit 'stone'"),
+    "two of one": (text(renamed(UNITS | {"x": "load [N]"})), "'load [N]' may both be force_N"),
+    "no motion": (text(renamed({"field": "B [mT]", "force": "F [N]"})), "no column is rate_mm_s"),
     "signs at random": (text(RANDOM_SIGN), "follows neither"),
-    "a word": (text(renamed(USUAL)) + "1,2,three,4\n", "row 602, field_mT: 'three' is no number"),
+    "a word": (text(renamed(USUAL)) + "1,2,three,4\n", "row 602, field_mT = 'three': allowed is a finite number"),
     "commas in commas": (text(renamed(USUAL), ",", ","), "decimal commas need ; or tab"),
-    "time that falls": (text(renamed({**USUAL, "time": "t"}, time=-1.0)), "t falls after -0 s"),
-    "a cycle of one row": ("t,cycle,F,B,v\n5,0,1,90,1\n0,1,1,91,1\n1,1,1,92,1\n", "a cycle of one row"),
+    "time that falls": (text(renamed({**USUAL, "time": "t_s"}, time=-1.0)), "t_s (s) falls after -0"),
+    "time that stands": ("t_s,F_N,B_mT,x_mm\n" + "1,1,90,1\n1,1,91,2\n2,1,92,3\n", "time_s stands still"),
+    "a cycle of one row": ("t_s,cycle,F_N,B_mT,v_mm_s\n5,0,1,90,1\n0,1,1,91,1\n1,1,1,92,1\n", "a cycle of one row"),
     "newtons of a press": (text(renamed(USUAL, force=1e6)), "is its unit another?"),
-    "nothing": ("", "no column is"),
+    "nothing": ("", "no numbers stand right below a row of names"),
     "a picture of sound": (text(renamed(USUAL)), "p.mp3: allowed is a name that ends with .png", "--picture", "p.mp3"),
 }
 

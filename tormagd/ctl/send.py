@@ -44,11 +44,11 @@ def send(
         hint="correct it and send again; tormagctl send --help shows the choices",
     ):
         if Path(what).suffix:
-            waveform, told = read_csv(Path(what), stated_columns(column, time_column))
+            waveform = read_csv(Path(what), stated_columns(column, time_column))
             lasts_s = min(waveform.duration_s, duration_s or math.inf)
         else:
             lasts_s = duration_s or 10.0
-            waveform, told = shape(what, from_N, to_N, frequency_hz, lasts_s), []
+            waveform = shape(what, from_N, to_N, frequency_hz, lasts_s)
     if valid_for_ms < 1e3 / rate_hz:
         raise usage_error(
             f"--valid-for-ms = {valid_for_ms:g}: allowed is at least one period, {1e3 / rate_hz:g} ms",
@@ -77,12 +77,12 @@ def send(
             )
             became = None if watch is None else watch.finish(done["sent"])
     left_out = f", {done['skipped']} left out because this machine was late" if done["skipped"] else ""
-    read = f"{what}: {'; '.join(told)}\n" if told else ""
+    read = f"{what}: {'; '.join(waveform.told)}\n" if waveform.told else ""
     text = f"{read}sent {done['sent']} setpoints as {source!r} in {done['seconds']:.1f} s{left_out}; "
     if became is None:
-        return Outcome({"source": source, "read": told, **done}, f"{text}whether they were taken is not known")
+        return Outcome({"source": source, "read": waveform.told, **done}, f"{text}whether they were taken is not known")
     held = f", held by {', '.join(became.limits)} at times" if became.limits else ""
-    result = {"source": source, "read": told, **done, **msgspec.structs.asdict(became)}
+    result = {"source": source, "read": waveform.told, **done, **msgspec.structs.asdict(became)}
     return Outcome(result, f"{text}{became.accepted} taken and rendered{held}")
 
 

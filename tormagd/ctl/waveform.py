@@ -33,6 +33,8 @@ class Waveform(NamedTuple):
     at: Callable[[float], Sample]
     least_N: float
     most_N: float
+    told: tuple[str, ...] = ()
+    "What was converted to read a file."
 
 
 def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
@@ -90,10 +92,10 @@ def beat(phase: float) -> float:
     return min(1.0, bells)
 
 
-def read_csv(path: Path, stated: Mapping[str, str] | None = None) -> tuple[Waveform, list[str]]:
-    """Return the forces of a file over time, and what was converted to read them."""
+def read_csv(path: Path, stated: Mapping[str, str] | None = None) -> Waveform:
     table = read_forces(path, stated or {})
     values = table.values
     start_s = values["time_s"][0]
     times_s = array("d", (time_s - start_s for time_s in values["time_s"]))
-    return _lines(times_s, values["force_N"], *(values.get(name) for name in OPTIONAL_COLUMNS)), table.told
+    others = (values.get(name) for name in OPTIONAL_COLUMNS)
+    return _lines(times_s, values["force_N"], *others)._replace(told=tuple(table.told))

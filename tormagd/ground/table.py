@@ -118,7 +118,8 @@ def read_table(path: Path, wanted: Wanted, most_bytes: int) -> Table:
     except csv.Error as error:
         raise TableError(f"{path}: not CSV: {error}; close its quotes, or save it anew as CSV") from error
     if len(table.rows) < MIN_ROWS:
-        raise TableError(f"{path}: {len(table.rows)} rows with all values: allowed is at least {MIN_ROWS}")
+        lacks = f" (row {table.missing[0]} lacks one)" if table.missing else ""
+        raise TableError(f"{path}: {len(table.rows)} rows with all values{lacks}: allowed is at least {MIN_ROWS}")
     table.taken.update({name: f"{column.name} ({column.unit})" for name, column in columns.items()})
     told += [f"{name} is {it.factor:g} times {it.name!r}" for name, it in columns.items() if it.factor != 1.0]
     places = {column.place for column in columns.values()}
@@ -166,7 +167,9 @@ def _delimiter(lines: list[str]) -> str:
         cells = line.split() if delimiter == " " else next(csv.reader([line], delimiter=delimiter), [])
         return sum(_NUMERIC.fullmatch(cell.strip()) is not None for cell in cells)
 
-    return max(";\t| ,", key=lambda delimiter: sum(numbers(delimiter, line) > 1 for line in lines))
+    shown = {delimiter: sum(numbers(delimiter, line) > 1 for line in lines) for delimiter in ";\t| ,"}
+    best = max(shown, key=shown.__getitem__)
+    return best if shown[best] else ","
 
 
 def _header(
@@ -183,13 +186,13 @@ def _header(
             if found >= enough:
                 told += [f"{at - 1} rows above the names are left out"] if at > 1 else []
                 return header, _columns(path, header, units, cells, wanted), (line, cells)
-            if found > most and len(header) > 1:
+            if found > most and len(header) > 1 and not any(map(_NUMERIC.fullmatch, header)):
                 nearest, most = (header, units, cells), found
         above = [*above[-1:], (line, [cell.lstrip("#% ") for cell in cells])]
     if nearest is not None:
         _columns(path, *nearest, wanted)
-    needed = ",".join(wanted.needed)
-    raise TableError(f"{path}: no row of names stands right above numbers: add one, as {needed}")
+    names = ",".join(wanted.needed)
+    raise TableError(f"{path}: no numbers stand right below a row of names: allowed is such a row, as {names}")
 
 
 def _split(cell: str) -> tuple[str, str | None]:
