@@ -159,3 +159,53 @@ def test_what_cannot_be_told_is_refused_with_the_cause(case: str, tmp_path: Path
     assert main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), *options]) == 2
     assert why in capsys.readouterr().err
     assert not out.exists()
+
+
+def imported(tmp_path: Path, content: bytes) -> tuple[int, Path]:
+    (tmp_path / "given.csv").write_bytes(content)
+    out = tmp_path / "rows.csv"
+    return main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), "--json"]), out
+
+
+@pytest.mark.parametrize("has_rate", [True, False])
+@pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 0.8])
+def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: float, tmp_path: Path, capsys) -> None:
+    step = np.arange(4_000) + offset
+    way = np.where(step // 40 % 2 == 0, 1.0, -1.0)
+    noise = np.random.default_rng(5).normal(0.0, 0.01, 4_000)
+    columns = {"t_s": 0.01 * step, "force_N": -way * (1.0 + 0.001 * step), "field_mT": 100.0 + step % 7}
+    columns |= {"v_mm_s": 25.0 * way + noise} if has_rate else {"x_mm": -10.0 * np.abs(step / 40.0 % 2.0 - 1.0)}
+    code, out = imported(tmp_path, text(columns).encode())
+    assert code == 0
+    assert json.loads(capsys.readouterr().out)["left_out"] == {"missing": 0, "duplicate": 0, "outlier": 0}
+    assert read_csv(out).force_N == pytest.approx(1.0 + 0.001 * step, rel=1e-4)
+
+
+FORCES = (("N", 1.0), ("mN", 1e3), ("kN", 1e-3), ("lbf", 1.0 / 4.4482216152605), ("", 1.0), ("oz", 3.6))
+FIELDS = (("mT", 1.0), ("T", 1e-3), ("G", 10.0), ("", 1e-3))
+PLACES = (("mm", 1.0), ("\u00b5m", 1e3), ("m", 1e-3), ("", 1.0))
+LANGUAGES = (("Time", "Force", "Field", "Position"), ("Zeit", "Kraft", "Feld", "Weg"), ("Temps", "Force", "Champ", "x"))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_mutated_file_is_read_as_meant_or_refused(seed: int, tmp_path: Path, capsys) -> None:
+    draw = np.random.default_rng(seed).integers
+    units = [("s", 1.0), FORCES[draw(6)], FIELDS[draw(4)], PLACES[draw(4)]]
+    names, pace, sign, each = LANGUAGES[draw(3)], (0.2, 1.0, 3.0)[draw(3)], (-1.0, 1.0)[draw(2)], int(draw(1, 5))
+    signed = SIGNED if draw(2) else measured()
+    known = (signed["time"] / pace, sign * signed["force"], signed["field"], signed["x"])
+    columns = {
+        f"{name} [{unit}]".removesuffix(" []"): factor * values[::each]
+        for name, (unit, factor), values in zip(names, units, known, strict=True)
+    }
+    comma, encoding = ((".", "utf-8"), (",", "cp1252"), (",", "utf-16"))[draw(3)]
+    code, out = imported(tmp_path, text(columns, ";", comma).encode(encoding))
+    given = [unit for unit, _ in units]
+    if code == 2:
+        assert "state --column" in capsys.readouterr().err
+        assert "" in given or "oz" in given or "Temps" in names
+    else:
+        rows = read_csv(out)
+        assert np.allclose(rows.force_N, 0.002 * rows.features[:, 2] + 0.3, rtol=1e-3)
+        assert 100.0 <= rows.features[:, 2].min() <= rows.features[:, 2].max() <= 700.0
+        assert rows.features[:, 1].max() <= 301.0 * pace

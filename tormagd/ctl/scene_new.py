@@ -3,6 +3,7 @@
 import math
 import os
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -163,7 +164,7 @@ def _with(tables: Tables, insert: str) -> Tables:
 
 
 def _write(out: Path, tables: Tables, insert: str, unmet: Sequence[str] = (), begin: str = UNMET) -> None:
-    lines = [f"{begin}{reason}" for reason in unmet]
+    lines = [line for reason in unmet for line in textwrap.wrap(f"{begin}{reason}", 100, subsequent_indent="#   ")]
     out.write_text("\n".join([*lines, as_toml(_with(tables, insert))]) + "\n", encoding="utf-8")
 
 

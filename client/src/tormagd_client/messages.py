@@ -6,13 +6,14 @@ values. Unknown fields are ignored, so that a newer client can talk to an older 
 docs/messages.md lists the fields of all messages, and says when `v` rises.
 """
 
+import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import msgpack
 import msgspec
 
-from tormagd_client.printable import require
+from tormagd_client.printable import in_short, require
 
 VERSION = 1
 TELEMETRY_TOPIC, MOTION_TOPIC, VERDICT_TOPIC = b"\xde", b"motion", b"verdict"
@@ -128,7 +129,9 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """What becomes of one setpoint: it is `rendered`, `arrives` in `arrives_ms`, or `cannot`, and `why`."""
+    """What becomes of one setpoint: it is `rendered`, `arrives` in `arrives_ms`, or `cannot`, and `why`; `is_raised` if
+    a force around zero is taken as 0.
+    """
 
     v: int
     t_ns: int
@@ -137,6 +140,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     outcome: str
     arrives_ms: float | None
     why: tuple[str, ...]
+    is_raised: bool = False
 
 
 class Mark(msgspec.Struct, frozen=True, kw_only=True):
@@ -241,7 +245,9 @@ class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's."""
+    """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's; `raised`
+    counts its setpoints around zero that were taken as 0.
+    """
 
     state: str
     silent_ms: float
@@ -258,6 +264,7 @@ class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
     clock: ClockReport | None
     cause: str
     remedy: str
+    raised: int = 0
 
 
 class PlayoutReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -573,21 +580,64 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Request, Reply)
 
+_EXPECTED = re.compile(r"Expected `(.+?)`, got `(.+?)`(?: - at `\$\.?(.*)`)?")
+_REMEDIES = {
+    ("int", "float"): "; pack a whole number (JavaScript: BigInt)",
+    ("int", "Timestamp"): "; pack ns since 1970",
+    ("object", "array"): "; pack the names with the values (rmp-serde: to_vec_named)",
+    ("str", "bin"): "; pack text as str",
+}
+_KINDS = {"object": "map", "bytes": "bin"}
+
 
 def decode(data: bytes, message_type: type[M]) -> M:
     """Return the message in `data`. Raises MessageError for anything but a valid map of this type."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise MessageError(f"message of {len(data)} bytes: allowed is {MAX_MESSAGE_BYTES}")
+    if not data:
+        raise MessageError("message is empty, or has several parts: allowed is one part, the map, without a topic")
     try:
         unpacked = msgpack.unpackb(
-            data, max_str_len=4096, max_bin_len=0, max_array_len=1024, max_map_len=256, max_ext_len=0
+            data,
+            object_pairs_hook=_map,
+            max_str_len=4096,
+            max_bin_len=4096,
+            max_array_len=1024,
+            max_map_len=256,
+            max_ext_len=256,
         )
+    except msgpack.ExtraData as error:
+        where = "after" if isinstance(error.unpacked, dict) else "before"
+        kind = "is JSON" if data[:1] in b"[{" else f"has bytes {where} the map"
+        raise MessageError(f"message {kind}: allowed is one msgpack map and nothing else") from error
+    except MessageError:
+        raise
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
         raise MessageError(f"not a msgpack map: {type(error).__name__} {error}".strip()) from error
     try:
         return msgspec.convert(unpacked, message_type)
     except msgspec.ValidationError as error:
-        raise MessageError(str(error)) from error
+        raise MessageError(_in_words(str(error))) from error
+
+
+def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    names = [name for name, _ in pairs]
+    for name in names:
+        if not isinstance(name, str):
+            raise MessageError(f"key {in_short(name)} is bin: allowed is str; pack names as str, numbers as numbers")
+        if names.count(name) > 1:
+            raise MessageError(f"{in_short(name)} stands twice: allowed is once")
+    return dict(pairs)
+
+
+def _in_words(text: str) -> str:
+    """Return what msgspec found wrong as `field is a type: allowed is another`."""
+    match = _EXPECTED.fullmatch(text)
+    if match is None:
+        return text
+    expected, got = (_KINDS.get(kind, kind) for kind in match.groups()[:2])
+    remedy = _REMEDIES.get((match[1], got), "")
+    return f"{match[3] or 'message'} is {got}: allowed is {expected.replace(' | null', '')}{remedy}"
 
 
 def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -> bytes:
