@@ -71,7 +71,7 @@ GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
     ),
     "other names": (
         text(renamed({"rate": "omega", "field": "Hall", "force": "Zug"}, field=1e-3)),
-        ("--column", "rate_mm_s=omega", "--column", "field_mT=Hall:T", "--column", "force_N=Zug:N"),
+        ("--column", "rate_mm_s=omega:mm/s", "--column", "field_mT=Hall:T", "--column", "force_N=Zug:N"),
         "as it was",
     ),
     "time that begins anew with each cycle": (
@@ -126,19 +126,27 @@ def test_several_files_are_a_cycle_each_and_what_is_missing_is_said_and_drawn(tm
 
 
 RANDOM_SIGN = renamed(USUAL) | {"force_N": measured()["force"] * np.where(np.arange(600) % 3 == 0, -1.0, 1.0)}
+UNITS = {"rate": "v [mm/s]", "field": "B [mT]", "force": "F [N]"}
 REFUSED: dict[str, tuple[str, ...]] = {
-    "no force": (text(renamed({"rate": "rate", "field": "field"})), "no column is force_N (force, load, f)"),
-    "tesla, unsaid": (text(renamed({"rate": "v", "field": "B", "force": "F"}, field=1e-3)), "field_mT=B:T"),
-    "a strange unit": (text(renamed({"rate": "v", "field": "B", "force": "F [lbf]"})), "unit 'lbf' of force_N"),
-    "two of one": (text(renamed({"rate": "v", "field": "B", "force": "F", "x": "load"})), "'F' and 'load' may both"),
-    "no motion": (text(renamed({"field": "B", "force": "F"})), "no column is rate_mm_s"),
+    "no force": (text(renamed({"rate": "v_mm_s", "field": "B_mT"})), "no column is force_N (force, load, kraft, F)"),
+    "no unit": (text(renamed(UNITS | {"field": "B"}, field=1e-3)), "state --column field_mT=B:UNIT"),
+    "a unit of the file, and another": (
+        text(renamed(UNITS | {"force": "Zug [mN]"})),
+        "'Zug [mN]' is in mN by its file, not in N",
+        "--column",
+        "force_N=Zug:N",
+    ),
+    "a strange unit": (text(renamed(UNITS | {"force": "F [stone]"})), "'F [stone]' has the unit 'stone'"),
+    "two of one": (text(renamed(UNITS | {"x": "load [N]"})), "'load [N]' may both be force_N"),
+    "no motion": (text(renamed({"field": "B [mT]", "force": "F [N]"})), "no column is rate_mm_s"),
     "signs at random": (text(RANDOM_SIGN), "follows neither"),
-    "a word": (text(renamed(USUAL)) + "1,2,three,4\n", "row 602, field_mT: 'three' is no number"),
+    "a word": (text(renamed(USUAL)) + "1,2,three,4\n", "row 602, field_mT = 'three': allowed is a finite number"),
     "commas in commas": (text(renamed(USUAL), ",", ","), "decimal commas need ; or tab"),
-    "time that falls": (text(renamed({**USUAL, "time": "t"}, time=-1.0)), "t falls after -0 s"),
-    "a cycle of one row": ("t,cycle,F,B,v\n5,0,1,90,1\n0,1,1,91,1\n1,1,1,92,1\n", "a cycle of one row"),
+    "time that falls": (text(renamed({**USUAL, "time": "t_s"}, time=-1.0)), "t_s (s) falls after -0"),
+    "time that stands": ("t_s,F_N,B_mT,x_mm\n" + "1,1,90,1\n1,1,91,2\n2,1,92,3\n", "time_s stands still"),
+    "a cycle of one row": ("t_s,cycle,F_N,B_mT,v_mm_s\n5,0,1,90,1\n0,1,1,91,1\n1,1,1,92,1\n", "a cycle of one row"),
     "newtons of a press": (text(renamed(USUAL, force=1e6)), "is its unit another?"),
-    "nothing": ("", "no column is"),
+    "nothing": ("", "no numbers stand right below a row of names"),
     "a picture of sound": (text(renamed(USUAL)), "p.mp3: allowed is a name that ends with .png", "--picture", "p.mp3"),
 }
 
@@ -151,3 +159,53 @@ def test_what_cannot_be_told_is_refused_with_the_cause(case: str, tmp_path: Path
     assert main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), *options]) == 2
     assert why in capsys.readouterr().err
     assert not out.exists()
+
+
+def imported(tmp_path: Path, content: bytes) -> tuple[int, Path]:
+    (tmp_path / "given.csv").write_bytes(content)
+    out = tmp_path / "rows.csv"
+    return main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), "--json"]), out
+
+
+@pytest.mark.parametrize("has_rate", [True, False])
+@pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 0.8])
+def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: float, tmp_path: Path, capsys) -> None:
+    step = np.arange(4_000) + offset
+    way = np.where(step // 40 % 2 == 0, 1.0, -1.0)
+    noise = np.random.default_rng(5).normal(0.0, 0.01, 4_000)
+    columns = {"t_s": 0.01 * step, "force_N": -way * (1.0 + 0.001 * step), "field_mT": 100.0 + step % 7}
+    columns |= {"v_mm_s": 25.0 * way + noise} if has_rate else {"x_mm": -10.0 * np.abs(step / 40.0 % 2.0 - 1.0)}
+    code, out = imported(tmp_path, text(columns).encode())
+    assert code == 0
+    assert json.loads(capsys.readouterr().out)["left_out"] == {"missing": 0, "duplicate": 0, "outlier": 0}
+    assert read_csv(out).force_N == pytest.approx(1.0 + 0.001 * step, rel=1e-4)
+
+
+FORCES = (("N", 1.0), ("mN", 1e3), ("kN", 1e-3), ("lbf", 1.0 / 4.4482216152605), ("", 1.0), ("oz", 3.6))
+FIELDS = (("mT", 1.0), ("T", 1e-3), ("G", 10.0), ("", 1e-3))
+PLACES = (("mm", 1.0), ("\u00b5m", 1e3), ("m", 1e-3), ("", 1.0))
+LANGUAGES = (("Time", "Force", "Field", "Position"), ("Zeit", "Kraft", "Feld", "Weg"), ("Temps", "Force", "Champ", "x"))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_mutated_file_is_read_as_meant_or_refused(seed: int, tmp_path: Path, capsys) -> None:
+    draw = np.random.default_rng(seed).integers
+    units = [("s", 1.0), FORCES[draw(6)], FIELDS[draw(4)], PLACES[draw(4)]]
+    names, pace, sign, each = LANGUAGES[draw(3)], (0.2, 1.0, 3.0)[draw(3)], (-1.0, 1.0)[draw(2)], int(draw(1, 5))
+    signed = SIGNED if draw(2) else measured()
+    known = (signed["time"] / pace, sign * signed["force"], signed["field"], signed["x"])
+    columns = {
+        f"{name} [{unit}]".removesuffix(" []"): factor * values[::each]
+        for name, (unit, factor), values in zip(names, units, known, strict=True)
+    }
+    comma, encoding = ((".", "utf-8"), (",", "cp1252"), (",", "utf-16"))[draw(3)]
+    code, out = imported(tmp_path, text(columns, ";", comma).encode(encoding))
+    given = [unit for unit, _ in units]
+    if code == 2:
+        assert "state --column" in capsys.readouterr().err
+        assert "" in given or "oz" in given or "Temps" in names
+    else:
+        rows = read_csv(out)
+        assert np.allclose(rows.force_N, 0.002 * rows.features[:, 2] + 0.3, rtol=1e-3)
+        assert 100.0 <= rows.features[:, 2].min() <= rows.features[:, 2].max() <= 700.0
+        assert rows.features[:, 1].max() <= 301.0 * pace

@@ -1,6 +1,8 @@
 """The ZeroMQ messages: whatever arrives becomes a valid message or a MessageError, and nothing else."""
 
 import math
+import re
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -25,6 +27,7 @@ from tormagd_client.messages import (
 )
 from tormagd_client.printable import LONGEST_SHOWN
 
+PAGE = (Path(__file__).parents[2] / "docs/messages.md").read_text(encoding="utf-8")
 WALL = {"handle_mm": 1.0, "stiffness_N_mm": 0.5}
 SETPOINT: dict[str, Any] = {"v": 1, "source": "a", "seq": 7, "stamp_ns": 10**18, "servo_cf": 1.5, "valid_for_ms": 50.0}
 REQUEST: dict[str, Any] = {"v": 1, "id": 3, "command": "status"}
@@ -157,7 +160,7 @@ def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> Non
         ({"seq": 1.5}, "seq"),
         ({"stamp_ns": -1}, "stamp_ns = -1"),
         ({"stamp_ns": 2**64 - 1}, "stamp_ns"),
-        ({"servo_cf": -1e-9}, "servo_cf = -1e-09"),
+        ({"servo_cf": -0.00501}, "servo_cf = -0.00501: allowed is 0..1000 N; a brake cannot push"),
         ({"servo_cf": 1_000.1}, "servo_cf = 1000.1"),
         ({"valid_for_ms": 0.0}, "valid_for_ms = 0.0"),
         ({"valid_for_ms": 60_001.0}, "valid_for_ms = 60001.0"),
@@ -188,7 +191,7 @@ def test_values_out_of_range_are_named(fields: dict[str, Any], name: str) -> Non
 @pytest.mark.parametrize(
     ("fields", "kind"),
     [
-        ({"preview_N": [-1.2345678901234567e-100] * MAX_PREVIEW_SAMPLES, "preview_dt_ms": 1.0}, Setpoint),
+        ({"preview_N": [-1.2345678901234567e100] * MAX_PREVIEW_SAMPLES, "preview_dt_ms": 1.0}, Setpoint),
         ({"source": "\x1b" * 4_000}, Setpoint),
         ({"command": "\x1b" * 4_000}, Request),
     ],
@@ -297,3 +300,41 @@ def test_damaged_setpoints_never_break_the_decoder(cut: int, flipped: int, bit: 
     else:
         return
     assert refused
+
+
+PACKED: dict[str, bytes] = {
+    "whole numbers as int": changed(SETPOINT, servo_cf=2, valid_for_ms=500),
+    "float32": msgpack.packb(SETPOINT, use_single_float=True),
+    **{f"`servo_cf` of {force}": changed(SETPOINT, servo_cf=float(force)) for force in ("-0.0", "-1e-17", "-0.003")},
+    **{f"`servo_cf` of {force}": changed(SETPOINT, servo_cf=float(force)) for force in ("-0.3", "NaN")},
+    "`servo_cf` by msgpack_numpy": changed(SETPOINT, servo_cf={b"nd": False, b"type": b"<f8", b"data": bytes(8)}),
+    "`stamp_ns` as float": changed(SETPOINT, stamp_ns=1e18),
+    "`stamp_ns` as timestamp": changed(SETPOINT, stamp_ns=msgpack.Timestamp(10**9)),
+    "`seq` as float": changed(SETPOINT, seq=7.0),
+    "`v` of true": changed(SETPOINT, v=True),
+    "`valid_for_ms` of 0": changed(SETPOINT, valid_for_ms=0),
+    "`source` with zeros of C": changed(SETPOINT, source="robot\0\0"),
+    "`source` as bin": changed(SETPOINT, source=b"robot"),
+    "names as bin": msgpack.packb({name.encode(): value for name, value in SETPOINT.items()}),
+    "a name twice": b"\x87" + changed(SETPOINT)[1:] + msgpack.packb("servo_cf") + msgpack.packb(0.5),
+    "array": msgpack.packb(list(SETPOINT.values())),
+    "two parts": b"",
+    "a topic in front": b"setpoint " + changed(SETPOINT),
+    "a newline behind": changed(SETPOINT) + b"\n",
+    "JSON": b'{"v":1,"source":"robot"}',
+}
+"""Setpoints as other packers write them. The daemon reads the first of two parts as empty."""
+TABLE = PAGE.partition("## What packers send")[2].partition("\n## ")[0]
+TOLD = dict(re.findall(r"^\| (.+) \| `?(.+?)`? \|$", TABLE, re.MULTILINE))
+
+
+def test_the_page_tells_of_each_packer() -> None:
+    assert [*PACKED] == [*TOLD][2:]
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_what_packers_send_is_taken_or_refused_as_the_page_says(name: str) -> None:
+    if TOLD[name].startswith("taken"):
+        assert decode(PACKED[name], Setpoint).servo_cf in (2.0, 1.5, 0.0, -1e-17, -0.003)
+    else:
+        assert refusal(PACKED[name]) == TOLD[name]

@@ -153,11 +153,13 @@ COMMANDS = {
         _waiting(30.0),
     ),
     "send": Command(
-        "publish setpoints: a synthetic shape or a CSV file t_s,force_N",
+        "publish setpoints: a synthetic shape, or times and forces of a file",
         "send.send",
         ("endpoints", "wait_s"),
         (
             option("what", metavar="{step|sine|ramp|pulse|FILE.csv}"),
+            option("--column", metavar="NAME[:UNIT]", help="the file's forces (force_N)"),
+            option("--time-column", metavar="NAME[:UNIT]", help="its times (t_s)"),
             option(
                 "--rate",
                 dest="rate_hz",
@@ -360,7 +362,8 @@ COMMANDS = {
             ),
             option("name", nargs="?", metavar="NAME|FILE"),
             option("--force", type=Path, metavar="FORCE.csv", help="new: from this recorded force"),
-            option("--column", metavar="NAME", help="new: its column (force_N)"),
+            option("--column", metavar="NAME[:UNIT]", help="new: its column (force_N)"),
+            option("--time-column", metavar="NAME[:UNIT]", help="new: its times (t_s)"),
             option("--scale", type=Within(-1e6, 1e6), metavar="K", help="new: newtons per unit (1)"),
             option("--offset", type=Within(-1e6, 1e6), dest="offset_N", metavar="N", help="new: newtons at 0 (0)"),
             option("--insert", metavar="NAME", help="new: insert (the softest that renders it all)"),

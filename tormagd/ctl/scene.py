@@ -43,7 +43,8 @@ def scene(
         raise usage_error("--plant: allowed only for scene check and new", "tormagctl scene check NAME --plant FILE")
     if unused := [key for key, value in recorded.items() if value is not None]:
         raise usage_error(
-            f"--{unused[0].removesuffix('_N')}: allowed only for scene new", "tormagctl scene new FILE.toml"
+            f"--{unused[0].removesuffix('_N').replace('_', '-')}: allowed only for scene new",
+            "tormagctl scene new FILE.toml",
         )
     if share is not None or tolerance_N is not None or out is not None:
         from tormagd.ctl.scene_served import serve_scene

@@ -182,6 +182,8 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
         parts[-1] += f", {source.clock.drift_ppm:+.0f} ppm"
     if source.restarts:
         parts.append(f"{source.restarts} restarts")
+    if source.raised:
+        parts.append(f"{source.raised} around zero taken as 0")
     return [f"source    {name!r}: {', '.join(parts)}", *_explained(source.cause, source.remedy, colour.yellow)]
 
 

@@ -42,6 +42,8 @@ class Taken(NamedTuple):
     source: str
     seq: int
     stamp_s: float
+    is_raised: bool = False
+    "A force around zero was taken as 0."
 
 
 class SetpointInbox:
@@ -198,17 +200,21 @@ class SetpointInbox:
         is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
         others = (Limit.OTHER_SOURCE,) if is_contested else ()
         due_s = source.stamp_s + playout_s
+        sent_N = (setpoint.servo_cf, *(setpoint.preview_N or ()), setpoint.withdraw_cf or 0.0)
+        is_raised = min(sent_N) < 0.0
+        source.raised += is_raised
+        servo_cf, *preview_N, withdraw_cf = (force_N if force_N > 0.0 else 0.0 for force_N in sent_N)
         timed = TimedSetpoint(
-            setpoint.servo_cf,
+            servo_cf,
             due_s,
             setpoint.valid_for_ms * 1e-3 - playout_s,
             setpoint.displacement_mm,
             setpoint.rate_mm_s,
-            setpoint.preview_N or (),
+            tuple(preview_N),
             (setpoint.preview_dt_ms or 0.0) * 1e-3,
             self._number,
             (*others, *source.found),
-            setpoint.withdraw_cf,
+            None if setpoint.withdraw_cf is None else withdraw_cf,
             None if wall is None else Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
         )
         if playout_s > 0.0:
@@ -221,7 +227,7 @@ class SetpointInbox:
             self._late += due_s < now_s
         while self._waiting and self._waiting[-1].setpoint.stamp_s >= due_s:
             self._waiting.pop()
-        self._waiting.append(Taken(timed, setpoint.source, setpoint.seq, source.stamp_s))
+        self._waiting.append(Taken(timed, setpoint.source, setpoint.seq, source.stamp_s, is_raised))
         return self.hand_on(now_s)
 
     def _hand_over(self, name: str, why: str) -> None:
@@ -264,8 +270,9 @@ class SetpointInbox:
         name, silent_ms = self.holder, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
+            silent = f"{silent_ms:.0f} ms" if silent_ms < 1e4 else f"{silent_ms * 1e-3:.0f} s"
             return Explanation(
-                f"{name!r} has sent nothing for {silent_ms:.0f} ms, and its setpoints are valid for {valid_ms:g} ms; "
+                f"{name!r} has sent nothing for {silent}, and its setpoints are valid for {valid_ms:g} ms; "
                 "the force decays to F_min",
                 "check the publisher and the network",
             )

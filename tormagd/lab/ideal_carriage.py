@@ -403,8 +403,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    table = read_forces(options.force)
-    plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
+    table = read_forces(options.force).values
+    plant, time_s, force_N = load_plant(options.plant), np.array(table["time_s"]), np.array(table["force_N"])
     plant = with_insert(plant, options.insert)
     brake = brake_of(plant)
     most_N = brake.sliding_N(brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.lag.branch_Tm), TURNED_MM_S)

@@ -16,7 +16,7 @@ from tormagd import __version__
 from tormagd.ctl.commands import Within
 from tormagd.element.physics.errors import DomainError
 from tormagd.ground.files import did_you_mean
-from tormagd.ground.force_file import ForceFileError
+from tormagd.ground.table import TableError
 from tormagd.ground.terminal import write_answer, write_in_any_encoding, write_line
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.told import lines
@@ -25,7 +25,7 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import in_short, printable
 
 NOT_TOLD, USAGE = 1, 2
-REFUSALS = (LabError, ConfigError, ForceFileError, DomainError, PlantError)
+REFUSALS = (LabError, ConfigError, TableError, DomainError, PlantError)
 
 
 class Found(NamedTuple):

@@ -8,16 +8,14 @@ up to 2 mm.
 """
 
 import argparse
-import csv
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from tormagd.element.model.displacement import MOBILISED_MM
-from tormagd.ground.files import read_bounded
+from tormagd.ground.table import MIN_ROWS, QUANTITIES, Table, Wanted, read_table
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found, within
@@ -25,33 +23,7 @@ from tormagd.lab.pages import subplots
 from tormagd.lab.training.dataset import ALLOWED, Dataset, records, write_csv
 
 MAX_FILE_BYTES = 1 << 28
-LENGTH = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1e3}
-UNITS = {
-    "force_N": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
-    "field_mT": {"mT": 1.0, "T": 1e3, "G": 0.1},
-    "rate_mm_s": {f"{unit}/s": factor for unit, factor in LENGTH.items()},
-    "displacement_mm": LENGTH,
-    "time_s": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
-    "cip_percent": {"%": 1.0, "percent": 1.0},
-    "cycle": {"": 1.0},
-}
-"Factors to our units; a file that states no unit has the first."
-NAMES = {
-    "force_N": ("force", "load", "f"),
-    "field_mT": ("field", "flux density", "b"),
-    "rate_mm_s": ("rate", "speed", "velocity", "v"),
-    "displacement_mm": ("displacement", "position", "travel", "x"),
-    "time_s": ("time", "t"),
-    "cip_percent": ("cip", "iron"),
-    "cycle": ("cycle", "run", "sweep"),
-}
-MIN_NAMED = 2
-"A row with so many known names is the header."
-ABSENT = ("", "nan", "-")
-"Cells without a value, in lower case."
-MIN_ROWS = 2
-MIN_FIELD_MT = 5.0
-"A smaller maximum without a stated unit is more likely in tesla."
+NEEDED, MOTION = ("force_N", "field_mT"), ("rate_mm_s", "time_s", "displacement_mm")
 SIGN_SHARE = 0.95
 "Least share of the rows beyond the noise that agree on the force's sign."
 QUIET = 0.05
@@ -63,18 +35,6 @@ MAX_OUTLIERS = 0.02
 GAP_OF_RANGE = 0.25
 "A gap of this share of the range, of rates on a logarithmic scale, is missing data."
 RATES_MM_S = (0.5, 300.0)
-
-
-class Column(NamedTuple):
-    name: str
-    unit: str
-    factor: float
-    "From its unit to ours."
-    has_unit: bool
-
-
-Stated = tuple[str, str | None]
-"A column's name and unit, as a person states them; None is the usual unit."
 
 
 class Imported(NamedTuple):
@@ -96,7 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="QUANTITY=NAME[:UNIT]",
-        help=f"take this column; quantities are {', '.join(UNITS)}",
+        help=f"take this column; quantities are {', '.join(QUANTITIES)}",
     )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw what is there and what is missing")
 
@@ -132,9 +92,10 @@ def run(options: argparse.Namespace) -> Found:
     )
 
 
-def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | None, cycle: int | None) -> Imported:
+def _imported(path: Path, stated: Mapping[str, str], cip_percent: float | None, cycle: int | None) -> Imported:
     """Return the rows of a file as training data; `cip_percent` and `cycle` replace missing columns."""
-    columns, quantities, missing = _read(path, stated)
+    table = _read(path, stated)
+    quantities = {name: np.array(values) for name, values in table.values.items()}
     if cip_percent is None and "cip_percent" not in quantities:
         raise LabError(f"{path}: no column has the share of iron; state it by --cip PERCENT")
     quantities, duplicates = _without_duplicates(quantities)
@@ -142,7 +103,9 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
     for name, value in (("cip_percent", cip_percent), ("cycle", cycle)):
         if value is not None and name not in quantities:
             quantities[name] = np.full(len(force_N), float(value))
-    made = [f"force_N {_sign(path, quantities)}", *_motion(path, quantities)]
+    told, rate_mm_s = _rate(path, quantities)
+    how, way = _sign(path, quantities, rate_mm_s)
+    made = [*table.told, f"force_N {how}", *told, *_motion(quantities, rate_mm_s, way)]
     far = quantities["displacement_mm"] >= MOBILISED_MM  # where a handle turns, forces leap from row to row
     if far.any():
         far[far] = _outliers(path, quantities["force_N"][far])
@@ -151,141 +114,36 @@ def _imported(path: Path, stated: Mapping[str, Stated], cip_percent: float | Non
         if not (values.min() >= least and values.max() <= most):
             seen = f"{name} from {values.min():g} to {values.max():g}"
             raise LabError(f"{path}: {seen}: allowed is {least:g}..{most:g}; is its unit another?")
-    left_out = {"missing": missing, "duplicate": duplicates, "outlier": int(np.count_nonzero(far))}
-    taken = {name: f"{column.name} ({column.unit})" for name, column in columns.items()}
-    return Imported(Dataset.of(quantities).subset(~far), taken, made, left_out)
+    left_out = {"missing": len(table.missing), "duplicate": duplicates, "outlier": int(np.count_nonzero(far))}
+    return Imported(Dataset.of(quantities).subset(~far), table.taken, made, left_out)
 
 
-def _stated(text: str) -> tuple[str, Stated]:
+def _stated(text: str) -> tuple[str, str]:
     """Parse the option `QUANTITY=NAME[:UNIT]`."""
-    quantity, equals, column = text.partition("=")
-    name, colon, unit = column.rpartition(":")
-    if not colon:
-        name, unit = column, ""
-    if quantity not in UNITS or not equals or (colon and unit not in UNITS[quantity]):
-        known = "; ".join(f"{each} in {', '.join(units)}" for each, units in UNITS.items() if each != "cycle")
+    quantity, _, column = text.partition("=")
+    if quantity not in QUANTITIES or not column:
+        known = "; ".join(f"{name} in {', '.join(each.units)}" for name, each in QUANTITIES.items() if each.units)
         raise LabError(f"--column {text[:80]}: allowed is QUANTITY=NAME[:UNIT] with {known}")
-    return quantity, (name, unit or None)
+    return quantity, column
 
 
-def _read(path: Path, stated: Mapping[str, Stated]) -> tuple[dict[str, Column], dict[str, Array], int]:
-    """Return columns and values by quantity, in our units, and how many rows lacked one."""
-    rows = _rows(path)
-    header, columns = _header(path, rows, stated)
-    places = {name: header.index(column.name) for name, column in columns.items()}
-    values: dict[str, list[float]] = {name: [] for name in columns}
-    missing = 0
-    for line, row in rows:
-        if len(row) != len(header):
-            told = f"{len(row)} values, {len(header)} columns; decimal commas need ; or tab between cells"
-            raise LabError(f"{path}: row {line}: {told}")
-        cells = {name: row[place] for name, place in places.items()}
-        numbers = {name: _number(cell) for name, cell in cells.items()}
-        if any(cell.lower() in ABSENT for cell in cells.values()):
-            missing += 1
-        elif not values["force_N"] and set(numbers.values()) == {None}:  # a row of units
-            named = _columns(path, [f"{name} [{unit}]" for name, unit in zip(header, row, strict=True)], stated)
-            columns = {name: column._replace(name=columns[name].name) for name, column in named.items()}
-        else:
-            for name, number in numbers.items():
-                if number is None:
-                    raise LabError(f"{path}: row {line}, {columns[name].name}: {cells[name][:40]!r} is no number")
-                values[name].append(number * columns[name].factor)
-    if len(values["force_N"]) < MIN_ROWS:
-        raise LabError(f"{path}: {len(values['force_N'])} rows; at least {MIN_ROWS} are needed")
-    found = {name: np.array(column) for name, column in values.items()}
-    _refuse_unlikely(path, columns, found)
-    return columns, found, missing
-
-
-def _header(
-    path: Path, rows: Iterator[tuple[int, list[str]]], stated: Mapping[str, Stated]
-) -> tuple[list[str], dict[str, Column]]:
-    """Take rows until one names MIN_NAMED quantities, and return its cells and the columns."""
-    header: list[str] = []
-    columns: dict[str, Column] = {}
-    for _, header in rows:
-        columns = _columns(path, header, stated)
-        if len(columns) >= MIN_NAMED:
-            break
-    if lacking := [f"{name} ({', '.join(NAMES[name])})" for name in ("force_N", "field_mT") if name not in columns]:
-        there = ", ".join(header)[:200]
-        raise LabError(f"{path}: no column is {' or '.join(lacking)}; its columns are {there}: state --column")
-    return header, columns
-
-
-def _refuse_unlikely(path: Path, columns: Mapping[str, Column], found: Mapping[str, Array]) -> None:
-    """Refuse fields that are likely in tesla, and a time that falls within a cycle."""
-    field, most_mT = columns["field_mT"], found["field_mT"].max()
-    if not field.has_unit and most_mT < MIN_FIELD_MT:
-        raise LabError(
-            f"{path}: {field.name} has no unit and is {most_mT:g} at most; state --column field_mT={field.name}:T if "
-            "these are tesla, :mT if not"
-        )
-    if "time_s" not in found:
-        return
-    fallen = np.flatnonzero(np.diff(found["time_s"]) < 0.0)
-    for place in fallen[np.diff(found.get("cycle", found["time_s"] * 0.0))[fallen] == 0.0][:1]:
-        before_s = found["time_s"][place]
-        raise LabError(
-            f"{path}: {columns['time_s'].name} falls after {before_s:g} s; allowed is to rise, and to begin anew with "
-            "each cycle, a column"
-        )
-    if min(rows.stop - rows.start for rows in records(found["time_s"])) < MIN_ROWS:
+def _read(path: Path, stated: Mapping[str, str]) -> Table:
+    needed = {name: QUANTITIES[name] for name in NEEDED}
+    optional = {name: each for name, each in QUANTITIES.items() if name not in needed}
+    option = {name: f"--column {name}=" for name in QUANTITIES}
+    table = read_table(path, Wanted(needed, optional, stated, option), MAX_FILE_BYTES)
+    time_s, cycle = table.values.get("time_s"), table.values.get("cycle")
+    if time_s is None:
+        return table
+    for place in range(1, len(table.rows)):
+        if time_s[place] < time_s[place - 1] and (cycle is None or cycle[place] == cycle[place - 1]):
+            raise LabError(
+                f"{path}: row {table.rows[place]}: {table.taken['time_s']} falls after {time_s[place - 1]:g}; "
+                "allowed is to rise, and to begin anew with each cycle, a column"
+            )
+    if min(rows.stop - rows.start for rows in records(np.array(time_s))) < MIN_ROWS:
         raise LabError(f"{path}: a cycle of one row; at least {MIN_ROWS} are needed")
-
-
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield each row's line number and cells, without comments and empty rows."""
-    try:
-        text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8-sig")
-    except OSError as error:
-        raise LabError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise LabError(f"{path}: not a text file in UTF-8 ({error.reason} at byte {error.start})") from error
-    numbered = enumerate(text.splitlines(), 1)
-    lines = [(line, row) for line, row in numbered if row.strip() and row.lstrip()[0] not in "#%"]
-    # a decimal comma may be as frequent as the semicolon beside it
-    delimiter = max((";", "\t", ","), key=lambda each: sum(each in row for _, row in lines))
-    for line, row in lines:
-        [cells] = csv.reader([row], delimiter=delimiter)
-        yield line, [cell.strip() if delimiter == "," else cell.strip().replace(",", ".") for cell in cells]
-
-
-def _columns(path: Path, header: list[str], stated: Mapping[str, Stated]) -> dict[str, Column]:
-    found: dict[str, Column] = {}
-    for cell in header:
-        match = re.fullmatch(r"([A-Za-z ]+?)[ _]*(?:[\[(](.*)[\])]|_([A-Za-z_/%]+))?", cell)
-        name = "" if match is None else match[1].strip().lower()
-        quantity = next((each for each, names in NAMES.items() if name in names), None)
-        if match is None or quantity is None or quantity in stated:
-            continue
-        if quantity in found:
-            raise LabError(f"{path}: {found[quantity].name!r} and {cell!r} may both be {quantity}: state --column")
-        unit = (match[2] or match[3] or "").strip().replace("_s", "/s").replace("\N{MICRO SIGN}", "u")
-        found[quantity] = _column(path, quantity, cell, unit or None)
-    for quantity, (name, unit) in stated.items():
-        if name in header:
-            found[quantity] = _column(path, quantity, name, unit)
-        elif len(found) >= MIN_NAMED:
-            raise LabError(f"{path}: no column {name!r} for {quantity}; there are {', '.join(header)[:200]}")
-    return found
-
-
-def _column(path: Path, quantity: str, name: str, unit: str | None) -> Column:
-    units = UNITS[quantity]
-    taken = next(iter(units)) if unit is None else unit
-    if taken not in units:
-        raise LabError(f"{path}: column {name!r}: unit {taken!r} of {quantity} is not known, only {', '.join(units)}")
-    return Column(name, taken, units[taken], unit is not None)
-
-
-def _number(text: str) -> float | None:
-    try:
-        number = np.nan if "_" in text else float(text)
-    except ValueError:
-        return None
-    return number if np.isfinite(number) else None
+    return table
 
 
 def _without_duplicates(quantities: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
@@ -308,41 +166,62 @@ def _outliers(path: Path, force_N: Array) -> Mask:
     return far
 
 
-def _sign(path: Path, quantities: dict[str, Array]) -> str:
-    """Make the force positive against the motion, in place, and return what was done."""
-    force_N, rate = quantities["force_N"], quantities.get("rate_mm_s")
-    if rate is None:
-        rate = np.gradient(quantities["displacement_mm"]) if "displacement_mm" in quantities else np.ones(len(force_N))
+def _rate(path: Path, quantities: Mapping[str, Array]) -> tuple[list[str], Array]:
+    """Return what was done to get the rate, and the rate with the sign that it has."""
+    if (rate := quantities.get("rate_mm_s")) is not None:
+        return [], rate
+    place, time_s = quantities.get("displacement_mm"), quantities.get("time_s")
+    if place is None or time_s is None:
+        lacking = [name for name in MOTION if name not in quantities]
+        known = " or ".join(f"{name} ({', '.join(QUANTITIES[name].names)})" for name in lacking)
+        raise LabError(f"{path}: no column is {known}: needed is rate_mm_s, or time_s and displacement_mm")
+    cycles = records(time_s)
+    if min(float(np.diff(time_s[rows], prepend=-np.inf, append=np.inf).min()) for rows in cycles) <= 0.0:
+        raise LabError(f"{path}: time_s stands still at some rows, and gives no rate there: state a column rate_mm_s")
+    rates = [np.gradient(place[rows], time_s[rows]) for rows in cycles]
+    return ["rate_mm_s from displacement_mm over time_s"], np.concatenate(rates)
+
+
+def _sign(path: Path, quantities: dict[str, Array], rate: Array) -> tuple[str, Array]:
+    """Make the force positive against the motion, in place; return what was done, and the motion's sign."""
+    force_N, way = quantities["force_N"], np.sign(rate)
     loud = np.abs(force_N) > QUIET * np.abs(force_N).max()
     moving = loud & (np.abs(rate) > QUIET * np.abs(rate).max())
-    for told, way, rows in (
-        ("as it was", np.ones(len(force_N)), loud),
-        ("turned round", -np.ones(len(force_N)), loud),
-        ("against the motion: it had the rate's sign", np.sign(rate), moving),
-        ("against the motion: it had the rate's opposite sign", -np.sign(rate), moving),
+    for told, has_way, sign in (
+        ("as it was", False, 1.0),
+        ("turned round", False, -1.0),
+        ("against the motion: it had the rate's sign", True, 1.0),
+        ("against the motion: it had the rate's opposite sign", True, -1.0),
     ):
-        if rows.any() and float(np.mean(force_N[rows] * way[rows] > 0.0)) >= SIGN_SHARE:
-            quantities["force_N"] = force_N * np.where(way == 0.0, 1.0, way)
-            return told
+        rows, agrees_N = (moving, sign * way * force_N) if has_way else (loud, sign * force_N)
+        if rows.any() and float(np.mean(agrees_N[rows] > 0.0)) >= SIGN_SHARE:
+            if has_way:
+                way = np.where(_turns(rate), sign * np.sign(force_N), way)
+                agrees_N = sign * way * force_N
+            quantities["force_N"] = agrees_N
+            return told, way
     raise LabError(f"{path}: the force's sign follows neither the rate's nor one way; is something taken off it?")
 
 
-def _motion(path: Path, quantities: dict[str, Array]) -> list[str]:
+def _turns(rate: Array) -> Mask:
+    """Return a mask of the rows where the motion rests or turns: the rate's own sign says nothing, the force's does."""
+    speed, back = np.abs(rate), np.sign(rate)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(speed, NEIGHBOURS, mode="edge"), 2 * NEIGHBOURS + 1)
+    turned = back[1:] != back[:-1]
+    beside = np.concatenate([turned, [False]]) | np.concatenate([[False], turned])
+    slow: Mask = speed <= QUIET * np.maximum(around.max(axis=1), np.median(speed))
+    return slow | beside
+
+
+def _motion(quantities: dict[str, Array], rate: Array, way: Array) -> list[str]:
     """Make the rate a magnitude and the displacement the travel since the turn, and return what was done."""
     made = []
-    place, time_s = quantities.get("displacement_mm"), quantities.get("time_s")
-    if "rate_mm_s" not in quantities:
-        if place is None or time_s is None:
-            raise LabError(f"{path}: no column is rate_mm_s; needed is that, or time_s and displacement_mm")
-        rates = [np.gradient(place[rows], time_s[rows]) for rows in records(time_s)]
-        quantities["rate_mm_s"] = np.concatenate(rates)
-        made.append("rate_mm_s from displacement_mm over time_s")
-    rate = quantities["rate_mm_s"]
+    place = quantities.get("displacement_mm")
     if place is None:
         quantities["displacement_mm"] = np.full(len(rate), MOBILISED_MM)
         made.append(f"displacement_mm = {MOBILISED_MM:g}: every row is taken as sliding")
     elif place.min() < 0.0 or place.max() > MOBILISED_MM:
-        has_turned = np.diff(np.sign(rate), prepend=np.sign(rate[0])) != 0.0
+        has_turned = np.diff(way, prepend=way[0]) != 0.0
         begins = np.maximum.accumulate(np.where(has_turned, np.arange(len(rate)), 0))
         quantities["displacement_mm"] = np.minimum(np.abs(place - place[begins]), MOBILISED_MM)
         made.append("displacement_mm from positions: travel since the last turn")
