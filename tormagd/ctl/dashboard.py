@@ -18,8 +18,6 @@ from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import RefusedError
 
-SECRET_BYTES = 32
-
 
 def dashboard(
     endpoints: Endpoints, path: Path | None, port: int, is_operated: bool, origin: str | None, wait_s: float
@@ -46,7 +44,7 @@ async def _live(endpoints: Endpoints, port: int, is_operated: bool, origin: str 
         operating = None
         if is_operated:
             await _require_operator(client)
-            operating = Operating(secrets.token_urlsafe(SECRET_BYTES), partial(_give, endpoints, wait_s))
+            operating = Operating(secrets.token_urlsafe(), partial(_give, endpoints, wait_s))
         listening = asyncio.create_task(shown.run())
         try:
             ready = partial(_ready, "" if operating is None else f"#{operating.secret}")

@@ -11,6 +11,7 @@ import hmac
 import math
 import signal
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -70,50 +71,16 @@ def application(
     async def about(request: web.Request) -> web.Response:
         return _json({"shown_s": SHOWN_S, "late_us": LATE_US, "operates": operating is not None, **shown.about})
 
-    async def live(request: web.Request) -> web.StreamResponse:
-        assert isinstance(shown, Live)
-        if len(shown.browsers) >= MAX_BROWSERS:
-            raise web.HTTPServiceUnavailable(text=f"{MAX_BROWSERS} browsers look already")
-        socket = web.WebSocketResponse(
-            heartbeat=HEARTBEAT_S, protocols=(PROTOCOL,), compress=False, max_msg_size=MAX_BODY_BYTES
-        )
-        await socket.prepare(request)
-        with shown.browser() as events:
-            telling = asyncio.create_task(_tell(socket, events))
-            try:
-                await socket.receive()  # nothing is expected: whatever comes ends it
-            finally:
-                telling.cancel()
-        await socket.close()
-        return socket
-
-    async def frame(request: web.Request) -> web.Response:
-        assert isinstance(shown, Recorded)
-        at_s = _seconds(request.query.get("at_s", ""))
-        try:
-            return _json(await asyncio.to_thread(shown.frame, at_s))
-        except RecordingError as error:  # the file was taken away, or is damaged there
-            raise web.HTTPGone(text=str(error)) from error
-
-    async def command(request: web.Request) -> web.Response:
-        assert operating is not None
-        if request.content_type != "application/json":
-            raise web.HTTPUnsupportedMediaType(text="allowed is application/json")
-        try:
-            asked = msgspec.json.decode(await request.read(), type=Asked)
-            return web.Response(text=await operating.give(asked.command))
-        except msgspec.DecodeError as error:
-            raise web.HTTPBadRequest(text=str(error)) from error
-        except ClientError as error:
-            raise web.HTTPConflict(text=str(error)) from error
-
     made = web.Application(middlewares=[_admission(operating, origin)], client_max_size=MAX_BODY_BYTES)
     made.on_response_prepare.append(_headers)
     made.router.add_get("/", page)
     made.router.add_get("/about", about)
-    made.router.add_get("/live", live) if isinstance(shown, Live) else made.router.add_get("/frame", frame)
+    if isinstance(shown, Live):
+        made.router.add_get("/live", partial(_stream, shown))
+    else:
+        made.router.add_get("/frame", partial(_frame, shown))
     if operating is not None:
-        made.router.add_post("/command", command)
+        made.router.add_post("/command", partial(_command, operating))
     made.router.add_static("/page", PAGE)
     return made
 
@@ -141,8 +108,7 @@ def _admission(operating: Operating | None, origin: str | None) -> Callable[...,
         if request.url.host not in NAMES:
             raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
         came_from = request.headers.getall("Origin", [])  # a browser may leave it out where it only gets
-        is_told = bool(came_from) or request.method == "POST"
-        if is_told and came_from not in ([f"http://{request.host}"], [origin]):
+        if (came_from or request.method == "POST") and came_from not in ([f"http://{request.host}"], [origin]):
             raise web.HTTPForbidden(text="allowed is a page of tormagctl dashboard itself, or of its --origin")
         is_public = request.path == "/" or request.path.startswith("/page/")
         if operating is not None and not is_public and not _has(request, operating.secret):
@@ -158,6 +124,43 @@ def _has(request: web.Request, secret: str) -> bool:
     if given is None:
         given = request.headers.get("Sec-WebSocket-Protocol", "").rpartition(",")[2].strip()
     return hmac.compare_digest(given.encode(errors="surrogateescape"), secret.encode())
+
+
+async def _frame(shown: Recorded, request: web.Request) -> web.Response:
+    at_s = _seconds(request.query.get("at_s", ""))
+    try:
+        return _json(await asyncio.to_thread(shown.frame, at_s))
+    except RecordingError as error:  # the file was taken away, or is damaged there
+        raise web.HTTPGone(text=str(error)) from error
+
+
+async def _stream(shown: Live, request: web.Request) -> web.StreamResponse:
+    if len(shown.browsers) >= MAX_BROWSERS:
+        raise web.HTTPServiceUnavailable(text=f"{MAX_BROWSERS} browsers look already")
+    socket = web.WebSocketResponse(
+        heartbeat=HEARTBEAT_S, protocols=(PROTOCOL,), compress=False, max_msg_size=MAX_BODY_BYTES
+    )
+    await socket.prepare(request)
+    with shown.browser() as events:
+        telling = asyncio.create_task(_tell(socket, events))
+        try:
+            await socket.receive()  # nothing is expected: whatever comes ends it
+        finally:
+            telling.cancel()
+    await socket.close()
+    return socket
+
+
+async def _command(operating: Operating, request: web.Request) -> web.Response:
+    if request.content_type != "application/json":
+        raise web.HTTPUnsupportedMediaType(text="allowed is application/json")
+    try:
+        asked = msgspec.json.decode(await request.read(), type=Asked)
+        return web.Response(text=await operating.give(asked.command))
+    except msgspec.DecodeError as error:
+        raise web.HTTPBadRequest(text=str(error)) from error
+    except ClientError as error:
+        raise web.HTTPConflict(text=str(error)) from error
 
 
 async def _tell(socket: web.WebSocketResponse, events: asyncio.Queue[str]) -> None:
