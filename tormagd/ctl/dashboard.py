@@ -61,7 +61,7 @@ async def _recorded(path: Path, port: int, origin: str | None) -> None:
 
 
 async def _require_operator(client: AsyncClient) -> None:
-    """Ask for what no daemon knows, which is refused as forbidden where the key may only look."""
+    """Raise RefusedError for a key that may only look: even an unknown command is forbidden to it."""
     try:
         await client.request("operate")
     except RefusedError as error:

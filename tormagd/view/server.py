@@ -1,8 +1,7 @@
 """The dashboard's HTTP server, reachable only from this machine.
 
-Read-only, or with a secret: then whoever has it may look and command. A browser says where a page came from (Origin,
-RFC 6454), and a foreign one is refused; the host's name is checked against DNS rebinding. The secret travels in headers
-only, because addresses get into logs and Referer.
+It only shows; with a secret, whoever has it may look and command. Foreign pages are refused by Origin (RFC 6454), DNS
+rebinding by Host. The secret travels in headers, because addresses get into logs and Referer.
 """
 
 import asyncio
@@ -33,7 +32,7 @@ MAX_BROWSERS = 32
 MAX_BODY_BYTES = 256
 HEARTBEAT_S = 10.0
 PROTOCOL = "tormag"
-"Of the WebSocket; the secret, if any, stands behind it, because a browser lets a page set no other header."
+"Of the WebSocket. The secret stands behind it: a page can set no other header there."
 PAGE = Path(__file__).parent / "page"
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; "
@@ -63,7 +62,7 @@ class Operating(NamedTuple):
 def application(
     shown: Live | Recorded, operating: Operating | None = None, origin: str | None = None
 ) -> web.Application:
-    """Return the server; pages from `origin` may use it besides its own."""
+    """Return the server, for its own pages and those from `origin`."""
 
     async def page(request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / "index.html")
@@ -101,13 +100,12 @@ async def serve(made: web.Application, port: int, ready: Callable[[str], None]) 
 
 
 def _admission(operating: Operating | None, origin: str | None) -> Callable[..., Awaitable[web.StreamResponse]]:
-    """Return what refuses another host, a foreign page, and where there is a secret whoever lacks it."""
 
     @web.middleware
     async def admission(request: web.Request, handler: Handler) -> web.StreamResponse:
         if request.url.host not in NAMES:
             raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
-        came_from = request.headers.getall("Origin", [])  # a browser may leave it out where it only gets
+        came_from = request.headers.getall("Origin", [])  # none where a browser gets from its own page
         if (came_from or request.method == "POST") and came_from not in ([f"http://{request.host}"], [origin]):
             raise web.HTTPForbidden(text="allowed is a page of tormagctl dashboard itself, or of its --origin")
         is_public = request.path == "/" or request.path.startswith("/page/")
@@ -119,7 +117,6 @@ def _admission(operating: Operating | None, origin: str | None) -> Callable[...,
 
 
 def _has(request: web.Request, secret: str) -> bool:
-    """Tell whether a request has the secret, in a time that does not depend on what it has instead."""
     given = request.headers.get("Tormag-Secret")
     if given is None:
         given = request.headers.get("Sec-WebSocket-Protocol", "").rpartition(",")[2].strip()

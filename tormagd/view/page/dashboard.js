@@ -12,7 +12,7 @@ const QUESTIONS = {
   disable: "Disable? The gap opens, and the drives are turned off.",
   arm: "Arm? It homes if needed, and the force ramps up: warn whoever holds the handle.",
 };
-// the address bar, the history and bookmarks keep no secret; a reload of this tab does
+// the address bar shows no secret, and a bookmark keeps none; a reload of this tab finds it here
 if (location.hash) {
   sessionStorage.secret = location.hash.slice(1);
   history.replaceState(null, "", location.pathname);
