@@ -304,7 +304,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
                 "relaxed": {"value": 0.2, "sd": None, "unit": "N", "acts": False},
             }
         },
-        ("believed  low_speed_factor 1.12, carriage_lag 0.035 ± 0.002 s",),
+        ("believed  force at a creep over that at speed 1.12, carriages' delay 35 ± 2 ms",),
         (),
     ),
     "why a profile is not used where one was to be": (

@@ -2,12 +2,14 @@
 
 import argparse
 import math
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
+ORIGIN = re.compile(r"(https://[a-z0-9.-]+|http://(localhost|127\.0\.0\.1))(:[0-9]{1,5})?")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 
 
@@ -73,6 +75,13 @@ def rates(text: str) -> tuple[float, ...]:
 def source(text: str) -> str:
     if not 0 < len(text) <= 64 or not text.isprintable():
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
+    return text
+
+
+def origin(text: str) -> str:
+    """Parse where a page comes from, as a browser names it: https, or http of this machine."""
+    if not ORIGIN.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are https://HOST[:PORT] and http://localhost[:PORT]")
     return text
 
 
@@ -341,7 +350,25 @@ COMMANDS = {
         (
             option("path", type=Path, nargs="?", metavar="FILE.mcap", help="recording; default: live"),
             option("--port", type=port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: a free one"),
+            option(
+                "--operate",
+                dest="is_operated",
+                action="store_true",
+                help="also STOP, disable, pause, resume and arm, for who has the link that is printed",
+            ),
+            option(
+                "--origin",
+                type=origin,
+                metavar="URL",
+                help="pages from there may use it too: https://HOST of a proxy, or http://localhost:PORT of your page",
+            ),
         ),
+    ),
+    "foxglove": Command(
+        "telemetry and control ticks live for Foxglove on this machine",
+        "foxglove.foxglove",
+        ("endpoints", "wait_s"),
+        (option("--port", type=port, default=8765, metavar="N", help="of 127.0.0.1 (8765); 0: a free one"),),
     ),
     "metrics": Command(
         "status for Prometheus, printed once or served with --port",

@@ -116,7 +116,7 @@ class RecordingWriter:
         at_ns = self._axis.of_snapshot(message.t_ns)
         if mark is not None and mark != before:
             self._thinning.happened(at_ns)
-        known = _known(msgspec.to_builtins(message))
+        known = only_known(msgspec.to_builtins(message))
         self._add(self._telemetry_channel, at_ns, msgspec.json.encode(known), self.telemetry_count)
         self._overview.add(at_ns, False, known | {"mark": mark})
         self.telemetry_count += 1
@@ -231,7 +231,7 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
 
 def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Value]:
     """Return a tick's row as a message, without values that are None, NaN or infinite."""
-    # inlines _known: some sixty values a thousand times a second
+    # inlines only_known: some sixty values a thousand times a second
     return {
         name: value
         for name, value in zip(columns, row, strict=True)
@@ -253,9 +253,9 @@ TICK_KINDS = {name: kind["type"] for name, kind in TICK_SCHEMA["properties"].ite
 OTHER_SCHEMA = {"title": "tormagd.OtherTick", "type": "object"}
 
 
-def _known(value: Any) -> Any:
+def only_known(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: known for name, inner in value.items() if (known := _known(inner)) is not None}
+        return {name: known for name, inner in value.items() if (known := only_known(inner)) is not None}
     if isinstance(value, list | tuple):
-        return None if None in map(_known, value) else value
+        return None if None in map(only_known, value) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value
