@@ -152,15 +152,13 @@ uninstall:
 wheels: | $(BIN)/python
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheels ./client .
 
-# a Debian package in build/, for the Python of this Debian: without torch, which only networks' training and two searches need
+# a Debian package in build/, for the Python of this Debian, with this Debian's packages and, inside, what systemd/bundled.txt locks
 deb: $(VENV)/.man
-	$(BIN)/python -c 'import sys, subprocess as s; v = "%d.%d" % sys.version_info[:2]; a = s.check_output(["/usr/bin/python3", \
-	    "-c", "import sys; print(\"%d.%d\" % sys.version_info[:2], end=\"\")"], text=True); \
-	    sys.exit(None if a == v else f"the package runs with Python {a}, but .venv has {v}: make clean, make deb PYTHON=/usr/bin/python3")'
+	@$(BIN)/python -c 'import sys; sys.exit(None if sys.base_prefix == "/usr" else \
+	    "the package is for Debian\x27s own Python: make clean, make deb PYTHON=/usr/bin/python3")'
 	rm -rf build/library
-	$(PIP_TO) build/library --no-deps ./client .
-	$(BIN)/python tools/dependencies.py record plot identify top dashboard metrics | grep -v '^torch=' > build/requirements.txt
-	$(PIP_TO) build/library --requirement build/requirements.txt
+	$(PIP_TO) build/library --no-compile --no-deps ./client .
+	$(PIP_TO) build/library --no-compile --no-deps --only-binary :all: --require-hashes --requirement systemd/bundled.txt
 	rm -rf build/library/bin
 	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library' systemd/deb.sh build/library build
 
@@ -176,7 +174,7 @@ $(VENV)/.demo: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
 	touch $@
 
 $(VENV)/.man: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
-	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6'
+	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6' 'shtab>=1.5.5'
 	touch $@
 
 $(VENV)/.dev: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python

@@ -1,6 +1,6 @@
 """`make run`: what a hand feels of a wall, then a measured human pulse, through the whole path, in real time.
 
-    publisher --ZeroMQ--> tormagd --serial, a pty--> virtual firmware --> plant
+    publisher --ZeroMQ--> tormagd --simulated CAN--> virtual firmware --> plant
 
 Hardware is simulated, each part in a process of its own. `rendering/show.py` starts and watches them,
 `rendering/live_touch.py` has the hand, and this script judges the pulse and sums up. Rendered is the plant's friction
@@ -119,7 +119,7 @@ def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
     if is_slow(scene, shown.spacing_s):
         return Verdict.MISSED, f"{what}; {slow(shown.spacing_s)}"
     if is_of_time and shown.host.took_much:
-        return Verdict.HOST, f"the host stood in the way{by_host}: {shown.host}"
+        return Verdict.HOST, f"the host spoiled it{by_host}: {shown.host}"
     return Verdict.MISSED, otherwise
 
 
@@ -198,7 +198,7 @@ def conclude(
 ) -> int:
     met = in_virtual_time = virtual_time_checks(scene, rehearsals)
     print_forces(shown, rehearsals)
-    print_ordered(shown, ordered)
+    print_ordered(scene, shown, ordered)
     summary: dict[str, Any] = {
         "touch": touch_told(scene, touched)[0],
         "virtual_time": {case.label: found.since(PULSE_START_S)._asdict() for case, found in rehearsals.items()},
@@ -285,11 +285,11 @@ def force_table(shown: Shown | Aborted, rehearsals: Rehearsals) -> list[str]:
     return [heading, *(f"  {label:{width}s} {line}" for label, line in rows.items())]
 
 
-def print_ordered(shown: Shown | Aborted, ordered: dict[str, Shown | Aborted]) -> None:
+def print_ordered(scene: Scene, shown: Shown | Aborted, ordered: dict[str, Shown | Aborted]) -> None:
     print(f"\nthe field searched for otherwise, {ORDERED_PULSE_S:g} s of the pulse each, real time, plant sample 1:")
     for label, found in {"k-nearest, as above": shown, **ordered}.items():
         if isinstance(found, Aborted):
-            print(f"  {label:36s} ended early: {found.error.cause}")
+            print(f"  {label:36s} {judge(scene, found)[1]}")
             continue
         rates = found.status["rates"]
         plan, searched = rates["inference"], rates.get("search", rates["inference"])

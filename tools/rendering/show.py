@@ -21,7 +21,6 @@ import numpy as np
 from machines.host import Host, HostWatch, processor_s
 from machines.own import own_machine
 from machines.processes import begun, end, first_line, is_linked
-from machines.wire import carried
 
 from rendering.following import RATE_HZ, Tracking, tracking
 from rendering.signals import with_approach
@@ -41,7 +40,11 @@ DEVICE_FIFO, PUBLISHER_FIFO = DAEMON_FIFO - 10, DAEMON_FIFO - 20
 CONFIG = f"""scene = "{{scene}}"
 
 [device]
+backend = "can"
 port = "{{port}}"
+
+[device.options]
+interface = "tormagsim"
 
 [endpoints]
 setpoint = "{ADDRESS.format("setpoint")}"
@@ -137,11 +140,7 @@ def staged(played: Callable[[HostWatch], Found]) -> Found | Aborted:
     """Run a show in an empty folder, with the host watched; `played` may raise ShowError."""
     shutil.rmtree(RUN_DIR, ignore_errors=True)
     RUN_DIR.mkdir(parents=True)
-    with (
-        (RUN_DIR / "bare_timer.log").open("w") as log,
-        HostWatch(DAEMON_FIFO + 1, log) as watched,
-        carried(DEVICE_FIFO),
-    ):
+    with (RUN_DIR / "bare_timer.log").open("w") as log, HostWatch(DAEMON_FIFO + 1, log) as watched:
         began_s = time.monotonic()
         try:
             return played(watched)
@@ -174,7 +173,7 @@ def start(stack: contextlib.ExitStack, name: str, *arguments: str, is_read: bool
 
 
 def enabled(stack: contextlib.ExitStack, watched: HostWatch, scene: str, *device: str) -> Rig:
-    options = ("--pty", "--seed", "1", "--truth", str(RUN_DIR / "truth.csv"), *device)
+    options = ("--can", "--seed", "1", "--truth", str(RUN_DIR / "truth.csv"), *device)
     simulator = start(stack, "simulator", *own_machine(DEVICE_FIFO, "tormagd.simulation", *options), is_read=True)
     port, power_on_s = first_line(simulator), time.monotonic()
     if not port:
