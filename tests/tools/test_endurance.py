@@ -1,4 +1,4 @@
-"""Every case of `tools/endure.py` for a moment, and that each can fail."""
+"""Every case of `judge.py endure` for a moment, and that each can fail."""
 
 import contextlib
 import math
@@ -6,10 +6,10 @@ import random
 from contextlib import ExitStack
 from pathlib import Path
 
-import endure
 import pytest
-from endurance import fuzz, replug, siege, soak, stalls
-from endurance.stand import Stand
+from judge import endure, fuzz, replug, siege, soak, stalls
+from judge.frame import parsed
+from judge.stand import Stand
 
 from firmware_protocol.c.build import BuildError
 from tormagd.control.safety.operating_state import COMMANDS
@@ -33,10 +33,18 @@ def test_cases_in_real_time_hold_on_one_stand_one_after_the_other() -> None:
         assert (stand.latched, stand.unhandled()) == ([], [])
 
 
-@pytest.mark.parametrize("wrong", [["nobody"], ["fuzz", "--count", "0"]])
-def test_a_wrong_command_line_is_refused(wrong: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (["nobody"], "invalid choice: 'nobody'"),
+        (["endure", "nobody"], "invalid choice: 'nobody'"),
+        (["endure", "fuzz", "--count", "0"], "0: allowed is at least 1"),
+    ],
+)
+def test_a_wrong_command_line_is_refused(wrong: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match=r"^2$"):
-        endure.main(wrong)
+        parsed("judge", {"endure": ""}, wrong)
+    assert says in capsys.readouterr().err
 
 
 def test_both_languages_hear_the_vectors_and_a_difference_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
