@@ -3,8 +3,8 @@
 import msgspec
 import pytest
 from judge import faults
+from judge.faults import OPEN_MM
 from judge.injections import CAN, MATRIX, OPENS, SERIAL, Injection
-from judge.watch import OPEN_MM
 
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.parameters import PlantParameters, load_plant

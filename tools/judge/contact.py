@@ -4,9 +4,8 @@ W is the waiting level: what the open gap, the scene's least force and its stand
 time from when the wall's force at the handle's place reaches W and 0.2 N until the kinetic force does; *short* is the
 share of that force that the run then lacks. *RMS* is the kinetic force less the wall's until the hand turns, then less
 W. *Held* is how long the handle is held back by more than W and 0.1 N while the hand draws it back. Where another force
-or a wall is sent, the bound are the run's own motors, which only open once the hand pulls. `--draws` are random walls,
-pushes and hands behind a network with 30 ms of jitter and 5 % loss in bursts. The picture's band is the just noticeable
-difference of force, 10 % (Jones 1989).
+or a wall is sent, the bound are the run's own motors, which only open once the hand pulls. The picture's band is
+the just noticeable difference of force, 10 % (Jones 1989).
 """
 
 import argparse
@@ -43,7 +42,6 @@ TOUCHES = ((0.05, 60.0), (0.25, 10.0), (0.25, 30.0), (1.0, 30.0))
 "Walls, N/mm, and pushes, mm/s."
 ROUND_TRIPS_MS = (0.0, 100.0, 400.0)
 MODES = ("force", "force_standby", "way", "way_standby", "law", "law_standby")
-JITTER_MS, LOSS = 30.0, 0.05
 EARLY_TICKS = 20
 "What is exceeded before the wall for no longer does not count."
 LATER_MS, WORSE, WORSE_N = 40.0, 1.1, 0.015
@@ -62,23 +60,6 @@ def cases() -> list[Case]:
     return [
         Case(device, hand, *touched, round_trip_ms, mode)
         for device, hand, touched, round_trip_ms, mode in product(DEVICES, HANDS_N_MM, TOUCHES, ROUND_TRIPS_MS, MODES)
-    ]
-
-
-def drawn(count: int) -> list[Case]:
-    random = np.random.default_rng(2037)
-    return [
-        Case(
-            str(random.choice(DEVICES)),
-            float(np.exp(random.uniform(math.log(0.1), 0.0))),
-            float(np.exp(random.uniform(math.log(0.05), 0.0))),
-            float(random.uniform(10.0, 60.0)),
-            float(random.uniform(0.0, 400.0)),
-            str(random.choice(MODES)),
-            JITTER_MS,
-            LOSS,
-        )
-        for _ in range(count)
     ]
 
 
@@ -229,12 +210,11 @@ def draw(picture: Path) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--draws", type=int, default=0, metavar="N", help="random touches instead of the matrix")
     parser.add_argument("--picture", type=Path, metavar="FILE.png")
 
 
 def measure(options: argparse.Namespace) -> Json:
-    rows = each(judged, "touches", drawn(options.draws) if options.draws else cases())
+    rows = each(judged, "touches", cases())
     if options.picture:
         draw(options.picture)
     of_modes = kept(rows)

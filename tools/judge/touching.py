@@ -33,8 +33,6 @@ from tormagd.simulation.plant import Plant, Truth
 
 PERIOD_S = 1e-3
 SETPOINT_TICKS = 2
-BURST = 25.0
-"Setpoints that are lost in a row, in the mean: 50 ms."
 MAX_N = 2.0
 FREE_MM = 20.0
 LEARNING: Legs = [(2.0, 15.0), (0.8, 0.0)]
@@ -52,8 +50,8 @@ MASS_KG = 0.15
 
 
 class Case(NamedTuple):
-    """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without; jitter
-    and loss are the network's. If `is_known`, a law tells the wall before it was met.
+    """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without.
+    If `is_known`, a law tells the wall before it was met.
     """
 
     device: str
@@ -62,8 +60,6 @@ class Case(NamedTuple):
     push_mm_s: float
     round_trip_ms: float
     mode: str
-    jitter_ms: float = 0.0
-    loss: float = 0.0
     is_known: bool = True
     most_N: float = MAX_N
 
@@ -91,9 +87,9 @@ def reached_ms(touch: Touch, wall_N_mm: float, force_N: float) -> float | None:
 
 class Link:
     def __init__(self, case: Case, wall: Wall, withdraw_N: float) -> None:
-        one_way_s, jitter_s = 5e-4 * case.round_trip_ms, 1e-3 * case.jitter_ms
-        self._there: NetworkDelay[float] = NetworkDelay(one_way_s, jitter_s, case.loss, BURST, seed=1)
-        self._back: NetworkDelay[TimedSetpoint] = NetworkDelay(one_way_s, jitter_s, case.loss, BURST, seed=2)
+        one_way_s = 5e-4 * case.round_trip_ms
+        self._there: NetworkDelay[float] = NetworkDelay(one_way_s)
+        self._back: NetworkDelay[TimedSetpoint] = NetworkDelay(one_way_s)
         self._wall, self._withdraw_N, self._mode = wall, withdraw_N, case.mode
         self._is_known = case.is_known
         self._tip: tuple[float, float] | None = None
