@@ -63,7 +63,7 @@ interpreted: $(VENV)/.dev
 
 # the firmware's sources under libFuzzer and sanitizers for so many seconds; where clang is not there, that is said
 fuzz: $(VENV)/.dev
-	$(BIN)/python tools/endure.py fuzz --count $(SECONDS) --seed $(SEED)
+	$(BIN)/python tools/judge.py endure fuzz --count $(SECONDS) --seed $(SEED)
 
 # which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
 # part are asked again, interpreted. pyproject.toml has the least share
@@ -127,7 +127,7 @@ reproduction: $(VENV)/.dev
 	$(BIN)/tormag-lab reproduce-thesis --out docs
 	$(BIN)/tormag-lab tactile-experiment --out docs
 
-# docs/evidence: the fault matrix and the cases of tools/endure.py in full (well over an hour); `make test` samples them
+# docs/evidence: the judges and the benchmarks in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev
 	$(BIN)/python tools/evidence.py
 

@@ -1,7 +1,7 @@
 """What every test shares: a live test that the host spoiled is started again, twice at most.
 
 If the host takes the processor for longer than the device may be silent, device and daemon protect themselves, and the
-scenario is over. Only the kernel's counters and bare timers on every processor (`tools/machines/host.py`) may blame the
+scenario is over. Only the kernel's counters and bare timers on every processor (`rigs/machines/host.py`) may blame the
 host; otherwise it is a failure.
 """
 

@@ -5,8 +5,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
 BASE = {"client", "firmware_protocol", "ground"}
@@ -30,17 +28,9 @@ MAY_IMPORT = {
 }
 MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"headroom"}
 """Nothing imports the laboratory."""
-TOOLS = ROOT / "tools"
-TOOL_ROOMS = {
-    "machines": set(),
-    "extremes": set(),
-    "rendering": {"machines"},
-    "fault_matrix": set(),
-    "risk": {"fault_matrix"},
-    "endurance": {"machines"},
-    "benchmarks": {"machines", "rendering"},
-}
-"""Of the tools; no room imports the scripts beside them."""
+TOOLS, RIGS = ROOT / "tools", ROOT / "tests" / "rigs"
+TOOL_ROOMS = {"judge": set(), "demo": {"judge"}, "benchmarks": {"judge"}}
+"""Of the tools; no room imports the scripts beside them, and no rig of the tests imports a tool."""
 
 
 def sources() -> Iterator[Path]:
@@ -78,11 +68,17 @@ def test_what_draws_takes_matplotlib_from_one_place():
         assert path.name == "drawing.py" or not re.search(r"^ *(from|import) matplotlib", path.read_text("utf-8"), re.M)
 
 
-@pytest.mark.parametrize("here", TOOL_ROOMS)
-def test_a_room_of_the_tools_imports_no_script_and_only_what_stands_left_of_it(here):
+def test_a_room_of_the_tools_imports_no_script_and_only_what_stands_left_of_it():
     ours = {path.stem for path in TOOLS.iterdir()}
-    for path in (TOOLS / here).glob("*.py"):
-        assert {name.split(".")[0] for name in imported(path)} & ours <= TOOL_ROOMS[here] | {here}, path
+    allowed = {TOOLS / here: rooms | {here} for here, rooms in TOOL_ROOMS.items()} | {RIGS: set()}
+    for folder, rooms in allowed.items():
+        for path in folder.rglob("*.py"):
+            assert {name.split(".")[0] for name in imported(path)} & ours <= rooms, path
+
+
+def test_tests_outside_their_own_room_take_nothing_from_the_tools():
+    for path in (path for path in (ROOT / "tests").rglob("*.py") if "tools" not in path.relative_to(ROOT).parts):
+        assert not {name.split(".")[0] for name in imported(path)} & TOOL_ROOMS.keys(), path
 
 
 def test_the_table_names_every_room_of_the_tools():

@@ -12,8 +12,8 @@ from statistics import mean
 from typing import final
 
 import numpy as np
-from rendering.following import RATE_HZ, Case, rehearse
-from rendering.signals import pulse_signal
+from judge.following import RATE_HZ, Case, rehearse
+from judge.signals import pulse_signal
 
 from firmware_protocol.c.build import BuildError, Target, build, debian_tool
 from firmware_protocol.conformance.check import run

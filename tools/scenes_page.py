@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from rendering.scene_runs import ROOT
+from benchmarks.scene_runs import ROOT
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core

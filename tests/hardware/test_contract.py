@@ -21,8 +21,7 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from extremes.stages import leaves
-from fault_matrix.bad_lines import (
+from bad_lines import (
     MakeTransfer,
     Transfer,
     damaging,
@@ -34,6 +33,7 @@ from fault_matrix.bad_lines import (
     unit_of,
     whole,
 )
+from leaves import leaves
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from tormagd.config import Config, Device

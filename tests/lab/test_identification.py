@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from rendering.device_draws import drawn_device
+from devices import drawn_device
 
 from tormagd.commission.procedure import Columns
 from tormagd.config import Config, Rates, load_config

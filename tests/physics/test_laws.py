@@ -11,7 +11,7 @@ import mpmath as mp
 import msgspec
 import numpy as np
 import pytest
-from extremes.cases import Batch, reference
+from digits import Batch, reference
 from hypothesis import example, given, strategies as st
 
 from tormagd.element.physics.errors import DomainError, require

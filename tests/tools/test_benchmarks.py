@@ -14,8 +14,8 @@ import benchmark
 import msgspec
 import numpy as np
 import pytest
-from benchmarks import inverse_report, inverse_workload, latency, loop, step, virtual_time
-from benchmarks.inverse_report import ROOT
+from benchmarks import inverse, latency, loop, step, virtual_time
+from benchmarks.inverse import ROOT
 
 from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG
 from tormagd.config import Config, RealTime, load_config
@@ -78,15 +78,11 @@ def test_a_scene_gets_a_search_that_is_measured_and_exact_enough(result):
 
 def test_the_roots_that_judge_are_roots():
     plant = load_plant("sample_1")
-    model = inverse_workload.trained(inverse_workload.training_data(plant, 600, seed=1), hidden=8, epochs=5)
-    along = inverse_workload.course(plant, 50)
-    for (displacement, rate, force), roots in zip(
-        along.rows(), inverse_workload.network_roots_mT(model, along), strict=True
-    ):
+    model = inverse.trained(inverse.training_data(plant, 600, seed=1), hidden=8, epochs=5)
+    along = inverse.course(plant, 50)
+    for (displacement, rate, force), roots in zip(along.rows(), inverse.network_roots_mT(model, along), strict=True):
         for root in roots.tolist():
-            assert model.predict_one(displacement, rate, root, inverse_workload.CIP_PERCENT) == pytest.approx(
-                force, abs=1e-9
-            )
+            assert model.predict_one(displacement, rate, root, inverse.CIP_PERCENT) == pytest.approx(force, abs=1e-9)
 
 
 def test_the_plant_of_the_workload_is_the_plant():
@@ -102,14 +98,14 @@ def test_the_plant_of_the_workload_is_the_plant():
     for ticks, rate in ((20_000, -speed), (round(travel / speed / dt), speed)):
         for tick in range(ticks):
             element.advance(tick * dt, gap, rate)
-    field = inverse_workload.NOMINAL.field_mT(gap)
-    (expected,) = inverse_workload.plant_force_N(plant, np.array([travel]), np.array([speed]), np.array([field]))
+    field = inverse.NOMINAL.field_mT(gap)
+    (expected,) = inverse.plant_force_N(plant, np.array([travel]), np.array([speed]), np.array([field]))
     assert element.force_N == pytest.approx(expected, abs=2e-3)
 
 
 def test_the_committed_page_is_of_the_committed_figures() -> None:
     figures = json.loads((ROOT / "docs/evidence/inverse.json").read_text(encoding="utf-8"))["figures"]
-    assert inverse_report.PAGE.read_text(encoding="utf-8") == inverse_report.page(figures), (
+    assert inverse.PAGE.read_text(encoding="utf-8") == inverse.page(figures), (
         "python tools/evidence.py inverse writes both anew"
     )
 

@@ -7,14 +7,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-import demo
 import numpy as np
 import pytest
+from demo import live_touch, main as demo, pictures, show
+from demo.pictures import touch_picture
+from judge.following import Case, Followed, rehearse
+from judge.touching import Case as Touching, Touch, ideal, reached_ms
 from machines.host import Host
-from rendering import live_touch, pictures, show
-from rendering.following import Case, Followed, rehearse
-from rendering.pictures import touch_picture
-from rendering.touching import Case as Touching, Touch, ideal, reached_ms
 
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import at_rates_of, build_core

@@ -329,7 +329,7 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
 
 def checkout(text: str) -> Path:
     root = Path(text).resolve()
-    if not (root / "tormagd" / "closed_loop.py").is_file() or not (root / "tools" / "benchmark.py").is_file():
+    if not (root / "tormagd").is_dir() or not (root / "tools" / "benchmark.py").is_file():
         raise argparse.ArgumentTypeError(f"{text}: allowed is the root of a checkout, with tormagd/ and tools/ in it")
     return root
 

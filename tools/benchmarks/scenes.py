@@ -17,10 +17,10 @@ from functools import partial
 from pathlib import Path
 
 import msgspec
-from rendering.device_draws import SAMPLES, SECOND
-from rendering.scene_runs import OF_A_HANDLE, ROOT, SITUATIONS, Case, run_all
+from devices import SAMPLES, SECOND
 
 from benchmarks import loop
+from benchmarks.scene_runs import OF_A_HANDLE, ROOT, SITUATIONS, Case, run_all
 from tormagd.config import RealTime
 from tormagd.control.assembly.build import choose_solver
 from tormagd.headroom.machine_loop import machine_us
