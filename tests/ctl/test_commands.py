@@ -579,7 +579,8 @@ def test_a_force_that_no_insert_renders_is_written_and_marked(
     result = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(1).result
     assert result["insert"] == insert
     assert all(any(part in line for line in result["unmet"]) for part in parts)
-    assert out.read_text().startswith(f"# NOT MET: {result['unmet'][0]}\n")
+    head = " ".join(line.strip("# ") for line in out.read_text().partition("\n[")[0].splitlines())
+    assert head.startswith(f"NOT MET: {result['unmet'][0]}")
     told = ctl("scene", "check", str(out), "--json").ended(1).error["message"]
     assert told == "scene mine: " + "; and ".join(result["unmet"])
 
