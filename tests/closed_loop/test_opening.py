@@ -8,12 +8,12 @@ import msgspec
 import pytest
 from benchmarks.step import drive as held
 from fault_matrix.bad_lines import BadSerialLine, losing
+from tormag_lab.training.bench_sweep import gap_plan
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
-from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.closed_loop import ClosedLoop, VirtualBus
 from tormagd.simulation.device import MessageDevice, VirtualDevice

@@ -15,6 +15,7 @@ from extremes.runs import Became, End, became, drawn_ends, ends, summed
 from extremes.stages import HOSTILE_STEPS, Draw, Row, Stage, leaves, tried
 from extremes.table import stages
 from hypothesis import given, strategies as st
+from tormag_lab.design.force_law import radial_moment_for_force_Tm
 
 import tormagd.control
 from tormagd.config import Position
@@ -28,7 +29,6 @@ from tormagd.element.physics.force import (
     brake_force_N,
     max_radial_moment_Tm,
 )
-from tormagd.lab.design.force_law import radial_moment_for_force_Tm
 
 EPISODES = 12
 

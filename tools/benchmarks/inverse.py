@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from tormag_lab.arrays import Array
 from tqdm import tqdm
 
 from benchmarks import inverse_report as report
@@ -36,7 +37,6 @@ from tormagd.element.inverse.nearest import field_grid
 from tormagd.element.inverse.solution import FieldSolution, FieldSolver, Reach, answer
 from tormagd.element.model.force_curve import ForceCurve
 from tormagd.element.model.model_file import ForceModel, falling_at
-from tormagd.lab.arrays import Array
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
 from tormagd.simulation.parameters import load_plant
 

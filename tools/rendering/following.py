@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from tormag_lab.arrays import Array, rms
+from tormag_lab.ideal_actuator import ideal_stepper
 
 from rendering.device_draws import device as device_of
 from rendering.hands import Legs, WaitingHand
@@ -13,8 +15,6 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.records import TimedSetpoint
-from tormagd.lab.arrays import Array, rms
-from tormagd.lab.ideal_actuator import ideal_stepper
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.closed_loop import ClosedLoop, stream
 from tormagd.simulation.device import FirmwareKind, VirtualDevice

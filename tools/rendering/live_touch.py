@@ -17,10 +17,10 @@ import numpy as np
 from machines.host import HostWatch
 from machines.own import own_machine
 from machines.processes import end, first_line
+from tormag_lab.arrays import Json
 
 from rendering.show import PUBLISHER_FIFO, RUN_DIR, Rig, enabled, ended, raise_fault, start, status, told_truth, watch
 from rendering.touching import MASS_KG, Case, Touch, ideal, reached_ms
-from tormagd.lab.arrays import Json
 from tormagd.simulation.hand import PRESSES_AT_S
 
 SCENE = Path(__file__).parents[2] / "examples" / "scenes" / "touch.toml"

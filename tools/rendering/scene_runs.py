@@ -12,6 +12,8 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from tormag_lab.arrays import Array, rms
+from tormag_lab.executors import finished
 
 from rendering import touching
 from rendering.device_draws import device
@@ -19,8 +21,6 @@ from rendering.following import FILE_PREVIEW_S, armed, publisher, taught
 from rendering.hands import swinging
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.lab.arrays import Array, rms
-from tormagd.lab.executors import finished
 from tormagd.scenes.scene import Bandwidth, Handle, Scene, Solver, load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, Hand, PressingHand, RecordedHand
