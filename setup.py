@@ -55,7 +55,7 @@ COMPILED = {
         *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay", "topics"),
         *("control_loop", "inference_loop", "black_box", "telemetry_loop"),
     ),
-    "tormagd/lab": ("ideal_actuator",),
+    "lab/src/tormag_lab": ("ideal_actuator",),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]
 GROUP = "firmware_protocol.core"

@@ -10,13 +10,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from tormag_lab.tactile.held import Case, hold
 
 from firmware_protocol.codec import DriveMode
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
-from tormagd.lab.tactile.held import Case, hold
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream

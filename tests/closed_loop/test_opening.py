@@ -7,12 +7,12 @@ from functools import partial
 import msgspec
 import pytest
 from bad_lines import BadSerialLine, losing
+from tormag_lab.training.bench_sweep import gap_plan
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
-from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import MessageDevice, VirtualDevice

@@ -13,6 +13,9 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from tormag_lab.training import calibration
+from tormag_lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
+from tormag_lab.training.dataset import Dataset
 
 from tormagd.commission import procedure as course
 from tormagd.commission.finding import Finding
@@ -34,9 +37,6 @@ from tormagd.ctl.outcome import CommandError
 from tormagd.element.model.displacement import MOVING_MM_S, Turn
 from tormagd.element.model.model_file import ForceModel, load_model, model_path
 from tormagd.element.physics.inserts import insert
-from tormagd.lab.training import calibration
-from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
-from tormagd.lab.training.dataset import Dataset
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand

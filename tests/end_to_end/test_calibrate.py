@@ -6,9 +6,9 @@ import subprocess
 import sys
 
 import pytest
+from tormag_lab.training.dataset import read_csv
 
 from tormagd.element.model.model_file import load_model
-from tormagd.lab.training.dataset import read_csv
 
 pytestmark = pytest.mark.live
 

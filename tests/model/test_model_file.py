@@ -16,6 +16,8 @@ import pytest
 import torch
 from hypothesis import given, strategies as st
 from safetensors import safe_open
+from tormag_lab.training.dataset import Dataset, fit_metrics, not_rising_share
+from tormag_lab.training.grey_box import GreyBox, GreyBoxMemory
 
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import build_core
@@ -36,8 +38,6 @@ from tormagd.element.model.model_file import (
 )
 from tormagd.element.model.network import to_network
 from tormagd.element.physics.errors import DomainError
-from tormagd.lab.training.dataset import Dataset, fit_metrics, not_rising_share
-from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
 
 
 @pytest.fixture(scope="session")

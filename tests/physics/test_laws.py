@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from digits import Batch, reference
 from hypothesis import example, given, strategies as st
+from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 
 from tormagd.element.physics.errors import DomainError, require
 from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw, flux_density_T
@@ -26,7 +27,6 @@ from tormagd.element.physics.force import (
 from tormagd.element.physics.inserts import INSERTS, Insert, MeasuredForceRange, insert, relative_permeability
 from tormagd.element.physics.magnets import CuboidMagnet, attraction_N
 from tormagd.element.physics.relaxation import PronySeries
-from tormagd.lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 
 LAWS: list[FieldLaw] = [ThesisFieldLaw(), PowerFieldLaw(), PowerFieldLaw(coefficient=0.462, exponent=-1.33)]
 
@@ -169,7 +169,7 @@ def test_the_inverse_returns_the_radial_moment_and_needs_few_steps(
     monkeypatch: pytest.MonkeyPatch, steps: int | None, seed: int, count: int, rel: float
 ) -> None:
     if steps is not None:
-        monkeypatch.setattr("tormagd.lab.design.force_law._NEWTON_STEPS", steps)
+        monkeypatch.setattr("tormag_lab.design.force_law._NEWTON_STEPS", steps)
     for case in islice(over_loads(seed), count):
         force_N = brake_force_N(*case)
         assert radial_moment_for_force_Tm(force_N, *case[1:]) == pytest.approx(case.moment, rel=rel)

@@ -2,8 +2,8 @@
 
 import msgspec
 import pytest
+from tormag_lab.ideal_carriage import brake_of
 
-from tormagd.lab.ideal_carriage import brake_of
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.second_element import SecondElement
 

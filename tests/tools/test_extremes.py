@@ -16,6 +16,7 @@ from judge.ends import Became, End, became, drawn_ends, ends, summed
 from judge.stage_table import stages
 from judge.stages import HOSTILE_STEPS, Draw, Row, Stage, tried
 from leaves import leaves
+from tormag_lab.design.force_law import radial_moment_for_force_Tm
 
 import tormagd.control
 from tormagd.config import Position
@@ -29,7 +30,6 @@ from tormagd.element.physics.force import (
     brake_force_N,
     max_radial_moment_Tm,
 )
-from tormagd.lab.design.force_law import radial_moment_for_force_Tm
 
 EPISODES = 12
 

@@ -19,6 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from tormag_lab.arrays import Array
+from tormag_lab.pages import figures_of, stamp, subplots, table
+from tormag_lab.training.dataset import Dataset
+from tormag_lab.training.fitting import fit_model
 from tqdm import tqdm
 
 from tormagd.control.nominal import FieldOfGap
@@ -34,10 +38,6 @@ from tormagd.element.physics.field import PowerFieldLaw
 from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.element.physics.friction import Friction
 from tormagd.element.physics.inserts import insert
-from tormagd.lab.arrays import Array
-from tormagd.lab.pages import figures_of, stamp, subplots, table
-from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.fitting import fit_model
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.static_laws import radial_moment_Tm

@@ -22,6 +22,7 @@ from typing import Any
 import msgspec
 from judge.following import Case, Rehearsals, Tracking, rehearse
 from judge.touching import Touch
+from tormag_lab.arrays import Array, Json
 
 from demo.live_touch import FELT_N, PUSH_MM_S, ROUND_TRIP_MS, Wall, felt, figures, lateness
 from demo.show import (
@@ -38,7 +39,6 @@ from demo.show import (
     staged,
 )
 from tormagd.config import Config
-from tormagd.lab.arrays import Array, Json
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd_client.endpoints import ConfigError

@@ -15,16 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 from devices import SAMPLES, SECOND, device, judging
+from tormag_lab.arrays import Array, Json, Mask
+from tormag_lab.ideal_carriage import TURNED_MM_S, brake_of
+from tormag_lab.pages import stamp, subplots
+from tormag_lab.told import lines
 
 from judge.following import VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
 from judge.frame import each
 from judge.hands import HANDS
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Limit
-from tormagd.lab.arrays import Array, Json, Mask
-from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
-from tormagd.lab.pages import stamp, subplots
-from tormagd.lab.told import lines
 
 DRAWS = 40
 SETPOINT_S = 0.002

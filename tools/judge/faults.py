@@ -14,6 +14,8 @@ import argparse
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from tormag_lab.arrays import Json
+from tormag_lab.told import table
 from tqdm import tqdm
 
 from firmware_protocol.codec import DeviceMode
@@ -22,8 +24,6 @@ from judge.rig import OTHER_N, Rig
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, RefusedError, next_commands
 from tormagd.daemon.arming import Arming
-from tormagd.lab.arrays import Json
-from tormagd.lab.told import table
 from tormagd.simulation.__main__ import FIRMWARES
 from tormagd.simulation.closed_loop import Sample
 from tormagd.simulation.device import FirmwareKind

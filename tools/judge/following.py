@@ -7,14 +7,14 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from devices import device as device_of
+from tormag_lab.arrays import Array, rms
+from tormag_lab.ideal_actuator import ideal_stepper
 
 from judge.hands import Legs, WaitingHand
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.records import TimedSetpoint
-from tormagd.lab.arrays import Array, rms
-from tormagd.lab.ideal_actuator import ideal_stepper
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.closed_loop import ClosedLoop, stream
 from tormagd.simulation.device import FirmwareKind, VirtualDevice

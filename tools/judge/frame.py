@@ -13,10 +13,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, TypeVar
 
+from tormag_lab.arrays import Json
+from tormag_lab.told import lines
 from tqdm import tqdm
-
-from tormagd.lab.arrays import Json
-from tormagd.lab.told import lines
 
 Found = TypeVar("Found")
 

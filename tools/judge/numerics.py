@@ -22,6 +22,8 @@ import mpmath as mp
 import numpy as np
 from digits import DIGITS, Batch, draw_batch, reference
 from numpy.typing import NDArray
+from tormag_lab.arrays import Array, Json, Mask
+from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 
 from judge.ends import became, drawn_ends, summed
 from judge.frame import count, each
@@ -30,8 +32,6 @@ from judge.stages import Row, tried
 from tormagd.element.physics.errors import FloatArray
 from tormagd.element.physics.field import ThesisFieldLaw
 from tormagd.element.physics.force import brake_force_N, max_radial_moment_Tm
-from tormagd.lab.arrays import Array, Json, Mask
-from tormagd.lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 
 BATCH = 500
 CHUNK = 20

@@ -34,7 +34,7 @@ EVERY = 4
 "Neighbouring ticks are nearly the same."
 
 PACES = ("steadily, about 20 turns a minute", "slowly, about 10 turns a minute", "quickly, about 25 turns a minute")
-FITTING = "tormagd.lab.training.calibration"
+FITTING = "tormag_lab.training.calibration"
 POLL_S = 0.2
 
 

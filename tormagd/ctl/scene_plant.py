@@ -30,7 +30,7 @@ def on_plant(scene: Scene, name: str, plant: str) -> dict[str, Any]:
         np.savetxt(table, np.column_stack([times_s, forces_N]), "%.6f", ",", header="t_s,force_N", comments="")
         words = ["bound", str(table), "--json", f"--plant={plant}", f"--insert={scene.insert.name}"]
         try:
-            found: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.lab.__main__", words, LONGEST_S))
+            found: dict[str, Any] = msgspec.json.decode(answer_of("tormag_lab.__main__", words, LONGEST_S))
         except (TimeoutError, ChildProcessError) as error:
             # the laboratory names the command that installs what it lacks
             said, lacks, remedy = str(error).partition(" is not installed")

@@ -24,4 +24,4 @@ def _run(module: str) -> int:
 
 daemon = partial(_run, "tormagd.daemon.main")
 ctl = partial(_run, "tormagd.ctl.main")
-lab = partial(_run, "tormagd.lab.main")
+lab = partial(_run, "tormag_lab.main")
