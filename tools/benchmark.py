@@ -11,8 +11,8 @@ import json
 import sys
 from collections.abc import Sequence
 
+from tormag_lab.told import lines
 from tormagd.headroom.machine_loop import machine_us
-from tormagd.lab.told import lines
 
 MEASUREMENTS = {
     "inverse": "speed against accuracy of the searches for the field",

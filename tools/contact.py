@@ -37,9 +37,9 @@ from rendering.touching import (
 )
 from tqdm import tqdm
 
-from tormagd.lab.arrays import Json, Mask, rms
-from tormagd.lab.pages import subplots
-from tormagd.lab.told import lines
+from tormag_lab.arrays import Json, Mask, rms
+from tormag_lab.pages import subplots
+from tormag_lab.told import lines
 
 DEVICES = (*SAMPLES, "draw 100", "draw 103", SECOND)
 HANDS_N_MM = (0.1, 0.3, 1.0)

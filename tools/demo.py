@@ -38,8 +38,8 @@ from rendering.show import (
 )
 from rendering.touching import Touch
 
+from tormag_lab.arrays import Array, Json
 from tormagd.config import Config
-from tormagd.lab.arrays import Array, Json
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd_client.endpoints import ConfigError

@@ -27,12 +27,12 @@ from rendering.hands import HANDS
 from rendering.models import models, models_table
 from tqdm import tqdm
 
+from tormag_lab.arrays import Array, Json, Mask
+from tormag_lab.ideal_carriage import TURNED_MM_S, brake_of
+from tormag_lab.pages import stamp, subplots
+from tormag_lab.told import lines
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Limit
-from tormagd.lab.arrays import Array, Json, Mask
-from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
-from tormagd.lab.pages import stamp, subplots
-from tormagd.lab.told import lines
 
 DRAWS = 40
 SETPOINT_S = 0.002

@@ -44,14 +44,14 @@ from rendering.signals import (
 )
 from tqdm import tqdm
 
+from tormag_lab.arrays import Json
+from tormag_lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
+from tormag_lab.told import lines
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
 from tormagd.control.assembly.profile import profile_of
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
-from tormagd.lab.arrays import Json
-from tormagd.lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
-from tormagd.lab.told import lines
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 

@@ -20,8 +20,8 @@ from firmware_protocol.conformance.check import run
 from firmware_protocol.conformance.examination import checks_on
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import SerialLine
+from tormag_lab.told import table
 from tormagd.config import Config
-from tormagd.lab.told import table
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import FirmwareKind, VirtualDevice
 from tormagd.simulation.emulated_firmware import EmulatedFirmware

@@ -15,10 +15,10 @@ from risk.named_tests import named_tests
 from risk.page import page, red_rows
 from risk.rows import Row, judgement, rows
 
+from tormag_lab.pages import table
 from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd.control.safety.operating_state import ROWS, Event, OperatingState, Refusal, Transition
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.lab.pages import table
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

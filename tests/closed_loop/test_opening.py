@@ -13,9 +13,8 @@ from firmware_protocol.codec import DeviceMode
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
-from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.closed_loop import ClosedLoop, VirtualBus
+from tormagd.simulation.closed_loop import ClosedLoop, VirtualBus, gap_plan
 from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.firmware import Firmware

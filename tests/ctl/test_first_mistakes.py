@@ -109,8 +109,6 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     (f"{NEW} --scale nan", 2, "--scale", FORCES),
     (f"{NEW} --insert MRE-70-10", 1, "torque_mre_70", FORCES),
     ("tormagctl scene new f.toml --force f.csv --offset 0.1", 2, "f.csv exists, where the scene's forces go", FORCES),
-    ("tormagctl scene check pulse --plant no_plant", 2, "no_plant", {}),
-    ("tormagctl scene show pulse --plant sample_1", 2, "--plant: allowed only", {}),
     ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene check pulse --tolerance 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene explain pulse --share 0.5", 2, "tormagctl scene check NAME with one of", {}),

@@ -13,13 +13,13 @@ from PIL import Image
 from reference_pages import commands_page, configuration_page, keys, subparsers, tables
 
 from firmware_protocol.conformance import __main__ as conformance
+from tormag_lab.pages import KEY, figures_of, stamp
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
 from tormagd.ctl.commands import COMMANDS
 from tormagd.daemon import main as daemon
 from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
-from tormagd.lab.pages import KEY, figures_of, stamp
 from tormagd.scenes.measured import measured
 from tormagd.simulation import __main__ as simulation
 
@@ -39,7 +39,7 @@ COMMAND = re.compile(
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^(?: {4}| {8})(\S.*)$", re.MULTILINE)
 IMPORTED = re.compile(r"^from (\w+) import (\w+)$", re.MULTILINE)
-LAB = importlib.import_module("tormagd.lab.main") if importlib.util.find_spec("tormagd.lab") else None
+LAB = importlib.import_module("tormag_lab.main") if importlib.util.find_spec("tormag_lab") else None
 DECISION = ["Question", "Decision", "Why", "Given up"]
 
 

@@ -17,6 +17,7 @@ from extremes.table import stages
 from hypothesis import given, strategies as st
 
 import tormagd.control
+from tormag_lab.design.force_law import radial_moment_for_force_Tm
 from tormagd.config import Position
 from tormagd.control.move.pid import Pid
 from tormagd.control.safety.codes import Limit
@@ -28,7 +29,6 @@ from tormagd.element.physics.force import (
     brake_force_N,
     max_radial_moment_Tm,
 )
-from tormagd.lab.design.force_law import radial_moment_for_force_Tm
 
 EPISODES = 12
 

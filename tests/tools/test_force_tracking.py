@@ -26,11 +26,11 @@ from rendering.signals import (
     recorded_signals,
 )
 
+from tormag_lab.arrays import rms
+from tormag_lab.human_pulse import pulse_profile
+from tormag_lab.training.dataset import not_rising_share
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
-from tormagd.lab.arrays import rms
-from tormagd.lab.human_pulse import pulse_profile
-from tormagd.lab.training.dataset import not_rising_share
 from tormagd.simulation.parameters import load_plant
 
 BEGINS_S, IDEAL_S = 4.0, 0.9

@@ -29,6 +29,7 @@ from benchmarks.inverse_workload import (
     trained,
     training_data,
 )
+from tormag_lab.arrays import Array
 from tormagd.daemon.realtime import freeze_garbage
 from tormagd.element.inverse import ordered
 from tormagd.element.inverse.choice import build, mean_error_N, named
@@ -36,7 +37,6 @@ from tormagd.element.inverse.nearest import field_grid
 from tormagd.element.inverse.solution import FieldSolution, FieldSolver, Reach, answer
 from tormagd.element.model.force_curve import ForceCurve
 from tormagd.element.model.model_file import ForceModel, falling_at
-from tormagd.lab.arrays import Array
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
 from tormagd.simulation.parameters import load_plant
 

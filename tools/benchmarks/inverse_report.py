@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from tormagd.lab.pages import figures_of, stamp, subplots, table
+from tormag_lab.pages import figures_of, stamp, subplots, table
 from tormagd.view.drawing import Axes
 
 ROOT = Path(__file__).parents[2]

@@ -9,6 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tormag_lab.arrays import Array
+from tormag_lab.training.dataset import Dataset
+from tormag_lab.training.fitting import fit_model
 from tormagd.control.nominal import FieldOfGap
 from tormagd.element.model.features import Element
 from tormagd.element.model.model_file import ForceModel
@@ -16,9 +19,6 @@ from tormagd.element.physics.field import PowerFieldLaw
 from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.element.physics.friction import Friction
 from tormagd.element.physics.inserts import insert
-from tormagd.lab.arrays import Array
-from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.fitting import fit_model
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
 

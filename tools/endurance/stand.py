@@ -17,8 +17,8 @@ from machines.own import own_machine
 from machines.processes import begun, end, first_line, received
 from machines.wire import carried
 
+from tormag_lab.arrays import Array
 from tormagd.config import load_config
-from tormagd.lab.arrays import Array
 from tormagd.record.ticks import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.keys import SECRET, SERVER, generate

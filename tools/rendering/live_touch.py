@@ -20,7 +20,7 @@ from machines.processes import end, first_line
 
 from rendering.show import PUBLISHER_FIFO, RUN_DIR, Rig, enabled, ended, raise_fault, start, status, told_truth, watch
 from rendering.touching import MASS_KG, Case, Touch, ideal, reached_ms
-from tormagd.lab.arrays import Json
+from tormag_lab.arrays import Json
 from tormagd.simulation.hand import PRESSES_AT_S
 
 SCENE = Path(__file__).parents[2] / "examples" / "scenes" / "touch.toml"

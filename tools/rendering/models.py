@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from rendering.device_draws import SAMPLES, device
+from tormag_lab.arrays import Array, Json
+from tormag_lab.pages import table
+from tormag_lab.training.dataset import force_metrics, not_rising_share
 from tormagd.control.nominal import FieldOfGap
 from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.model_file import ForceModel, load_model, model_path
 from tormagd.element.physics.field import PowerFieldLaw
 from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.element.physics.inserts import Insert, insert
-from tormagd.lab.arrays import Array, Json
-from tormagd.lab.pages import table
-from tormagd.lab.training.dataset import force_metrics, not_rising_share
 from tormagd.simulation.parameters import PlantParameters, with_insert
 from tormagd.simulation.static_laws import radial_moment_Tm
 

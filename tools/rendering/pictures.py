@@ -6,8 +6,8 @@ from rendering.following import Followed, Rehearsals, tracking
 from rendering.live_touch import FELT_N, HALF_S, PUSH_MM_S, ROUND_TRIP_MS, Wall, figures as touch_figures, lateness
 from rendering.show import PULSE_START_S, Shown
 from rendering.touching import Touch
-from tormagd.lab.arrays import Array
-from tormagd.lab.pages import stamp, subplots
+from tormag_lab.arrays import Array
+from tormag_lab.pages import stamp, subplots
 from tormagd.scenes.scene import Scene
 from tormagd.view.drawing import Axes
 

@@ -25,9 +25,9 @@ from machines.wire import carried
 
 from rendering.following import RATE_HZ, Tracking, tracking
 from rendering.signals import with_approach
+from tormag_lab.arrays import Array
+from tormag_lab.human_pulse import pulse_profile
 from tormagd.control.safety.codes import FAULTS, Fault
-from tormagd.lab.arrays import Array
-from tormagd.lab.human_pulse import pulse_profile
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd_client import Client, ClientError, UnreachableError
 from tormagd_client.messages import MessageError, Telemetry

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from tormagd.lab.arrays import Array
-from tormagd.lab.human_pulse import pulse_profile, recorded, scaled
+from tormag_lab.arrays import Array
+from tormag_lab.human_pulse import pulse_profile, recorded, scaled
 
 PULSE_N = (1.4, 1.7)
 RATE_HZ = 500
