@@ -1,6 +1,6 @@
 #!/bin/sh
 # Packs a Debian package:  deb.sh LIBRARY OUT
-# LIBRARY is a folder with both distributions and all that they import, for PYTHON (/usr/bin/python3), which the package runs with. All
+# LIBRARY is a folder with the three distributions and all that they import, for PYTHON (/usr/bin/python3), which the package runs with. All
 # of it is in the package, but for torch, which only networks' training and two searches need: a console need not reach a registry.
 set -eu
 library=$1 out=$2

@@ -39,7 +39,7 @@ MAY_START = {
     "daemon": {"record"},
     "view": {"firmware_protocol"},
 }
-"""`python -m` of another room: replay, rehearsal, headroom, the check of a scene; the keeper; a command that is told."""
+"""`python -m` of another room: replay, rehearsal, headroom, a scene's check; the keeper; a command that is told."""
 PACKAGES = {
     "tormagd_client": ROOT / "client/src/tormagd_client",
     "firmware_protocol": ROOT / "firmware_protocol",
@@ -153,9 +153,9 @@ def test_no_arrow_comes_back():
                 rooms[room(name)].add(other)
                 kinds[each.kind].add((room(name), other))
     list(TopologicalSorter(files).static_order())
-    order, floor = list(TopologicalSorter(rooms).static_order()), {}
-    for name in order:
-        floor[name] = 1 + max((floor[other] for other in rooms[name]), default=0)
+    floor = {}
+    for name in TopologicalSorter(rooms).static_order():
+        floor[name] = 1 + max((floor[there] for here, there in kinds["imports"] if here == name), default=0)
     for level in range(1, max(floor.values()) + 1):
         print(f"floor {level}: {', '.join(sorted(name for name in floor if floor[name] == level))}")
     print(f"{len(rooms)} rooms, {max(floor.values())} floors, {len(kinds['imports'])} arrows")
