@@ -1,6 +1,6 @@
 #!/bin/sh
 # Packs a Debian package:  deb.sh LIBRARY OUT
-# LIBRARY is a folder with both distributions and what bundled.txt lists, for PYTHON (/usr/bin/python3), which the package runs
+# LIBRARY is a folder with the three distributions and what bundled.txt lists, for PYTHON (/usr/bin/python3), which the package runs
 # with. What else they import is Debian's: Depends is for the service, Recommends for what is drawn, served and fitted. torch is
 # nobody's here: it is for networks' training and two searches only. DEBFULLNAME and DEBEMAIL name who builds.
 set -eu

@@ -14,13 +14,13 @@ from typing import final
 import numpy as np
 from judge.following import RATE_HZ, Case, rehearse
 from judge.signals import pulse_signal
-from tormag_lab.told import table
 
 from firmware_protocol.c.build import BuildError, Target, build, debian_tool
 from firmware_protocol.conformance.check import run
 from firmware_protocol.conformance.examination import checks_on
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import SerialLine
+from tormag_lab.told import table
 from tormagd.config import Config
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import FirmwareKind, VirtualDevice

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from judge.risk import Row, judgement, named_tests, page, red_rows, rows
-from tormag_lab.pages import table
 
+from tormag_lab.pages import table
 from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd.control.safety.operating_state import ROWS, Event, OperatingState, Refusal, Transition
 from tormagd.hardware.measurement import DeviceRequest

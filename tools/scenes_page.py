@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.scene_runs import ROOT
-from tormag_lab.pages import stamp, subplots, table
 
+from tormag_lab.pages import stamp, subplots, table
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, Measurements, OperatingPoint, measured

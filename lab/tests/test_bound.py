@@ -3,19 +3,14 @@
 import json
 import math
 import re
+from importlib.resources import files
 
 import msgspec
 import numpy as np
 import pytest
 
-from tormagd.config import Config
-from tormagd.control.assembly.build import Core, build_core
-from tormagd.control.core import Stepper
-from tormagd.control.records import TimedSetpoint
-from tormagd.element.physics.relaxation import PronySeries
 from tormag_lab.arrays import rms
 from tormag_lab.human_pulse import pulse_profile
-from tormag_lab.ideal_actuator import ideal_stepper
 from tormag_lab.ideal_carriage import (
     Asked,
     Brake,
@@ -29,12 +24,19 @@ from tormag_lab.ideal_carriage import (
     no_delay_mm,
 )
 from tormag_lab.main import main
+from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.core import Stepper
+from tormagd.control.records import TimedSetpoint
+from tormagd.element.physics.relaxation import PronySeries
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.ideal_actuator import ideal_stepper
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.plant import Plant
+from tormagd.simulation.second_element import SecondElement
 
 STEP_S = 1e-3
 SPEED_MM_S = 40.0
@@ -257,3 +259,30 @@ def test_they_stand_where_nothing_is_planned_for(command: str) -> None:
     # the firmware opens a disabled device by its own motors
     assert (device.truth.gap_mm > stood_mm + 0.3) is (command == "disable")
     assert device.truth.gap_mm > stood_mm - 0.01
+
+
+@pytest.mark.parametrize("gap_mm", [94.0, 70.0, 50.0])
+def test_the_brake_knows_the_second_plants_force_but_for_play_and_creep(gap_mm: float) -> None:
+    second, speed_mm_s = load_plant("second"), 42.0
+    element, brake = SecondElement(second, gap_mm, STEP_S), brake_of(second)
+    for _ in range(200):
+        element.advance(0.0, gap_mm, speed_mm_s)
+    moment_T = float(brake.moment_Tm[abs(brake.gap_mm - gap_mm).argmin()])
+    known_N = 0.85 * brake.sliding_N(brake.fresh_at_N(moment_T), speed_mm_s)
+    assert element.force_N == pytest.approx(known_N, rel=0.02)
+
+
+def test_a_scene_is_judged_on_a_plant_of_ones_own(tmp_path, capsys) -> None:
+    weak, sample = tmp_path / "weak.toml", files("tormagd.simulation") / "plants" / "sample_1.toml"
+    weak.write_text(sample.read_text().replace("kinetic_friction = 0.204", "kinetic_friction = 0.06"))
+    assert main(["bound", "pulse", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["least_N"] < 0.8 < 4.5 < found["most_N"]
+    assert found["unmet"] == []
+    steady = tmp_path / "steady.toml"
+    steady.write_text(
+        'name = "steady"\ndescription = "x"\n[force]\nleast_N = 0.8\nmost_N = 2.0\nresolution_N = 0.1\n'
+        'tolerance_rms_N = 0.05\n[insert]\nname = "MRE-50-40"\nmodel = "torque_mre_50_40"\n'
+    )
+    assert main(["bound", str(steady), "--plant", str(weak)]) == 1
+    assert "force.most_N = 2: plant" in capsys.readouterr().out

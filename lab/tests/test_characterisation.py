@@ -12,9 +12,6 @@ import pytest
 import torch
 from hypothesis import assume, given, settings, strategies as st
 
-from tormagd.element.physics.errors import DomainError
-from tormagd.element.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N
-from tormagd.element.physics.relaxation import PronySeries
 from tormag_lab.characterisation.compression import (
     CompressionRecord,
     Sample,
@@ -43,6 +40,9 @@ from tormag_lab.design.force_law import stretch_minus_one
 from tormag_lab.errors import LabError
 from tormag_lab.main import main
 from tormag_lab.tables import read_columns
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.relaxation import PronySeries
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

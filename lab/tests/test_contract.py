@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from tormagd import __version__
-from tormagd.element.model.model_file import load_model
 from tormag_lab import errors
 from tormag_lab.main import COMMANDS, main
+from tormagd import __version__
+from tormagd.element.model.model_file import load_model
 
 ROOT = Path(__file__).parents[2]
-SOURCES = [path for folder in ("tormagd", "firmware_protocol") for path in sorted((ROOT / folder).rglob("*.py"))]
+SOURCES = [
+    path for folder in ("tormagd", "firmware_protocol", "lab/src") for path in sorted((ROOT / folder).rglob("*.py"))
+]
 PAGES = [
     *ROOT.glob("*.md"),
     ROOT / "Makefile",
@@ -195,7 +197,7 @@ def test_a_missing_package_is_one_sentence_with_the_command_that_brings_it(tmp_p
     done = without_heavy(COMMAND, "train-model", *given, "--element", "torque", "--insert", "A")
     assert (done.returncode, done.stderr) == (
         2,
-        "tormag-lab train-model: torch is not installed: pip install 'tormagd[lab]'\n",
+        "tormag-lab train-model: torch is not installed: pip install 'tormag-lab[all]'\n",
     )
 
 
@@ -209,7 +211,7 @@ def test_the_law_trains_without_torch(tmp_path):
 
 
 def test_where_tormagd_stands_in_a_folder_of_its_own_packages_are_brought_there(monkeypatch, tmp_path):
-    monkeypatch.setattr(errors, "__file__", str(tmp_path / "tormagd" / "tormagd" / "lab" / "errors.py"))
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "tormagd" / "tormag_lab" / "errors.py"))
     assert errors.not_installed("torch").endswith(
         f"sudo python3 -m pip install --target {tmp_path}/tormagd 'torch==2.13.0'"
     )

@@ -13,10 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.element.physics.errors import DomainError
-from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.element.physics.inserts import INSERTS
 from tormag_lab.design import optimisation
 from tormag_lab.design.brake import Brake
 from tormag_lab.design.optimisation import (
@@ -40,6 +36,10 @@ from tormag_lab.design.range_fit import (
 from tormag_lab.design.selection import ForceTask, Verdict, judge, rank
 from tormag_lab.thesis import page, table_2_5
 from tormag_lab.thesis.values import TABLE_2_5
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.inserts import INSERTS
 
 BRAKE = Brake.as_built(Elastomer(300e3, 3.8, 0.2))
 USE_CASE_1, USE_CASE_2 = Region(0.0, 0.0, 2.5, 1.0), Region(0.5, 0.25, 3.0, 1.0)

@@ -12,10 +12,10 @@ import pyarrow.parquet
 import pytest
 from distributed import LocalCluster
 
-from tormagd.commission.finding import Finding
-from tormagd.commission.sequence import Report
 from tormag_lab.consoles.summary import Console, Drift, Summary, consoles, files, read, read_all
 from tormag_lab.main import main
+from tormagd.commission.finding import Finding
+from tormagd.commission.sequence import Report
 from tormagd.record.ticks import TickBatch
 from tormagd.record.writer import RecordingWriter
 

@@ -9,12 +9,6 @@ import numpy as np
 import pytest
 from devices import drawn_device
 
-from tormagd.commission.procedure import Columns
-from tormagd.config import Config, Rates, load_config
-from tormagd.control.assembly.build import build_core
-from tormagd.control.records import TimedSetpoint
-from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
-from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
 from tormag_lab.errors import LabError
 from tormag_lab.main import main
 from tormag_lab.motor import command, fit, identification
@@ -24,6 +18,12 @@ from tormag_lab.twin.estimate import keys_of, value_at
 from tormag_lab.twin.excerpt import Excerpt, excerpt_of
 from tormag_lab.twin.fit import COMBINATIONS, twin_of
 from tormag_lab.twin.force import STRENGTH
+from tormagd.commission.procedure import Columns
+from tormagd.config import Config, Rates, load_config
+from tormagd.control.assembly.build import build_core
+from tormagd.control.records import TimedSetpoint
+from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
+from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
 from tormagd.record.telemetry import tick_record
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import RecordingWriter

@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tormag_lab.errors import LabError
+from tormag_lab.tactile import branches, experiment, held, models, report, shipped
+from tormag_lab.tactile.held import Case, hold
+from tormag_lab.tactile.models import QUICK
+from tormag_lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
+from tormag_lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
 from tormagd.element.model.model_file import load_model, model_path, save_model
 from tormagd.element.physics.errors import DomainError
-from tormag_lab.errors import LabError
-from tormag_lab.tactile import branches, experiment, held, models, report, shipped
-from tormag_lab.tactile.models import QUICK
-from tormag_lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
-from tormag_lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
 from tormagd.scenes.scene import scene_path
 from tormagd.simulation.tactile_pad import TactilePad, cycling_program, worked_pad
 
@@ -205,3 +206,18 @@ def test_a_pads_model_is_trained_and_taken_by_a_scene(tmp_path: Path) -> None:
     text = Path(scene_path("radial_pulse")).read_text().replace('"tactile_mre_c"', '"mine.safetensors"')
     (tmp_path / "scene.toml").write_text(text.replace('file = "radial_pulse.csv"', "bandwidth_hz = 0.1"))
     assert build_core(Config(scene=str(tmp_path / "scene.toml"))).model == model.fingerprint
+
+
+def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
+    within, without = (hold(Case("pad_1", remembers, False, 200.0, coarse=True)) for remembers in (True, False))
+    assert within["force_error"] < 0.01
+    assert not within["fault"]
+    assert without["last_force_error"] < -0.05
+
+
+def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
+    whole, coarse = (hold(Case("pad_1", False, False, 10.0, is_coarse)) for is_coarse in (False, True))
+    # friction lets the gap rest in different places; how the force falls from there is the same
+    fell, fell_coarse = (run["last_force_error"] - run["shares"][0] for run in (whole, coarse))
+    assert fell == pytest.approx(fell_coarse, abs=1e-4)
+    assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=2e-3)

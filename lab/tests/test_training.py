@@ -10,16 +10,6 @@ import pytest
 import torch
 from hypothesis import given, strategies as st
 
-from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
-from tormagd.element.model.displacement import MOBILISED_MM
-from tormagd.element.model.features import FIELD
-from tormagd.element.model.memory import NO_MEMORY, Memory
-from tormagd.element.model.model_file import load_model
-from tormagd.element.model.network import ForceNetwork
-from tormagd.element.physics.errors import DomainError
-from tormagd.element.physics.friction import Friction
-from tormagd.element.physics.inserts import insert
-from tormagd.element.physics.relaxation import PronySeries
 from tormag_lab.arrays import rms
 from tormag_lab.errors import LabError
 from tormag_lab.main import main
@@ -29,8 +19,10 @@ from tormag_lab.training.dataset import (
     ALLOWED,
     COLUMNS,
     Dataset,
+    fit_metrics,
     leave_cycles_out,
     leave_one_out,
+    not_rising_share,
     random_split,
     read_csv,
     write_csv,
@@ -40,6 +32,20 @@ from tormag_lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, f
 from tormag_lab.training.law import Law, fit_law, fit_law_model
 from tormag_lab.training.levenberg_marquardt import jacobian, train
 from tormag_lab.training.unremembered import identify
+from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import build_core
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.records import Handle, Measured
+from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.element.model.features import FIELD
+from tormagd.element.model.memory import NO_MEMORY, Memory
+from tormagd.element.model.model_file import ForceModel, load_model, model_path
+from tormagd.element.model.network import ForceNetwork
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.inserts import insert
+from tormagd.element.physics.relaxation import PronySeries
 
 HEADER = "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N"
 GOOD = "0.5,10,300,40,1.5"
@@ -530,3 +536,51 @@ def test_forces_held_out_are_not_looked_at(cycles: Dataset) -> None:
     spoiled = Dataset(cycles.features, np.where(known, cycles.force_N, 900.0), cycles.cycle, cycles.time_s)
     models = [fit_network(data, known, 5, epochs=3)[0].predict(cycles.features) for data in (cycles, spoiled)]
     assert models[0] == pytest.approx(models[1])
+
+
+def shipped(name: str) -> ForceModel:
+    return load_model(model_path(name, Path()), element="torque")
+
+
+def test_metrics_of_a_known_error() -> None:
+    model = shipped("torque_mre_50_40")
+    low, high = np.array(model.feature_ranges).T
+    rows = np.random.default_rng(3).uniform(low, high, (300, 4))
+    data = Dataset(rows, model.predict(rows) + np.where(np.arange(300) % 2, 0.5, -0.5))
+    r2 = 1 - 0.25 / np.var(data.force_N)
+    expected = {"mae_N": 0.5, "rmse_N": 0.5, "max_N": 0.5, "mae_percent": 50 / model.force_span_N, "r2": r2}
+    assert fit_metrics(model, data) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("name", ["torque_mre_50_40", "torque_mre_50"])
+def test_not_rising_counts_where_the_force_falls_with_the_field(name: str) -> None:
+    model = shipped(name)
+
+    def share(field_weights: list[float], bias: list[float]) -> float:
+        hidden, unused = model.metadata.hidden, model.metadata.hidden - 2
+        weight = np.zeros((hidden, 4))
+        weight[:2, FIELD] = field_weights
+        changed = {"hidden_weight": weight, "hidden_bias": np.array(bias + [0.0] * unused)}
+        return not_rising_share(replace(model, **changed, output_weight=np.ones(hidden)))
+
+    assert (share([1.0, 0.0], [0.0, 0.0]), share([-1.0, 0.0], [0.0, 0.0])) == (0, 1)
+    # a hill: rises in the lower half of the fields, falls in the upper
+    assert 0.3 < share([8.0, -8.0], [4.0, 4.0]) < 1.0
+
+
+def test_the_daemon_remembers_what_the_grey_box_does() -> None:
+    model = load_model(model_path("tactile_mre_c", Path()), element="tactile")
+    grey = GreyBox(model, model.metadata.memory.free, model.metadata.memory.added)
+    element = build_core(Config(scene="radial_pulse", rates=Rates(control_hz=500, inference_hz=83))).element
+    gap_range_mm = element.portrait.gap_mm[-1], element.portrait.gap_mm[0]
+    lab, memory = GreyBoxMemory(grey, 0.01), ElementMemory(element.memory, element.nominal, element.field, gap_range_mm)
+    memory.free, memory.added = element.memory.free.relaxed(0.0), element.memory.added.relaxed(0.0)
+    memory.field_mT, memory.time_s = 140.0, 0.0
+    draw = np.random.default_rng(4)
+    for step in range(1, 300):
+        place = min(0.01 * step, 2.0), 0.3, float(draw.uniform(140.0, 360.0))
+        expected_N = lab.advance(*place, 45.0)
+        at_mm, handle = element.field.gap_mm(place[2]) / 2.0, Handle(*place[:2], Turn(1.0, 0.0, 0.0))
+        seen = Measured(step, True, 0.0, at_mm, at_mm, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+        memory.update(0.01 * step, seen)
+        assert memory.force_N(element.nominal.now(seen)) == pytest.approx(expected_N, abs=1e-6)

@@ -7,9 +7,9 @@ from functools import partial
 import msgspec
 import pytest
 from bad_lines import BadSerialLine, losing
-from tormag_lab.training.bench_sweep import gap_plan
 
 from firmware_protocol.codec import DeviceMode
+from tormag_lab.training.bench_sweep import gap_plan
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault

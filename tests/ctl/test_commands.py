@@ -3,7 +3,6 @@ import math
 import re
 import subprocess
 import sys
-from importlib.resources import files
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -196,21 +195,6 @@ def test_a_scene_is_checked_as_the_daemon_does(ctl):
     waits_N, comes_s = zip(*result["approaches_s"], strict=True)
     assert list(waits_N) == sorted(waits_N)
     assert list(comes_s) == sorted(comes_s, reverse=True)
-
-
-def test_a_scene_is_checked_on_a_plant_of_ones_own(tmp_path, ctl, checked_here):
-    weak, sample = tmp_path / "weak.toml", files("tormagd.simulation") / "plants" / "sample_1.toml"
-    weak.write_text(sample.read_text().replace("kinetic_friction = 0.204", "kinetic_friction = 0.06"))
-    found = ctl("--json", "scene", "check", "pulse", "--plant", "sample_1").ended(0).result["on_plant"]
-    assert found["least_N"] < 0.8 < 4.5 < found["most_N"]
-    assert "on plant" in ctl("scene", "check", "pulse", "--plant", str(weak)).ended(1).err
-
-
-def test_a_package_that_a_check_on_a_plant_lacks_is_told_with_what_brings_it_alone(monkeypatch, ctl, checked_here):
-    monkeypatch.setitem(sys.modules, "clarabel", None)
-    error = ctl("--json", "scene", "check", "pulse", "--plant", "sample_1").ended(2).error
-    assert error["message"].endswith("tormag-lab bound: clarabel is not installed")
-    assert error["hint"] == "pip install 'tormagd[lab]'"
 
 
 def test_every_measured_way_is_shown_with_what_it_costs(ctl, checked_here):

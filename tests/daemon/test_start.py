@@ -15,8 +15,8 @@ from tormagd.ground import entry
 
 
 COMMANDS = {
-    "tormagd": "import tormagd.ground.entry; sys.exit(tormagd.ground.entry.daemon())",
-    "tormagctl": "import tormagd.ground.entry; sys.argv[1:] = ['status']; sys.exit(tormagd.ground.entry.ctl())",
+    "tormagd": "from tormagd.daemon.__main__ import command; sys.exit(command())",
+    "tormagctl": "from tormagd.ctl.__main__ import command; sys.argv[1:] = ['status']; sys.exit(command())",
     "simulation": "import runpy; sys.argv[1:] = ['--pty']; runpy.run_module('tormagd.simulation', run_name='__main__')",
 }
 SIGNALLED_AT = """

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from reference_pages import commands_page, configuration_page, keys, subparsers, tables
-from tormag_lab.pages import KEY, figures_of, stamp
 
 from firmware_protocol.conformance import __main__ as conformance
+from tormag_lab.pages import KEY, figures_of, stamp
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
 from tormagd.ctl.commands import COMMANDS

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.io import savemat
+
 from tormag_lab.main import main as lab
 from tormag_lab.training.dataset import Dataset, write_csv
 from tormag_lab.training.law import START
-
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
 from tormagd.ctl.main import main as ctl

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from benchmarks import inverse, latency, loop, step, virtual_time
 from benchmarks.inverse import ROOT
-from tormag_lab.told import lines
 
+from tormag_lab.told import lines
 from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG
 from tormagd.config import Config, RealTime, load_config
 from tormagd.control.assembly.build import build_core

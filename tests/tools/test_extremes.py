@@ -16,9 +16,9 @@ from judge.ends import Became, End, became, drawn_ends, ends, summed
 from judge.stage_table import stages
 from judge.stages import HOSTILE_STEPS, Draw, Row, Stage, tried
 from leaves import leaves
-from tormag_lab.design.force_law import radial_moment_for_force_Tm
 
 import tormagd.control
+from tormag_lab.design.force_law import radial_moment_for_force_Tm
 from tormagd.config import Position
 from tormagd.control.move.pid import Pid
 from tormagd.control.safety.codes import Limit

@@ -23,10 +23,10 @@ from judge.tracking import (
     step_figures,
     track,
 )
+
 from tormag_lab.arrays import rms
 from tormag_lab.human_pulse import pulse_profile
 from tormag_lab.training.dataset import not_rising_share
-
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
 from tormagd.simulation.parameters import load_plant

@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from tqdm import tqdm
+
 from tormag_lab.arrays import Array
 from tormag_lab.pages import figures_of, stamp, subplots, table
 from tormag_lab.training.dataset import Dataset
 from tormag_lab.training.fitting import fit_model
-from tqdm import tqdm
-
 from tormagd.control.nominal import FieldOfGap
 from tormagd.daemon.realtime import freeze_garbage
 from tormagd.element.inverse import ordered

@@ -19,9 +19,9 @@ import msgpack
 import numpy as np
 import zmq
 from machines.processes import received
-from tormag_lab.arrays import Array
 
 from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
+from tormag_lab.arrays import Array
 from tormagd.config import Config, RealTime
 from tormagd.daemon.endpoint import context
 from tormagd.daemon.realtime import prepare, priority_of_threads

@@ -33,12 +33,12 @@ import zmq
 from machines.host import processor_s
 from machines.own import own_machine
 from machines.processes import begun, first_line, is_linked, received
-from tormag_lab.arrays import Array
-from tormag_lab.pages import subplots
 
 from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compiler
+from tormag_lab.arrays import Array
+from tormag_lab.pages import subplots
 from tormagd.config import Config, RealTime, load_config
-from tormagd.ctl.scene import as_toml
+from tormagd.ctl.scene_check import as_toml
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads

@@ -16,9 +16,9 @@ from devices import device
 from judge import touching
 from judge.following import FILE_PREVIEW_S, armed, publisher, taught
 from judge.hands import swinging
+
 from tormag_lab.arrays import Array, rms
 from tormag_lab.executors import finished
-
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.scenes.scene import Bandwidth, Handle, Scene, Solver, load_scene, scene_path

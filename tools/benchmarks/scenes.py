@@ -18,11 +18,11 @@ from pathlib import Path
 
 import msgspec
 from devices import SAMPLES, SECOND
-from tormag_lab import executors
-from tormag_lab.arrays import Json
 
 from benchmarks import loop
 from benchmarks.scene_runs import OF_A_HANDLE, ROOT, SITUATIONS, Case, run_all
+from tormag_lab import executors
+from tormag_lab.arrays import Json
 from tormagd.config import RealTime
 from tormagd.control.assembly.build import choose_solver
 from tormagd.headroom.machine_loop import machine_us

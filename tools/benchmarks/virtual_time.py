@@ -19,13 +19,12 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from tormag_lab.training.bench_sweep import gap_plan
 
 from benchmarks.step import START_MM, STEP_MM
 from firmware_protocol.build import SWITCH, settle
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
-from tormagd.simulation.closed_loop import ClosedLoop, stream
+from tormagd.simulation.closed_loop import ClosedLoop, gap_plan, stream
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

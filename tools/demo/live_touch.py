@@ -18,9 +18,9 @@ from judge.touching import MASS_KG, Case, Touch, ideal, reached_ms
 from machines.host import HostWatch
 from machines.own import own_machine
 from machines.processes import end, first_line
-from tormag_lab.arrays import Json
 
 from demo.show import PUBLISHER_FIFO, RUN_DIR, Rig, enabled, ended, raise_fault, start, status, told_truth, watch
+from tormag_lab.arrays import Json
 from tormagd.simulation.hand import PRESSES_AT_S
 
 SCENE = Path(__file__).parents[2] / "examples" / "scenes" / "touch.toml"

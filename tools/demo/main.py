@@ -22,7 +22,6 @@ from typing import Any
 import msgspec
 from judge.following import Case, Rehearsals, Tracking, rehearse
 from judge.touching import Touch
-from tormag_lab.arrays import Array, Json
 
 from demo.live_touch import FELT_N, PUSH_MM_S, ROUND_TRIP_MS, Wall, felt, figures, lateness
 from demo.show import (
@@ -38,6 +37,7 @@ from demo.show import (
     show,
     staged,
 )
+from tormag_lab.arrays import Array, Json
 from tormagd.config import Config
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.parameters import PlantError, load_plant

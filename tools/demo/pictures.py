@@ -4,11 +4,11 @@ from pathlib import Path
 
 from judge.following import Followed, Rehearsals, tracking
 from judge.touching import Touch
-from tormag_lab.arrays import Array
-from tormag_lab.pages import stamp, subplots
 
 from demo.live_touch import FELT_N, HALF_S, PUSH_MM_S, ROUND_TRIP_MS, Wall, figures as touch_figures, lateness
 from demo.show import PULSE_START_S, Shown
+from tormag_lab.arrays import Array
+from tormag_lab.pages import stamp, subplots
 from tormagd.scenes.scene import Scene
 from tormagd.view.drawing import Axes
 

@@ -23,9 +23,9 @@ from judge.signals import with_approach
 from machines.host import Host, HostWatch, processor_s
 from machines.own import own_machine
 from machines.processes import begun, end, first_line, is_linked
+
 from tormag_lab.arrays import Array
 from tormag_lab.human_pulse import pulse_profile
-
 from tormagd.control.safety.codes import FAULTS, Fault
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd_client import Client, ClientError, UnreachableError

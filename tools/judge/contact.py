@@ -16,9 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from devices import SAMPLES, SECOND
-from tormag_lab.arrays import Json, Mask, rms
-from tormag_lab.pages import subplots
-from tormag_lab.told import lines
 
 from judge.frame import each
 from judge.touching import (
@@ -35,6 +32,9 @@ from judge.touching import (
     reached_ms,
     rendered,
 )
+from tormag_lab.arrays import Json, Mask, rms
+from tormag_lab.pages import subplots
+from tormag_lab.told import lines
 
 DEVICES = (*SAMPLES, "draw 100", "draw 103", SECOND)
 HANDS_N_MM = (0.1, 0.3, 1.0)

@@ -15,14 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 from devices import SAMPLES, SECOND, device, judging
-from tormag_lab.arrays import Array, Json, Mask
-from tormag_lab.ideal_carriage import TURNED_MM_S, brake_of
-from tormag_lab.pages import stamp, subplots
-from tormag_lab.told import lines
 
 from judge.following import VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
 from judge.frame import each
 from judge.hands import HANDS
+from tormag_lab.arrays import Array, Json, Mask
+from tormag_lab.ideal_carriage import TURNED_MM_S, brake_of
+from tormag_lab.pages import stamp, subplots
+from tormag_lab.told import lines
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Limit
 

@@ -14,13 +14,13 @@ import argparse
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from tormag_lab.arrays import Json
-from tormag_lab.told import table
 from tqdm import tqdm
 
 from firmware_protocol.codec import DeviceMode
 from judge.injections import FOLLOWED, HELD, HELD_OR_OPENS, LIMITED, MATRIX, OPENS, SERIAL, STAYS, Injection
 from judge.rig import OTHER_N, Rig
+from tormag_lab.arrays import Json
+from tormag_lab.told import table
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, RefusedError, next_commands
 from tormagd.daemon.arming import Arming

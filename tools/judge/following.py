@@ -7,10 +7,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from devices import device as device_of
-from tormag_lab.arrays import Array, rms
-from tormag_lab.ideal_actuator import ideal_stepper
 
 from judge.hands import Legs, WaitingHand
+from tormag_lab.arrays import Array, rms
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
@@ -20,6 +19,7 @@ from tormagd.simulation.closed_loop import ClosedLoop, stream
 from tormagd.simulation.device import FirmwareKind, VirtualDevice
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import Hand, parse_hand
+from tormagd.simulation.ideal_actuator import ideal_stepper
 from tormagd.simulation.parameters import PlantParameters
 
 Levels = list[tuple[float, float]]

@@ -13,9 +13,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, TypeVar
 
+from tqdm import tqdm
+
 from tormag_lab.arrays import Json
 from tormag_lab.told import lines
-from tqdm import tqdm
 
 Found = TypeVar("Found")
 

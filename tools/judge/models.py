@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from devices import SAMPLES, device
+
 from tormag_lab.arrays import Array, Json
 from tormag_lab.pages import table
 from tormag_lab.training.dataset import force_metrics, not_rising_share
-
 from tormagd.control.nominal import FieldOfGap
 from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.model_file import ForceModel, load_model, model_path

@@ -22,13 +22,13 @@ import mpmath as mp
 import numpy as np
 from digits import DIGITS, Batch, draw_batch, reference
 from numpy.typing import NDArray
-from tormag_lab.arrays import Array, Json, Mask
-from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 
 from judge.ends import became, drawn_ends, summed
 from judge.frame import count, each
 from judge.stage_table import stages
 from judge.stages import Row, tried
+from tormag_lab.arrays import Array, Json, Mask
+from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 from tormagd.element.physics.errors import FloatArray
 from tormagd.element.physics.field import ThesisFieldLaw
 from tormagd.element.physics.force import brake_force_N, max_radial_moment_Tm

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
+
 from tormag_lab.arrays import Array
 from tormag_lab.human_pulse import pulse_profile, recorded, scaled
 

@@ -16,8 +16,8 @@ import zmq
 from machines.own import own_machine
 from machines.processes import begun, end, first_line, received
 from machines.wire import carried
-from tormag_lab.arrays import Array
 
+from tormag_lab.arrays import Array
 from tormagd.config import load_config
 from tormagd.record.ticks import listening
 from tormagd_client import Client, ClientError

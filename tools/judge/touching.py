@@ -14,12 +14,11 @@ import msgspec
 import numpy as np
 from devices import device as device_of
 from msgspec import UNSET, UnsetType
-from tormag_lab.arrays import Array
-from tormag_lab.ideal_actuator import put_gap
-from tormag_lab.ideal_carriage import Brake, Drive, brake_of, drive_of
 
 from judge.following import VALID_S, armed
 from judge.hands import Legs, WaitingHand
+from tormag_lab.arrays import Array
+from tormag_lab.ideal_carriage import Brake, Drive, brake_of, drive_of
 from tormagd.config import Config, Rates
 from tormagd.control.ask.path import FLATTEST_N_MM, TIMES_S, nearest_path_mm
 from tormagd.control.assembly.build import Core, build_core
@@ -27,6 +26,7 @@ from tormagd.control.records import TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import FeltHand, Impedance
+from tormagd.simulation.ideal_actuator import put_gap
 from tormagd.simulation.parameters import with_insert
 from tormagd.simulation.patient import NetworkDelay
 from tormagd.simulation.plant import Plant, Truth

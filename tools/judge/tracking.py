@@ -15,9 +15,6 @@ from itertools import pairwise, product
 
 import numpy as np
 from devices import SAMPLES, device, judging
-from tormag_lab.arrays import Json
-from tormag_lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
-from tormag_lab.told import lines
 
 from judge.following import (
     FILE_PREVIEW_S,
@@ -42,6 +39,9 @@ from judge.signals import (
     recorded_signals,
     with_approach,
 )
+from tormag_lab.arrays import Json
+from tormag_lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
+from tormag_lab.told import lines
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
 from tormagd.control.assembly.profile import profile_of

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tormagd.ground.command_line import Within, number
 from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
@@ -29,31 +30,6 @@ class Command(NamedTuple):
 
 def option(*names: str, **settings: Any) -> Option:
     return names, settings
-
-
-def number(text: str) -> float:
-    """Parse a finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed is a finite number")
-    return value
-
-
-class Within(NamedTuple):
-    """Parses a number from `least` to `most`."""
-
-    least: float
-    most: float
-    unit: str = ""
-
-    def __call__(self, text: str) -> float:
-        value = number(text)
-        if not self.least <= value <= self.most:
-            raise argparse.ArgumentTypeError(f"{text}: allowed is {self.least:g}..{self.most:g}{self.unit}")
-        return value
 
 
 def port(text: str) -> int:
@@ -285,15 +261,14 @@ COMMANDS = {
         ),
     ),
     "calibrate": Command(
-        "guided: learn the device, sweep an insert into a model file, or log the motors",
+        "guided: learn the device, sweep an insert for tormag-lab calibrate, or log the motors",
         "calibrate.calibrate",
         ("config", "endpoints", "wait_s"),
         (
             option("--device", action="store_true", help="learn the device into its profile"),
             option("--insert", metavar="NAME", help="the fitted insert, such as MRE-50-40"),
             option("--motors", action="store_true", help="record a motor log instead"),
-            option("--out", type=Path, metavar="FILE", help="MODEL.safetensors, or LOG.csv"),
-            option("--csv", type=Path, metavar="FILE", help="also write the training data"),
+            option("--out", type=Path, metavar="FILE.csv", help="the sweeps, or the log"),
             option(
                 "--rates",
                 dest="rates_N_s",
@@ -302,7 +277,6 @@ COMMANDS = {
                 metavar="N/s,...",
                 help="at least three (0.1,0.2,0.4,0.2,0.1,0.4)",
             ),
-            option("--law", dest="by_law", action="store_true", help="fit the brake's law, without torch"),
             option("--side", choices=("left", "right"), default="left", help="motor to log (left)"),
             option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),
         ),
@@ -410,7 +384,6 @@ COMMANDS = {
             option(
                 "--out", "-o", type=Path, metavar="FILE.toml", help="check: write the scene served so to a new file"
             ),
-            option("--plant", metavar="P", help="check, new: simulated device, such as tormag-lab twin's"),
         ),
     ),
     "keys": Command(

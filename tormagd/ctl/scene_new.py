@@ -12,7 +12,7 @@ import msgspec
 
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ctl.scene import as_toml, check_scene
+from tormagd.ctl.scene_check import as_toml, check_scene
 from tormagd.ground.force_file import read_column, read_forces, stated_columns
 from tormagd.ground.table import TableError
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Scene
@@ -48,12 +48,12 @@ class Recorded(NamedTuple):
     tolerance_N: float | None = None
 
 
-def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | None = None) -> Outcome:
+def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
     force_file, told = _forces_of(out, recorded)
     try:
-        made = _proposed(out, force_file, recorded, config, plant)
+        made = _proposed(out, force_file, recorded, config)
     except CommandError:
         if force_file is not None and force_file != recorded.force:
             force_file.unlink()
@@ -64,9 +64,7 @@ def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | N
     return msgspec.structs.replace(made, result=made.result | {"read": told}, text=text)
 
 
-def _proposed(
-    out: Path, force_file: Path | None, recorded: Recorded, config: Path | None, plant: str | None
-) -> Outcome:
+def _proposed(out: Path, force_file: Path | None, recorded: Recorded, config: Path | None) -> Outcome:
     """Write the scene file `out` for the forces in `force_file`, or from a person's answers."""
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
     if recorded.tolerance_N is not None:
@@ -78,7 +76,7 @@ def _proposed(
         raise usage_error(
             f"no scene can be made of this: {error}", "tormagctl guide scenes says what each key asks"
         ) from error
-    insert, checked, unmet = _softest(out, tables, inserts, config, plant)
+    insert, checked, unmet = _softest(out, tables, inserts, config)
     found = {"file": str(out), "insert": insert, "unmet": unmet, "unmet_if_weak": []}
     if checked is None:
         said = f"{out} is written, with insert {insert}, and is NOT MET:\n" + "\n".join(unmet)
@@ -129,7 +127,7 @@ def _forces_of(out: Path, recorded: Recorded) -> tuple[Path | None, list[str]]:
 
 
 def _softest(
-    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None, plant: str | None
+    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None
 ) -> tuple[str, Outcome | None, list[str]]:
     """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all."""
     taken: dict[str, Outcome] = {}
@@ -137,7 +135,7 @@ def _softest(
     for insert in inserts:
         _write(out, tables, insert)
         try:
-            taken[insert] = check_scene(str(out), config, plant)
+            taken[insert] = check_scene(str(out), config)
         except CommandError as error:
             reason = error.message.removeprefix(f"scene {tables['name']}: ")
             # a machine too busy to say, or an unknown insert or model

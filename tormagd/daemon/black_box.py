@@ -27,9 +27,11 @@ from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import Beside
 from tormagd.hardware.connection import Connection
 from tormagd.record.journal import FORMAT, Journal, Packer
-from tormagd.record.keeper_messages import KEEPER, REQUEST, Begin, End, Part, Said, Write, Written
+from tormagd.record.keeper_messages import REQUEST, Begin, End, Part, Said, Write, Written
 from tormagd_client.messages import BlackBoxReport, TickRecord
 
+KEEPER = "tormagd.record.keeper"
+"The keeper's main module, with its socket's descriptor as the argument."
 PART_TICKS = 20
 "Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
 SNAPSHOT_S = 1.0

@@ -2,8 +2,6 @@
 
 import msgspec
 
-KEEPER = "tormagd.record.keeper"
-"The keeper's main module, with its socket's descriptor as the argument."
 REQUEST = "REQUEST"
 "Reason of a black box that somebody asked for; any other is a fault's."
 READ, WROTE = "read", "wrote"

@@ -265,3 +265,7 @@ def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callabl
         return TimedSetpoint(sent_N[sent - 1], sent_s[sent - 1], valid_for_s) if sent else None
 
     return newest
+
+
+def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())

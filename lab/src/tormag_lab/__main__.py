@@ -1,8 +1,11 @@
-"""`python -m tormag_lab`, as `tormag-lab`."""
+"""`tormag-lab`, as `python -m tormag_lab`."""
 
 import sys
+from functools import partial
 
-from tormag_lab.main import main
+from tormagd.ground.entry import run
+
+command = partial(run, "tormag_lab.main")
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())

@@ -14,10 +14,11 @@ class LabError(ValueError):
 def not_installed(module: str) -> str:
     """Return the sentence `PACKAGE is not installed: COMMAND` for a module."""
     package = PACKAGE_OF.get(module, module)
-    library = Path(__file__).resolve().parents[2]
-    if library.name == "tormagd" and not (library / "pyproject.toml").exists():  # packaged in a folder of its own
-        needed = next((line for line in requires("tormagd") or () if line.startswith(package)), package)
+    library = Path(__file__).resolve().parents[1]
+    if library.name == "tormagd":  # packaged in a folder of its own
+        lines = [*(requires("tormagd") or ()), *(requires("tormag-lab") or ())]
+        needed = next((line for line in lines if line.startswith(package)), package)
         command = f"sudo python3 -m pip install --target {library} '{needed.partition(';')[0]}'"
     else:
-        command = "pip install 'tormagd[lab]'"
+        command = "pip install 'tormag-lab[all]'"
     return f"{package} is not installed: {command}"

@@ -7,7 +7,8 @@ scenes' greatest. Steps are 1 ms or less.
 
 *Without delay*, a step knows the force at its end and how fast it changes. *With foresight*, the whole signal is known,
 and the RMS error is the least that the drive allows, to 2 %. Sequential quadratic programmes find it (Gauss-Newton,
-each solved by Clarabel); without the field's lag a search of everything agrees to 0.4 %.
+each solved by Clarabel); without the field's lag a search of everything agrees to 0.4 %. A scene's greatest force and
+tolerance are judged by these figures.
 """
 
 import argparse
@@ -19,13 +20,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from tormag_lab.arrays import Array, Json, rms
+from tormag_lab.errors import LabError
+from tormag_lab.main import Found
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.friction import Friction
 from tormagd.element.physics.relaxation import PronySeries
 from tormagd.ground.force_file import read_forces
-from tormag_lab.arrays import Array, Json, rms
-from tormag_lab.errors import LabError
-from tormag_lab.main import Found
+from tormagd.scenes.scene import Scene, load_scene, scene_path, shipped_scenes
+from tormagd.scenes.signal import asked
 from tormagd.simulation.curve import Curve
 from tormagd.simulation.gap_field import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PLANTS_INSERT, PlantParameters, SecondParameters, load_plant, with_insert
@@ -44,6 +47,8 @@ EXACT_N = 1e-6
 SECANT_MM_S = 5.0
 "A secant, as the limit has a kink at 0."
 MIN_BRAKING_MM_S2 = 50.0
+SIGNAL_S, SIGNAL_HZ = 5.0, 200
+"This much of a scene's signal is enough."
 
 
 GRID_MM = 2e-3
@@ -397,22 +402,47 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
+    parser.add_argument("force", metavar="FORCE.csv|SCENE", help="columns t_s,force_N; or a scene's file or name")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
-    parser.add_argument("--insert", default=PLANTS_INSERT, help=f"insert in it ({PLANTS_INSERT})")
+    parser.add_argument("--insert", help=f"insert in it (the scene's, or {PLANTS_INSERT})")
 
 
 def run(options: argparse.Namespace) -> Found:
-    table = read_forces(options.force).values
-    plant, time_s, force_N = load_plant(options.plant), np.array(table["time_s"]), np.array(table["force_N"])
-    plant = with_insert(plant, options.insert)
+    is_scene = options.force in shipped_scenes() or options.force.endswith(".toml")
+    scene = load_scene(options.force) if is_scene else None
+    if scene is None:
+        table, usual = read_forces(Path(options.force)).values, PLANTS_INSERT
+        time_s, force_N = np.array(table["time_s"]), np.array(table["force_N"])
+    else:
+        (time_s, force_N), usual = signal_of(scene, options.force), scene.insert.name
+    plant = with_insert(load_plant(options.plant), options.insert or usual)
     brake = brake_of(plant)
     most_N = brake.sliding_N(brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.lag.branch_Tm), TURNED_MM_S)
     try:
         figures = bound(plant, time_s, force_N).figures()
-        return Found({**figures, "least_N": brake.open_N(TURNED_MM_S), "most_N": most_N})
     except RuntimeError as error:
         raise LabError(str(error)) from error
+    found = {**figures, "least_N": brake.open_N(TURNED_MM_S), "most_N": most_N}
+    if scene is None:
+        return Found(found)
+    limits = (
+        ("force.most_N", scene.force.most_N, most_N),
+        ("force.tolerance_rms_N", -scene.force.tolerance_rms_N, -found["foresight_rms_N"]),
+    )
+    unmet = [
+        f"{name} = {abs(stated_N):.3g}: plant {options.plant} gives {abs(given_N):.3g}"
+        for name, stated_N, given_N in limits
+        if stated_N > given_N
+    ]
+    return Found(found | {"unmet": unmet}, exit_code=int(bool(unmet)))
+
+
+def signal_of(scene: Scene, name: str) -> tuple[Array, Array]:
+    """Return times, s, and forces, N: the scene's signal, or without one its range once up and down."""
+    least_N, most_N = scene.force.least_N, scene.force.most_N
+    if scene.signal is None:
+        return np.array([0.0, SIGNAL_S / 2.0, SIGNAL_S]), np.array([least_N, most_N, least_N])
+    return asked(scene.signal, Path(str(scene_path(name))).parent, (least_N, most_N), SIGNAL_S, SIGNAL_HZ)
 
 
 def _reached(

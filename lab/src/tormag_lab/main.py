@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from tormag_lab.errors import LabError, not_installed
+from tormag_lab.told import lines
 from tormagd import __version__
-from tormagd.ctl.commands import Within
 from tormagd.element.physics.errors import DomainError
+from tormagd.ground.command_line import Within
 from tormagd.ground.files import did_you_mean
 from tormagd.ground.table import TableError
 from tormagd.ground.terminal import write_answer, write_in_any_encoding, write_line
-from tormag_lab.errors import LabError, not_installed
-from tormag_lab.told import lines
 from tormagd.simulation.parameters import PlantError
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import in_short, printable
@@ -44,6 +44,7 @@ COMMANDS = {
     "optimise-design": ("design.command", "the brake's geometry for a task"),
     "bound": ("ideal_carriage", "what a device's ideal carriages miss of a force"),
     "bench-sweep": ("training.bench_sweep", "training data from the simulated device on a bench"),
+    "calibrate": ("training.calibration", "a model file from the sweeps of `tormagctl calibrate --insert`"),
     "import-data": ("training.import_data", "training data from measured CSV files of any columns, units and signs"),
     "train-model": ("training.train_model", "a model file from training data"),
     "tactile-model": ("tactile.shipped", "a model file of a simulated pad"),
@@ -106,7 +107,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
         command: Callable[[argparse.Namespace], Found] = module.run
         found = command(options)
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.startswith("tormagd"):
+        if error.name is None or error.name.startswith("tormag"):
             raise
         return _refuse(name, not_installed(error.name.partition(".")[0]))
     except OSError as error:

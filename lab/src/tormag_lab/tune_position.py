@@ -10,10 +10,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from tormagd.commission.gains import stiffest, tunings
-from tormagd.config import load_config
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
+from tormagd.commission.gains import stiffest, tunings
+from tormagd.config import load_config
 
 DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
 FILTER_TIMES_S = (0.002, 0.003, 0.004)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tormagd.element.physics.errors import require
 from tormag_lab.arrays import Array, Mask
 from tormag_lab.errors import LabError
 from tormag_lab.tables import read_columns
+from tormagd.element.physics.errors import require
 
 CYCLES = 4
 "Three conditioning cycles and the evaluated one."

@@ -15,13 +15,13 @@ import msgspec
 import pyarrow
 import pyarrow.parquet
 
-from tormagd.commission.sequence import Report
-from tormagd.ground.terminal import write_line
 from tormag_lab import executors
 from tormag_lab.consoles.summary import SUFFIX, Console, Drift, Summary, consoles, files, read_all
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
 from tormag_lab.told import table
+from tormagd.commission.sequence import Report
+from tormagd.ground.terminal import write_line
 from tormagd_client.printable import printable
 
 HEADINGS = (

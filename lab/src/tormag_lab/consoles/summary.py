@@ -14,9 +14,9 @@ import fsspec
 import msgspec
 import numpy as np
 
-from tormagd.commission.sequence import MAX_BYTES, Report
 from tormag_lab.arrays import rms
 from tormag_lab.executors import finished
+from tormagd.commission.sequence import MAX_BYTES, Report
 from tormagd.record.overview import Floats, Glance, OverviewBuilder
 from tormagd.record.reader import Seen, read_open
 

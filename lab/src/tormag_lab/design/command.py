@@ -9,11 +9,11 @@ import os
 import msgspec
 import numpy as np
 
-from tormagd.config import Position
 from tormag_lab import executors
 from tormag_lab.design.optimisation import Design, Problem, Run, coverage_as_made, sweep
 from tormag_lab.design.phase_portrait import Region
 from tormag_lab.main import GAP_SPEED, SEED, Found, whole, within
+from tormagd.config import Position
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

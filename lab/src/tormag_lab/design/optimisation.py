@@ -20,13 +20,13 @@ import msgspec
 import numpy as np
 from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differential_evolution, minimize
 
-from tormagd.element.physics.errors import DomainError
-from tormagd.element.physics.field import PowerFieldLaw
-from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 from tormag_lab.arrays import Array
 from tormag_lab.design.brake import Brake
 from tormag_lab.design.phase_portrait import PhasePortrait, Region
 from tormag_lab.executors import finished
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
 Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
 "Coverage by the trapezoid or the true boundary, or the thesis's cost."

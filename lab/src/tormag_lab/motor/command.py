@@ -14,13 +14,13 @@ from typing import Any
 
 import msgspec
 
-from tormagd.config import Config, Motor, load_config
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
 from tormag_lab.motor.fit import THINNED_HZ, fit_volts
 from tormag_lab.motor.identification import identify
 from tormag_lab.motor.log import Log, read_log
 from tormag_lab.pages import draw_beside
+from tormagd.config import Config, Motor, load_config
 
 VAGUE_SHARE = 0.5
 

@@ -18,10 +18,10 @@ import numpy as np
 from scipy.signal import butter, decimate, sosfiltfilt
 from scipy.stats import t as student
 
-from tormagd.commission.finding import solved
 from tormag_lab.arrays import Array
 from tormag_lab.errors import LabError
 from tormag_lab.motor.log import Log
+from tormagd.commission.finding import solved
 
 CUTOFF_HZ = 100.0
 THINNED_HZ = 40.0

@@ -17,14 +17,14 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
+from tormag_lab.errors import LabError
+from tormag_lab.main import WORKERS, Found, within
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import build_core
 from tormagd.control.move.watch import SENSOR_FAULT_S
 from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.element.model.displacement import Turn
-from tormag_lab.errors import LabError
-from tormag_lab.main import WORKERS, Found, within
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice

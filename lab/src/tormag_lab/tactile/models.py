@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from tormagd.element.model.features import CIP
-from tormagd.element.model.model_file import ForceModel
 from tormag_lab.arrays import Array, Mask
 from tormag_lab.tactile.pads import PADS, PadRecord, cyclic_records, holding_records
 from tormag_lab.training.dataset import (
@@ -21,6 +19,8 @@ from tormag_lab.training.dataset import (
 )
 from tormag_lab.training.fitting import fit_network
 from tormag_lab.training.grey_box import GreyBox, fit_grey_box
+from tormagd.element.model.features import CIP
+from tormagd.element.model.model_file import ForceModel
 from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, RATES_MM_S, TOUCHING_MM, worked_pad
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tormagd.element.model.features import FIELD
 from tormag_lab.arrays import Array, Json
 from tormag_lab.pages import subplots, table, write_page
 from tormag_lab.tactile.models import SCORED_SLOPE_N_MT, Trained
 from tormag_lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT
 from tormag_lab.training.dataset import Dataset
+from tormagd.element.model.features import FIELD
 from tormagd.view.drawing import Figure
 
 WAYS = {

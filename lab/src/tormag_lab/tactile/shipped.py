@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 import torch
 
-from tormagd.element.model.memory import Memory
-from tormagd.element.model.model_file import ForceModel, save_model
 from tormag_lab.main import Found
 from tormag_lab.tactile.models import FULL, Effort
 from tormag_lab.tactile.pads import cyclic_records, holding_records
 from tormag_lab.training.dataset import force_metrics, not_rising_share, random_split
 from tormag_lab.training.grey_box import fit_grey_box
+from tormagd.element.model.memory import Memory
+from tormagd.element.model.model_file import ForceModel, save_model
 from tormagd.simulation.parameters import PlantError, load_plant
 
 INSERT = "MRE-C"

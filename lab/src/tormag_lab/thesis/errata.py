@@ -4,9 +4,6 @@ import math
 
 import numpy as np
 
-from tormagd.element.physics.field import PowerFieldLaw, ThesisFieldLaw
-from tormagd.element.physics.force import MU0_H_M, TORMAG, Elastomer
-from tormagd.element.physics.inserts import INSERTS
 from tormag_lab.characterisation import constitutive
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormag_lab.design.force_law import stretch_minus_one
@@ -18,6 +15,9 @@ from tormag_lab.thesis.values import (
     TABLE_2_4_MEAN_PERCENT,
     USE_CASES,
 )
+from tormagd.element.physics.field import PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import MU0_H_M, TORMAG, Elastomer
+from tormagd.element.physics.inserts import INSERTS
 
 SAMPLE = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
 APPENDIX_MU_R = 3.8

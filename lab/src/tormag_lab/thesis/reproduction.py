@@ -11,9 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.element.physics.force import Elastomer
-from tormagd.element.physics.inserts import INSERTS, Insert, insert
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormag_lab.design.optimisation import Design, Outcome, Problem, Run, coverage, sweep
@@ -37,6 +34,9 @@ from tormag_lab.thesis.values import (
     USE_CASES,
 )
 from tormag_lab.told import table
+from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import Elastomer
+from tormagd.element.physics.inserts import INSERTS, Insert, insert
 
 CONTROLLER_SPEED_MM_S = 40.0
 "Two carriages at 150 rpm on 8 mm screws; a measured speed goes in with --gap-speed."

@@ -21,18 +21,17 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
-from tormagd.config import load_config
-from tormagd.control.core import Stepper
-from tormagd.control.nominal import FieldOfGap
-from tormagd.control.records import Plan
-from tormagd.element.model.displacement import MOBILISED_MM
-from tormagd.element.physics.field import PowerFieldLaw
-from tormagd.element.physics.inserts import insert
 from tormag_lab.arrays import Array, Mask
 from tormag_lab.main import SEED, Found
 from tormag_lab.training.dataset import Dataset, write_csv
+from tormagd.config import load_config
+from tormagd.control.core import Stepper
+from tormagd.control.nominal import FieldOfGap
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.inserts import insert
 from tormagd.scenes.scene import Scene, load_scene
-from tormagd.simulation.closed_loop import ClosedLoop
+from tormagd.simulation.closed_loop import ClosedLoop, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
@@ -231,10 +230,6 @@ def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
         start_right_mm=home_mm - 0.5,
     )
     return msgspec.structs.replace(plant, assumed=stops)
-
-
-def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
 
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:

@@ -1,19 +1,13 @@
-"""From a bench sweep to a model file: training rows, a fit on some sweeps, a judgement on the others, or a refusal.
+"""From the sweeps of `tormagctl calibrate --insert` to a model file, fitted on some and judged on the others.
 
-    python -m tormag_lab.training.calibration SWEEP.csv --insert NAME --out MODEL.safetensors [--csv TRAINING.csv]
-    python -m tormag_lab.training.calibration --insert NAME     only says whether a fit can be made of that insert
+tormag-lab calibrate SWEEPS.csv --insert MRE-50-40 --out MODEL.safetensors
 
-It is a process of its own, so that `tormagctl` carries no training. It prints one JSON object: `{"result": {...}}`, or
-`{"error": {"code", "message", "hint"}}` with exit code 1 and no model file.
+A sweep that teaches nothing, and a fit that is poor, are refused, and nothing is saved.
 """
 
 import argparse
 import datetime
-import importlib.util
-import json
 import math
-import sys
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,17 +16,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from tormag_lab.arrays import Array
+from tormag_lab.errors import LabError
+from tormag_lab.main import Found, within
+from tormag_lab.tables import read_columns
+from tormag_lab.training.dataset import ALLOWED, Dataset, fit_metrics, write_csv
 from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.element.model.features import FEATURES, FIELD, Element
 from tormagd.element.model.model_file import ForceModel, save_model
-from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.element.physics.inserts import Insert, insert
 from tormagd.ground.files import in_place_of
-from tormag_lab.arrays import Array
-from tormag_lab.errors import LabError, not_installed
-from tormag_lab.tables import read_columns
-from tormag_lab.training.dataset import ALLOWED, Dataset, fit_metrics, write_csv
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 "The handle's travel is at the roller; rate and force are positive in the direction of motion."
@@ -49,10 +43,6 @@ STEADY_MM_S = 10.0
 "A handle within this (5th to 95th percentile of its rate) teaches nothing about the rate."
 RARE_SHARE = 0.01
 
-NEEDED = ("torch", "tqdm")
-"Packages that a network needs, checked before anybody turns a handle."
-NEEDED_BY_LAW = ("scipy",)
-
 MIN_R2 = 0.97
 "R2 of the thesis's own network, table 4.1."
 MAX_MAE_SHARE = 0.02
@@ -60,14 +50,15 @@ MAX_MAE_SHARE = 0.02
 MAX_MAE_OVER_NOISE = 3.0
 MEAN_OVER_SIGMA = math.sqrt(2.0 / math.pi)
 "Mean absolute value of Gaussian noise over its standard deviation."
+RADIUS = within(1e-3, 100.0, "mm")
 
 
-class CalibrationError(ValueError):
+class CalibrationError(LabError):
     """A sweep that gives no model: a stable code, what was found beside what is needed, and what to do."""
 
     def __init__(self, code: str, message: str, hint: str) -> None:
-        super().__init__(message)
-        self.code, self.message, self.hint = code, message, hint
+        super().__init__(f"{code}: {message}; {hint}")
+        self.code = code
 
 
 def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
@@ -228,83 +219,33 @@ def require_rising(model: ForceModel) -> None:
         )
 
 
-def calibrate(
-    sweep: Path,
-    insert_name: str,
-    inner_radius_mm: float,
-    out: Path,
-    training_csv: Path | None,
-    created: datetime.date,
-    by_law: bool = False,
-) -> dict[str, Any]:
-    data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
-    require_usable(data)
-    model = fit(data, insert_name, created, by_law=by_law)
-    with nullcontext() if training_csv is None else in_place_of(training_csv) as beside:
-        if beside is not None:
-            write_csv(beside, data)
-        save_model(out, model)
-    return {
-        "model": str(out),
-        "csv": None if training_csv is None else str(training_csv),
-        "insert": insert_name,
-        "created": created.isoformat(),
-        "rows": len(data),
-        "ranges": data.ranges(),
-        "metrics": model.metadata.metrics,
-    }
-
-
-def read_sweep(path: Path) -> Array:
+def read_sweeps(path: Path) -> Array:
     return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED, is_exact=True).values()))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument(
-        "sweep", type=Path, nargs="?", metavar="SWEEP.csv", help=f"columns {','.join(COLUMNS)}; none: check the insert"
-    )
-    parser.add_argument("--insert", required=True)
-    parser.add_argument("--inner-radius-mm", type=float, default=4.0, help="where the field is stated (4)")
-    parser.add_argument("--out", type=Path, metavar="MODEL.safetensors", help="with a sweep")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("sweeps", type=Path, metavar="SWEEPS.csv", help=f"columns {','.join(COLUMNS)}")
+    parser.add_argument("--insert", required=True, help="the insert that was swept, such as MRE-50-40")
+    parser.add_argument("--inner-radius-mm", type=RADIUS, default=4.0, help="where the field is stated (4)")
+    parser.add_argument("--out", type=Path, required=True, metavar="MODEL.safetensors")
     parser.add_argument("--csv", type=Path, metavar="TRAINING.csv", help="write the training data too")
-    parser.add_argument("--law", dest="by_law", action="store_true", help="the law of the brake, no network")
-    options = parser.parse_args(arguments)
-    if (options.sweep is None) != (options.out is None):
-        parser.error("SWEEP.csv and --out go together")
-    try:
-        if options.sweep is None:
-            result: dict[str, Any] = {"insert": insert(options.insert).name}
-            for module in NEEDED_BY_LAW if options.by_law else NEEDED:
-                if importlib.util.find_spec(module) is None:
-                    raise ModuleNotFoundError(name=module)
-        else:
-            result = calibrate(
-                options.sweep,
-                options.insert,
-                options.inner_radius_mm,
-                options.out,
-                options.csv,
-                datetime.datetime.now(datetime.UTC).date(),
-                options.by_law,
-            )
-    except CalibrationError as error:
-        return _refuse(error.code, error.message, error.hint)
-    except (LabError, DomainError) as error:
-        return _refuse("data", str(error), "correct what is named and calibrate again")
-    except ModuleNotFoundError as error:
-        told, _, command = not_installed(error.name or "").partition(": ")
-        return _refuse("not_installed", told, command if options.by_law else f"{command}; or calibrate with --law")
-    except OSError as error:
-        return _refuse("file", f"{error.filename}: {error.strerror}", "give files in a directory you may write to")
-    print(json.dumps({"result": result}))
-    return 0
+    parser.add_argument("--law", action="store_true", help="fit the law of the brake, ten numbers, without torch")
 
 
-def _refuse(code: str, message: str, hint: str) -> int:
-    print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}))
-    return 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def run(options: argparse.Namespace) -> Found:
+    data = training_rows(read_sweeps(options.sweeps), insert(options.insert), options.inner_radius_mm)
+    require_usable(data)
+    model = fit(data, options.insert, datetime.date.today(), by_law=options.law)
+    with nullcontext() if options.csv is None else in_place_of(options.csv) as beside:
+        if beside is not None:
+            write_csv(beside, data)
+        save_model(options.out, model)
+    figures = {"model": str(options.out), "insert": options.insert, "rows": len(data), "ranges": data.ranges()}
+    metrics = model.metadata.metrics
+    told = (
+        f"{options.out}: {options.insert}, {len(data)} rows. On sweeps kept from the fit: R2 {metrics['judged_r2']:.4f}"
+        f", mean error {metrics['judged_mae_N'] * 1e3:.1f} mN (allowed {metrics['most_mae_N'] * 1e3:.1f}; the sensor's "
+        f"noise alone {metrics['noise_mae_N'] * 1e3:.1f} mN)",
+        "next: name the file as insert.model in a scene file of your own",
+    )
+    return Found(figures | {"metrics": metrics}, told)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from tormag_lab.arrays import Array, Mask
+from tormag_lab.training.dataset import Dataset, records, times_of
 from tormagd.element.model.features import FIELD, RATE
 from tormagd.element.model.model_file import ForceModel
 from tormagd.element.physics.relaxation import PronySeries
-from tormag_lab.arrays import Array, Mask
-from tormag_lab.training.dataset import Dataset, records, times_of
 
 START_TIMES_S = (1.0, 10.0, 100.0, 1000.0)
 START_FRACTION = 0.03

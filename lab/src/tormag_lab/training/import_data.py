@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tormagd.element.model.displacement import MOBILISED_MM
-from tormagd.ground.table import MIN_ROWS, QUANTITIES, Table, Wanted, read_table
 from tormag_lab.arrays import Array, Mask
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found, within
 from tormag_lab.pages import subplots
 from tormag_lab.training.dataset import ALLOWED, Dataset, records, write_csv
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.ground.table import MIN_ROWS, QUANTITIES, Table, Wanted, read_table
 
 MAX_FILE_BYTES = 1 << 28
 NEEDED, MOTION = ("force_N", "field_mT"), ("rate_mm_s", "time_s", "displacement_mm")

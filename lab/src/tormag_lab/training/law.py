@@ -20,6 +20,8 @@ from scipy.optimize import least_squares, minimize
 from scipy.special import expit
 from scipy.stats.qmc import Halton
 
+from tormag_lab.arrays import Array
+from tormag_lab.training.dataset import Dataset, trained_metrics
 from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.features import FEATURES, FIELD, RATE, Element
 from tormagd.element.model.memory import NO_MEMORY, Memory
@@ -28,8 +30,6 @@ from tormagd.element.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
 from tormagd.element.physics.errors import require_that
 from tormagd.element.physics.force import MU0_H_M, TORMAG
 from tormagd.element.physics.inserts import Insert, insert
-from tormag_lab.arrays import Array
-from tormag_lab.training.dataset import Dataset, trained_metrics
 
 MIDDLE_MT = 450.0
 REFERENCE_MM_S, SLOW_MM_S = 42.0, 0.1

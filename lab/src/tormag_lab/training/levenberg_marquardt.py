@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from tormag_lab.training.dataset import Dataset
 from tormagd.element.model.features import FIELD
 from tormagd.element.model.network import ForceNetwork
 from tormagd.element.physics.errors import DomainError
-from tormag_lab.training.dataset import Dataset
 
 BATCH_ROWS = 4096
 "10 MB of the Jacobian at 50 hidden units."

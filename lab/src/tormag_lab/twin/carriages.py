@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tormagd.commission.carriage_findings import SIDES
 from tormag_lab.arrays import Array, rms
 from tormag_lab.errors import LabError
 from tormag_lab.twin.estimate import Estimate, Prior, Values, estimated, named, value_at, with_values
 from tormag_lab.twin.excerpt import GRID_HZ, IDLE_A, Excerpt, Moves
+from tormagd.commission.carriage_findings import SIDES
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import pull_of_magnets_N
 

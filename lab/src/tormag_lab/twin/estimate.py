@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from tormagd.commission.finding import sandwich
 from tormag_lab.arrays import Array
+from tormagd.commission.finding import sandwich
 from tormagd.simulation.parameters import PlantParameters
 
 TOLD = 0.5

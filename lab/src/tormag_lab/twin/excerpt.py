@@ -10,9 +10,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from tormagd.commission.carriage_findings import SIDES, smooth, smoothed
 from tormag_lab.arrays import Array
 from tormag_lab.errors import LabError
+from tormagd.commission.carriage_findings import SIDES, smooth, smoothed
 from tormagd.record.reader import RecordingError, Seen, read_recording
 
 GRID_HZ = 100.0
