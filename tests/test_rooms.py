@@ -138,8 +138,9 @@ def test_a_planted_arrow_is_seen(here, planted, reached):
 
 
 def test_no_arrow_comes_back():
-    rooms, files = {name: set() for name in MAY_IMPORT}, {}
-    kinds = {"imports": set(), "starts": set()}
+    rooms: dict[str, set[str]] = {name: set() for name in MAY_IMPORT}
+    files: dict[str, set[str]] = {}
+    kinds: dict[str, set[tuple[str, str]]] = {"imports": set(), "starts": set()}
     known = {name: path for name, path in sources() if path.name != "__init__.py"}
     for name, path in known.items():
         ours = [each for each in arrows(path.read_text(encoding="utf-8")) if each.name.partition(".")[0] in PACKAGES]
@@ -150,7 +151,7 @@ def test_no_arrow_comes_back():
                 rooms[room(name)].add(other)
                 kinds[each.kind].add((room(name), other))
     list(TopologicalSorter(files).static_order())
-    floor = {}
+    floor: dict[str, int] = {}
     for name in TopologicalSorter(rooms).static_order():
         floor[name] = 1 + max((floor[there] for here, there in kinds["imports"] if here == name), default=0)
     for level in range(1, max(floor.values()) + 1):

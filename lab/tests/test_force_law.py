@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from extremes.cases import Batch, reference
+from digits import Batch, reference
 
 from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 from tormagd.element.physics.errors import DomainError

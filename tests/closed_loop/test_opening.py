@@ -9,12 +9,11 @@ import pytest
 from bad_lines import BadSerialLine, losing
 
 from firmware_protocol.codec import DeviceMode
-from tormag_lab.training.bench_sweep import gap_plan
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
 from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.closed_loop import ClosedLoop, Sample, VirtualBus
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, VirtualBus, gap_plan
 from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.firmware import Firmware

@@ -69,7 +69,7 @@ def test_a_signal_in_the_middle_of_loading_ends_a_command_without_a_word(
 def test_ctrl_c_between_loading_and_running_is_quiet_too(monkeypatch: pytest.MonkeyPatch):
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(daemon_main, "main", Mock(side_effect=KeyboardInterrupt))
-    assert entry.daemon() == entry.INTERRUPTED
+    assert entry.run("tormagd.daemon.main") == entry.INTERRUPTED
     assert signal.getsignal(signal.SIGINT) == before
 
 

@@ -12,10 +12,11 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from tormagd.daemon.black_box import KEEPER
 from tormagd.record import keeper
 from tormagd.record.black_box import is_tick, read_black_box
 from tormagd.record.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring, ring_paths
-from tormagd.record.keeper_messages import KEEPER, Begin, End, Part, Said, Write, Written
+from tormagd.record.keeper_messages import Begin, End, Part, Said, Write, Written
 
 PATIENCE_S = 60.0
 HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}

@@ -262,7 +262,7 @@ def _column(
         return f"{name!r} states no unit of {quantity} ({', '.join(known.units)})"
     if unit not in known.units:
         return f"{name!r} has the unit {unit!r}, and {quantity} is in {', '.join(known.units)}"
-    if said in known.units and known.units[said] != known.units[unit]:
+    if said and said in known.units and known.units[said] != known.units[unit]:
         return f"{name!r} is in {said} by its file, not in {unit}"
     return _Column(place, name, unit, known.units[unit])
 

@@ -209,8 +209,8 @@ def _turns(rate: Array) -> Mask:
     around = np.lib.stride_tricks.sliding_window_view(np.pad(speed, NEIGHBOURS, mode="edge"), 2 * NEIGHBOURS + 1)
     turned = back[1:] != back[:-1]
     beside = np.concatenate([turned, [False]]) | np.concatenate([[False], turned])
-    slow: Mask = speed <= QUIET * np.maximum(around.max(axis=1), np.median(speed))
-    return slow | beside
+    turning: Mask = beside | (speed <= QUIET * np.maximum(around.max(axis=1), np.median(speed)))
+    return turning
 
 
 def _motion(quantities: dict[str, Array], rate: Array, way: Array) -> list[str]:
