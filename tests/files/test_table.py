@@ -70,5 +70,5 @@ def test_a_scaled_column_needs_no_unit(tmp_path: Path) -> None:
     (tmp_path / "f.csv").write_text("'Elapsed time','PLETH'\n'seconds','NU'\n0,-0.5\n1,0.5\n")
     stated = {"force_N": "PLETH"}
     assert list(read_column(tmp_path / "f.csv", stated, has_unit=False).values["force_N"]) == [-0.5, 0.5]
-    with pytest.raises(TableError, match="'PLETH' has the unit 'NU', and force_N is in N"):
+    with pytest.raises(TableError, match="'PLETH' has the unit 'NU': force_N is in N"):
         read_column(tmp_path / "f.csv", stated, has_unit=True)

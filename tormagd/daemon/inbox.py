@@ -200,21 +200,19 @@ class SetpointInbox:
         is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
         others = (Limit.OTHER_SOURCE,) if is_contested else ()
         due_s = source.stamp_s + playout_s
-        sent_N = (setpoint.servo_cf, *(setpoint.preview_N or ()), setpoint.withdraw_cf or 0.0)
-        is_raised = min(sent_N) < 0.0
+        servo_cf, withdraw_cf, preview_N, is_raised = _from_zero(setpoint)
         source.raised += is_raised
-        servo_cf, *preview_N, withdraw_cf = (force_N if force_N > 0.0 else 0.0 for force_N in sent_N)
         timed = TimedSetpoint(
             servo_cf,
             due_s,
             setpoint.valid_for_ms * 1e-3 - playout_s,
             setpoint.displacement_mm,
             setpoint.rate_mm_s,
-            tuple(preview_N),
+            preview_N,
             (setpoint.preview_dt_ms or 0.0) * 1e-3,
             self._number,
             (*others, *source.found),
-            None if setpoint.withdraw_cf is None else withdraw_cf,
+            withdraw_cf,
             None if wall is None else Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
         )
         if playout_s > 0.0:
@@ -306,3 +304,12 @@ def _refuse_way(setpoint: Setpoint) -> None:
     for name in ("withdraw_cf", "contact"):
         if getattr(setpoint, name) is not None:
             raise MessageError(f"{name}: allowed is servo_cf alone, as the scene's element is a pad")
+
+
+def _from_zero(setpoint: Setpoint) -> tuple[float, float | None, tuple[float, ...], bool]:
+    """Return the forces of a setpoint, 0 for those around zero, and whether one was below it."""
+    withdraw, preview_N = setpoint.withdraw_cf, setpoint.preview_N or ()
+    is_raised = min((setpoint.servo_cf, withdraw or 0.0, *preview_N)) < 0.0
+    # 0.0 stands first: of 0.0 and -0.0, max takes the first
+    servo_cf, withdraw_cf = max(0.0, setpoint.servo_cf), None if withdraw is None else max(0.0, withdraw)
+    return servo_cf, withdraw_cf, tuple(max(0.0, force_N) for force_N in preview_N), is_raised

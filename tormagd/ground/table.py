@@ -111,7 +111,7 @@ def read_table(path: Path, wanted: Wanted, most_bytes: int) -> Table:
     try:
         header, columns, first = _header(path, rows, wanted, told)
         sample = [first, *itertools.islice(rows, SAMPLE)]
-        mark = _mark(path, [cells[it.place] for _, cells in sample for it in columns.values() if it.place < len(cells)])
+        mark = _mark(path, sample, {column.place for column in columns.values()})
         table = Table({name: array("d") for name in columns}, array("q"), {}, [], told)
         for line, cells in itertools.chain(sample, rows):
             _take(f"{path}: row {line}", line, cells, header, columns, mark, table)
@@ -121,13 +121,18 @@ def read_table(path: Path, wanted: Wanted, most_bytes: int) -> Table:
         lacks = f" (row {table.missing[0]} lacks one)" if table.missing else ""
         raise TableError(f"{path}: {len(table.rows)} rows with all values{lacks}: allowed is at least {MIN_ROWS}")
     table.taken.update({name: f"{column.name} ({column.unit})" for name, column in columns.items()})
-    told += [f"{name} is {it.factor:g} times {it.name!r}" for name, it in columns.items() if it.factor != 1.0]
+    told += [*_converted(header, columns), *(["its commas are decimal"] if mark == "," else [])]
+    return table
+
+
+def _converted(header: list[str], columns: Mapping[str, _Column]) -> Iterator[str]:
+    """Yield what becomes of the columns, unless they are taken as they are."""
+    for quantity, column in columns.items():
+        if column.factor != 1.0:
+            yield f"{quantity} is {column.factor:g} times {column.name!r}"
     places = {column.place for column in columns.values()}
     if others := [name for place, name in enumerate(header) if name and place not in places]:
-        told.append(f"columns that are left out: {', '.join(others)[:200]}")
-    if mark == ",":
-        told.append("its commas are decimal")
-    return table
+        yield f"columns that are left out: {', '.join(others)[:200]}"
 
 
 def _text(path: Path, most_bytes: int) -> tuple[str, list[str]]:
@@ -165,7 +170,7 @@ def _delimiter(lines: list[str]) -> str:
 
     def numbers(delimiter: str, line: str) -> int:
         cells = line.split() if delimiter == " " else next(csv.reader([line], delimiter=delimiter), [])
-        return sum(_NUMERIC.fullmatch(cell.strip()) is not None for cell in cells)
+        return sum(_is_numeric(cell.strip()) for cell in cells)
 
     shown = {delimiter: sum(numbers(delimiter, line) > 1 for line in lines) for delimiter in ";\t| ,"}
     best = max(shown, key=shown.__getitem__)
@@ -176,23 +181,27 @@ def _header(
     path: Path, rows: _Rows, wanted: Wanted, told: list[str]
 ) -> tuple[list[str], dict[str, _Column], tuple[int, list[str]]]:
     """Take rows until numbers stand below two wanted names; return the names, their columns and the first numbers."""
-    above: list[tuple[int, list[str]]] = []
+    above: list[tuple[int, list[str]]] = [(0, [])]
     nearest: tuple[list[str], list[str], list[str]] | None = None
     most, enough = -1, min(2, len(wanted.needed))
     for line, cells in itertools.islice(rows, SAMPLE):
-        is_numeric = any(map(_NUMERIC.fullmatch, cells)) and not cells[0].startswith(COMMENT)
-        for (at, header), units in ((above[-1], []), (above[0], above[-1][1])) if above and is_numeric else ():
-            found = sum(bool(_places(header, name, wanted)) for name in (*wanted.needed, *wanted.optional))
+        is_below = any(map(_is_numeric, cells)) > cells[0].startswith(COMMENT)
+        for (at, header), units in ((above[-1], []), (above[0], above[-1][1])) if is_below else ():
+            found = len([name for name in {**wanted.needed, **wanted.optional} if _places(header, name, wanted)])
             if found >= enough:
-                told += [f"{at - 1} rows above the names are left out"] if at > 1 else []
+                told += [f"{at - 1} rows above the names are left out"][: at - 1]
                 return header, _columns(path, header, units, cells, wanted), (line, cells)
-            if found > most and len(header) > 1 and not any(map(_NUMERIC.fullmatch, header)):
+            if found > most and len(header) > sum(map(_is_numeric, header)) + 1:
                 nearest, most = (header, units, cells), found
         above = [*above[-1:], (line, [cell.lstrip("#% ") for cell in cells])]
     if nearest is not None:
         _columns(path, *nearest, wanted)
     names = ",".join(wanted.needed)
     raise TableError(f"{path}: no numbers stand right below a row of names: allowed is such a row, as {names}")
+
+
+def _is_numeric(cell: str) -> bool:
+    return _NUMERIC.fullmatch(cell) is not None
 
 
 def _split(cell: str) -> tuple[str, str | None]:
@@ -254,21 +263,24 @@ def _column(
     name, text = header[place], wanted.stated.get(quantity, "")
     if not known.units:
         return _Column(place, name, "as it is", 1.0)
-    said = _split(name)[1] or _unit("".join(units[place : place + 1]))
+    said = _split(name)[1] or _unit("".join(units[place : place + 1])) or _clock("".join(first[place : place + 1]))
     stated = _unit(text.rpartition(":")[2]) if ":" in text and text != name else None
-    is_clock = CLOCK in known.units and _TIME_OF_DAY.fullmatch("".join(first[place : place + 1]))
-    unit = stated or said or (CLOCK if is_clock else None)
-    if unit is None:
-        return f"{name!r} states no unit of {quantity} ({', '.join(known.units)})"
-    if unit not in known.units:
-        return f"{name!r} has the unit {unit!r}, and {quantity} is in {', '.join(known.units)}"
-    if said and said in known.units and known.units[said] != known.units[unit]:
+    unit = stated or said or ""
+    if (factor := known.units.get(unit)) is None:
+        what = f"has the unit {unit!r}" if unit else "states no unit"
+        return f"{name!r} {what}: {quantity} is in {', '.join(known.units)}"
+    if known.units.get(said or "", factor) != factor:
         return f"{name!r} is in {said} by its file, not in {unit}"
-    return _Column(place, name, unit, known.units[unit])
+    return _Column(place, name, unit, factor)
 
 
-def _mark(path: Path, cells: list[str]) -> str:
+def _clock(text: str) -> str | None:
+    return CLOCK if _TIME_OF_DAY.fullmatch(text) else None
+
+
+def _mark(path: Path, rows: list[tuple[int, list[str]]], places: set[int]) -> str:
     """Return the decimal mark of a table's numbers, and "" where no number shows which it is."""
+    cells = [cell for _, row in rows for place, cell in enumerate(row) if place in places]
     proofs = {mark: next(filter(_PROOF[mark].fullmatch, cells), None) for mark in ".,"}
     if proofs["."] and proofs[","]:
         raise TableError(
@@ -288,9 +300,7 @@ def _take(
     """Append a row's values, or its number if one is missing."""
     if cells[0].startswith(COMMENT):
         return
-    if len(cells) <= max(column.place for column in columns.values()) or any(cells[len(header) :]):
-        hint = "; decimal commas need ; or tab between the values" if len(cells) > len(header) else ""
-        raise TableError(f"{where} has {len(cells)} values: allowed is {len(header)}{hint}")
+    _require_width(where, cells, len(header), max(column.place for column in columns.values()))
     if any(cells[column.place].lower() in ABSENT for column in columns.values()):
         table.missing.append(line)
         return
@@ -301,6 +311,13 @@ def _take(
             raise TableError(f"{where}, {column.name} = {text[:40]!r}: allowed is a finite number")
         table.values[quantity].append(value)
     table.rows.append(line)
+
+
+def _require_width(where: str, cells: list[str], width: int, last: int) -> None:
+    """Refuse a row that ends before the `last` place, or has values without a name."""
+    if len(cells) <= last or any(cells[width:]):
+        hint = "; decimal commas need ; or tab between the values" if len(cells) > width else ""
+        raise TableError(f"{where} has {len(cells)} values: allowed is {width}{hint}")
 
 
 def _number(text: str, mark: str) -> float:

@@ -132,9 +132,13 @@ def _read(path: Path, stated: Mapping[str, str]) -> Table:
     optional = {name: each for name, each in QUANTITIES.items() if name not in needed}
     option = {name: f"--column {name}=" for name in QUANTITIES}
     table = read_table(path, Wanted(needed, optional, stated, option), MAX_FILE_BYTES)
-    time_s, cycle = table.values.get("time_s"), table.values.get("cycle")
-    if time_s is None:
-        return table
+    if "time_s" in table.values:
+        _require_rising(path, table)
+    return table
+
+
+def _require_rising(path: Path, table: Table) -> None:
+    time_s, cycle = table.values["time_s"], table.values.get("cycle")
     for place in range(1, len(table.rows)):
         if time_s[place] < time_s[place - 1] and (cycle is None or cycle[place] == cycle[place - 1]):
             raise LabError(
@@ -143,7 +147,6 @@ def _read(path: Path, stated: Mapping[str, str]) -> Table:
             )
     if min(rows.stop - rows.start for rows in records(np.array(time_s))) < MIN_ROWS:
         raise LabError(f"{path}: a cycle of one row; at least {MIN_ROWS} are needed")
-    return table
 
 
 def _without_duplicates(quantities: Mapping[str, Array]) -> tuple[dict[str, Array], int]:
