@@ -38,7 +38,7 @@ COMMAND = re.compile(
 )
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^(?: {4}| {8})(\S.*)$", re.MULTILINE)
-IMPORTED = re.compile(r"^from (\w+) import (\w+)$", re.MULTILINE)
+IMPORTED = re.compile(r"^from (\w+)(?:\.| import )(\w+)", re.MULTILINE)
 LAB = importlib.import_module("tormag_lab.main") if importlib.util.find_spec("tormag_lab") else None
 DECISION = ["Question", "Decision", "Why", "Given up"]
 

@@ -245,3 +245,9 @@ def test_a_result_is_told_by_lines_and_tables() -> None:
         "rate_hz 999.3", "lateness_us p50 44, p99 900", "against ratio p50 1.5",
         "variants", "name p50_us more RATE", "a 1.25", "long 10 0.5", "cpus 0, 1",
     ]  # fmt: skip
+
+
+def test_only_a_checkout_can_be_measured_against(tmp_path: Path):
+    assert loop.checkout(str(ROOT)) == ROOT
+    with pytest.raises(argparse.ArgumentTypeError, match="allowed is the root of a checkout"):
+        loop.checkout(str(tmp_path))

@@ -40,6 +40,8 @@ def test_without_a_name_every_case_is_measured(monkeypatch: pytest.MonkeyPatch, 
     module, options = parsed("judge", {"tracking": ""}, ["tracking", "--json", *named])
     assert told(module, options, module.measure(options)) == 0
     assert tuple(json.loads(capsys.readouterr().out)) == measured
+    assert told(module, options, {"passed": False, "missed": ["a bound"]}) == 1
+    assert capsys.readouterr().err == "missed: a bound\n"
 
 
 def course(*errors: tuple[float, float, float]) -> Followed:
