@@ -29,7 +29,7 @@ from tormagd.ctl import (
 )
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, agree, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
-from tormagd.ctl.calibrate_run import Progress, Range
+from tormagd.ctl.calibrate_run import Progress, Range, armed
 from tormagd.ctl.outcome import CommandError
 from tormagd.element.model.displacement import MOVING_MM_S, Turn
 from tormagd.element.model.model_file import ForceModel, load_model, model_path
@@ -41,6 +41,8 @@ from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
+from tormagd_client import Client, ClientError
+from tormagd_client.endpoints import in_folder
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)
@@ -213,6 +215,15 @@ def test_displacement_is_what_the_daemon_calls_it():
     known = np.isfinite(found)
     assert known[500:].all()
     assert found[known] == pytest.approx(np.array(expected)[known])
+
+
+def test_a_device_that_is_not_homed_is_homed_first(fake_daemon):
+    fake_daemon.says(is_homed=False)
+    fake_daemon.refuse("home", "busy")
+    endpoints = in_folder(str(fake_daemon.directory))
+    with Client(endpoints, 20.0) as client, pytest.raises(ClientError, match="cannot home"):
+        armed(endpoints, client, 1.0).__enter__()
+    assert [command for command in fake_daemon.commands if command != "status"] == ["home", "disable"]
 
 
 def test_what_ctl_may_not_import_is_equal():
