@@ -21,9 +21,11 @@ from tormagd.ctl import (
 )
 from tormagd.ctl.calibrate import COLUMNS, SWEEP_COLUMNS, agree, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
-from tormagd.ctl.calibrate_run import Progress
+from tormagd.ctl.calibrate_run import Progress, armed
 from tormagd.ctl.outcome import CommandError
 from tormagd.element.model.displacement import MOVING_MM_S
+from tormagd_client import Client, ClientError
+from tormagd_client.endpoints import in_folder
 
 INSERT = "MRE-50-40"
 

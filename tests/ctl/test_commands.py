@@ -345,6 +345,8 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
         ("followed  to 136 mN RMS, 44 mN with a delay of 180 ms taken out",),
         (),
     ),
+    "how old the search is": ({"search_age_ms": 12.0}, ("field     of a search 12 ms ago",), ()),
+    "nothing of a search where there was none": ({"search_age_ms": None}, (), ("of a search",)),
     "a compiled core": ({"build": "compiled"}, ("core      compiled",), (COST, REMEDY)),
     "what an interpreted core costs": (
         {"build": "interpreted: no C compiler"},

@@ -11,7 +11,7 @@ from tormagd.ctl.outcome import CommandError
 from tormagd.ctl.watch import held_back
 from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
 from tormagd.ground.table import TableError
-from tormagd_client.messages import Setpoint, Status
+from tormagd_client.messages import MAX_PREVIEW_SAMPLES, Setpoint, Status
 
 
 @pytest.fixture
@@ -36,6 +36,7 @@ def file(tmp_path):
 def test_every_setpoint_arrives_from_the_first_on(published):
     result, arrived = published("ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
     assert result["sent"] + result["skipped"] == 61
+    assert 0.0 <= result["worst_late_ms"] <= 1e3 * result["seconds"]
     assert (len(arrived), arrived[0].servo_cf, arrived[-1].servo_cf) == (result["sent"], 1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
     # the force belongs to the setpoint's own deadline
@@ -55,13 +56,15 @@ def test_a_second_run_of_the_same_source_is_newer(published):
     assert {(s.source, s.valid_for_ms) for s in arrived} == {("me", 70.0)}
 
 
-def test_a_preview_is_what_will_be_sent(published):
-    _, arrived = published("sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")
-    forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
+@pytest.mark.parametrize(("rate_hz", "preview_ms", "count"), [(100, 50, 5), (320, 800, MAX_PREVIEW_SAMPLES)])
+def test_a_preview_is_what_will_be_sent(published, rate_hz, preview_ms, count):
+    options = ("--duration", "0.2", "--rate", str(rate_hz), "--preview-ms", str(preview_ms))
+    _, arrived = published("sine", *options)
+    forces = {round(rate_hz * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
     for setpoint in arrived:
-        assert (len(setpoint.preview_N), setpoint.preview_dt_ms) == (5, 10.0)
+        assert (len(setpoint.preview_N), setpoint.preview_dt_ms) == (count, 1e3 / rate_hz)
         for after, force in enumerate(setpoint.preview_N, start=1):
-            later = min(round(100.0 * after_s(setpoint, arrived[0])) + after, 20)
+            later = min(round(rate_hz * after_s(setpoint, arrived[0])) + after, 0.2 * rate_hz)
             assert force == pytest.approx(forces.get(later, force), abs=1e-9)
 
 

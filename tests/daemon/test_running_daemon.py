@@ -226,11 +226,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
 
 
 @pytest.fixture
-def running(clock: Clock, core: Core, tmp_path: Path) -> Iterator[Running]:
+def running(clock: Clock, core: Core, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    told: list[str] = []
+    monkeypatch.setattr(daemon_module, "notify", told.append)
     with asyncio.Runner() as runner:
         made = Running(runner, clock, core, tmp_path)
         yield made
         made.end()
+    assert told == ["STOPPING=1"]
 
 
 @pytest.fixture
