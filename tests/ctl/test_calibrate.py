@@ -234,3 +234,12 @@ def test_who_ends_the_input_has_not_agreed_that_anything_moves(monkeypatch, term
     agree()
     with pytest.raises(CommandError, match="nobody agreed"):
         agree()
+
+
+def test_a_device_that_is_not_homed_is_homed_first(fake_daemon):
+    fake_daemon.says(is_homed=False)
+    fake_daemon.refuse("home", "busy")
+    endpoints = in_folder(str(fake_daemon.directory))
+    with Client(endpoints, 20.0) as client, pytest.raises(ClientError, match="cannot home"):
+        armed(endpoints, client, 1.0).__enter__()
+    assert [command for command in fake_daemon.commands if command != "status"] == ["home", "disable"]
