@@ -188,7 +188,7 @@ $(VENV)/.demo: pyproject.toml client/pyproject.toml lab/pyproject.toml setup.py 
 	touch $@
 
 $(VENV)/.man: pyproject.toml client/pyproject.toml lab/pyproject.toml setup.py | $(BIN)/python
-	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6' 'shtab>=1.5.5'
+	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6' 'shtab>=1.7'
 	touch $@
 
 $(VENV)/.dev: pyproject.toml client/pyproject.toml lab/pyproject.toml setup.py | $(BIN)/python

@@ -45,7 +45,7 @@ Version: $version
 Architecture: $(dpkg --print-architecture)
 Maintainer: $maintainer
 Installed-Size: $(du -sk "$root" | cut -f1)
-Depends: libc6, libgcc-s1, python3 (>= $abi), python3 (<< $next), systemd, passwd, procps, $(packages can lz4 msgpack numpy serial shtab uvloop zmq zstandard)
+Depends: libc6, libgcc-s1, python3 (>= $abi), python3 (<< $next), systemd, passwd, procps, $(packages lz4 msgpack numpy packaging serial typing-extensions uvloop wrapt zmq zstandard)
 Recommends: $(packages aiohttp matplotlib prometheus-client rich scipy tqdm)
 Section: science
 Priority: optional

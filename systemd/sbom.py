@@ -1,6 +1,6 @@
 """Prints what LIBRARY has inside, as CycloneDX: python -P systemd/sbom.py LIBRARY PAGE.
 
-PAGE is the dashboard's folder, whose script names its own version. A wheel with compiled crates brings their list.
+PAGE is the dashboard's folder, whose script names its version. A compiled wheel brings the list of its crates itself.
 """
 
 import json

@@ -14,7 +14,7 @@ import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import msgspec
 import pytest
@@ -43,7 +43,7 @@ PORTRAIT = {"force_N": [0.5, 1.0, 3.0], "rate_N_s": [1.0, 2.0, 8.0]}
 SECONDS = 30.0
 COLUMNS: tuple[str, ...] = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm")
 COLUMNS += ("reference_gap_mm", "field_mT", "operating_state", "limits", "faults", "lateness_us")
-Browser: TypeAlias = "TestClient[Any, Any]"  # aiohttp before 3.9 has no parameters here
+Browser = TestClient[Any, Any]
 
 
 def tick(k: int) -> tuple[Any, ...]:
