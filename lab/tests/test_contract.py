@@ -92,8 +92,8 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
     *(
         (("bound", "given", *more), FORCES + text, reason)
         for text, more, reason in (
-            ("1,nan\n2,1\n", (), "row 3, force_N = 'nan'"),
-            ("1,1\n1,1\n", (), "row 4, t_s = 1"),
+            ("1,nan\n2,1\n", (), "row 3 lacks a value"),
+            ("1,1\n1,1\n", (), "row 4, time_s = 1"),
             ("1,1\n1e4,1\n", (), "t_s = 0.0 .. 10000.0"),
             ("1,1\n2,1\n", ("--plant", "sample_9"), "sample_9"),
         )

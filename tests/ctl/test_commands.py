@@ -346,7 +346,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
         (),
     ),
     "how old the search is": ({"search_age_ms": 12.0}, ("field     of a search 12 ms ago",), ()),
-    "nothing of a search where there was none": ({"search_age_ms": None}, (), ("of a search",)),
+    "nothing of a search where there was none": ({"search_age_ms": 0.0}, (), ("of a search",)),
     "a compiled core": ({"build": "compiled"}, ("core      compiled",), (COST, REMEDY)),
     "what an interpreted core costs": (
         {"build": "interpreted: no C compiler"},

@@ -145,7 +145,9 @@ def test_every_decision_has_the_same_four_parts(page):
     assert re.findall(r"^## (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE) == DECISION
 
 
-SOURCES = sorted(file for room in ("tormagd", "firmware_protocol", "client") for file in (ROOT / room).rglob("*.py"))
+SOURCES = sorted(
+    file for room in ("tormagd", "firmware_protocol", "client/src") for file in (ROOT / room).rglob("*.py")
+)
 NAMED = re.compile(r"\b(tormagctl(?: --?[\w-]+)*|tormag-lab|python -m|python|make) ([a-z][\w./-]*)|\b(tools/\w+\.py)")
 TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 PROSE = ("of", "are")

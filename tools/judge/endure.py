@@ -190,9 +190,8 @@ class Stop(NamedTuple):
 def stalled(stand: Stand, count: int, seed: int) -> Figures:
     """Stop daemon or device for some milliseconds while force is held.
 
-    A stop's true length is measured and decides, because a busy machine makes it longer. Below the device's own timeout
-    of 50 ms nothing may latch, and the plant's force must stay within 0.1 N. From 60 ms on the gap must be open in the
-    end, and one fault must say what happened.
+    A stop's measured length decides. Below the device's timeout of 50 ms nothing may latch, and the force must stay
+    within 0.1 N. From 60 ms on the gap must be open in the end, and one fault must say what happened.
     """
     draw = random.Random(seed)
     stops: list[Stop] = []

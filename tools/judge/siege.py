@@ -52,7 +52,7 @@ NO_SETPOINT: dict[str, tuple[Any, ...]] = {
     "source": ("", "x" * 65, "\x1b[2J", "a\nb", "\u202e"),
     "seq": (-1, 2**63, 2**64 - 1, 1.5),
     "stamp_ns": (-1, 2**63, 2**64 - 1),
-    "servo_cf": (*NO_NUMBERS, -1e-9, -1.0, 1_001.0, 1e308),
+    "servo_cf": (*NO_NUMBERS, -0.006, -1.0, 1_001.0, 1e308),
     "valid_for_ms": (*NO_NUMBERS, 0.0, -1.0, 60_001.0),
     "displacement_mm": (*NO_NUMBERS, -0.1, 2.1),
     "rate_mm_s": (*NO_NUMBERS, -301.0, 301.0),

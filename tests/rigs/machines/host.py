@@ -92,9 +92,10 @@ class Host(NamedTuple):
 
 class HostWatch:
     def __init__(self, fifo_priority: int, log: IO[str]) -> None:
-        command = [sys.executable, str(Path(__file__).with_name("bare_timer.py")), "--fifo", str(fifo_priority)]
+        command = [sys.executable, "-m", "machines.bare_timer", "--fifo", str(fifo_priority)]
+        there = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
         self._timers = [
-            subprocess.Popen([*command, "--cpu", str(cpu)], stdout=subprocess.PIPE, stderr=log, text=True)
+            subprocess.Popen([*command, "--cpu", str(cpu)], stdout=subprocess.PIPE, stderr=log, env=there, text=True)
             for cpu in sorted(os.sched_getaffinity(0))[:MAX_TIMERS]
         ]
         self._stalls: list[list[Stall]] = []
