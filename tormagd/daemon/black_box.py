@@ -84,7 +84,7 @@ class BlackBox:
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
             self._start(self._begun)
-        self.journal.is_kept = self._beside is not None
+        self.journal.is_kept = not self._refusal
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._connection: Connection | None = None
