@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def components(library: str, page: Path) -> list[dict[str, str]]:
-    inside = [("pypi", found.name, found.version) for found in distributions(path=[library])]
+    inside = [("pypi", found.name, found.version) for found in distributions(path=[library]) if found.name]
     drawing = re.search(r"\(v([\d.]+)\)", (page / "vendor/uPlot.iife.min.js").read_text(encoding="utf-8"))
     assert drawing is not None
     return [
