@@ -130,7 +130,7 @@ def test_a_room_imports_and_starts_only_what_it_may():
         ("ctl", 'answer_of("tormag_lab.main", words, 1.0)', ("starts", "lab")),
         ("ctl", 'os.system("python3 -P -m tormag_lab.main bound")', ("starts", "lab")),
         ("daemon", 'subprocess.run(["tormag-lab", "twin"])', ("starts", "lab")),
-        ("daemon", 'Beside("tormagd.simulation")', ("starts", "simulation")),
+        ("daemon", 'ChildProcess("tormagd.simulation")', ("starts", "simulation")),
     ],
 )
 def test_a_planted_arrow_is_seen(here, planted, reached):

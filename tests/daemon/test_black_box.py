@@ -43,7 +43,7 @@ class Rig:
         self.process = Mock()
         self.stepper, self.planner = core.stepper(), core.planner()
         self.output = self.stepper.step(1.0, None, self.planner.planned)
-        with patch("tormagd.daemon.child_process.start_beside", self.start):
+        with patch("tormagd.daemon.child_process.start_child", self.start):
             self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000)
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
         self.box.begin(self.stepper, self.planner, connection)
@@ -164,7 +164,7 @@ def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: Ca
 
 
 def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tormagd.daemon.child_process.start_beside", rig.start)
+    monkeypatch.setattr("tormagd.daemon.child_process.start_child", rig.start)
     waits: list[float] = []
     for _ in range(4):
         rig.its.close()
@@ -214,7 +214,7 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     ("name", "fails", "says"),
     [
         (
-            "tormagd.daemon.child_process.start_beside",
+            "tormagd.daemon.child_process.start_child",
             Mock(side_effect=OSError(11, "Try again")),
             "did not start: Try again",
         ),

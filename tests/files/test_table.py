@@ -72,3 +72,12 @@ def test_a_scaled_column_needs_no_unit(tmp_path: Path) -> None:
     assert list(read_column(tmp_path / "f.csv", stated, has_unit=False).values["force_N"]) == [-0.5, 0.5]
     with pytest.raises(TableError, match="'PLETH' has the unit 'NU': force_N is in N"):
         read_column(tmp_path / "f.csv", stated, has_unit=True)
+
+
+@pytest.mark.parametrize(
+    "name", ["[" * 100_000, "F" + " " * 100_000 + "x", "F [" + "m" * 100_000], ids=["[", "F x", "F [m"]
+)
+def test_a_heading_of_any_length_is_read_at_once(tmp_path: Path, name: str) -> None:
+    (tmp_path / "f.csv").write_text(f"t_s,{name}\n0,1\n1,1\n")
+    with pytest.raises(TableError, match=r"no column is force_N \(force, load"):
+        read_forces(tmp_path / "f.csv")

@@ -52,8 +52,8 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import parse_hand
 from tormagd.simulation.parameters import load_plant
 from tormagd.simulation.plant import Truth
-from tormagd.simulation.pty_port import Pty, PtyDoor
-from tormagd.simulation.slcan_port import SlcanDoor
+from tormagd.simulation.pty_port import Pty, PtyPort
+from tormagd.simulation.slcan_port import SlcanPort
 
 CONFIG = Config()
 PATIENCE_S = 10.0
@@ -156,7 +156,7 @@ class PtyEnd(Pty):
             assert select.select([descriptor(backend)], [], [], PATIENCE_S)[0], "the backend gets nothing"
 
 
-class SerialEnd(PtyEnd, PtyDoor):
+class SerialEnd(PtyEnd, PtyPort):
     end = b"\x00"
 
     @property
@@ -164,7 +164,7 @@ class SerialEnd(PtyEnd, PtyDoor):
         return Device(port=self.address)
 
 
-class SlcanEnd(PtyEnd, SlcanDoor):
+class SlcanEnd(PtyEnd, SlcanPort):
     end = b"\r"
 
     @property

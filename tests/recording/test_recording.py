@@ -332,6 +332,19 @@ def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path
     assert len(everything) == known.overview.ticks + known.overview.snapshots
 
 
+def test_a_damaged_chunk_of_a_file_that_was_not_ended_costs_no_other(path: Path, tmp_path: Path) -> None:
+    summary = summary_of(path)
+    assert summary is not None
+    places = summary[0].places
+    data = bytearray(path.read_bytes()[: places[20].at])  # its recorder was killed there
+    data[places[10].at + 200] ^= 1
+    spoilt = tmp_path / "killed.mcap"
+    spoilt.write_bytes(data)
+    known = RecordingFile(spoilt)
+    assert (known.is_complete, "left out: 1" in known.notes[0]) == (False, True)
+    assert known.overview.duration_s == pytest.approx((places[19].to_ns - places[0].from_ns) * 1e-9)
+
+
 def test_zeros_where_a_tail_was_are_a_cut(path: Path, tmp_path: Path) -> None:
     data, spoilt = path.read_bytes(), tmp_path / "zeros.mcap"
     spoilt.write_bytes(data[: len(data) // 2] + bytes(len(data) // 2))

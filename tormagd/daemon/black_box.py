@@ -24,7 +24,7 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import Core, platform_name, sources_hash
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
-from tormagd.daemon.child_process import Beside
+from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
 from tormagd.record.journal import FORMAT, Journal, Packer
 from tormagd.record.keeper_messages import REQUEST, Begin, End, Part, Said, Write, Written
@@ -74,7 +74,7 @@ class BlackBox:
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
         self._folder, self._begun = folder, Begin(str(folder), header)
         self._refusal, self._newest, self._dropped = "", "", 0
-        self._beside: Beside | None = None
+        self._beside: ChildProcess | None = None
         self._started_s, self._due_s, self._wait_s = -math.inf, math.inf, 0.5 * AGAIN_S[0]
         self.journal, self._packer = Journal(is_kept=False), Packer()
         if folder is None:
@@ -217,7 +217,7 @@ class BlackBox:
         """Start the keeper; where that fails, it is tried again."""
         self._started_s, self._due_s = time.monotonic(), math.inf
         try:
-            self._beside = Beside(KEEPER)
+            self._beside = ChildProcess(KEEPER)
         except OSError as error:
             self._stop(f"the process that keeps it did not start: {error.strerror}")
             return

@@ -14,7 +14,7 @@ import sys
 import time
 
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.daemon.child_process import MAX_PACKET, Beside
+from tormagd.daemon.child_process import MAX_PACKET, ChildProcess
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd_client.endpoints import ConfigError
@@ -43,7 +43,7 @@ class SearchProcess:
             )
 
     def _begin(self) -> None:
-        self._beside = Beside(__name__)
+        self._beside = ChildProcess(__name__)
         self._beside.send(self._searched)
 
     def answer(self) -> Answer | None:

@@ -11,7 +11,7 @@ from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.commands import Commands
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
-from tormagd.daemon.force_delay import Way
+from tormagd.daemon.force_delay import ForceDelay
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.topics import Topics
@@ -46,7 +46,7 @@ class TelemetryLoop:
             self.groups.append(inference.beside.timing)
         self.newest: Telemetry
         self._ticks: list[TickRecord] = []
-        self.way = Way()
+        self.way = ForceDelay()
         self.topics = Topics(config, core, control, inference, endpoint)
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // self._hz
         self.waiting = 0

@@ -22,6 +22,8 @@ from tormagd.ground.files import read_bounded
 MIN_ROWS: Final = 2
 SAMPLE: Final = 1000
 "Rows that may stand above the names; rows that show how cells are separated, and which mark is decimal."
+LONGEST_NAME: Final = 200
+"A longer heading names no unit: looking for one takes the square of its length."
 ABSENT: Final = ("", "nan", "-")
 "Cells without a value, in lower case."
 COMMENT: Final = ("#", "%")
@@ -206,7 +208,7 @@ def _is_numeric(cell: str) -> bool:
 
 def _split(cell: str) -> tuple[str, str | None]:
     """Return a heading's name, in lower case if it is a word, and its unit as we spell it."""
-    match = _HEADING.fullmatch(cell)
+    match = _HEADING.fullmatch(cell) if len(cell) <= LONGEST_NAME else None
     name, unit = (cell, None) if match is None else (match[1], match[3] if match[2] is None else match[2])
     return name if len(name) == 1 else name.lower(), _unit(unit)
 

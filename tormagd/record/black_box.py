@@ -77,18 +77,16 @@ class Shown(NamedTuple):
 class Derived:
     """Derives the messages of `/ticks` and `/frames` from the parts of `/core`."""
 
-    def __init__(self, columns: str) -> None:
-        """Begin; `columns` names the values of a tick, a list in JSON."""
+    def __init__(self, columns: str, offset_ns: int = 0) -> None:
+        """Begin; `columns` names the values of a tick, a list in JSON, `offset_ns` is from monotonic time to 1970's."""
         self._columns = msgspec.json.decode(columns, type=tuple[str, ...])
         self._ticks = self._frames = 0
-        self._offset_ns: int | None = None
+        self._offset_ns = offset_ns
         self._axis = Axis()
         self._monotonic_at = self._columns.index("monotonic_s") if "monotonic_s" in self._columns else 0
 
-    def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
+    def of(self, entries: Sequence[Any]) -> Iterator[Shown]:
         """Yield the messages derived from one part's entries, in their order: one a tick, one a frame."""
-        if self._offset_ns is None:
-            self._offset_ns = offset_ns
         for entry in entries:
             if is_tick(entry):
                 data = msgspec.json.encode(known_values(self._columns, entry))
@@ -96,7 +94,7 @@ class Derived:
                 self._ticks += 1
             for frame in frames_in(entry):
                 self._frames += 1
-                t_ns = round(frame.monotonic_s * 1e9) + (self._offset_ns or 0)
+                t_ns = round(frame.monotonic_s * 1e9) + self._offset_ns
                 yield Shown(FRAMES_TOPIC, t_ns, self._frames, msgspec.json.encode(frame))
 
 
@@ -104,18 +102,18 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -
     """Write a new black box of these parts, whole or not at all."""
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
-    derived = Derived(header["columns"])
+    offset_ns = parts[0].t_ns - round(parts[0].time_s * 1e9)
+    derived = Derived(header["columns"], offset_ns)
     with in_place_of(path) as beside, beside.open("wb") as file:
         mcap = begun(file, {"version": __version__, "kind": HEADER})
         mcap.add_metadata(HEADER, header)
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
         schemas = {TICKS_TOPIC: TICK_SCHEMA, FRAMES_TOPIC: plain_schema(Frame)}
         channels = {topic: registered(mcap, topic, schema) for topic, schema in schemas.items()}
-        offset_ns = parts[0].t_ns - round(parts[0].time_s * 1e9)
         for number, part in enumerate(parts):
             at_ns = round(part.time_s * 1e9) + offset_ns
             mcap.add_message(core, log_time=at_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
-            for shown in derived.of(msgspec.msgpack.decode(part.entries), offset_ns):
+            for shown in derived.of(msgspec.msgpack.decode(part.entries)):
                 t_ns, channel = shown.t_ns, channels[shown.topic]
                 mcap.add_message(channel, t_ns, shown.data, publish_time=t_ns, sequence=shown.sequence)
         mcap.finish()  # type: ignore[no-untyped-call]
@@ -193,7 +191,7 @@ class _Reading:
         if self._derived is None:
             self._derived = Derived(self.header.get("columns", "[]"))
         try:
-            for shown in self._derived.of(entries, None) if self._expected else ():
+            for shown in self._derived.of(entries) if self._expected else ():
                 self._expected[shown.topic].append(shown)
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"

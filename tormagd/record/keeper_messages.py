@@ -19,7 +19,7 @@ class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
-    """Some control periods, as entries of `assembly/journal.py`. Both times are the last period's."""
+    """Some control periods, as entries of `journal.py`. Both times are the last period's."""
 
     time_s: float
     t_ns: int

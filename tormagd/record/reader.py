@@ -7,6 +7,7 @@ at most MAX_RECORD_BYTES, and all chunks together MAX_RATIO times the file's byt
 import contextlib
 import struct
 import zlib
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -136,59 +137,82 @@ def scan(
 
     Damage goes to `lost`, and reading goes on with the next chunk. Returns False for a file that was cut short.
     """
-    at, size, records = MAGIC_SIZE, 0, _records(file, has_magic=True)
+    size, damage, is_whole = 0, "", True
+
+    def note(text: str) -> None:
+        nonlocal damage
+        damage = damage or text
+        lost(text)
+
     with readable(name):
-        while True:
-            try:
-                record = next(records, None)
-                within = _within(record) if isinstance(record, Chunk) else [record]
-            except EOFError:
-                return False
-            except UNREADABLE as error:
-                following = next((place.at for place in _indexed(file) if place.at > at), 0)
-                if not (size or following):
-                    raise
-                lost(f"byte {at}: {str(error)[:80] or repr(error)}")
-                if not following:
-                    return False
-                at, records = file.seek(following), _records(file)
-                continue
-            if record is None:
-                break
-            if isinstance(record, Chunk):
-                take(record, at)
-                size += record.uncompressed_size
-                if size > MAX_RATIO * file.tell() + FREE_BYTES:
-                    raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
-            for each in within:
-                if isinstance(each, Message):
-                    message(each)
-                elif each is not None:
-                    take(each, at)
-            at = file.tell()
-        if file.read(1):
+        try:
+            for at, record, within in _intact(file, note):
+                if isinstance(record, Chunk):
+                    take(record, at)
+                    size += record.uncompressed_size
+                    if size > MAX_RATIO * file.tell() + FREE_BYTES:
+                        raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
+                for each in within:
+                    if isinstance(each, Message):
+                        message(each)
+                    else:
+                        take(each, at)
+        except EOFError:
+            is_whole = False
+        if damage and not size:
+            raise ValueError(damage)
+        if is_whole and file.read(1):
             raise ValueError("it does not end as MCAP does")
-    return True
+    return is_whole
 
 
-class Place(NamedTuple):
-    """Where a chunk begins in the file, and its messages' times, ns since 1970."""
+def _intact(file: BinaryIO, lost: Callable[[str], None]) -> Iterator[tuple[int, McapRecord, list[McapRecord]]]:
+    """Yield where each record begins, the record, and what is in a chunk; EOFError where no more can be read.
 
-    from_ns: int
-    to_ns: int
-    at: int
+    After damage the summary says where the next chunk is; without one, reading goes on after a chunk.
+    """
+    at, records = MAGIC_SIZE, _records(file, has_magic=True)
+    chunks: list[int] | None = None
+    while True:
+        record: McapRecord | None = None
+        try:
+            record = next(records, None)
+            if record is None:
+                return
+            within = _within(record) if isinstance(record, Chunk) else [record]
+        except UNREADABLE as error:
+            if record is None and isinstance(error, EOFError):
+                raise
+            lost(f"byte {at}: {str(error)[:80] or repr(error)}")
+            end = file.tell()
+            if chunks is None:
+                chunks = sorted(each.chunk_start_offset for each in _indexed(file))
+            following = bisect_right(chunks, at)
+            if following == len(chunks) and record is None:
+                raise EOFError from error
+            at = file.seek(chunks[following] if following < len(chunks) else end)
+            records = _records(file)
+        else:
+            yield at, record, within
+            at = file.tell()
 
 
-def _indexed(file: BinaryIO) -> list[Place]:
-    """List the chunks that the file's summary names, in their order; none where it is not there."""
-    places: list[Place] = []
+def _indexed(file: BinaryIO) -> list[ChunkIndex]:
+    """List the chunks that the file's summary names; none where it is not there."""
+    found: list[ChunkIndex] = []
     with contextlib.suppress(*UNREADABLE):
-        footer, _ = _end(file)
-        file.seek(footer.summary_start if footer else 0, 0 if footer else 2)
-        for record in _records(file):
-            if isinstance(record, ChunkIndex) and len(places) < MAX_INDEX:
-                places.append(Place(record.message_start_time, record.message_end_time, record.chunk_start_offset))
-    return places
+        for record in _summary(file):
+            if isinstance(record, ChunkIndex) and len(found) < MAX_INDEX:
+                found.append(record)
+    return found
+
+
+def _summary(file: BinaryIO) -> Iterator[McapRecord]:
+    """Yield the records of a file's summary; none of one that was cut short."""
+    footer, _ = _end(file)
+    if footer is not None:
+        file.seek(footer.summary_start)
+        yield from _records(file)
 
 
 def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
@@ -235,6 +259,14 @@ def _crc(file: BinaryIO, first: int, end: int) -> int:
     for at in range(first, end, BLOCK_BYTES):
         crc = zlib.crc32(file.read(min(end - at, BLOCK_BYTES)), crc)
     return crc
+
+
+class Place(NamedTuple):
+    """Where a chunk begins in the file, and its messages' times, ns since 1970."""
+
+    from_ns: int
+    to_ns: int
+    at: int
 
 
 class Contents:
@@ -346,11 +378,7 @@ def summary_of(path: Path) -> tuple[Contents, Overview] | None:
     """Read contents and overview from the end of the file, if they are there."""
     found, told, overview_at = Contents(), [], 0
     with opened(path) as file, readable(str(path)):
-        footer, _ = _end(file)
-        if footer is None:
-            return None
-        file.seek(footer.summary_start)
-        for record in _records(file):
+        for record in _summary(file):
             if isinstance(record, ChunkIndex) and len(found.places) < MAX_INDEX:
                 place = Place(record.message_start_time, record.message_end_time, record.chunk_start_offset)
                 found.places.append(place)

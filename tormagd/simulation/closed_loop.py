@@ -1,7 +1,7 @@
 """The closed loop in virtual time: the daemon's core against the simulated device, as fast as the processor goes.
 
 `plan` and `step`, the connection and the protocol bytes are the daemon's own; only time, sockets and the port are
-replaced. The module stands beside the rooms because it joins control with simulation, which no room may.
+replaced.
 """
 
 from collections.abc import Callable, Iterable

@@ -34,7 +34,7 @@ from tormagd.simulation.__main__ import main
 from tormagd.simulation.can_bus import SimulatorBus
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, from_socket, to_socket
-from tormagd.simulation.can_port import MAX_HOSTS, CanDoor
+from tormagd.simulation.can_port import MAX_HOSTS, CanPort
 from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -167,7 +167,7 @@ def test_a_wrong_call_says_what_is_right_and_exits_with_2(
 class Served:
     def __init__(self, path: Path) -> None:
         self.device = CanDevice(MessageDevice(load_plant("sample_1"), SteadyHand(), seed=1))
-        self.door = CanDoor(self.device, path)
+        self.door = CanPort(self.device, path)
         self.now_s = 0.0
 
     def host(self) -> socket.socket:
