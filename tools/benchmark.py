@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from judge.frame import parsed, told
 
-from tormagd.headroom.machine_loop import machine_us
+from tormagd.ground.machine_loop import machine_us
 
 MEASUREMENTS = {
     "inverse": "speed against accuracy of the searches for the field",

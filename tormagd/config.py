@@ -92,7 +92,9 @@ class Rates(Strict, frozen=True):
     control_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 1_000
     "Control ticks; the default gains are for 1000."
     inference_hz: Annotated[int, Meta(ge=MIN_INFERENCE_HZ, le=4_000)] = 500
-    "The least rate of plans; each setpoint is planned in the next tick."
+    "Plans; more where each setpoint is planned for."
+    plan_every_setpoint: bool = True
+    "Whether a setpoint is planned in the tick that takes it; otherwise the newest waits for the next plan."
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
     "Telemetry messages."
     motion_hz: Annotated[int, Meta(ge=1, le=4_000)] = 500

@@ -197,6 +197,16 @@ def test_a_force_is_found_on_a_plant_of_other_structure(
         assert Limit.MODEL_RANGE not in samples[-1].plan.limits
 
 
+@pytest.mark.parametrize(("is_every", "planned"), [(True, 500), (False, 100)])
+def test_setpoints_wait_for_the_next_plan_where_the_rate_binds(arm: Callable[..., ClosedLoop], is_every, planned):
+    rates = Rates(control_hz=500, inference_hz=100, plan_every_setpoint=is_every)
+    config = Config(rates=rates)
+    loop = arm("sample_1", core=build_core(config), config=config)
+    samples = list(loop.run(1.0, lambda now_s: TimedSetpoint(1.0, now_s, 0.1)))
+    assert len({sample.plan.time_s for sample in samples}) == pytest.approx(planned, abs=1)
+    assert samples[-1].plan.stamp_s > samples[-1].time_s - 0.011
+
+
 SCENE = load_scene("radial_pulse")
 CONFIG = Config(scene="radial_pulse", rates=Rates(control_hz=500, inference_hz=83))
 PRESSED_S, PULSE_S = 14.0, 5.0

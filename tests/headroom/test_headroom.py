@@ -12,7 +12,8 @@ import uvloop
 from firmware_protocol.build import Build
 from tormagd.config import Config, RealTime
 from tormagd.control.assembly.build import build_core
-from tormagd.headroom import __main__ as program, core_cost, machine_loop
+from tormagd.ground import machine_loop
+from tormagd.headroom import __main__ as program, core_cost
 from tormagd.headroom.bare_timer import beat, lateness
 
 pytestmark = pytest.mark.usefixtures("usual_slices")

@@ -14,6 +14,7 @@ from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.features import FEATURES
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
+from tormagd.scenes.measured import OperatingPoint, measured
 from tormagd.scenes.scene import EVERY_TERM, Scene, Terms, load_scene, scene_path, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
@@ -260,3 +261,12 @@ def test_a_hold_of_a_day_and_a_recording_at_1_khz_are_taken(write, tmp_path: Pat
     rows = "".join(f"{n / 1000:.3f},{1.2 + 0.3 * (n % 2000) / 2000:.5f}\n" for n in range(2000))
     (tmp_path / "fast.csv").write_text(f"t_s,force_N\n{rows}")
     assert of_path(write(signal__file='"fast.csv"')).missed.rms_N < 1e-3
+
+
+def test_a_share_is_scaled_to_the_machine_and_to_the_plans_that_a_publisher_causes():
+    file = measured()
+    few, many = (OperatingPoint(500, hz, "newton") for hz in (83, 500))
+    taken = [file.daemon_share(few, file.machine_us, hz) for hz in (83, 500)]
+    assert taken == pytest.approx([file.share(way).daemon for way in (few, many)])
+    assert file.daemon_share(few, 2.0 * file.machine_us) == pytest.approx(2.0 * taken[0])
+    assert file.daemon_share(OperatingPoint(500, 83, "thesis"), file.machine_us, 500.0) is None

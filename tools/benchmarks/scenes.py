@@ -25,7 +25,7 @@ from tormag_lab import executors
 from tormag_lab.arrays import Json
 from tormagd.config import RealTime
 from tormagd.control.assembly.build import choose_solver
-from tormagd.headroom.machine_loop import machine_us
+from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import (
     FILE,
     MeasuredScene,
@@ -119,7 +119,7 @@ def measured_scene(name: str, runs: Runs) -> MeasuredScene:
     tolerance_N = scene.force.tolerance_rms_N
     usual, *others = tried
     chosen, judged = usual.way, judge(name, scene, usual.way, usual.way, runs)
-    for other in sorted(others, key=lambda each: each.way.control_hz + each.way.inference_hz):
+    for other in sorted(others, key=lambda each: each.way.sum_hz):
         pairs = zip(other.rms_N, usual.rms_N, strict=True)
         if usual.worst_N > tolerance_N or any(error_N > allowed_N(usual_N, tolerance_N) for error_N, usual_N in pairs):
             continue

@@ -8,7 +8,8 @@ import msgspec
 from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, folded, usage_error
 from tormagd.ctl.scene_check import LONGEST_S, as_toml, check_scene, derived_of, loaded, measured_as, way_of
-from tormagd.scenes.measured import OperatingPoint, Share, Tried, measured
+from tormagd.ground.machine_loop import machine_us
+from tormagd.scenes.measured import MeasuredScene, OperatingPoint, Tried, measured
 from tormagd.scenes.scene import load_scene, shipped_scenes
 from tormagd_client.endpoints import Endpoints
 
@@ -99,13 +100,15 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     found = measured_as(loaded(name), file)
     derived = derived_of(name, config)
     tolerance_N = found.tolerance_N
-    runs = way_of(derived)
+    runs, machine = way_of(derived), machine_us()
+    shares = {each.way: file.daemon_share(each.way, machine) for each in found.tried}
     lines = [
         f"{found.name}: tolerance {1e3 * tolerance_N:g} mN RMS",
         "",
         f"{'way':28} {'samples 1 to 3, mN':>22} {'of a processor':>15}",
-        *(_tried(each, file.share(each.way), found.chosen, runs) for each in found.tried),
+        *(_tried(each, shares[each.way], found, runs) for each in found.tried),
         "",
+        *_cheaper(found, shares),
         *([] if found.is_met else ["NOT MET: the usual way itself is over the tolerance", ""]),
         f"{'chosen, judged':28} {'worst device':>14} {'chosen':>10} {'usual':>10}",
         *(
@@ -114,15 +117,33 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
             for item in found.judged
         ),
         "",
-        f"Shares: the daemon's processes, live on the simulated device, beside a machine_us of {file.machine_us:g}.",
+        "Shares: the daemon's processes, live on the simulated device, with as many setpoints as plans; scaled from a",
+        f"machine_us of {file.machine_us:g} to this machine's {machine:.0f}.",
     ]
-    result = msgspec.to_builtins(found) | {"shares": msgspec.to_builtins(file.shares), "derived": derived}
+    result = msgspec.to_builtins(found) | {
+        "shares": msgspec.to_builtins(file.shares),
+        "stored_machine_us": file.machine_us,
+        "machine_us": machine,
+        "derived": derived,
+    }
     return Outcome(result, folded("\n".join(lines)))
 
 
-def _tried(tried: Tried, share: Share | None, chosen: OperatingPoint, runs: OperatingPoint) -> str:
+def _cheaper(found: MeasuredScene, shares: dict[OperatingPoint, float | None]) -> list[str]:
+    """Return a line on each way that is as exact as the chosen one, to 0.1 mN, for less."""
+    most_N, most = round(found.of(found.chosen).worst_N, 4), shares[found.chosen] or 0.0
+    cheaper = (
+        (each.way, share)
+        for each in found.offered
+        if round(each.worst_N, 4) <= most_N and (share := shares[each.way]) and share < most
+    )
+    return [f"The scene states its search; {way} is as exact for {share:.1%}.\n" for way, share in cheaper]
+
+
+def _tried(tried: Tried, share: float | None, found: MeasuredScene, runs: OperatingPoint) -> str:
     """Return one way's row: errors on three samples, share of a processor, whether chosen."""
-    marks = [word for way, word in ((chosen, "chosen"), (runs, "runs here")) if way == tried.way]
+    marks = [word for way, word in ((found.chosen, "chosen"), (runs, "runs here")) if way == tried.way]
+    marks += [] if tried in found.offered else ["fails a judged case"]
     errors = " ".join(f"{1e3 * error_N:6.1f}" for error_N in tried.rms_N)
-    taken = "not measured" if share is None else f"{share.daemon:.1%}"
+    taken = "not measured" if share is None else f"{share:.1%}"
     return f"{tried.way!s:28} {errors:>22} {taken:>15}  {', '.join(marks)}".rstrip()

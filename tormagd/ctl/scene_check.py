@@ -4,8 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, answer_of, as_usage_error, folded
+from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import MeasuredScene, Measurements, OperatingPoint, measured
 from tormagd.scenes.scene import Force, Scene, load_scene
 from tormagd_client.endpoints import ConfigError
@@ -18,17 +20,19 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     """Say whether a daemon with this configuration takes the scene, how it serves it, and at what cost."""
     scene = loaded(name)
     derived = derived_of(name, config)
-    file = measured()
-    share = file.share(way_of(derived)) if not derived["terms_out"] else None
-    if share is not None and share.daemon > scene.budget.core_share:
+    way, sent_hz = way_of(derived), UNSET if scene.signal is None else scene.signal.setpoint_hz
+    plans_hz = way.inference_hz if sent_hz is UNSET or not derived["plan_every_setpoint"] else sent_hz
+    plans_hz = max(plans_hz, way.inference_hz)
+    share = None if derived["terms_out"] else measured().daemon_share(way, machine_us(), plans_hz)
+    if share is not None and share > scene.budget.core_share:
         raise CommandError(
             Exit.REFUSED,
             "budget",
-            f"scene {scene.name}: a daemon takes {share.daemon:.1%} of a processor for it: allowed is "
+            f"scene {scene.name}: a daemon takes {share:.1%} of a processor here for it: allowed is "
             f"budget.core_share = {scene.budget.core_share:g}",
             "tormagctl scene explain says what other rates and searches take",
         )
-    force, signal, least_N = scene.force, scene.signal, derived["least_N"]
+    force, least_N = scene.force, derived["least_N"]
     lines = [
         f"{scene.name}: taken",
         f"forces     {force.least_N:g}..{force.most_N:g} N of the device's {least_N:.2f}..{derived['most_N']:.2f}"
@@ -43,20 +47,17 @@ def check_scene(name: str, config: Path | None) -> Outcome:
         if derived["missed_rms_N"] is None
         else f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
         f"{1e3 * force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster",
-        *(
-            [f"           its publisher sends {signal.setpoint_hz:g} times a second"]
-            if signal is not None and signal.setpoint_hz is not msgspec.UNSET
-            else []
-        ),
+        *([] if sent_hz is UNSET else [f"           its publisher sends {sent_hz:g} times a second"]),
         *_waiting(force, derived["approaches_s"]),
-        f"served     {way_of(derived)}",
+        f"served     {way}",
         "cost       not measured of these rates, search and terms"
         if share is None
-        else f"cost       {share.daemon:.1%} of a processor for the daemon, {scene.budget.core_share:.0%} are allowed",
+        else f"cost       {share:.1%} of a processor of this machine for {plans_hz:g} plans a second, "
+        f"{scene.budget.core_share:.0%} are allowed",
     ]
     result = {
         "scene": scene.name,
-        "core_share": share and share.daemon,
+        "core_share": share,
         "core_share_allowed": scene.budget.core_share,
     } | derived
     return Outcome(result, folded("\n".join(lines)))

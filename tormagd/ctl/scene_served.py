@@ -8,6 +8,7 @@ import msgspec
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.scene_check import as_toml, loaded, measured_as
+from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import OperatingPoint, measured
 from tormagd.scenes.scene import load_scene, scene_path
 
@@ -20,22 +21,22 @@ class Served(NamedTuple):
 
 
 def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
-    """Choose the most exact measured way within `share` of a processor, or the cheapest within an error."""
+    """Choose the most exact way within `share` of a processor, or the cheapest within an error, to 0.1 mN."""
     if action != "check" or (share is None) == (tolerance_N is None):
         raise usage_error(
             "--share, --tolerance and --out choose how a scene is served",
             "tormagctl scene check NAME with one of --share S and --tolerance N, and --out FILE.toml to write it",
         )
-    scene, file = loaded(name), measured()
+    scene, file, machine = loaded(name), measured(), machine_us()
     ways = [
-        Served(tried.way, (taken.daemon, tried.worst_N))
-        for tried in measured_as(scene, file).tried
-        if (taken := file.share(tried.way)) is not None
+        Served(tried.way, (taken, round(tried.worst_N, 4)))
+        for tried in measured_as(scene, file).offered
+        if (taken := file.daemon_share(tried.way, machine)) is not None
     ]
     way, (daemon_share, rms_N) = _best(ways, share, tolerance_N or 0.0)
     text = (
         f"{scene.name}: {way}: {1e3 * rms_N:.1f} mN RMS at worst on samples 1 to 3, "
-        f"the daemon takes {daemon_share:.1%} of a processor"
+        f"the daemon takes {daemon_share:.1%} of a processor of this machine"
     )
     if out is not None:
         _write(name, way, out)
@@ -55,9 +56,9 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
             Exit.REFUSED,
             "no_way",
             f"{asked} = {most:g}: allowed is at least {least:.3g} {unit}",
-            "tormagctl scene explain shows every way that was measured",
+            "tormagctl scene explain shows every way that was measured; not offered is one that fails a judged case",
         )
-    return min(fits, key=lambda way: way.figures[1 - bounded])
+    return min(fits, key=lambda way: (way.figures[1 - bounded], way.figures[bounded]))
 
 
 def _write(name: str, way: OperatingPoint, out: Path) -> None:

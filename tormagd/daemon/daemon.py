@@ -193,7 +193,7 @@ class Daemon:
 
     def _plan(self, beat: Beat) -> None:
         # before the step: a setpoint is driven in the beat that takes it
-        is_asked = self._endpoint.take_setpoints()
+        is_asked = self._endpoint.take_setpoints() and self._config.rates.plan_every_setpoint
         stepper = self._control.stepper
         self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
 

@@ -1,4 +1,4 @@
-"""The inference loop, a phase of every beat: plans for each new setpoint, and at least at its own rate."""
+"""The inference loop, a phase of every beat: plans at its own rate, and when it is asked."""
 
 import logging
 import time

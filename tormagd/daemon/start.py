@@ -84,6 +84,7 @@ def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
             "solver": core.solver._asdict(),
             "control_hz": config.rates.control_hz,
             "inference_hz": config.rates.inference_hz,
+            "plan_every_setpoint": config.rates.plan_every_setpoint,
             "fingerprint": core.scene.fingerprint,
             "terms_out": core.scene.terms.left_out,
             "least_resolution_N": least_resolution_N(core.portrait, core.scene.force.most_N),

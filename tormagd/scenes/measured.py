@@ -11,6 +11,11 @@ class OperatingPoint(Struct, frozen=True):
     inference_hz: int
     search: str
 
+    @property
+    def sum_hz(self) -> int:
+        """Order in which ways are judged: the first that serves every case is chosen."""
+        return self.control_hz + self.inference_hz
+
     def __str__(self) -> str:
         return f"{self.control_hz} / {self.inference_hz} Hz, {self.search}"
 
@@ -65,13 +70,18 @@ class MeasuredScene(Struct, frozen=True):
     def of(self, way: OperatingPoint) -> Tried:
         return next(each for each in self.tried if each.way == way)
 
+    @property
+    def offered(self) -> tuple[Tried, ...]:
+        """Those with no lower rates than the chosen way's: a lower one failed a case that the chosen way passes."""
+        return tuple(each for each in self.tried if each.way.sum_hz >= self.chosen.sum_hz)
+
 
 class Measurements(Struct, frozen=True):
     """The file of measurements: how it was made, what each way costs, and every scene."""
 
     command: str
     machine_us: float
-    "See `tormagd.headroom.machine_loop`."
+    "See `tormagd.ground.machine_loop`."
     pairs: int
     "Runs of each way that a share is the median of."
     draws: int
@@ -81,6 +91,17 @@ class Measurements(Struct, frozen=True):
 
     def share(self, way: OperatingPoint) -> Share | None:
         return next((each for each in self.shares if each.way == way), None)
+
+    def daemon_share(self, way: OperatingPoint, machine_us: float, plans_hz: float | None = None) -> float | None:
+        """Return what the daemon takes of a processor of `machine_us`: a line through the measured rates of plans."""
+        plans_hz = way.inference_hz if plans_hz is None else plans_hz
+        alike = [each for each in self.shares if (each.way.control_hz, each.way.search) == (way.control_hz, way.search)]
+        found = sorted((each.way.inference_hz, each.daemon) for each in alike)
+        if not found or (len(found) == 1 and plans_hz > way.inference_hz):
+            return None
+        (low_hz, low), (high_hz, high) = found[0], found[-1]
+        slope = (high - low) / (high_hz - low_hz) if len(found) > 1 else 0.0
+        return (low + slope * (plans_hz - low_hz)) * machine_us / self.machine_us
 
     def scene(self, fingerprint: str) -> MeasuredScene | None:
         return next((each for each in self.scenes if each.fingerprint == fingerprint), None)

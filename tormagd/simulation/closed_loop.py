@@ -226,7 +226,8 @@ class ClosedLoop:
         if planner is None:
             raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
         is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
-        if is_new or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
+        is_asked = is_new and self._config.rates.plan_every_setpoint
+        if is_asked or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
             self._answer_question(planner, now_s)
             planner.plan(now_s, setpoint, self.stepper.measured, self.stepper.is_followed)
             planner.foresee()
