@@ -42,6 +42,7 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
         rig.arm()
         rig.render(1.6)
         newest = rig.status()
+        rig.until(lambda: rig.status()["t_ns"] > newest["t_ns"] + 100_000_000, "what it has told is on its way")
         assert rig.end(rig.daemon, signal.SIGKILL) == -signal.SIGKILL
         rig.end(recorder, signal.SIGINT)
     finally:
