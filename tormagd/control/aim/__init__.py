@@ -1,1 +1,1 @@
-"""Stage of the control core."""
+"""Which gap gives the force."""

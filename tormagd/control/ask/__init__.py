@@ -1,1 +1,1 @@
-"""Stage of the control core."""
+"""What force is asked for, over the time ahead."""

@@ -1,1 +1,1 @@
-"""Stage of the control core."""
+"""What is believed of the device: its strength, memory, zero, and whether its sensor is."""

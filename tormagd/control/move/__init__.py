@@ -1,1 +1,1 @@
-"""Stage of the control core."""
+"""How the carriages come there: trajectory, and duty."""
