@@ -29,7 +29,7 @@ from tormag_lab.training.dataset import (
 )
 from tormag_lab.training.fitting import fit_network
 from tormag_lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series, relaxed_N
-from tormag_lab.training.law import Law, fit_law, fit_law_model
+from tormag_lab.training.law import Law, fit_bend, fit_law, fit_law_model
 from tormag_lab.training.levenberg_marquardt import jacobian, train
 from tormag_lab.training.unremembered import identify
 from tormagd.config import Config, Rates
@@ -263,7 +263,7 @@ def test_what_cannot_be_trained_is_refused() -> None:
             refused()
 
 
-LAW = Law(0.1, -0.7, 1.1, 0.05, 0.15, 2.0, 0.01, 2e-4, 1.8, 0.5)
+LAW = Law(0.1, -0.7, 1.1, 0.05, 0.15, 2.0, 0.01, 2e-4, 1.8, 0.5, 0.0)
 OF_LAW = {"insert_name": "MRE-50-40", "data_sha256": "0" * 64, "created": datetime.date(2024, 1, 1)}
 
 
@@ -280,6 +280,29 @@ def test_fifty_rows_tell_the_law() -> None:
     fresh = lawful(2000, noise_N=0.0)
     found_N = fit_law(lawful(50), insert("MRE-50-40")).forces_N(fresh.features, insert("MRE-50-40"))
     assert np.abs(found_N - fresh.force_N).mean() < 0.01
+
+
+def foreign(rows: int, noise_N: float, seed: int, least_mm: float) -> Dataset:
+    """An elastomer whose moment saturates as Langevin's, and whose presliding has a length, not a stiffness."""
+    rng = np.random.default_rng(seed)
+    field_mT, rate_mm_s = rng.uniform(60.0, 800.0, rows), np.exp(rng.uniform(0.0, np.log(300.0), rows))
+    displacement_mm = np.where(rng.random(rows) < 0.7, 2.0, rng.uniform(least_mm, 2.0, rows))
+    moment = 1.0 / np.tanh(field_mT / 120.0) - 120.0 / field_mT
+    level_N = (0.1 + 3.0 * moment**1.5) * (1.0 + 0.08 * np.exp(-np.square(rate_mm_s / 12.0))) + 6e-4 * rate_mm_s
+    force_N = np.where(displacement_mm < 2.0, level_N * -np.expm1(-displacement_mm / 0.4), level_N)
+    features = np.column_stack((displacement_mm, rate_mm_s, field_mT, np.full(rows, 40.0)))
+    return Dataset(features, force_N + noise_N * rng.normal(size=rows))
+
+
+def test_some_hundred_rows_tell_an_elastomer_of_another_law() -> None:
+    few, fresh, own = foreign(400, 0.01, 1, 0.0), foreign(4000, 0.0, 7, 2.0), insert("MRE-50-40")
+    law = fit_law(few, own)
+    bend = fit_bend(few, own, law)
+    assert np.abs(law.forces_N(fresh.features, own, bend) - fresh.force_N).mean() < 0.006
+    beyond_N = law.forces_N(
+        np.column_stack((*np.full((2, 50), 2.0), np.linspace(1, 1500, 50), np.full(50, 40.0))), own, bend
+    )
+    assert (np.diff(beyond_N) >= 0.0).all()
 
 
 def test_a_law_becomes_a_network_that_rises_and_is_near_it() -> None:

@@ -229,7 +229,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--inner-radius-mm", type=RADIUS, default=4.0, help="where the field is stated (4)")
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL.safetensors")
     parser.add_argument("--csv", type=Path, metavar="TRAINING.csv", help="write the training data too")
-    parser.add_argument("--law", action="store_true", help="fit the law of the brake, ten numbers, without torch")
+    parser.add_argument("--law", action="store_true", help="fit the law of the brake, without torch")
 
 
 def run(options: argparse.Namespace) -> Found:

@@ -1,12 +1,13 @@
-"""The device's law: the force of a brake with one insert in ten numbers, fitted by least squares, without torch.
+"""The device's law: the force of a brake with one insert, fitted by least squares, without torch.
 
-    K = m K0(b) + F0                   K0: the thesis's force law (Eq. 33) of the insert, its modulus scaled, too
+    K = g(m K0(b) + F0)                K0: the thesis's force law (Eq. 33) of the insert, its modulus scaled, too
     b = tanh(q B_m (B / B_m)^n) / q    what of the field B acts: iron saturates
     L = K (1 + r exp(-(v / v_s)^2) + e ln((v + v_0) / (v_1 + v_0))) + c v
-    F = L (1 - exp(-k x / L)) before mobilisation, then L
+    F = L (1 - exp(-(k / L + p) x)) before mobilisation, then L
 
-The law rises with the field whatever the rows, and about fifty of them determine it. A network that rises with the
-field is fitted to it for the model file, whose metrics say how far the two differ.
+About fifty rows determine these eleven numbers. g, which is fitted to what they miss, rises in straight pieces: an
+elastomer of another law needs some hundred rows. The law rises with the field whatever the rows. A network that rises
+is fitted to it for the model file, whose metrics say how far the two differ.
 """
 
 import datetime
@@ -38,9 +39,11 @@ MIN_N = 1e-6
 ROBUST_N = 0.05
 "Larger errors count less: they are rows near a reversal."
 FITTED_ROWS = 3000
+PIECES, SLOPE_SD = 8, 0.3
+"Of the curve that rises, and the spread of its slope's logarithm that needs no rows to show it."
 DRAWN = 2048
 "Points of the box at which the network is fitted."
-SLIDING = 0.7
+SLIDING = 0.85
 "Share of these points at full displacement, which plans ask for."
 EDGE = 0.05
 "Share of these points at each end of a range."
@@ -62,10 +65,23 @@ class Law(NamedTuple):
     viscous_N_s_mm: float
     log_stiffness_N_mm: float
     saturating_1_T: float
+    preslide_1_mm: float
+    "p: a share of the stiffness grows with the normal force."
 
-    def forces_N(self, rows: Array, fitted: Insert) -> Array:
+    def forces_N(self, rows: Array, fitted: Insert, bend: "Bend | None" = None) -> Array:
         """Return the force (n) at `rows` (n x 4, order of `FEATURES`)."""
         displacement_mm, rate_mm_s, field_mT, _ = rows.T
+        kinetic_N = self.kinetic_N(field_mT, fitted)
+        if bend is not None:
+            kinetic_N = bend.bent_N(kinetic_N)
+        over = 1.0 + self.static * np.exp(-np.square(rate_mm_s / np.exp(self.log_stribeck_mm_s)))
+        over += self.by_rate * np.log((rate_mm_s + SLOW_MM_S) / (REFERENCE_MM_S + SLOW_MM_S))
+        level_N = np.maximum(kinetic_N * over + self.viscous_N_s_mm * rate_mm_s, MIN_N)
+        stiffness_N_mm = np.exp(self.log_stiffness_N_mm) + self.preslide_1_mm * level_N
+        return mobilised_N(level_N, displacement_mm, stiffness_N_mm)
+
+    def kinetic_N(self, field_mT: Array, fitted: Insert) -> Array:
+        """Return K (n) at fields (n)."""
         nominal, thickness_m = fitted.elastomer, TORMAG.thickness_m
         inner_m, outer_m = TORMAG.inner_radius_m, TORMAG.outer_radius_m
         modulus_Pa = nominal.shear_modulus_Pa * np.exp(self.log_modulus)
@@ -77,23 +93,33 @@ class Law(NamedTuple):
             2.0 * np.pi * thickness_m * inner_m**2 / TORMAG.roller_radius_m * nominal.friction_coefficient * modulus_Pa
         )
         compressed = np.minimum(curve.compression(load), MAX_COMPRESSION)
-        kinetic_N = np.exp(self.log_m) * scale_N * curve.force(compressed, load) + self.free_N
-        over = 1.0 + self.static * np.exp(-np.square(rate_mm_s / np.exp(self.log_stribeck_mm_s)))
-        over += self.by_rate * np.log((rate_mm_s + SLOW_MM_S) / (REFERENCE_MM_S + SLOW_MM_S))
-        level_N = np.maximum(kinetic_N * over + self.viscous_N_s_mm * rate_mm_s, MIN_N)
-        return mobilised_N(level_N, displacement_mm, np.exp(self.log_stiffness_N_mm))
+        kinetic_N: Array = np.exp(self.log_m) * scale_N * curve.force(compressed, load) + self.free_N
+        return kinetic_N
 
 
-def mobilised_N(level_N: Array, displacement_mm: Array, stiffness_N_mm: float) -> Array:
+class Bend(NamedTuple):
+    """g, in pieces of equal width over `law_N`; beyond, it rises as the law does."""
+
+    law_N: tuple[float, float]
+    offset_N: float
+    log_slopes: Array
+
+    def bent_N(self, kinetic_N: Array) -> Array:
+        knots_N, width_N = np.linspace(*self.law_N, len(self.log_slopes) + 1, retstep=True)
+        more_N = np.append(0.0, np.cumsum(np.expm1(self.log_slopes)) * width_N)
+        return kinetic_N + self.offset_N + np.interp(kinetic_N, knots_N, more_N)
+
+
+def mobilised_N(level_N: Array, displacement_mm: Array, stiffness_N_mm: float | Array) -> Array:
     """Return the force (n) at displacements (n) with the friction level (n) above 0."""
     borne_N: Array = level_N * -np.expm1(-stiffness_N_mm * displacement_mm / level_N)
     return np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
 
 
-START = Law(0.0, 0.0, 1.0, 0.0, 0.1, np.log(10.0), 0.0, 1e-4, np.log(5.0), 0.3)
-LEAST = Law(-3.0, -3.0, 0.5, -0.5, 0.0, np.log(0.5), -0.1, 0.0, np.log(0.5), 1e-3)
-MOST = Law(3.0, 3.0, 2.0, 1.0, 1.0, np.log(100.0), 0.1, 0.01, np.log(50.0), 5.0)
-SCALE = Law(0.1, 0.1, 0.1, 0.05, 0.1, 0.5, 0.01, 1e-3, 0.5, 0.3)
+START = Law(0.0, 0.0, 1.0, 0.0, 0.1, np.log(10.0), 0.0, 1e-4, np.log(5.0), 0.3, 0.5)
+LEAST = Law(-3.0, -3.0, 0.5, -0.5, 0.0, np.log(0.5), -0.1, 0.0, np.log(0.5), 1e-3, 0.0)
+MOST = Law(3.0, 3.0, 2.0, 1.0, 1.0, np.log(100.0), 0.1, 0.01, np.log(50.0), 5.0, 20.0)
+SCALE = Law(0.1, 0.1, 0.1, 0.05, 0.1, 0.5, 0.01, 1e-3, 0.5, 0.3, 1.0)
 
 
 def fit_law(data: Dataset, fitted: Insert) -> Law:
@@ -106,6 +132,20 @@ def fit_law(data: Dataset, fitted: Insert) -> Law:
     robust = {"loss": "soft_l1", "f_scale": ROBUST_N}
     found = least_squares(residual, START, bounds=(LEAST, MOST), x_scale=SCALE, **robust)
     return Law(*found.x.tolist())
+
+
+def fit_bend(data: Dataset, fitted: Insert, law: Law) -> Bend:
+    """Fit g: its slopes are 1 where no rows show another."""
+    kinetic_N = law.kinetic_N(data.features[:, FIELD], fitted)
+    ends_N = float(kinetic_N.min()), float(kinetic_N.max())
+
+    def residual(numbers: Array) -> Array:
+        bend = Bend(ends_N, numbers[0], numbers[1:])
+        off_N = law.forces_N(data.features, fitted, bend) - data.force_N
+        return np.concatenate((off_N / ROBUST_N, numbers[1:] / SLOPE_SD))
+
+    offset_N, *log_slopes = least_squares(residual, np.zeros(1 + PIECES), loss="soft_l1").x
+    return Bend(ends_N, offset_N, np.array(log_slopes))
 
 
 def fit_law_model(
@@ -137,7 +177,7 @@ def fit_law_model(
     )
     law = fit_law(training, fitted)
     rows = _drawn(training)
-    forces_N = law.forces_N(rows, fitted)
+    forces_N = law.forces_N(rows, fitted, fit_bend(training, fitted, law))
     model = _as_network(metadata, rows, forces_N, epochs, seed)
     off_N = np.abs(model.predict(rows) - forces_N)
     metrics = {

@@ -44,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--law",
         action="store_true",
-        help="fit the law of a brake with one insert, ten numbers that rise with the field",
+        help="fit the law of a brake with one insert, which rises with the field",
     )
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
