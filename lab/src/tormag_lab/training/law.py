@@ -107,7 +107,8 @@ class Bend(NamedTuple):
     def bent_N(self, kinetic_N: Array) -> Array:
         knots_N, width_N = np.linspace(*self.law_N, len(self.log_slopes) + 1, retstep=True)
         more_N = np.append(0.0, np.cumsum(np.expm1(self.log_slopes)) * width_N)
-        return kinetic_N + self.offset_N + np.interp(kinetic_N, knots_N, more_N)
+        bent_N: Array = kinetic_N + self.offset_N + np.interp(kinetic_N, knots_N, more_N)
+        return bent_N
 
 
 def mobilised_N(level_N: Array, displacement_mm: Array, stiffness_N_mm: float | Array) -> Array:
