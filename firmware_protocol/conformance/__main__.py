@@ -12,18 +12,19 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final, TextIO
 
 from firmware_protocol.codec import Identity
+from firmware_protocol.conformance.bench import left_open
 from firmware_protocol.conformance.check import Check, Result, run
 from firmware_protocol.conformance.examination import CHECKS, checks_on
 from firmware_protocol.conformance.host import OPENING_MM_S, STROKE_MM, Host
 from firmware_protocol.conformance.line import Line
-from firmware_protocol.conformance.overall import left_open
 from firmware_protocol.conformance.ports import open_line
+from firmware_protocol.conformance.rules import RULES
 
 PASSED, FAILED, USAGE = 0, 1, 2
 RESET_S: Final = 30.0
 PAGE: Final = "firmware_protocol/README.md"
 WARNING: Final = """\
-{line}: THE DEVICE'S MOTORS WILL MOVE, for about five minutes: homings, duties of up to 1, the whole way to the closed
+{line}: THE DEVICE'S MOTORS WILL MOVE, for about six minutes: homings, duties of up to 1, the whole way to the closed
 switches, openings because this program falls silent on purpose. A firmware that is wrong may do anything: keep the
 motors' supply switch in reach, take hands and patient's side off the brake, and end the daemon."""
 
@@ -35,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.list:
         for one in CHECKS:
             print(f"{one.name}: {one.sent}: {one.expected} ({one.page}; else {one.hazard.value})")
+        print(*(f"{finds} cannot be checked: {rule}" for rule, finds in RULES.items() if finds[0] == "-"), sep="\n")
         return PASSED
     if options.line is None:
         command.error("the following arguments are required: PORT|CHANNEL")
@@ -97,6 +99,7 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
         stroke_mm=options.stroke_mm,
         uptime_s=options.uptime,
         reset=_resetter(options),
+        ask=lambda what: _say(f"please {what}", sys.stderr),
     )
     results: list[Result] = []
 
@@ -183,6 +186,49 @@ def _is_agreed(line: str) -> bool:
     return sys.stdin.readline().strip().lower() == "yes"
 
 
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: allowed are numbers over 0")
+    return value
+
+
+OPTIONS: Final[dict[str, dict[str, Any]]] = {
+    "--yes": {"action": "store_true", "help": "let the motors move without asking"},
+    "--json": {"action": "store_true", "help": "JSON on stdout, progress on stderr"},
+    "--only": {
+        "action": "append",
+        "default": [],
+        "metavar": "CHECK",
+        "help": "run only this and left_open; may be repeated",
+    },
+    "--list": {"action": "store_true", "help": "list the checks of every line, and the rules that none can check"},
+    "--baud": {"type": int, "default": 1_000_000, "metavar": "N", "help": "of a serial port; default 1000000"},
+    "--bitrate": {"type": int, "default": 1_000_000, "metavar": "N", "help": "of a CAN bus; default 1000000"},
+    "--node": {"type": int, "choices": range(16), "default": 1, "metavar": "N", "help": "on a CAN bus; default 1"},
+    "--reset": {
+        "metavar": "COMMAND",
+        "help": "resets the device, given warm (memory kept) or cold (supply off and on); the line stays",
+    },
+    "--uptime": {"type": _positive, "metavar": "S", "help": "how long the device's clock has run"},
+    "--opening-mm-s": {
+        "type": _positive,
+        "default": OPENING_MM_S,
+        "metavar": "V",
+        "help": f"default {OPENING_MM_S:g}",
+    },
+    "--stroke-mm": {
+        "type": _positive,
+        "default": STROKE_MM,
+        "metavar": "MM",
+        "help": f"between switches; default {STROKE_MM:g}",
+    },
+}
+
+
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="python -m firmware_protocol.conformance",
@@ -196,38 +242,9 @@ def parser() -> argparse.ArgumentParser:
         help="path of a serial port, or INTERFACE:CHANNEL of a CAN bus: socketcan:can0, slcan:/dev/ttyACM0, "
         "tormagsim:PATH",
     )
-    made.add_argument("--yes", action="store_true", help="let the motors move without asking")
-    made.add_argument("--json", action="store_true", help="JSON on stdout, progress on stderr")
-    made.add_argument(
-        "--only", action="append", default=[], metavar="CHECK", help="run only this and left_open; may be repeated"
-    )
-    made.add_argument("--list", action="store_true", help="list the checks of every line")
-    made.add_argument("--baud", type=int, default=1_000_000, metavar="N", help="of a serial port; default 1000000")
-    made.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="of a CAN bus; default 1000000")
-    made.add_argument("--node", type=int, choices=range(16), default=1, metavar="N", help="on a CAN bus; default 1")
-    made.add_argument(
-        "--reset",
-        metavar="COMMAND",
-        help="resets the device, given warm (memory kept) or cold (supply off and on); the line stays",
-    )
-    made.add_argument("--uptime", type=_positive, metavar="S", help="how long the device's clock has run")
-    made.add_argument(
-        "--opening-mm-s", type=_positive, default=OPENING_MM_S, metavar="V", help=f"default {OPENING_MM_S:g}"
-    )
-    made.add_argument(
-        "--stroke-mm", type=_positive, default=STROKE_MM, metavar="MM", help=f"between switches; default {STROKE_MM:g}"
-    )
+    for name, options in OPTIONS.items():
+        made.add_argument(name, **options)
     return made
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text}: allowed are numbers over 0")
-    return value
 
 
 if __name__ == "__main__":

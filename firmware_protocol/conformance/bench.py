@@ -7,22 +7,19 @@ from firmware_protocol.conformance.check import Check, Hazard, check
 from firmware_protocol.conformance.host import (
     NO_FAULT,
     OPENED_S,
+    SEEN_S,
     Beat,
     Host,
-    Unmet,
     Untested,
     is_open,
     positions,
     shown,
+    unless,
 )
-from firmware_protocol.conformance.opening import MIN_SHARE
-from firmware_protocol.conformance.running import refuses_run
+from firmware_protocol.conformance.moving import keeps_still
+from firmware_protocol.conformance.taking import MIN_SHARE
 
-PAGE: Final = "Reset"
-FAR_INSIDE_MM: Final = 10.0
-BOOT_S: Final = 10.0
-UNHOMED_SHARE: Final = 0.5
-TO_TURN_S: Final = 0.5
+FAR_INSIDE_MM, BOOT_S, UNHOMED_SHARE, TO_TURN_S = 10.0, 10.0, 0.5, 0.5
 
 
 def _is_new(host: Host, how: str) -> str:
@@ -32,10 +29,12 @@ def _is_new(host: Host, how: str) -> str:
     host.running(FAR_INSIDE_MM)
     host.reset(how)
     host.begin()
-    if not host.until(lambda: host.status.command_nonce == 0, BOOT_S, Beat.NOTHING):
-        raise Unmet(f"no reset, or one that keeps the nonce: {shown(host.status)}")
-    host.shows(DeviceMode.IDLE, Beat.NOTHING, homed=False, fault=NO_FAULT, besides="after the reset")
-    seen = [refuses_run(host, DeviceMode.IDLE)]
+    is_reset = host.until(lambda: host.status.command_nonce == 0, BOOT_S, Beat.NOTHING)
+    unless(not is_reset, f"no reset, or one that keeps the nonce: {shown(host.status)}")
+    host.counter = 255
+    seen = [keeps_still(host, "after the reset")]
+    host.send(Home(0))
+    host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT, besides="after a Home with nonce 0")
     start_s, start = host.now_s, host.last(State)
     host.obeyed(Retract)
     host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S)
@@ -43,12 +42,11 @@ def _is_new(host: Host, how: str) -> str:
     limit_s = FAR_INSIDE_MM / (MIN_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
     is_late = host.now_s - start_s > limit_s
     host.shows(DeviceMode.IDLE, homed=False, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=is_late)
-    host.obeyed(Home)
-    host.until(lambda: host.status.mode is not DeviceMode.HOMING, OPENED_S)
-    host.shows(DeviceMode.IDLE, homed=True, fault=NO_FAULT, besides="homed without a Hello")
-    seen.append(refuses_run(host, DeviceMode.IDLE))
-    host.running()
-    return f"{'; '.join(seen)} without a Hello; after it {shown(host.status)}"
+    host.home(Beat.NOTHING)
+    seen.append(keeps_still(host, "homed without a Hello,"))
+    host.hello()
+    host.pass_time(SEEN_S, Beat.RUN)
+    return host.shows(DeviceMode.RUN, Beat.RUN, homed=True, besides=f"{'; '.join(seen)}; after it")
 
 
 LIKE_NEW: Final = (
@@ -57,13 +55,13 @@ LIKE_NEW: Final = (
 )
 
 
-@check(Hazard.CLOSES, PAGE, f"in RUN, {FAR_INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
+@check(Hazard.CLOSES, "Reset", f"in RUN, {FAR_INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
 def warm_reset(host: Host) -> str:
     """A zero that was kept over a reset by watchdog or pin may be off."""
     return _is_new(host, "warm")
 
 
-@check(Hazard.CLOSES, PAGE, f"in RUN, {FAR_INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
+@check(Hazard.CLOSES, "Reset", f"in RUN, {FAR_INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
 def cold_reset(host: Host) -> str:
     return _is_new(host, "cold")
 
@@ -85,4 +83,17 @@ BY_HAND: Final = (
     _by_hand("temperature", Hazard.WORN, "the sensor warmed to over 60 degC", "TEMPERATURE; as SUPPLY"),
     _by_hand("watchdog", Hazard.CLOSES, "a firmware that hangs in RUN", "a reset within 50 ms, drives off"),
 )
+
+
+@check(
+    Hazard.SHUT,
+    "Who says what when, 7",
+    "Drive OFF; where that does not open, Clear and Retract",
+    "both open switches, drives off",
+)
+def left_open(host: Host) -> str:
+    hindrance = host.leave_open()
+    return unless(hindrance, f"THE GAP MAY BE SHUT: {hindrance}" if hindrance else shown(host.status))
+
+
 CHECKS: Final = (warm_reset, cold_reset, *BY_HAND)

@@ -2,40 +2,22 @@
 
 from collections.abc import Sequence
 
-from firmware_protocol.codec import FUNCTION, Drive
-from firmware_protocol.conformance import (
-    bench,
-    damage,
-    homing,
-    meeting,
-    opening,
-    overall,
-    running,
-    silence,
-    streams,
-    stroke,
-)
+from firmware_protocol.conformance import bench, moving, taking, telling
 from firmware_protocol.conformance.check import Check
-from firmware_protocol.conformance.line import Line
+from firmware_protocol.conformance.line import Line, SerialLine
 
 
 def checks_on(line: Line) -> Sequence[Check]:
-    """Return all checks but those of damages that the line's carrier cannot do."""
-    damages = line.damages(FUNCTION[Drive], b"")
-    return [one for one in CHECKS if one not in damage.ON_A_CARRIER or one.name in damages]
+    """Return all checks but that of a serial line's frames on a bus."""
+    return [one for one in CHECKS if isinstance(line, SerialLine) or one is not telling.frames_as_they_come]
 
 
 CHECKS = (
-    *meeting.CHECKS,
-    *streams.CHECKS,
-    *damage.CHECKS,
-    *damage.ON_A_CARRIER,
-    *homing.CHECKS,
-    *running.CHECKS,
-    *stroke.CHECKS,
-    *opening.CHECKS,
-    *silence.CHECKS,
-    *overall.CHECKS,
+    *telling.STREAMS,
+    *moving.GATES,
+    *taking.CHECKS,
+    *moving.CHECKS,
+    *telling.OVERALL,
     *bench.CHECKS,
-    overall.left_open,
+    bench.left_open,
 )

@@ -23,7 +23,7 @@ PATIENCE_S: Final = 1.0
 
 @final
 class SerialPort:
-    """An open, exclusively held serial port: a `BytePort`."""
+    """An open, exclusively held serial port: a `Port`."""
 
     def __init__(self, path: str, baud: int) -> None:
         """Open the port at `path`, with its latency timer at 1 ms if it has one."""
@@ -63,7 +63,7 @@ class SerialPort:
 
 @final
 class CanPort:
-    """An open CAN bus: a `FramePort`."""
+    """An open CAN bus: a `Port`."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
         """Open a bus by python-can; `baud` is of an adapter's serial port."""
