@@ -8,8 +8,7 @@ import random
 from array import array
 from collections import Counter
 from collections.abc import Callable
-from enum import Enum, auto
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeAlias, TypeVar
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -48,7 +47,8 @@ INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
 TIME_SPAN_S: Final = period(State, "device_time_s")
-OPEN: Final = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
+OPEN: Final = ENDS[0] | ENDS[1]
 NO_FAULT: Final = DeviceFault(0)
 COLUMNS: Final = (
     *("arrived_s", "device_time_s", "counter", "left_mm", "right_mm"),
@@ -77,12 +77,8 @@ def unless(is_wrong: object, seen: str) -> str:
     return seen
 
 
-class Beat(Enum):
-    """The Drive that is sent every millisecond, or none."""
-
-    NOTHING = auto()
-    OFF = auto()
-    RUN = auto()
+Beat: TypeAlias = DriveMode | None
+"The Drive that is sent every millisecond, or none."
 
 
 class Heard(NamedTuple):
@@ -97,7 +93,6 @@ class Host:
         *,
         opening_mm_s: float = OPENING_MM_S,
         stroke_mm: float = STROKE_MM,
-        uptime_s: float | None = None,
         reset: Callable[[str], None] | None = None,
         ask: Callable[[str], None] = lambda what: None,
     ) -> None:
@@ -107,7 +102,6 @@ class Host:
         self.reset = reset
         self.ask = ask
         self.random = random.Random(41)
-        self._booted_s = None if uptime_s is None else line.port.now_s() - uptime_s
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
         self.refused = Counter[str]()
@@ -121,17 +115,12 @@ class Host:
         """The greatest lateness of this process since `begin`."""
         self.drive_s = line.port.now_s()
         self.counter = 0
-        self._nonce = 0
         self._next_s = line.port.now_s()
         self._status_s = math.inf
 
     @property
     def now_s(self) -> float:
         return self.line.port.now_s()
-
-    @property
-    def uptime_s(self) -> float | None:
-        return None if self._booted_s is None else self.now_s - self._booted_s
 
     # -- what is sent ------------------------------------------------------------------------------------------------
 
@@ -149,19 +138,16 @@ class Host:
         schema_hash: int = SCHEMA_HASH,
         version: int = PROTOCOL_VERSION,
         nonce: int = HELLO_NONCE,
-        beat: Beat = Beat.NOTHING,
+        beat: Beat = None,
     ) -> None:
         """Send one Hello, and wait for its answer."""
         self.send(Hello(schema_hash, version, nonce))
         self.pass_time(ANSWER_S, beat)
 
     def new_nonce(self) -> int:
-        self._nonce = self._nonce % MAX_NONCE + 1
-        if self._nonce == self._shown_nonce():
-            self._nonce = self._nonce % MAX_NONCE + 1
-        return self._nonce
+        return self.status.command_nonce % MAX_NONCE + 1
 
-    def command(self, kind: Command, beat: Beat = Beat.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
+    def command(self, kind: Command, beat: Beat = DriveMode.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
         """Repeat a command until a Status acknowledges it; return whether one did within `limit_s`."""
         nonce = self.new_nonce()
         start_s = due_s = self._next_s
@@ -174,7 +160,7 @@ class Host:
             self.beat(beat)
         return True
 
-    def obeyed(self, kind: Command, beat: Beat = Beat.OFF) -> None:
+    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF) -> None:
         unless(not self.command(kind, beat), f"{kind.__name__} not acknowledged: {shown(self.status)}")
 
     def beat(
@@ -186,19 +172,17 @@ class Host:
         besides: Callable[[], None] = lambda: None,
     ) -> None:
         """Send a Drive, or none, and another message `besides`; then listen."""
-        if beat is not Beat.NOTHING:
-            self.drive(DriveMode.RUN if beat is Beat.RUN else DriveMode.OFF, left, right)
+        if beat is not None:
+            self.drive(beat, left, right)
         besides()
         self._listen(period_s)
 
-    def pass_time(
-        self, seconds: float, beat: Beat = Beat.NOTHING, period_s: float = PERIOD_S, duty: float = 0.0
-    ) -> None:
+    def pass_time(self, seconds: float, beat: Beat = None, period_s: float = PERIOD_S, duty: float = 0.0) -> None:
         """Repeat `beat` for a time, with `duty` for both motors."""
         for _ in range(round(seconds / period_s)):
             self.beat(beat, duty, duty, period_s)
 
-    def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = Beat.OFF) -> bool:
+    def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = DriveMode.OFF) -> bool:
         """Repeat `beat` until `reached()` or for `limit_s`; return whether it was reached."""
         end_s = self._next_s + limit_s
         while not reached():
@@ -232,7 +216,7 @@ class Host:
     @property
     def status(self) -> Status:
         if Status not in self.newest:
-            self.until(lambda: Status in self.newest, 10 * STATUS_S, Beat.NOTHING)
+            self.until(lambda: Status in self.newest, 10 * STATUS_S, None)
         return self.last(Status)
 
     def next_status(self, beat: Beat) -> Status:
@@ -245,7 +229,7 @@ class Host:
     def shows(
         self,
         mode: DeviceMode,
-        beat: Beat = Beat.OFF,
+        beat: Beat = DriveMode.OFF,
         *,
         homed: bool | None = None,
         opened: bool | None = None,
@@ -262,9 +246,6 @@ class Host:
             and fault in (None, status.faults)
         )
         return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
-
-    def _shown_nonce(self) -> int:
-        return self.last(Status).command_nonce if Status in self.newest else 0
 
     def _listen(self, period_s: float) -> None:
         """Take what comes in the next `period_s`, and note how late this process is."""
@@ -298,7 +279,8 @@ class Host:
         if isinstance(message, Status):
             is_late = self.stalled_s < STALLED_S and heard.time_s - self._status_s > 2.5 * STATUS_S
             self.contradictions["a Status that was late"] += is_late
-            self.contradictions["nonce 0 again: a reset"] += self._shown_nonce() > message.command_nonce == 0
+            nonce = self.last(Status).command_nonce if Status in self.newest else 0
+            self.contradictions["nonce 0 again: a reset"] += nonce > message.command_nonce == 0
             self._status_s = heard.time_s
             self.contradictions.update(contradictions(message))
             self.contradictions.update(self._misplaced(heard.time_s, message))
@@ -307,23 +289,23 @@ class Host:
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
         """Return the end switches in a Status that do not fit the State just before it."""
-        state = self.newest.get(State)
-        is_usable = Status in self.newest and is_homed(self.last(Status)) and is_homed(status)
-        if state is None or not is_usable or time_s - state.time_s > FRESH_S:
+        if not {State, Status} <= self.newest.keys() or time_s - self.newest[State].time_s > FRESH_S:
             return []
-        found = []
-        for side, at_mm in zip(("LEFT", "RIGHT"), places(self.last(State)), strict=True):
-            for end, in_mm in (("OPEN", at_mm), ("CLOSED", -self.stroke_mm - at_mm)):
-                closed = Switches[f"{side}_{end}"] in status.switches
-                if (closed and in_mm < -SWITCH_MM) or (not closed and in_mm > SWITCH_MM):
-                    found.append(f"{side}_{end} {'closed' if closed else 'not closed'} at {at_mm:+.1f} mm")
-        return found
+        left_mm, right_mm = places(self.last(State))
+        beyond_mm = (left_mm, right_mm, -self.stroke_mm - left_mm, -self.stroke_mm - right_mm)
+        signs = [-1.0 if each in status.switches else 1.0 for each in ENDS]
+        is_usable = is_homed(self.last(Status)) and is_homed(status)
+        return [
+            f"{each.name} {'not closed' if sign > 0.0 else 'closed'} at {mm:+.1f} mm beyond it"
+            for each, sign, mm in zip(ENDS, signs, beyond_mm, strict=True)
+            if is_usable and sign * mm > SWITCH_MM
+        ]
 
     # -- where a check begins ----------------------------------------------------------------------------------------
 
     def idle(self) -> None:
         self.hello()
-        self.pass_time(SEEN_S, Beat.OFF)
+        self.pass_time(SEEN_S, DriveMode.OFF)
         unless(not self.until(self.is_resting, HOMED_S), f"not at rest after {HOMED_S:g} s: {shown(self.status)}")
         if self.status.mode is DeviceMode.LATCHED:
             self.obeyed(Clear)
@@ -343,7 +325,7 @@ class Host:
             self.until(self.is_resting, OPENED_S)
         self.shows(DeviceMode.IDLE, homed=True, opened=True, besides="after Home and Retract")
 
-    def home(self, beat: Beat = Beat.OFF) -> float:
+    def home(self, beat: Beat = DriveMode.OFF) -> float:
         """Home an idle device; return how long it took."""
         start_s = self._next_s
         self.obeyed(Home, beat)
@@ -354,12 +336,12 @@ class Host:
 
     def running(self, inside_mm: float = 0.0) -> None:
         self.homed()
-        self.pass_time(2 * PERIOD_S, Beat.OFF)
-        self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, Beat.RUN)
+        self.pass_time(2 * PERIOD_S, DriveMode.OFF)
+        self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, DriveMode.RUN)
         unless(self.status.mode is not DeviceMode.RUN, f"Drive RUN does not lead to RUN: {shown(self.status)}")
         if inside_mm > 0.0:
             self.bring(-inside_mm, -inside_mm)
-            self.pass_time(SEEN_S, Beat.RUN)
+            self.pass_time(SEEN_S, DriveMode.RUN)
 
     def bring(
         self, left_mm: float, right_mm: float, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
@@ -376,53 +358,35 @@ class Host:
             left_to, right_to = (at + clamped(goal - at, step_mm) for at, goal in zip(targets, goals, strict=True))
             targets = left_to, right_to
             left, right = (clamped(DUTY_PER_MM * (to - at), 1.0) for to, at in zip(targets, at_mm, strict=True))
-            self.beat(Beat.RUN, left, right)
+            self.beat(DriveMode.RUN, left, right)
             is_off = not ends() and (self.status.mode is not DeviceMode.RUN or self._next_s > end_s)
             unless(is_off, f"on the way to {goals} mm: {positions(self.last(State))}, {shown(self.status)}")
 
-    def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] | None = None) -> float:
+    def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] = lambda: None) -> float:
         """Send no Drive in RUN for a time, then one; return the silence by the device's clock, s."""
-        self.next_status(Beat.RUN)
-        self.pass_time(self.random.randrange(20) * PERIOD_S, Beat.RUN)
-        self._answered(Beat.RUN)
+        self.next_status(DriveMode.RUN)
+        self.pass_time(self.random.randrange(20) * PERIOD_S, DriveMode.RUN)
+        self._answered(DriveMode.RUN)
         before = self.last(State)
         while self._next_s < self.drive_s + silent_s - 0.5 * PERIOD_S:
-            if meanwhile is not None:
-                meanwhile()
-            self.beat(Beat.NOTHING)
-        return (self._answered(Beat.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
+            self.beat(None, besides=meanwhile)
+        return (self._answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
 
     def _answered(self, beat: Beat) -> State:
         before = self.newest.get(State)
         self.beat(beat)
-        is_answered = self.until(lambda: self.newest.get(State) is not before, ANSWER_S, Beat.NOTHING)
+        is_answered = self.until(lambda: self.newest.get(State) is not before, ANSWER_S, None)
         unless(not is_answered, f"no State: {shown(self.status)}")
         return self.last(State)
 
     def latched(self) -> None:
         """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN."""
-        status = self.next_status(Beat.NOTHING)
+        status = self.next_status(None)
         if status.mode is not DeviceMode.LATCHED or status.faults != DeviceFault.COMMAND_TIMEOUT:
             self.running(INSIDE_MM)
             self.pass_time(0.1)
             self.until(self.is_resting, OPENED_S)
-            self.shows(DeviceMode.LATCHED, Beat.NOTHING, fault=DeviceFault.COMMAND_TIMEOUT, besides="after silence")
-
-    def leave_open(self) -> str:
-        """Open the gap from any state; return what hinders it in words, or ""."""
-        self.hello()
-        for _ in range(2):
-            if Status not in self.newest and not self.until(lambda: Status in self.newest, 0.2):
-                return "the device sends no Status"
-            self.until(self.is_resting, OPENED_S)
-            if is_open(self.next_status(Beat.OFF)) and self.is_resting():
-                return ""
-            if self.status.mode is DeviceMode.LATCHED:
-                self.command(Clear)
-            self.command(Retract)
-            self.until(self.is_resting, OPENED_S)
-        status = self.next_status(Beat.OFF)
-        return "" if is_open(status) and self.is_resting() else shown(status)
+            self.shows(DeviceMode.LATCHED, None, fault=DeviceFault.COMMAND_TIMEOUT, besides="after silence")
 
     def is_resting(self) -> bool:
         """Whether the newest Status shows the drives off."""

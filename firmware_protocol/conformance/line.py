@@ -112,10 +112,7 @@ class CanLine:
         can_identifier(1, node)
         self.port, self._node = port, node
         self._others: set[int] = set()
-
-    @property
-    def frame_errors(self) -> dict[str, int]:
-        return {}
+        self.frame_errors: dict[str, int] = {}
 
     def send(self, function: int, payload: bytes) -> None:
         self.port.write(can_identifier(function, self._node), payload)

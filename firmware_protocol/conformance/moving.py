@@ -6,16 +6,8 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from firmware_protocol.codec import (
-    Clear,
-    DeviceFault,
-    DeviceMode,
-    Sense,
-    State,
-    Status,
-)
+from firmware_protocol.codec import Clear, DeviceFault, DeviceMode, DriveMode, Sense, State, Status
 from firmware_protocol.conformance.check import Check, Hazard, check
 from firmware_protocol.conformance.host import (
     ANSWER_S,
@@ -27,11 +19,8 @@ from firmware_protocol.conformance.host import (
     SEEN_S,
     STROKE_MM,
     SWITCH_MM,
-    TIME_SPAN_S,
-    Beat,
     Host,
     Unmet,
-    Untested,
     is_homed,
     is_open,
     places,
@@ -39,9 +28,9 @@ from firmware_protocol.conformance.host import (
     shown,
     unless,
 )
-from firmware_protocol.conformance.taking import DUTY, PLACES, Sent, opens_fully, put_off, refused, taken
+from firmware_protocol.conformance.taking import DUTY, PLACES, SPARSE_S, Sent, opens_fully, put_off, refused, taken
+from firmware_protocol.conformance.telling import columns
 
-Array = npt.NDArray[np.float64]
 RUNNING: Final = next(place for place in PLACES if place.name == "RUN")
 
 SILENCE, DRIVE = "Who says what when, 6", "Drive"
@@ -70,8 +59,6 @@ SHORT_S, LONG_S, BORNE_S, NOTICED_S = 0.047, 0.053, 0.0495, 0.0515
 "By the device's clock shorter silences are borne, longer ones noticed, with a tick for tolerance."
 SHORTS, LONGS, HELD_S, HOLDS = 12, 5, 37.0, 3
 "The holds together meet every time modulo 2^16 ms in RUN, and a silence in every 2^15 ms."
-SPARSE_S, OVER_S = 0.02, 16.0
-UPTIMES: Final = {31: 2.0**31 * 1e-6, 32: 2.0**32 * 1e-6}
 TIMED_OUT: Final = DeviceFault.COMMAND_TIMEOUT
 
 
@@ -87,7 +74,7 @@ def home_homes(host: Host) -> str:
     host.without_zero()
     unless(is_homed(host.status), f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     seen = []
-    for beat in (Beat.OFF, Beat.NOTHING):
+    for beat in (DriveMode.OFF, None):
         host.forget()
         seconds, state = host.home(beat), host.last(State)
         modes = [status.mode for _, status in host.all_of(Status)]
@@ -95,7 +82,7 @@ def home_homes(host: Host) -> str:
         first = next((each for time_s, each in host.all_of(State) if time_s > homed_s), state)
         jumps_mm = [abs(there - here) for there, here in zip(places(first), places(state), strict=True)]
         seen.append(f"{seconds:.1f} s, first {positions(first)}, then {positions(state)}")
-        is_off = beat is Beat.OFF and (max(map(abs, places(state))) > ZERO_MM or max(jumps_mm) > JUMP_MM)
+        is_off = beat is DriveMode.OFF and (max(map(abs, places(state))) > ZERO_MM or max(jumps_mm) > JUMP_MM)
         wrong = is_off or DeviceMode.HOMING not in modes or seconds > LAST_S
         host.shows(DeviceMode.IDLE, homed=True, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=wrong)
     return "; ".join(seen)
@@ -110,20 +97,20 @@ def home_homes(host: Host) -> str:
 )
 def run_is_entered(host: Host) -> str:
     host.running()
-    host.beat(Beat.OFF)
-    host.shows(DeviceMode.RETRACTING, Beat.RUN)
-    host.until(lambda: host.status.mode is not DeviceMode.RETRACTING, OPENED_S, Beat.RUN)
-    host.pass_time(SEEN_S, Beat.RUN)
-    return host.shows(DeviceMode.RUN, Beat.RUN)
+    host.beat(DriveMode.OFF)
+    host.shows(DeviceMode.RETRACTING, DriveMode.RUN)
+    host.until(lambda: host.status.mode is not DeviceMode.RETRACTING, OPENED_S, DriveMode.RUN)
+    host.pass_time(SEEN_S, DriveMode.RUN)
+    return host.shows(DeviceMode.RUN, DriveMode.RUN)
 
 
 def _duty_moves(side: int, host: Host) -> str:
-    """Let one duty fall until its carriage moves."""
+    """Let one duty fall until its carriage moves: with a wrong side or sign every safe state closes the gap."""
     host.running()
     start, duty, seen = places(host.last(State)), 0.0, ""
     while duty > -MAX_DUTY:
         duty -= RAMP_PER_S * PERIOD_S
-        host.beat(Beat.RUN, 0.0 if side else duty, duty if side else 0.0)
+        host.beat(DriveMode.RUN, 0.0 if side else duty, duty if side else 0.0)
         ways_mm = [at - began for at, began in zip(places(host.last(State)), start, strict=True)]
         sense = host.last(Sense)
         currents_A = abs(sense.left_current_A), abs(sense.right_current_A)
@@ -134,13 +121,6 @@ def _duty_moves(side: int, host: Host) -> str:
             return unless(currents_A[side] <= currents_A[1 - side], seen)
         unless(max(map(abs, ways_mm)) >= MOVED_MM, seen)
     raise Unmet(f"{seen}, {shown(host.status)}")
-
-
-def _of_duty(side: int, name: str, other: str) -> Check:
-    """Return the check of a duty's side and sign: with a wrong one every safe state closes the gap."""
-    sent = f"in RUN, a {name} duty that falls from 0 to -{MAX_DUTY:g} at most, {other} 0"
-    expected = f"the {name} carriage goes in by {MOVED_MM:g} mm, the {other} one stays; the {name} motor draws more"
-    return Check(f"{name}_duty", Hazard.CLOSES, DRIVE, sent, expected, partial(_duty_moves, side), True, True)
 
 
 @check(
@@ -154,26 +134,19 @@ def open_switch_stops(host: Host) -> str:
     host.running()
     unless(not is_open(host.status), f"not at the open switches: {shown(host.status)}")
     seen = []
-    for inside in ((), (0,), (1,)):
-        left_mm, right_mm = (-BESIDE_MM if side in inside else at for side, at in enumerate(places(host.last(State))))
-        host.bring(left_mm, right_mm)
-        host.pass_time(SEEN_S, Beat.RUN)
-        start = places(host.last(State))
-        host.forget()
-        host.pass_time(0.2, Beat.RUN, duty=MAX_DUTY if inside else AT_STOP_DUTY)
-        ways_mm = [at - began for at, began in zip(places(host.last(State)), start, strict=True)]
-        senses = [sense for _, sense in host.all_of(Sense)]
-        most_A = [
-            max(abs(each[side]) for each in ((it.left_current_A, it.right_current_A) for it in senses))
-            for side in (0, 1)
-        ]
-        seen.append(f"by {ways_mm[0]:+.2f} and {ways_mm[1]:+.2f} mm, {max(most_A):.2f} A at most")
-        stop = [most_A[side] > AT_STOP_A or abs(ways_mm[side]) > AT_STOP_MM for side in (0, 1) if side not in inside]
+    for inside in ((False, False), (True, False), (False, True)):
+        goals = np.where(inside, -BESIDE_MM, places(host.last(State)))
+        host.bring(goals[0], goals[1])
+        host.pass_time(SEEN_S, DriveMode.RUN)
+        first = len(host.rows)
+        host.pass_time(0.2, DriveMode.RUN, duty=MAX_DUTY if any(inside) else AT_STOP_DUTY)
+        rows = columns(host, first)
+        ways_mm = np.array([rows[name][-1] - rows[name][0] for name in ("left_mm", "right_mm")])
+        most_A = np.array([np.abs(rows[name]).max() for name in ("left_A", "right_A")])
+        seen.append(f"by {ways_mm[0]:+.2f} and {ways_mm[1]:+.2f} mm, {most_A[0]:.2f} and {most_A[1]:.2f} A at most")
+        stirs = (most_A > AT_STOP_A) | (np.abs(ways_mm) > AT_STOP_MM)
         host.shows(
-            DeviceMode.RUN,
-            Beat.RUN,
-            besides=seen[-1],
-            wrong=any(stop) or any(ways_mm[side] < MOVED_MM for side in inside),
+            DeviceMode.RUN, DriveMode.RUN, besides=seen[-1], wrong=np.where(inside, ways_mm < MOVED_MM, stirs).any()
         )
     return "; ".join(seen)
 
@@ -189,11 +162,11 @@ def zero_is_at_switch(host: Host) -> str:
     host.running()
     for goals in ((-BESIDE_MM, 0.0), (0.0, -BESIDE_MM)):
         host.bring(*goals, SLOW_MM_S)
-        host.pass_time(SEEN_S, Beat.RUN)
+        host.pass_time(SEEN_S, DriveMode.RUN)
         host.bring(BESIDE_MM, BESIDE_MM, SLOW_MM_S, lambda: is_open(host.status))
     for _ in range(3):
         host.running()
-        host.pass_time(0.2, Beat.RUN, duty=-1.0)
+        host.pass_time(0.2, DriveMode.RUN, duty=-1.0)
     wrong = +host.contradictions
     return unless(wrong, ", ".join(wrong) or "all changed in their place")
 
@@ -211,21 +184,19 @@ def duties_make_currents(host: Host) -> str:
     pulses: list[list[tuple[float, float, float]]] = [[], []]
     for left, right in ((sign * one, sign * other) for one, other in PAIRED for sign in (-1.0, 1.0)):
         host.bring(-MIDDLE_MM, -MIDDLE_MM)
-        host.pass_time(SETTLED_S, Beat.RUN)
+        host.pass_time(SETTLED_S, DriveMode.RUN)
         for _ in range(round(PULSE_S / PERIOD_S)):
-            host.beat(Beat.RUN, left, right)
+            host.beat(DriveMode.RUN, left, right)
         unless(host.status.mode is not DeviceMode.RUN, f"{left:+.2f} and {right:+.2f}: {shown(host.status)}")
-        rows = np.array(host.rows[-round(SETTLED_S / PERIOD_S) * len(COLUMNS) :]).reshape(-1, len(COLUMNS))
-        table = dict(zip(COLUMNS, rows.T, strict=True))
-        times_s = np.unwrap(table["device_time_s"], period=TIME_SPAN_S)
+        rows = columns(host, -round(SETTLED_S / PERIOD_S) * len(COLUMNS))
         for side, name, duty in ((0, "left", left), (1, "right", right)):
-            mm_s = float(np.polyfit(times_s - times_s[0], table[f"{name}_mm"], 1)[0])
-            pulses[side].append((duty, mm_s, float(table[f"{name}_A"].mean())))
+            mm_s = float(np.polyfit(rows["device_s"] - rows["device_s"][0], rows[f"{name}_mm"], 1)[0])
+            pulses[side].append((duty, mm_s, float(rows[f"{name}_A"].mean())))
     host.bring(-MIDDLE_MM, -MIDDLE_MM)
-    host.pass_time(SETTLED_S, Beat.RUN)
+    host.pass_time(SETTLED_S, DriveMode.RUN)
     start_mm = places(host.last(State))
     # the second Drive measures what the first began; an answer that lags shows a motor at rest
-    host.pass_time(2 * STARTED_S, Beat.RUN, STARTED_S, duty=1.0)
+    host.pass_time(2 * STARTED_S, DriveMode.RUN, STARTED_S, duty=1.0)
     sense, way_mm = host.last(Sense), min(np.subtract(places(host.last(State)), start_mm))
     seen = [f"{sense.left_current_A:+.2f} and {sense.right_current_A:+.2f} A, {way_mm:+.2f} mm at once"]
     starting_A = np.array((sense.left_current_A, sense.right_current_A))
@@ -251,15 +222,14 @@ def _ends_run(fault: DeviceFault, from_share: float, ahead_mm: float, most_mm: f
         host.bring(goals[0], goals[1], SLOW_MM_S, lambda: _apart_mm(host) > SKEW_MM + BOUND_MM or _has_left(host))
         innermost_mm = min(places(state)[side] for _, state in host.all_of(State))
         off_mm = _apart_mm(host) - SKEW_MM if is_skew else innermost_mm + host.stroke_mm
-        seen.append(f"{off_mm:+.2f} mm from where it ends: {shown(host.next_status(Beat.RUN))}")
+        seen.append(f"{off_mm:+.2f} mm from where it ends: {shown(host.next_status(DriveMode.RUN))}")
         unless(host.status.faults != fault or abs(off_mm) > most_mm, "; ".join(seen))
         seen.append(opens_fully(host, fault))
     return "; ".join(seen)
 
 
 def _apart_mm(host: Host) -> float:
-    left_mm, right_mm = places(host.last(State))
-    return abs(left_mm - right_mm)
+    return abs(float(np.subtract(*places(host.last(State)))))
 
 
 def _has_left(host: Host) -> bool:
@@ -278,32 +248,34 @@ def let_go_after_all(host: Host) -> str:
     seen = [_has_to_let_go(host)]
     host.running(INSIDE_MM)
     host.pass_time(0.1)
-    host.until(host.is_resting, OPENED_S, Beat.RUN)
-    host.obeyed(Clear, Beat.RUN)
-    host.home(Beat.RUN)
+    host.until(host.is_resting, OPENED_S, DriveMode.RUN)
+    host.obeyed(Clear, DriveMode.RUN)
+    host.home(DriveMode.RUN)
     return "; ".join([*seen, _has_to_let_go(host)])
 
 
 def _has_to_let_go(host: Host) -> str:
     keeps_still(host, "before a Drive OFF")
-    host.beat(Beat.OFF)
-    host.pass_time(SEEN_S, Beat.RUN)
-    return host.shows(DeviceMode.RUN, Beat.RUN, besides="IDLE, and after a Drive OFF and Drive RUN again")
+    host.beat(DriveMode.OFF)
+    host.pass_time(SEEN_S, DriveMode.RUN)
+    return host.shows(DeviceMode.RUN, DriveMode.RUN, besides="IDLE, and after a Drive OFF and Drive RUN again")
 
 
 def keeps_still(host: Host, when: str) -> str:
     """Send Drive RUN to an idle device that must not run yet."""
-    host.beat(Beat.RUN)
+    host.beat(DriveMode.RUN)
     host.pass_time(ANSWER_S)
     start = places(host.last(State))
-    host.pass_time(SEEN_S, Beat.RUN, duty=DUTY)
+    host.pass_time(SEEN_S, DriveMode.RUN, duty=DUTY)
     way_mm = max(abs(at - began) for at, began in zip(places(host.last(State)), start, strict=True))
-    return host.shows(DeviceMode.IDLE, Beat.RUN, besides=f"{when} moved by {way_mm:.2f} mm", wrong=way_mm > AT_STOP_MM)
+    return host.shows(
+        DeviceMode.IDLE, DriveMode.RUN, besides=f"{when} moved by {way_mm:.2f} mm", wrong=way_mm > AT_STOP_MM
+    )
 
 
 def _is_noticed(host: Host, silent_s: float) -> bool:
     silence_s = host.fall_silent(silent_s)
-    status = host.next_status(Beat.RUN)
+    status = host.next_status(DriveMode.RUN)
     has_ended = status.mode is not DeviceMode.RUN
     seen = f"after {silence_s * 1e3:.2f} ms on the device's clock: {shown(status)}"
     unless(silence_s < BORNE_S if has_ended else silence_s > NOTICED_S, seen)
@@ -342,7 +314,7 @@ def only_good_drives_extend(host: Host) -> str:
     seen = ""
     for step in (1, -1):
         host.running(2.0 * INSIDE_MM)
-        host.next_status(Beat.RUN)
+        host.next_status(DriveMode.RUN)
         bad = deque([*list(taken(host, RUNNING))[:-2], *refused(host)][::step])
 
         def chatter(bad: deque[Sent] = bad) -> None:
@@ -352,20 +324,8 @@ def only_good_drives_extend(host: Host) -> str:
 
         silence_s = host.fall_silent(LONG_S, chatter)
         seen = f"after {silence_s * 1e3:.1f} ms"
-        host.shows(DeviceMode.RETRACTING, Beat.RUN, fault=TIMED_OUT, besides=seen, wrong=silence_s < NOTICED_S)
+        host.shows(DeviceMode.RETRACTING, DriveMode.RUN, fault=TIMED_OUT, besides=seen, wrong=silence_s < NOTICED_S)
     return seen
-
-
-def _holds(host: Host, end_s: float) -> str:
-    """Hold RUN with sparse Drives until then, and fall silent."""
-    host.running()
-    while host.now_s < end_s:
-        host.beat(Beat.RUN, period_s=SPARSE_S)
-        unless(_has_left(host), f"RUN with a Drive every {SPARSE_S * 1e3:g} ms ends: {shown(host.status)}")
-    host.pass_time(SEEN_S, Beat.RUN)
-    _is_noticed(host, LONG_S + PERIOD_S)
-    host.until(host.is_resting, OPENED_S)
-    return host.shows(DeviceMode.LATCHED, fault=TIMED_OUT)
 
 
 @check(
@@ -377,17 +337,17 @@ def _holds(host: Host, end_s: float) -> str:
 )
 def any_uptime(host: Host) -> str:
     """Finds a timeout's counter that overflows at 2^16 ms or changes its sign."""
-    began_s = host.now_s
-    seen = [_holds(host, began_s + at * HELD_S) for at in range(1, HOLDS + 1)]
-    return f"{len(seen)} times: {seen[-1]}"
-
-
-def _runs_over(bits: int, host: Host) -> str:
-    """Let a counter of microseconds overflow at 2 to this power."""
-    up_s, over_s = host.uptime_s, UPTIMES[bits]
-    if up_s is None or not up_s < over_s < up_s + OVER_S:
-        raise Untested(f"build a firmware whose clock starts {OVER_S / 2.0:g} s before {over_s:.0f} s; --uptime")
-    return _holds(host, host.now_s + OVER_S)
+    began_s, seen = host.now_s, ""
+    for at in range(1, HOLDS + 1):
+        host.running()
+        while host.now_s < began_s + at * HELD_S:
+            host.beat(DriveMode.RUN, period_s=SPARSE_S)
+            unless(_has_left(host), f"RUN with a Drive every {SPARSE_S * 1e3:g} ms ends: {shown(host.status)}")
+        host.pass_time(SEEN_S, DriveMode.RUN)
+        _is_noticed(host, LONG_S + PERIOD_S)
+        host.until(host.is_resting, OPENED_S)
+        seen = host.shows(DeviceMode.LATCHED, fault=TIMED_OUT)
+    return f"{HOLDS} times: {seen}"
 
 
 SKEW: Final = Check(
@@ -421,18 +381,20 @@ CHECKS: Final = (
     silence_is_noticed,
     only_good_drives_extend,
     any_uptime,
+)
+GATES: Final = (
+    home_homes,
     *(
         Check(
-            f"uptime_of_2_{bits}_us",
-            Hazard.SHUT,
-            SILENCE,
-            f"in RUN while the uptime becomes {over_s:.0f} s, then no Drive any more",
-            "stays RUN; then COMMAND_TIMEOUT alone",
-            partial(_runs_over, bits),
+            f"{name}_duty",
+            Hazard.CLOSES,
+            DRIVE,
+            f"in RUN, a {name} duty that falls from 0 to -{MAX_DUTY:g} at most, {other} 0",
+            f"the {name} carriage goes in by {MOVED_MM:g} mm, the {other} one stays; the {name} motor draws more",
+            partial(_duty_moves, side),
             moves=True,
-            is_gate=False,
+            is_gate=True,
         )
-        for bits, over_s in UPTIMES.items()
+        for side, name, other in ((0, "left", "right"), (1, "right", "left"))
     ),
 )
-GATES: Final = (home_homes, _of_duty(0, "left", "right"), _of_duty(1, "right", "left"))

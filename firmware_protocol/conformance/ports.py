@@ -67,11 +67,10 @@ class CanPort:
 
     def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
         """Open a bus by python-can; `baud` is of an adapter's serial port."""
-        settings: dict[str, Any] = {}
-        if interface == "slcan":  # by default it sleeps for 2 s when it opens
-            settings = {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0}
-        elif interface == "udp_multicast":
-            settings = {"hop_limit": 0, "fd": False}
+        settings: dict[str, Any] = {
+            "slcan": {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0},  # else it sleeps for 2 s
+            "udp_multicast": {"hop_limit": 0, "fd": False},
+        }.get(interface, {})
         try:
             self._bus = can.Bus(interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **settings)
             self._fd: int = self._bus.fileno()
@@ -115,9 +114,8 @@ class CanPort:
             raise OSError(str(error)) from error
         except (ValueError, IndexError):  # slcan's answer to a damaged line from the adapter
             return None
-        if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
-            return None
-        return frame
+        is_other = frame and (frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd)
+        return None if is_other else frame
 
 
 def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:

@@ -101,7 +101,7 @@ RULES: Final = {
     "The new origin counts from the first State after a Status with HOMED": "home_homes",
     "A carriage that moves 1 mm towards closed while driven open": "- it would take a motor with its leads swapped",
     "Left screw relative to home": "positions_run_on",
-    "When the positions were latched, on the device's clock.": "clock_runs_on uptime_of_2_31_us uptime_of_2_32_us",
+    "When the positions were latched, on the device's clock.": "clock_runs_on",
     "Left motor current; positive drives towards open.": "duties_make_currents",
     "positive against a positive motion of the handle.": "handle_runs_on force_follows_gap",
     "Roller surface position: 16384 counts a turn": "handle_runs_on homing_retract homing_hello_misfit",
