@@ -53,8 +53,8 @@ HANDLE_SPAN_MM, STEP_MM = period(Sense, "handle_position_mm"), period(State, "le
 TURN_MM, TURNED_S, LEAP_MM = 40.0 * math.pi, 20.0, 1.0
 "A handle at 0.3 m/s moves a third of LEAP_MM in 1 ms; one of swapped bytes leaps by 2 mm a step."
 SUCCESSIVE_S, APART_S = 3e-3, 0.1
-STEPS: Final = 4.5
-"From so many steps in one period on a place that is not between its neighbours is wrong."
+STEPS, ASTRAY = 4.5, 0.75
+"From STEPS in a period on, a place is wrong by ASTRAY of that; one that is latched by its own tick is off by half."
 NONCES: Final = (1, 129, 1, 65, 1, 33, 1, 17, 1, 9, 1, 5, 1, 3, 2, 254, 253, 128, 127, 126, 6)
 """Each bit changes alone, up and down by any distance."""
 SLIDES_MM_S, NEAR_MM, GROWS, DEPTHS_MM = 10.0, 0.7, 1.15, (12.0, 16.0, 20.0, 24.0)
@@ -253,10 +253,10 @@ def astray(device_s: Array, at_mm: Array, step_mm: float) -> int:
     steps_s, ways_mm = np.diff(device_s), np.diff(at_mm)
     near = np.logical_and.reduce([steps_s[at : len(steps_s) - 3 + at] < SUCCESSIVE_S for at in range(4)])
     before, after = ways_mm[:-3], ways_mm[3:]
-    share = steps_s[1:-2] / (steps_s[1:-2] + steps_s[2:-1])
-    off_mm = ways_mm[1:-2] - share * (ways_mm[1:-2] + ways_mm[2:-1])
+    off_mm = ways_mm[1:-2] - steps_s[1:-2] * (ways_mm[1:-2] + ways_mm[2:-1]) / (steps_s[1:-2] + steps_s[2:-1])
     least_mm = np.minimum(np.abs(before), np.abs(after))
-    return int(np.sum(near & (before * after > 0.0) & (least_mm > STEPS * step_mm) & (np.abs(off_mm) > 0.6 * least_mm)))
+    moves = near & (before * after > 0.0) & (least_mm > STEPS * step_mm)
+    return int(np.sum(moves & (np.abs(off_mm) > ASTRAY * least_mm)))
 
 
 @check(Hazard.MISLED, "State", ALL, "in each motion a position is between those before and after it")
