@@ -269,7 +269,8 @@ def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
 def _say(host: Host, name: str, beat: Beat, misfit: Hello) -> None:
     if name in COMMANDS:
         host.obeyed(COMMANDS[name], beat)
-    host.beat(beat, besides=partial(host.send, misfit) if name == MISFITS else lambda: None)
+    duty = -1.0 if beat is DriveMode.OFF else 0.0
+    host.beat(beat, duty, duty, besides=partial(host.send, misfit) if name == MISFITS else lambda: None)
     host.pass_time(2.0 * SILENCE_S if name == SILENT else 0.0)
 
 
@@ -277,8 +278,7 @@ def _begun(host: Host, place: Place, to: str, start: tuple[float, float], inward
     """Compare the mode after a message, and what RUN ends with, with what must be."""
     ways_mm = [at - began for _, state in host.all_of(State) for at, began in zip(places(state), start, strict=True)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
-    seen = f"{min(ways_mm):+.2f} mm at the innermost, {min(ways_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, "
-    seen += " ".join(dict.fromkeys(modes))
+    seen = f"{min(ways_mm):+.2f} mm at the innermost, {min(ways_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
     is_closing = place.mode is DeviceMode.RUN and (min(ways_mm) < -inward_mm or min(ways_mm[-2:]) < BEGUN_MM)
     return unless(is_closing or modes[:1] != [to] * (to in MODES), seen)
 

@@ -106,9 +106,12 @@ def status_rate(host: Host) -> str:
     counts = []
     for beat in (None, DriveMode.OFF):
         host.forget()
+        start_s = host.now_s
         host.pass_time(LISTENED_S, beat)
-        counts.append(len(host.all_of(Status)) * STATUS_S / LISTENED_S)
-    return unless(any(abs(count - 1.0) > STATUS_TOLERANCE for count in counts), f"{counts} of all")
+        counts.append(len(host.all_of(Status)) * STATUS_S / (host.now_s - start_s))
+    return unless(
+        any(abs(count - 1.0) > STATUS_TOLERANCE for count in counts), f"{counts[0]:.3f} and {counts[1]:.3f} of all"
+    )
 
 
 @check(
@@ -308,7 +311,8 @@ def force_follows_gap(host: Host) -> str:
     inside_mm = -0.5 * (rows["left_mm"] + rows["right_mm"])
     slides = np.abs(rows["handle_mm_s"]) > SLIDES_MM_S
     forces_N = [
-        np.median(np.abs(rows["force_N"][slides & (np.abs(inside_mm - depth_mm) < NEAR_MM)])) for depth_mm in DEPTHS_MM
+        np.median(part_N) if part_N.size else math.nan
+        for part_N in (np.abs(rows["force_N"][slides & (np.abs(inside_mm - mm) < NEAR_MM)]) for mm in DEPTHS_MM)
     ]
     seen = ", ".join(f"{force_N:.2f} N" for force_N in forces_N)
     if np.isnan(forces_N).any():

@@ -217,20 +217,17 @@ def test_weak_magnet_wrong_insert_and_sensor_gain_share_a_row_that_names_them(be
     assert red(found)[0] == "force over the model's: magnets, insert, or sensor's gain"
 
 
-@pytest.mark.parametrize("gain", [1.0, 0.55])
-def test_a_weight_tells_the_sensors_gain(bench, gain):
-    hung = bench(
-        SAMPLE,
-        hand=SteadyHand(0.0),
-        alters=lambda now_s, message: (
-            message.replaced(force_N=gain * (message.force_N + 2.0 * (now_s > 10.0)))
-            if isinstance(message, Sense)
-            else message
-        ),
-    )
+@pytest.mark.parametrize(("gain", "bent_per_N"), [(1.0, 0.0), (0.55, 0.0), (1.0, 0.1), (1.0, -0.1)])
+def test_a_weight_tells_the_sensors_gain_and_a_bent_line(bench, gain, bent_per_N):
+    def weighs(now_s, force_N):
+        hung_N = force_N + 2.0 * (now_s > 10.0)
+        return gain * hung_N * (1.0 + bent_per_N * hung_N)
+
+    hung = bench(SAMPLE, hand=SteadyHand(0.0), alters=through(weighs))
     found, stopped = hung.commission(chosen("weight"), weight_N=2.0)
-    assert (found["weight"][0].value, stopped) == (pytest.approx(gain, abs=0.02), None)
-    assert red(found) == ([] if gain == 1.0 else ["sensor's gain, by the weight"])
+    expected = gain * (1.0 + 2.0 * bent_per_N)
+    assert (found["weight"][0].value, stopped) == (pytest.approx(expected, abs=0.02), None)
+    assert red(found) == ([] if expected == 1.0 else ["sensor's gain, by the weight"])
 
 
 @pytest.mark.parametrize(
