@@ -166,8 +166,7 @@ def zero_is_at_switch(host: Host) -> str:
     for _ in range(3):
         host.running()
         host.pass_time(0.2, DriveMode.RUN, duty=-1.0)
-    wrong = +host.contradictions
-    return unless(wrong, ", ".join(wrong) or "all changed in their place")
+    return unless(+host.contradictions, ", ".join(+host.contradictions) or "all changed in their place")
 
 
 @check(

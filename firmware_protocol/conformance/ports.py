@@ -67,12 +67,14 @@ class CanPort:
 
     def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
         """Open a bus by python-can; `baud` is of an adapter's serial port."""
-        settings: dict[str, Any] = {
+        known: dict[str, dict[str, Any]] = {
             "slcan": {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0},  # else it sleeps for 2 s
             "udp_multicast": {"hop_limit": 0, "fd": False},
-        }.get(interface, {})
+        }
         try:
-            self._bus = can.Bus(interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **settings)
+            self._bus = can.Bus(
+                interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **known.get(interface, {})
+            )
             self._fd: int = self._bus.fileno()
         except NotImplementedError as error:
             raise OSError(f"{interface}: this driver cannot be waited for; use the kernel's, socketcan") from error

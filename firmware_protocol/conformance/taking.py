@@ -62,7 +62,8 @@ MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
 "A homing that goes in further than it backs off obeys another message."
 BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM = 0.1, 0.2, 0.8, 0.05, 0.6
 "A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
-TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 2.2 * STATUS_S / PERIOD_S
+TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 100
+"A Drive and a Status on their way put a Status behind by more than the beats in TWO_STATUS_S."
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
 COMMANDS: Final[dict[str, type[Retract | Home | Clear]]] = {"Retract": Retract, "Home": Home, "Clear": Clear}
 FITS, MISFITS, OFF = "Hello that fits", "Hello that does not", "Drive OFF"

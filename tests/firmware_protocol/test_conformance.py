@@ -1262,9 +1262,11 @@ def mutated(mutant: Mutant) -> SerialLine:
             return device.real.receive(time_s, message, sensors)
         if mutant.effect == "dropped":
             return Answer.NONE
-        device.real.mode = DeviceMode[mutant.effect]
+        was = device.real.mode = DeviceMode[mutant.effect]
+        motion = device.real._motion
         answer = device.real.receive(time_s, message, sensors)
-        device.real.mode = mutant.mode if device.mode is DeviceMode[mutant.effect] else device.mode
+        if (device.real.mode, device.real._motion) == (was, motion):
+            device.real.mode = mutant.mode
         return answer
 
     return serial_line(wrong(Rogue, receive=receive, ticks=ticks), wrong(Wire, down=down))
