@@ -320,7 +320,7 @@ def only_good_drives_extend(host: Host) -> str:
             bad[1].send()
             bad.rotate(-2)
 
-        silence_s = host.fall_silent(LONG_S, chatter)
+        silence_s = host.fall_silent(1.2 * LONG_S, chatter)  # a device's delay may take some of it
         seen = f"after {silence_s * 1e3:.1f} ms"
         host.shows(DeviceMode.RETRACTING, DriveMode.RUN, fault=TIMED_OUT, besides=seen, wrong=silence_s < NOTICED_S)
     return seen
