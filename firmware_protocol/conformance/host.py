@@ -6,7 +6,7 @@ A device that does not follow ends the check with `Unmet`.
 import math
 import random
 from array import array
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final, NamedTuple, TypeAlias, TypeVar
 
@@ -109,6 +109,7 @@ class Host:
         self.contradictions = Counter[str]()
         self.rows = array("d")
         """A row of COLUMNS for each Sense."""
+        self._unpaired = deque[State](maxlen=8)
         self.drives = self.states = 0
         """How many Drives that must be answered were sent, and how many State came."""
         self.stalled_s = 0.0
@@ -197,6 +198,7 @@ class Host:
         """Forget the messages heard and the lateness, and restart the rhythm from now."""
         self.forget()
         self.stalled_s = 0.0
+        self._unpaired.clear()
         self._next_s = self.now_s
         self._status_s = math.inf
 
@@ -268,22 +270,24 @@ class Host:
     def _take(self, heard: Heard) -> None:
         """Keep a message, and count the resets and contradictions that a Status shows."""
         message = heard.message
-        if isinstance(message, Sense) and State in self.newest:
-            state = self.last(State)
+        if isinstance(message, State):
+            self.states += 1
+            self._unpaired.append(message)
+        if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
+            state = self._unpaired.popleft()
             self.rows.extend((heard.time_s, state.device_time_s, state.counter, *places(state)))
             self.rows.extend(
                 (message.left_current_A, message.right_current_A, message.force_N, message.handle_position_mm)
             )
-        if isinstance(message, State):
-            self.states += 1
         if isinstance(message, Status):
-            is_late = self.stalled_s < STALLED_S and heard.time_s - self._status_s > 2.5 * STATUS_S
-            self.contradictions["a Status that was late"] += is_late
-            nonce = self.last(Status).command_nonce if Status in self.newest else 0
-            self.contradictions["nonce 0 again: a reset"] += nonce > message.command_nonce == 0
+            self.contradictions["a Status that was late"] += (
+                self.stalled_s < STALLED_S and heard.time_s - self._status_s > 2.5 * STATUS_S
+            )
+            self.contradictions["nonce 0 again: a reset"] += (
+                Status in self.newest and self.last(Status).command_nonce > message.command_nonce == 0
+            )
             self._status_s = heard.time_s
-            self.contradictions.update(contradictions(message))
-            self.contradictions.update(self._misplaced(heard.time_s, message))
+            self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
         self.heard.append(heard)
         self.newest[type(message)] = heard
 

@@ -41,7 +41,7 @@ RAMP_PER_S, MAX_DUTY, MOVED_MM = 1.0, 0.5, 0.3
 AT_STOP_DUTY, AT_STOP_MM, AT_STOP_A = 0.3, 0.1, 0.3
 "A motor that pushes into the stop at AT_STOP_DUTY draws several times AT_STOP_A."
 SLOW_MM_S, BESIDE_MM, SCALE_MM = 2.0, 1.5, 0.02 * STROKE_MM
-SKEW_MM, BOUND_MM, AHEAD_MM = 2.0, 0.3, 0.7
+SKEW_MM, BOUND_MM, AHEAD_MM = 2.0, 0.3, 1.2
 "BOUND_MM is two Status at SLOW_MM_S, and the sway of a carriage."
 NEAR, PAST = 0.85, 1.15
 """Shares of the stroke: that is travelled at a brisk speed; and further than any scale is off, so that a device that
@@ -210,14 +210,14 @@ def duties_make_currents(host: Host) -> str:
 
 def _ends_run(fault: DeviceFault, from_share: float, ahead_mm: float, most_mm: float, host: Host) -> str:
     """Bring the carriages in until one of them goes too far, and then the other."""
+    is_skew, begins_mm = fault is DeviceFault.SKEW, -from_share * host.stroke_mm
     seen = []
     for side in (0, 1):
-        begins_mm = -from_share * host.stroke_mm
         host.running(-begins_mm)
-        is_skew = fault is DeviceFault.SKEW
-        goals = [(begins_mm if is_skew else -PAST * host.stroke_mm) - ahead_mm * (at == side) for at in (0, 1)]
         host.forget()
-        host.bring(goals[0], goals[1], SLOW_MM_S, lambda: _apart_mm(host) > SKEW_MM + BOUND_MM or _has_left(host))
+        for to_mm in (begins_mm,) if is_skew else (begins_mm, -PAST * host.stroke_mm):
+            goals = [to_mm - ahead_mm * (at == side) for at in (0, 1)]
+            host.bring(goals[0], goals[1], SLOW_MM_S, lambda: _apart_mm(host) > SKEW_MM + BOUND_MM or _has_left(host))
         innermost_mm = min(places(state)[side] for _, state in host.all_of(State))
         off_mm = _apart_mm(host) - SKEW_MM if is_skew else innermost_mm + host.stroke_mm
         seen.append(f"{off_mm:+.2f} mm from where it ends: {shown(host.next_status(DriveMode.RUN))}")

@@ -946,6 +946,13 @@ PLANTED = (
     rogue("opens half the way", "run_silence", ticked=stops_after(0.8)),
     rogue("skew unwatched", "skew_opens", ticked=unwatched(DeviceFault.SKEW)),
     rogue("end stops unwatched", "end_stop_opens", ticked=unwatched(DeviceFault.END_STOP)),
+    rogue(
+        "left end stop alone watched",
+        "end_stop_opens",
+        senses=with_switches(
+            lambda device, switches: switches if Switches.LEFT_CLOSED in switches else switches & ~Switches.RIGHT_CLOSED
+        ),
+    ),
     rogue("remembers its zero", "warm_reset", boots=remembering()),
     rogue("remembers its zero", "cold_reset", boots=remembering()),
     rogue("browns out", "duties_make_currents", ticked=browns_out),
