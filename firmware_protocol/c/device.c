@@ -48,7 +48,6 @@ void tormag_device_init(struct tormag_device *device, const struct tormag_device
     device->parameters = *parameters;
     device->may_run = true;
     device->drive_counter = NONE_YET;
-    device->nonce = NONE_YET;
 }
 
 /* -- what is measured ---------------------------------------------------------------------------------------------- */

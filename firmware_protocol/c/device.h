@@ -75,7 +75,7 @@ struct tormag_device {
     } motion;
     int16_t drive_counter; /* of the last accepted Drive, -1 before the first */
     double drive_s;
-    int16_t nonce; /* of the last accepted command, -1 before the first */
+    uint8_t nonce; /* of the last accepted command, 0 before the first */
     double calm_s[TORMAG_SIDES];
     double watch_since_s;
     bool watching;

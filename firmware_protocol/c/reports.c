@@ -54,9 +54,9 @@ bool tormag_report_status(
     status->faults = device->faults;
     status->temperature_c = (int8_t)temperature;
     status->supply_v = (uint8_t)supply;
-    /* before anything was accepted, 0 */
+    /* before any was accepted, 0 */
     status->drive_counter = (uint8_t)(device->drive_counter < 0 ? 0 : device->drive_counter);
-    status->command_nonce = (uint8_t)(device->nonce < 0 ? 0 : device->nonce);
+    status->command_nonce = device->nonce;
     return true;
 }
 

@@ -1,41 +1,126 @@
-"""All checks in their order: first those that move nothing."""
+"""All checks in their order, first those that move nothing; and those that need a reset, or a bench."""
 
 from collections.abc import Sequence
+from typing import Final
 
-from firmware_protocol.codec import FUNCTION, Drive
-from firmware_protocol.conformance import (
-    bench,
-    damage,
-    homing,
-    meeting,
-    opening,
-    overall,
-    running,
-    silence,
-    streams,
-    stroke,
+from firmware_protocol.codec import Clear, DeviceMode, DriveMode, Home, Retract, State
+from firmware_protocol.conformance import moving, taking, telling
+from firmware_protocol.conformance.check import Check, Hazard, check
+from firmware_protocol.conformance.host import (
+    NO_FAULT,
+    OPENED_S,
+    SEEN_S,
+    Host,
+    Unmet,
+    Untested,
+    is_open,
+    positions,
+    shown,
+    unless,
 )
-from firmware_protocol.conformance.check import Check
-from firmware_protocol.conformance.line import Line
+from firmware_protocol.conformance.line import Line, SerialLine
+
+FAR_INSIDE_MM, BOOT_S, UNHOMED_SHARE, TO_TURN_S = 10.0, 10.0, 0.5, 0.5
+
+
+def _is_new(host: Host, how: str) -> str:
+    """Reset a device in RUN, FAR_INSIDE_MM in, and compare it with a new one."""
+    if host.reset is None:
+        raise Untested(f"nobody can reset the device: --reset COMMAND, which is called with {how}")
+    host.running(FAR_INSIDE_MM)
+    host.reset(how)
+    host.begin()
+    host.until(lambda: host.status.command_nonce == 0, BOOT_S, None)
+    unless(host.status.command_nonce, f"no reset, or one that keeps the nonce: {shown(host.status)}")
+    host.counter = 255
+    seen = [moving.keeps_still(host, "after the reset")]
+    host.send(Home(0))
+    host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT, besides="after a Home with nonce 0")
+    start_s, start = host.now_s, host.last(State)
+    host.obeyed(Retract)
+    host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S)
+    seen.append(f"opens in {host.now_s - start_s:.1f} s from {positions(start)}")
+    limit_s = FAR_INSIDE_MM / (taking.MIN_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
+    host.shows(
+        DeviceMode.IDLE,
+        homed=False,
+        opened=True,
+        fault=NO_FAULT,
+        besides=seen[-1],
+        wrong=host.now_s - start_s > limit_s,
+    )
+    host.home(None)
+    seen.append(moving.keeps_still(host, "homed without a Hello,"))
+    host.hello()
+    host.pass_time(SEEN_S, DriveMode.RUN)
+    return host.shows(DeviceMode.RUN, DriveMode.RUN, homed=True, besides=f"{'; '.join(seen)}; after it")
+
+
+LIKE_NEW: Final = (
+    f"nonce 0, IDLE, not HOMED, no fault, drives off; opens {FAR_INSIDE_MM:g} mm at over "
+    f"{taking.MIN_SHARE * UNHOMED_SHARE:g} of the device's speed and {TO_TURN_S:g} s; "
+    "runs after Home and Hello, not before"
+)
+
+
+@check(Hazard.CLOSES, "Reset", f"in RUN, {FAR_INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
+def warm_reset(host: Host) -> str:
+    """A zero that was kept over a reset by watchdog or pin may be off."""
+    return _is_new(host, "warm")
+
+
+@check(Hazard.CLOSES, "Reset", f"in RUN, {FAR_INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
+def cold_reset(host: Host) -> str:
+    return _is_new(host, "cold")
+
+
+def _by_hand(host: Host) -> str:
+    raise Untested("for the bench, by hand")
+
+
+BY_HAND: Final = [
+    Check(name, hazard, "Faults", sent, expected, _by_hand, moves=False, is_gate=False)
+    for name, hazard, sent, expected in (
+        ("overcurrent", Hazard.WORN, "in RUN a carriage held", "OVERCURRENT after 0.15 s; LATCHED"),
+        ("retract_failed", Hazard.SHUT, "a carriage held while RETRACTING", "RETRACT_FAILED"),
+        ("uncommanded_motion", Hazard.CLOSES, "IDLE, a screw turned by 0.3 mm", "UNCOMMANDED_MOTION, opens"),
+        ("supply", Hazard.SHUT, "a supply of 8.5 V, and of 15.5 V", "SUPPLY until Clear, refused meanwhile"),
+        ("temperature", Hazard.WORN, "the sensor warmed to over 60 degC", "TEMPERATURE; as SUPPLY"),
+        ("watchdog", Hazard.CLOSES, "a firmware that hangs in RUN", "a reset within 50 ms, drives off"),
+    )
+]
+
+
+@check(
+    Hazard.SHUT,
+    "Who says what when, 7",
+    "Drive OFF; where that does not open, Clear and Retract",
+    "both open switches, drives off",
+)
+def left_open(host: Host) -> str:
+    host.hello()
+    for kind in (None, Clear, Retract, Clear, Retract):
+        if kind is not None:
+            host.command(kind)
+        host.until(host.is_resting, OPENED_S)
+        if host.is_resting() and is_open(host.next_status(DriveMode.OFF)):
+            return shown(host.status)
+    raise Unmet(f"THE GAP MAY BE SHUT: {shown(host.status)}")
+
+
+CHECKS: Final = (
+    *telling.STREAMS,
+    *moving.GATES,
+    *taking.CHECKS,
+    *moving.CHECKS,
+    *telling.OVERALL,
+    warm_reset,
+    cold_reset,
+    *BY_HAND,
+    left_open,
+)
 
 
 def checks_on(line: Line) -> Sequence[Check]:
-    """Return all checks but those of damages that the line's carrier cannot do."""
-    damages = line.damages(FUNCTION[Drive], b"")
-    return [one for one in CHECKS if one not in damage.ON_A_CARRIER or one.name in damages]
-
-
-CHECKS = (
-    *meeting.CHECKS,
-    *streams.CHECKS,
-    *damage.CHECKS,
-    *damage.ON_A_CARRIER,
-    *homing.CHECKS,
-    *running.CHECKS,
-    *stroke.CHECKS,
-    *opening.CHECKS,
-    *silence.CHECKS,
-    *overall.CHECKS,
-    *bench.CHECKS,
-    overall.left_open,
-)
+    """Return all checks but that of a serial line's frames on a bus."""
+    return [one for one in CHECKS if isinstance(line, SerialLine) or one is not telling.frames_as_they_come]

@@ -5,11 +5,10 @@ A device that does not follow ends the check with `Unmet`.
 
 import math
 import random
-from collections import Counter
+from array import array
+from collections import Counter, deque
 from collections.abc import Callable
-from enum import Enum, auto
-from itertools import dropwhile, groupby
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeAlias, TypeVar
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -36,34 +35,26 @@ from firmware_protocol.codec import (
 )
 from firmware_protocol.conformance.line import Line
 
-PERIOD_S: Final = 1e-3
-REPEAT_S: Final = 0.05
-"A command or Hello that is not acknowledged is sent again after this time."
-ANSWER_S: Final = 0.02
-"An immediate answer has arrived by then, on any carrier that the position loop can use."
-STATUS_S: Final = 0.02
-SEEN_S: Final = 0.065
-"Three Status come in this time: one of them shows the present state, even where one is lost."
-ACKNOWLEDGED_S: Final = 0.5
-OPENED_S: Final = 10.0
-HOMED_S: Final = 12.0
-"What the daemon allows a homing."
-HELLO_NONCE: Final = 255
-MAX_NONCE: Final = 254
-INSIDE_MM: Final = 2.0
-DUTY_PER_MM: Final = 3.0
-TRAVEL_MM_S: Final = 8.0
-ARRIVED_MM: Final = 0.3
-MOVED_S: Final = 2.0
-"Time that a motion may take in addition to that at TRAVEL_MM_S."
-OPENING_MM_S: Final = 15.0
-STROKE_MM: Final = 25.25
-SWITCH_MM: Final = 0.5
-"A switch may close this far from its place, while a carriage passes it at any speed."
-FRESH_S: Final = 5e-3
+PERIOD_S, STATUS_S, FRESH_S, REPEAT_S = 1e-3, 0.02, 5e-3, 0.05
+"A command that is not acknowledged is sent again after REPEAT_S."
+ANSWER_S, SEEN_S, ACKNOWLEDGED_S = 0.02, 0.065, 0.5
+"""An immediate answer has arrived by ANSWER_S, on any carrier that the position loop can use. Three Status come in
+SEEN_S: one of them shows the present state, even where one is lost."""
+OPENED_S, HOMED_S, MOVED_S = 10.0, 12.0, 2.0
+"HOMED_S is what the daemon allows a homing; a motion may take MOVED_S in addition to its time at TRAVEL_MM_S."
+HELLO_NONCE, MAX_NONCE = 255, 254
+INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
+OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
+"A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
 TIME_SPAN_S: Final = period(State, "device_time_s")
-OPEN: Final = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
+OPEN: Final = ENDS[0] | ENDS[1]
 NO_FAULT: Final = DeviceFault(0)
+COLUMNS: Final = (
+    *("arrived_s", "device_time_s", "counter", "left_mm", "right_mm"),
+    *("left_A", "right_A", "force_N", "handle_mm"),
+)
+"A row of `Host.rows` is a State with its Sense."
 STALLED_S: Final = 0.005
 "From this lateness on this process may be to blame for a failed check."
 
@@ -79,10 +70,6 @@ class Untested(Exception):  # noqa: N818  (nothing has gone wrong here either)
     """A rule cannot be tested here; the text says why, and what would help."""
 
 
-def told(was_acknowledged: bool) -> str:
-    return "acknowledged" if was_acknowledged else "not acknowledged"
-
-
 def unless(is_wrong: object, seen: str) -> str:
     """Return `seen`, or raise Unmet with it if `is_wrong`."""
     if is_wrong:
@@ -90,27 +77,13 @@ def unless(is_wrong: object, seen: str) -> str:
     return seen
 
 
-class Beat(Enum):
-    """The Drive that is sent every millisecond, or none."""
-
-    NOTHING = auto()
-    OFF = auto()
-    RUN = auto()
+Beat: TypeAlias = DriveMode | None
+"The Drive that is sent every millisecond, or none."
 
 
 class Heard(NamedTuple):
     time_s: float
     message: Message
-
-
-class Homing(NamedTuple):
-    was_acknowledged: bool
-    seconds: float
-    status: Status
-    modes: tuple[DeviceMode, ...]
-    """In the order in which Status showed them, without repetitions."""
-    first: State | None
-    last: State | None
 
 
 class Host:
@@ -120,39 +93,35 @@ class Host:
         *,
         opening_mm_s: float = OPENING_MM_S,
         stroke_mm: float = STROKE_MM,
-        uptime_s: float | None = None,
         reset: Callable[[str], None] | None = None,
+        ask: Callable[[str], None] = lambda what: None,
     ) -> None:
         self.line = line
         self.opening_mm_s = opening_mm_s
         self.stroke_mm = stroke_mm
         self.reset = reset
+        self.ask = ask
         self.random = random.Random(41)
-        self._booted_s = None if uptime_s is None else line.port.now_s() - uptime_s
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
         self.refused = Counter[str]()
         """What was wrong with whole frames that held no message of a device, and how often."""
-        self.resets = 0
-        """How often nonce 0 followed another nonce in Status."""
         self.contradictions = Counter[str]()
-        self.misplaced = Counter[str]()
-        """End switches that did not fit the positions, and how often."""
-        self.homings: list[Homing] = []
+        self.rows = array("d")
+        """A row of COLUMNS for each Sense."""
+        self._unpaired = deque[State](maxlen=8)
+        self.drives = self.states = 0
+        """How many Drives that must be answered were sent, and how many State came."""
         self.stalled_s = 0.0
         """The greatest lateness of this process since `begin`."""
         self.drive_s = line.port.now_s()
         self.counter = 0
-        self._nonce = 0
         self._next_s = line.port.now_s()
+        self._status_s = math.inf
 
     @property
     def now_s(self) -> float:
         return self.line.port.now_s()
-
-    @property
-    def uptime_s(self) -> float | None:
-        return None if self._booted_s is None else self.now_s - self._booted_s
 
     # -- what is sent ------------------------------------------------------------------------------------------------
 
@@ -161,6 +130,7 @@ class Host:
 
     def drive(self, mode: DriveMode, left: float = 0.0, right: float = 0.0) -> None:
         self.counter = (self.counter + 1) % 256
+        self.drives += 1
         self.drive_s = self.now_s
         self.send(Drive(left, right, mode, self.counter))
 
@@ -169,19 +139,16 @@ class Host:
         schema_hash: int = SCHEMA_HASH,
         version: int = PROTOCOL_VERSION,
         nonce: int = HELLO_NONCE,
-        beat: Beat = Beat.NOTHING,
+        beat: Beat = None,
     ) -> None:
         """Send one Hello, and wait for its answer."""
         self.send(Hello(schema_hash, version, nonce))
         self.pass_time(ANSWER_S, beat)
 
     def new_nonce(self) -> int:
-        self._nonce = self._nonce % MAX_NONCE + 1
-        if self._nonce == self._shown_nonce():
-            self._nonce = self._nonce % MAX_NONCE + 1
-        return self._nonce
+        return self.status.command_nonce % MAX_NONCE + 1
 
-    def command(self, kind: Command, beat: Beat = Beat.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
+    def command(self, kind: Command, beat: Beat = DriveMode.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
         """Repeat a command until a Status acknowledges it; return whether one did within `limit_s`."""
         nonce = self.new_nonce()
         start_s = due_s = self._next_s
@@ -194,33 +161,29 @@ class Host:
             self.beat(beat)
         return True
 
-    def obeyed(self, kind: Command, beat: Beat = Beat.OFF) -> None:
-        if not self.command(kind, beat):
-            raise Unmet(f"{kind.__name__} not acknowledged: {shown(self.status)}")
+    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF) -> None:
+        unless(not self.command(kind, beat), f"{kind.__name__} not acknowledged: {shown(self.status)}")
 
-    def is_refused(self, kind: Command, beat: Beat = Beat.OFF) -> bool:
-        """Send a command for SEEN_S; return whether it is not acknowledged."""
-        return not self.command(kind, beat, SEEN_S)
-
-    def refuses(self, kind: Command, mode: DeviceMode, beat: Beat = Beat.OFF, *, homed: bool | None = None) -> str:
-        """Send a command that the device must refuse, and return what the next Status shows."""
-        is_refused = self.is_refused(kind, beat)
-        besides = f"{kind.__name__} {told(not is_refused)}"
-        return self.shows(mode, beat, homed=homed, besides=besides, wrong=not is_refused)
-
-    def beat(self, beat: Beat, left: float = 0.0, right: float = 0.0, period_s: float = PERIOD_S) -> None:
-        if beat is not Beat.NOTHING:
-            self.drive(DriveMode.RUN if beat is Beat.RUN else DriveMode.OFF, left, right)
+    def beat(
+        self,
+        beat: Beat,
+        left: float = 0.0,
+        right: float = 0.0,
+        period_s: float = PERIOD_S,
+        besides: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Send a Drive, or none, and another message `besides`; then listen."""
+        if beat is not None:
+            self.drive(beat, left, right)
+        besides()
         self._listen(period_s)
 
-    def pass_time(
-        self, seconds: float, beat: Beat = Beat.NOTHING, period_s: float = PERIOD_S, duty: float = 0.0
-    ) -> None:
+    def pass_time(self, seconds: float, beat: Beat = None, period_s: float = PERIOD_S, duty: float = 0.0) -> None:
         """Repeat `beat` for a time, with `duty` for both motors."""
         for _ in range(round(seconds / period_s)):
             self.beat(beat, duty, duty, period_s)
 
-    def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = Beat.OFF) -> bool:
+    def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = DriveMode.OFF) -> bool:
         """Repeat `beat` until `reached()` or for `limit_s`; return whether it was reached."""
         end_s = self._next_s + limit_s
         while not reached():
@@ -235,7 +198,9 @@ class Host:
         """Forget the messages heard and the lateness, and restart the rhythm from now."""
         self.forget()
         self.stalled_s = 0.0
+        self._unpaired.clear()
         self._next_s = self.now_s
+        self._status_s = math.inf
 
     def forget(self) -> None:
         """Forget the messages heard, except `newest`."""
@@ -253,20 +218,20 @@ class Host:
     @property
     def status(self) -> Status:
         if Status not in self.newest:
-            self.until(lambda: Status in self.newest, 10 * STATUS_S, Beat.NOTHING)
+            self.until(lambda: Status in self.newest, 10 * STATUS_S, None)
         return self.last(Status)
 
     def next_status(self, beat: Beat) -> Status:
         """Wait for a Status that comes from now on."""
         before = self.newest.get(Status)
-        if not self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat):
-            raise Unmet(f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
+        has_come = self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat)
+        unless(not has_come, f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
         return self.last(Status)
 
     def shows(
         self,
         mode: DeviceMode,
-        beat: Beat = Beat.OFF,
+        beat: Beat = DriveMode.OFF,
         *,
         homed: bool | None = None,
         opened: bool | None = None,
@@ -283,9 +248,6 @@ class Host:
             and fault in (None, status.faults)
         )
         return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
-
-    def _shown_nonce(self) -> int:
-        return self.last(Status).command_nonce if Status in self.newest else 0
 
     def _listen(self, period_s: float) -> None:
         """Take what comes in the next `period_s`, and note how late this process is."""
@@ -308,39 +270,50 @@ class Host:
     def _take(self, heard: Heard) -> None:
         """Keep a message, and count the resets and contradictions that a Status shows."""
         message = heard.message
+        if isinstance(message, State):
+            self.states += 1
+            self._unpaired.append(message)
+        if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
+            state = self._unpaired.popleft()
+            self.rows.extend((heard.time_s, state.device_time_s, state.counter, *places(state)))
+            self.rows.extend(
+                (message.left_current_A, message.right_current_A, message.force_N, message.handle_position_mm)
+            )
         if isinstance(message, Status):
-            self.resets += self._shown_nonce() != 0 and message.command_nonce == 0
-            self.contradictions.update(contradictions(message))
-            self.misplaced.update(self._misplaced(heard.time_s, message))
+            self.contradictions["a Status that was late"] += (
+                self.stalled_s < STALLED_S and heard.time_s - self._status_s > 2.5 * STATUS_S
+            )
+            self.contradictions["nonce 0 again: a reset"] += (
+                Status in self.newest and self.last(Status).command_nonce > message.command_nonce == 0
+            )
+            self._status_s = heard.time_s
+            self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
         self.heard.append(heard)
         self.newest[type(message)] = heard
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
         """Return the end switches in a Status that do not fit the State just before it."""
-        state = self.newest.get(State)
-        is_usable = Status in self.newest and is_homed(self.last(Status)) and is_homed(status)
-        if state is None or not is_usable or time_s - state.time_s > FRESH_S:
+        if not {State, Status} <= self.newest.keys() or time_s - self.newest[State].time_s > FRESH_S:
             return []
-        found = []
-        for side, at_mm in zip(("LEFT", "RIGHT"), places(self.last(State)), strict=True):
-            for end, in_mm in (("OPEN", at_mm), ("CLOSED", -self.stroke_mm - at_mm)):
-                closed = Switches[f"{side}_{end}"] in status.switches
-                if (closed and in_mm < -SWITCH_MM) or (not closed and in_mm > SWITCH_MM):
-                    found.append(f"{side}_{end} {'closed' if closed else 'not closed'} at {at_mm:+.1f} mm")
-        return found
+        left_mm, right_mm = places(self.last(State))
+        beyond_mm = (left_mm, right_mm, -self.stroke_mm - left_mm, -self.stroke_mm - right_mm)
+        signs = [-1.0 if each in status.switches else 1.0 for each in ENDS]
+        is_usable = is_homed(self.last(Status)) and is_homed(status)
+        return [
+            f"{each.name} {'not closed' if sign > 0.0 else 'closed'} at {mm:+.1f} mm beyond it"
+            for each, sign, mm in zip(ENDS, signs, beyond_mm, strict=True)
+            if is_usable and sign * mm > SWITCH_MM
+        ]
 
     # -- where a check begins ----------------------------------------------------------------------------------------
 
     def idle(self) -> None:
         self.hello()
-        self.pass_time(SEEN_S, Beat.OFF)
-        if not self.until(self.is_resting, HOMED_S):
-            raise Unmet(f"not IDLE after {HOMED_S:g} s of Drive OFF: {shown(self.status)}")
-        if self.status.mode is DeviceMode.LATCHED and not self.command(Clear):
-            raise Unmet(f"Clear was not acknowledged: {shown(self.status)}")
-        status = self.next_status(Beat.OFF)
-        if status.mode is not DeviceMode.IDLE or status.faults:
-            raise Unmet(f"not IDLE without a fault after Hello, Drive OFF and Clear: {shown(status)}")
+        self.pass_time(SEEN_S, DriveMode.OFF)
+        unless(not self.until(self.is_resting, HOMED_S), f"not at rest after {HOMED_S:g} s: {shown(self.status)}")
+        if self.status.mode is DeviceMode.LATCHED:
+            self.obeyed(Clear)
+        self.shows(DeviceMode.IDLE, fault=NO_FAULT, besides="after Hello, Drive OFF and Clear")
 
     def without_zero(self) -> None:
         """Take the device's zero away by a mismatched Hello, and bring it to IDLE."""
@@ -351,37 +324,28 @@ class Host:
         self.idle()
         if not is_homed(self.status):
             self.home()
-            if not is_homed(self.status):
-                raise Unmet(f"not homed: {shown(self.status)}")
-        if not is_open(self.status) and not (self.command(Retract) and self.until(self.is_resting, OPENED_S)):
-            raise Unmet(f"Retract does not open: {shown(self.status)}")
+        if not is_open(self.status):
+            self.obeyed(Retract)
+            self.until(self.is_resting, OPENED_S)
+        self.shows(DeviceMode.IDLE, homed=True, opened=True, besides="after Home and Retract")
 
-    def home(self, beat: Beat = Beat.OFF) -> Homing:
-        """Home an idle device and record how it went."""
+    def home(self, beat: Beat = DriveMode.OFF) -> float:
+        """Home an idle device; return how long it took."""
         start_s = self._next_s
-        first_heard = len(self.heard)
-        was_acknowledged = self.command(Home, beat)
-        if was_acknowledged:
-            self.until(lambda: self.status.mode is not DeviceMode.HOMING, HOMED_S, beat)
+        self.obeyed(Home, beat)
+        self.until(lambda: self.status.mode is not DeviceMode.HOMING, HOMED_S, beat)
         seconds = self._next_s - start_s
         self.pass_time(SEEN_S, beat)
-        heard = [one.message for one in self.heard[first_heard:]]
-        modes = tuple(mode for mode, _ in groupby(message.mode for message in heard if isinstance(message, Status)))
-        states = [message for message in heard if isinstance(message, State)]
-        since_homed = dropwhile(lambda message: not (isinstance(message, Status) and is_homed(message)), heard)
-        first = next((message for message in since_homed if isinstance(message, State)), None)
-        homing = Homing(was_acknowledged, seconds, self.status, modes, first, states[-1] if states else None)
-        self.homings.append(homing)
-        return homing
+        return seconds
 
     def running(self, inside_mm: float = 0.0) -> None:
         self.homed()
-        self.pass_time(2 * PERIOD_S, Beat.OFF)
-        if not self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, Beat.RUN):
-            raise Unmet(f"Drive RUN does not lead to RUN: {shown(self.status)}")
+        self.pass_time(2 * PERIOD_S, DriveMode.OFF)
+        self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, DriveMode.RUN)
+        unless(self.status.mode is not DeviceMode.RUN, f"Drive RUN does not lead to RUN: {shown(self.status)}")
         if inside_mm > 0.0:
             self.bring(-inside_mm, -inside_mm)
-            self.pass_time(SEEN_S, Beat.RUN)
+            self.pass_time(SEEN_S, DriveMode.RUN)
 
     def bring(
         self, left_mm: float, right_mm: float, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
@@ -398,55 +362,35 @@ class Host:
             left_to, right_to = (at + clamped(goal - at, step_mm) for at, goal in zip(targets, goals, strict=True))
             targets = left_to, right_to
             left, right = (clamped(DUTY_PER_MM * (to - at), 1.0) for to, at in zip(targets, at_mm, strict=True))
-            self.beat(Beat.RUN, left, right)
-            if not ends() and (self.status.mode is not DeviceMode.RUN or self._next_s > end_s):
-                seen = f"{positions(self.last(State))}, {shown(self.status)}"
-                raise Unmet(f"on the way to left {left_mm:+.1f} mm, right {right_mm:+.1f} mm: {seen}")
+            self.beat(DriveMode.RUN, left, right)
+            is_off = not ends() and (self.status.mode is not DeviceMode.RUN or self._next_s > end_s)
+            unless(is_off, f"on the way to {goals} mm: {positions(self.last(State))}, {shown(self.status)}")
 
-    def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] | None = None) -> float:
+    def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] = lambda: None) -> float:
         """Send no Drive in RUN for a time, then one; return the silence by the device's clock, s."""
-        self.next_status(Beat.RUN)
-        self.pass_time(self.random.randrange(20) * PERIOD_S, Beat.RUN)
-        self._answered(Beat.RUN)
+        self.next_status(DriveMode.RUN)
+        self.pass_time(self.random.randrange(20) * PERIOD_S, DriveMode.RUN)
+        self._answered(DriveMode.RUN)
         before = self.last(State)
         while self._next_s < self.drive_s + silent_s - 0.5 * PERIOD_S:
-            if meanwhile is not None:
-                meanwhile()
-            self.beat(Beat.NOTHING)
-        return (self._answered(Beat.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
+            self.beat(None, besides=meanwhile)
+        return (self._answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
 
     def _answered(self, beat: Beat) -> State:
         before = self.newest.get(State)
         self.beat(beat)
-        if not self.until(lambda: self.newest.get(State) is not before, ANSWER_S, Beat.NOTHING):
-            raise Unmet(f"no State: {shown(self.status)}")
+        is_answered = self.until(lambda: self.newest.get(State) is not before, ANSWER_S, None)
+        unless(not is_answered, f"no State: {shown(self.status)}")
         return self.last(State)
 
     def latched(self) -> None:
         """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN."""
-        status = self.next_status(Beat.NOTHING)
-        if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults:
+        status = self.next_status(None)
+        if status.mode is not DeviceMode.LATCHED or status.faults != DeviceFault.COMMAND_TIMEOUT:
             self.running(INSIDE_MM)
             self.pass_time(0.1)
             self.until(self.is_resting, OPENED_S)
-            if self.status.mode is not DeviceMode.LATCHED:
-                raise Unmet(f"silence in RUN does not lead to LATCHED: {shown(self.status)}")
-
-    def leave_open(self) -> str:
-        """Open the gap from any state; return what hinders it in words, or ""."""
-        self.hello()
-        for _ in range(2):
-            if Status not in self.newest and not self.until(lambda: Status in self.newest, 0.2):
-                return "the device sends no Status"
-            self.until(self.is_resting, OPENED_S)
-            if is_open(self.next_status(Beat.OFF)) and self.is_resting():
-                return ""
-            if self.status.mode is DeviceMode.LATCHED:
-                self.command(Clear)
-            self.command(Retract)
-            self.until(self.is_resting, OPENED_S)
-        status = self.next_status(Beat.OFF)
-        return "" if is_open(status) and self.is_resting() else shown(status)
+            self.shows(DeviceMode.LATCHED, None, fault=DeviceFault.COMMAND_TIMEOUT, besides="after silence")
 
     def is_resting(self) -> bool:
         """Whether the newest Status shows the drives off."""
@@ -487,11 +431,7 @@ def contradictions(status: Status) -> list[str]:
         "RIGHT_OPEN with RIGHT_CLOSED": (Switches.RIGHT_OPEN | Switches.RIGHT_CLOSED) in switches,
         f"HOMED while {mode.name}": is_homed(status) and mode in (DeviceMode.HOMING, DeviceMode.LATCHED),
         "LATCHED without a fault": mode is DeviceMode.LATCHED and not status.faults,
+        "HOMED in IDLE and not open": mode is DeviceMode.IDLE and is_homed(status) and not is_open(status),
         f"a fault while {mode.name}": status.faults and mode in (DeviceMode.IDLE, DeviceMode.RUN),
     }
     return [what for what, is_so in found.items() if is_so]
-
-
-def usual(values: list[float]) -> float:
-    """Return the median; NaN of no values."""
-    return sorted(values)[len(values) // 2] if values else math.nan

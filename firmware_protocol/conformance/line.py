@@ -1,7 +1,7 @@
 """Lines carry frames between the kit and a device, have a clock, and can send damaged frames."""
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple, Protocol, TypeAlias
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 from firmware_protocol.codec import can_identifier
 from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, cobs_decode, cobs_encode, encode_frame
@@ -17,44 +17,28 @@ class Arrival(NamedTuple):
     payload: bytes
 
 
-class BytePort(Protocol):
-    """A serial port and a clock, real or virtual."""
+class Port(Protocol):
+    """A serial port, or a CAN bus for classical frames with 11-bit identifiers; and a clock, real or virtual."""
 
     def now_s(self) -> float:
         """Return a time that never falls."""
 
-    def write(self, data: bytes) -> None:
-        """Send bytes. Raises OSError when the port is gone."""
+    def write(self, *data: Any) -> None:
+        """Send bytes; on a bus a frame, by its identifier and data. Raises OSError when the port is gone."""
 
-    def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Wait until `until_s`; return what came, with its times. Raises OSError when the port is gone."""
+    def read(self, until_s: float) -> list[Any]:
+        """Wait until `until_s`; return what came: the time, on a bus the identifier, the data. Raises OSError when the
+        port is gone.
+        """
 
     def close(self) -> None:
         """Close the port."""
 
 
-class FramePort(Protocol):
-    """A CAN bus and a clock, real or virtual, for classical frames with 11-bit identifiers."""
-
-    def now_s(self) -> float:
-        """Return a time that never falls."""
-
-    def write(self, identifier: int, data: bytes) -> None:
-        """Send a frame. Raises OSError when the bus is gone."""
-
-    def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
-        """Wait until `until_s`; return the time, identifier and data of each frame. Raises OSError when the bus is
-        gone.
-        """
-
-    def close(self) -> None:
-        """Close the bus."""
-
-
 class SerialLine:
     """One conversation with a device, in frames of COBS and CRC-16 on a serial port."""
 
-    def __init__(self, port: BytePort) -> None:
+    def __init__(self, port: Port) -> None:
         self.port = port
         self._decoder = FrameDecoder()
         self._sequence = 0
@@ -81,6 +65,11 @@ class SerialLine:
             "frame_zero_inside": (body[:middle] + DELIMITER + body[middle:] + DELIMITER,),
             "noise": (NOISE + DELIMITER, NOISE[: MAX_ENCODED - 2] + DELIMITER, NOISE * 40 + DELIMITER),
         }
+
+    def unusual(self, function: int, payload: bytes) -> tuple[tuple[bytes, ...], ...]:
+        """Return writes that are one frame each time: repeated, among empty ones, in two parts."""
+        first, second, third = (self._frame(function, payload) for _ in range(3))
+        return (first, first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])
 
     def send_damaged(self, unit: bytes) -> None:
         self.port.write(unit)
@@ -119,14 +108,11 @@ class SerialLine:
 class CanLine:
     """One conversation with a node on a CAN bus."""
 
-    def __init__(self, port: FramePort, node: int) -> None:
+    def __init__(self, port: Port, node: int) -> None:
         can_identifier(1, node)
         self.port, self._node = port, node
         self._others: set[int] = set()
-
-    @property
-    def frame_errors(self) -> dict[str, int]:
-        return {}
+        self.frame_errors: dict[str, int] = {}
 
     def send(self, function: int, payload: bytes) -> None:
         self.port.write(can_identifier(function, self._node), payload)

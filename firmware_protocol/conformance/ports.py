@@ -23,7 +23,7 @@ PATIENCE_S: Final = 1.0
 
 @final
 class SerialPort:
-    """An open, exclusively held serial port: a `BytePort`."""
+    """An open, exclusively held serial port: a `Port`."""
 
     def __init__(self, path: str, baud: int) -> None:
         """Open the port at `path`, with its latency timer at 1 ms if it has one."""
@@ -63,17 +63,18 @@ class SerialPort:
 
 @final
 class CanPort:
-    """An open CAN bus: a `FramePort`."""
+    """An open CAN bus: a `Port`."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
         """Open a bus by python-can; `baud` is of an adapter's serial port."""
-        settings: dict[str, Any] = {}
-        if interface == "slcan":  # by default it sleeps for 2 s when it opens
-            settings = {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0}
-        elif interface == "udp_multicast":
-            settings = {"hop_limit": 0, "fd": False}
+        known: dict[str, dict[str, Any]] = {
+            "slcan": {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0},  # else it sleeps for 2 s
+            "udp_multicast": {"hop_limit": 0, "fd": False},
+        }
         try:
-            self._bus = can.Bus(interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **settings)
+            self._bus = can.Bus(
+                interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **known.get(interface, {})
+            )
             self._fd: int = self._bus.fileno()
         except NotImplementedError as error:
             raise OSError(f"{interface}: this driver cannot be waited for; use the kernel's, socketcan") from error
@@ -115,9 +116,8 @@ class CanPort:
             raise OSError(str(error)) from error
         except (ValueError, IndexError):  # slcan's answer to a damaged line from the adapter
             return None
-        if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
-            return None
-        return frame
+        is_other = frame and (frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd)
+        return None if is_other else frame
 
 
 def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:

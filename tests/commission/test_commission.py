@@ -89,6 +89,63 @@ def sensing(changed):
     )
 
 
+def second_order(hz):
+    """Return a low pass of a damping of 0.7."""
+    value, rate, last_s = 0.0, 0.0, 0.0
+    per_s = 2.0 * math.pi * hz
+
+    def passes(now_s, force_N):
+        nonlocal value, rate, last_s
+        for _ in range(round((now_s - last_s) / 5e-4)):
+            rate += 5e-4 * (per_s**2 * (force_N - value) - 1.4 * per_s * rate)
+            value += 5e-4 * rate
+        last_s = now_s
+        return value
+
+    return passes
+
+
+def first_order(hz):
+    value, last_s = 0.0, 0.0
+
+    def passes(now_s, force_N):
+        nonlocal value, last_s
+        value += (1.0 - math.exp(-2.0 * math.pi * hz * (now_s - last_s))) * (force_N - value)
+        last_s = now_s
+        return value
+
+    return passes
+
+
+def read_at(hz):
+    value, next_s = 0.0, 0.0
+
+    def reads(now_s, force_N):
+        nonlocal value, next_s
+        if now_s >= next_s:
+            value, next_s = force_N, now_s + 1.0 / hz
+        return value
+
+    return reads
+
+
+def with_play(width_N):
+    value = 0.0
+
+    def plays(_now_s, force_N):
+        nonlocal value
+        value = min(max(value, force_N - width_N / 2.0), force_N + width_N / 2.0)
+        return value
+
+    return plays
+
+
+def through(sensor):
+    return lambda now_s, message: (
+        message.replaced(force_N=sensor(now_s, message.force_N)) if isinstance(message, Sense) else message
+    )
+
+
 NOISE = random.Random(1)
 
 
@@ -103,6 +160,10 @@ NOISE = random.Random(1)
         (("sensor",), {"alters": sensing(lambda force_N: force_N + 0.2)}, "sensor's zero"),
         (("sensor",), {"alters": sensing(lambda force_N: force_N + NOISE.gauss(0.0, 0.06))}, "sensor's noise"),
         (("sensor",), {"alters": sensing(lambda force_N: 0.05 * round(force_N / 0.05))}, "sensor's resolution"),
+        (("sensor",), {"alters": through(first_order(3.0))}, "sensor's rise after the handle's turn"),
+        (("sensor",), {"alters": through(first_order(5.0))}, "sensor's rise after the handle's turn"),
+        (("steps",), {"alters": through(read_at(12.0))}, "sensor's readings apart"),
+        (("force over gap",), {"alters": through(with_play(0.06))}, "force of a closing gap over an opening one's"),
         (("carriages",), {"plant": with_part("screw", friction_coefficient=0.7)}, "left friction over the configured"),
         (
             ("carriages",),
@@ -120,6 +181,20 @@ NOISE = random.Random(1)
 def test_the_row_of_what_a_fault_changes_turns_red(bench, steps, device, expected):
     found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
     assert (expected in red(found), stopped) == (True, None)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "steps"),
+    [
+        (read_at(50.0), ("sensor", "force over gap", "steps")),
+        (second_order(15.0), ("sensor",)),
+        (with_play(0.03), ("force over gap",)),
+    ],
+    ids=["50/s", "15 Hz", "30 mN"],
+)
+def test_a_fair_sensor_is_taken(bench, sensor, steps):
+    found, stopped = bench(SAMPLE, alters=through(sensor)).commission(chosen(*steps))
+    assert (red(found), stopped) == ([], None)
 
 
 def test_a_handle_that_turns_seldom_makes_no_screw_rub(bench):
@@ -142,20 +217,17 @@ def test_weak_magnet_wrong_insert_and_sensor_gain_share_a_row_that_names_them(be
     assert red(found)[0] == "force over the model's: magnets, insert, or sensor's gain"
 
 
-@pytest.mark.parametrize("gain", [1.0, 0.55])
-def test_a_weight_tells_the_sensors_gain(bench, gain):
-    hung = bench(
-        SAMPLE,
-        hand=SteadyHand(0.0),
-        alters=lambda now_s, message: (
-            message.replaced(force_N=gain * (message.force_N + 2.0 * (now_s > 10.0)))
-            if isinstance(message, Sense)
-            else message
-        ),
-    )
+@pytest.mark.parametrize(("gain", "bent_per_N"), [(1.0, 0.0), (0.55, 0.0), (1.0, 0.1), (1.0, -0.1)])
+def test_a_weight_tells_the_sensors_gain_and_a_bent_line(bench, gain, bent_per_N):
+    def weighs(now_s, force_N):
+        hung_N = force_N + 2.0 * (now_s > 10.0)
+        return gain * hung_N * (1.0 + bent_per_N * hung_N)
+
+    hung = bench(SAMPLE, hand=SteadyHand(0.0), alters=through(weighs))
     found, stopped = hung.commission(chosen("weight"), weight_N=2.0)
-    assert (found["weight"][0].value, stopped) == (pytest.approx(gain, abs=0.02), None)
-    assert red(found) == ([] if gain == 1.0 else ["sensor's gain, by the weight"])
+    expected = gain * (1.0 + 2.0 * bent_per_N)
+    assert (found["weight"][0].value, stopped) == (pytest.approx(expected, abs=0.02), None)
+    assert red(found) == ([] if expected == 1.0 else ["sensor's gain, by the weight"])
 
 
 @pytest.mark.parametrize(

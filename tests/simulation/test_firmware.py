@@ -12,6 +12,7 @@ from firmware_protocol.codec import (
     Clear,
     DeviceFault,
     DeviceMode,
+    DriveMode,
     Hello,
     Home,
     Sense,
@@ -63,13 +64,13 @@ class Bench(Host):
         for _ in range(round(seconds / PERIOD_S)):
             state = self.last(State)
             errors = (target_mm - state.left_position_mm, target_mm - state.right_position_mm)
-            self.beat(Beat.RUN, *(min(max(2.0 * error, -1.0), 1.0) for error in errors))
+            self.beat(DriveMode.RUN, *(min(max(2.0 * error, -1.0), 1.0) for error in errors))
 
     def run_until(self, time_s: float, duty: float = 0.0) -> None:
         while self.now_s < time_s:
-            self.beat(Beat.RUN, duty, duty)
+            self.beat(DriveMode.RUN, duty, duty)
 
-    def reaches(self, mode: DeviceMode, beat: Beat = Beat.NOTHING, limit_s: float = 10.0) -> None:
+    def reaches(self, mode: DeviceMode, beat: Beat = None, limit_s: float = 10.0) -> None:
         assert self.until(lambda: self.status.mode is mode, limit_s, beat), self.status
 
 
@@ -88,7 +89,7 @@ def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "s
 def test_drive_run_is_refused_without_a_hello() -> None:
     host = Bench()
     host.command(Home)
-    host.pass_time(3.0, Beat.OFF)
+    host.pass_time(3.0, DriveMode.OFF)
     assert Switches.HOMED in host.status.switches
     host.run_until(host.now_s + 0.1, -1.0)
     assert host.status.mode is DeviceMode.IDLE
@@ -110,7 +111,7 @@ def test_homing_zeroes_the_encoders_at_the_open_switches_repeatably(name: str) -
         assert (truth.left_mm, truth.right_mm) == pytest.approx((47.5, 47.5), abs=0.05)
         assert host.status.switches == Switches.LEFT_OPEN | Switches.RIGHT_OPEN | Switches.HOMED
         host.go_to(80.0, 1.0)
-        host.pass_time(2.0, Beat.OFF)
+        host.pass_time(2.0, DriveMode.OFF)
     assert [zero for pair in zeros for zero in pair] == pytest.approx([47.5] * 4, abs=0.02)
     assert zeros[0] == pytest.approx(zeros[1], abs=0.01)
 
@@ -123,10 +124,10 @@ def test_homing_that_fails_opens_where_it_can_and_does_not_press_shut(fault: str
     min_mm = before.gap_mm
     is_reversed = "reversed" in fault
     while host.status.mode is not DeviceMode.LATCHED:
-        host.pass_time(0.01, Beat.OFF)
+        host.pass_time(0.01, DriveMode.OFF)
         assert host.now_s < (2.0 if is_reversed else 20.0)
         min_mm = min(min_mm, host.device.truth.gap_mm)
-    host.pass_time(3.0, Beat.OFF)
+    host.pass_time(3.0, DriveMode.OFF)
     assert (host.status.mode, host.status.faults) == (DeviceMode.LATCHED, DeviceFault.HOMING_FAILED)
     assert Switches.HOMED not in host.status.switches
     assert not host.device.messages.firmware.output.enabled
@@ -234,7 +235,7 @@ ENDINGS = {
 def test_how_a_run_ends(ending: Ending) -> None:
     host = running(ending.faults, gap_mm=ending.gap_mm)
     host.run_until(3.5)
-    beat = (Beat.NOTHING,) if ending.duties is None else (Beat.RUN, *ending.duties)
+    beat = (None,) if ending.duties is None else (DriveMode.RUN, *ending.duties)
     while host.status.mode is DeviceMode.RUN:
         host.beat(*beat)
         assert host.now_s < 20.0
@@ -247,7 +248,7 @@ def test_how_a_run_ends(ending: Ending) -> None:
     truth = host.device.truth
     assert (host.status.faults, truth.left_A, truth.right_A) == (ending.latched, 0.0, 0.0)
     assert (truth.left_mm, truth.right_mm) == pytest.approx((ending.left_mm, ending.right_mm), abs=ending.within_mm)
-    assert host.is_refused(Clear) is (DeviceFault.SUPPLY in ending.latched), "its cause lasts"
+    assert host.command(Clear) is (DeviceFault.SUPPLY not in ending.latched), "its cause lasts"
 
 
 @pytest.mark.parametrize(("percent", "within_s"), [(-100, 0.4), (-75, 3.5), (-200, 3.5)])
@@ -255,7 +256,7 @@ def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int
     host = running([f"opening={percent}%@3.5"], gap_mm=52.0)
     host.run_until(3.5)
     started_s = host.now_s
-    host.beat(Beat.OFF)
+    host.beat(DriveMode.OFF)
     while DeviceFault.RETRACT_FAILED not in host.status.faults:
         host.pass_time(0.01)
         assert host.now_s - started_s < within_s
@@ -267,7 +268,7 @@ def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap() -> None:
     assert host.status.mode is DeviceMode.IDLE
     assert Switches.HOMED not in host.status.switches
     stood_mm = host.device.truth.gap_mm
-    host.pass_time(0.5, Beat.OFF)
+    host.pass_time(0.5, DriveMode.OFF)
     assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=1e-6)
     assert host.last(State).left_position_mm == pytest.approx(0.0, abs=0.3)
     host.homed()
@@ -278,7 +279,7 @@ def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open(
     host = running(["worn_gearbox@3.5", "supply_loss@3.5"], gap_mm=47.0, plant="sample_3")
     host.run_until(3.5)
     while DeviceFault.UNCOMMANDED_MOTION not in host.status.faults:
-        host.beat(Beat.NOTHING)
+        host.beat(None)
         assert host.now_s < 5.0
     assert host.status.mode is DeviceMode.RETRACTING
     assert DeviceFault.RETRACT_FAILED not in host.status.faults
@@ -295,7 +296,7 @@ def test_a_device_that_is_mended_homes_as_a_healthy_one() -> None:
     for host in (mended, healthy):
         for message in (Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1), Clear(2), Home(3)):
             host.send(message)
-        host.pass_time(5.8, Beat.OFF)
+        host.pass_time(5.8, DriveMode.OFF)
         host.pass_time(2.0 * STATUS_PERIOD_S)
     assert mended.status == healthy.status
     assert Switches.HOMED in mended.status.switches

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
@@ -40,6 +41,11 @@ WORN = "compare the insert with the scene's; replace one that is worn or swollen
 STRENGTH = (0.6, 1.5)
 "The lower bound is the default `[trim]` for the weakest device; of 60 healthy draws the weakest has 0.63."
 GAINS = "let the daemon run by the calibration that this commissioning writes (device.calibrations)"
+CHANGING_N_S: Final = 1.0
+STILL_MM_S, STROKE_S, TURNED_MM, RISEN = 2.0, 0.3, 0.5, 0.8
+"The rubber's own way is under TURNED_MM: a force that is not at RISEN by then waits for its sensor."
+SLOW = "set the sensor's amplifier to 15 Hz or more, and to 50 readings a second, or replace it"
+STICKS = "look for what rubs beside the sensor, and for play in its mount; replace it"
 SENSOR = "tare the sensor, look at its cable, shielding and supply"
 ELEMENT = (
     "hang up a weight (--weight-N): it tells the sensor's gain from magnets and insert. Compare both with the scene"
@@ -83,6 +89,7 @@ def sensor(known: Known) -> Course[list[Finding]]:
             "sensor's noise", np.sqrt(np.mean(still**2) / 2.0) if still.size else np.nan, "mN", (0.0, 40.0), SENSOR, 1e3
         ),
         finding("sensor's resolution", jumps_N[jumps_N > 1e-6].min(initial=np.inf), "mN", (0.0, 25.0), SENSOR, 1e3),
+        finding("sensor's rise after the handle's turn", _rises_s(known, later), "ms", (-300.0, 10.0), SLOW, 1e3),
         finding(
             "force when slow over force at speed, to the model's",
             float(np.nanmean(slow) / np.nanmean(fast)) if slow.size and fast.size else np.nan,
@@ -112,6 +119,7 @@ def force_over_gap(known: Known) -> Course[list[Finding]]:
     off_N = np.sqrt(np.mean(means_N**2))
     return [
         _strength(ticks),
+        finding("force of a closing gap over an opening one's", _hysteresis_N(ticks), "mN", (-5.0, 45.0), STICKS, 1e3),
         finding("force over gap, off the learned curve by", off_N, "mN", (0.0, 45.0), ELEMENT, 1e3),
     ]
 
@@ -147,9 +155,40 @@ def steps(known: Known) -> Course[list[Finding]]:
     return [
         finding("steps, off the asked force in the mean", np.array(errors_N).mean(), "mN", (-60.0, 60.0), SENSOR, 1e3),
         finding("steps, at worst", np.abs(errors_N).max(), "mN", (0.0, 100.0), SENSOR, 1e3),
+        finding("sensor's readings apart", _readings_apart_s(ticks), "ms", (0.0, 30.0), SLOW, 1e3),
         finding("carriages overshoot", max(0.0, *overshoots), "%", (0.0, 5.0), GAINS, 100.0),
         finding("carriages apart, of 99 % of the time", np.percentile(apart_mm, 99), "mm", (0.0, limit_mm), GAINS),
     ]
+
+
+def _readings_apart_s(ticks: Columns) -> float:
+    """Return the time between two readings while the force changes fast."""
+    slope_N_s = np.abs(np.gradient(ticks["predicted_cf"] / ticks["trim"], ticks["monotonic_s"]))
+    changes = np.flatnonzero(np.diff(ticks["device_force_N"]))
+    between_s = np.diff(ticks["monotonic_s"][changes])[slope_N_s[changes[1:]] > CHANGING_N_S]
+    # an equal reading hides that it is one
+    return float(np.quantile(between_s, 0.25)) if between_s.size else math.nan
+
+
+def _rises_s(known: Known, ticks: Columns) -> float:
+    """Return how long after a turned handle's TURNED_MM the force has come to RISEN of its stroke's."""
+    speed, force_N = np.abs(ticks["handle_rate_mm_s"]), ticks["device_force_N"]
+    rises_s = []
+    for rows in np.split(np.arange(speed.size), np.flatnonzero(np.diff(speed > STILL_MM_S)) + 1):
+        if speed[rows[0]] > STILL_MM_S and rows.size * known.period_s > STROKE_S:
+            level_N = np.median(force_N[rows[rows.size // 2 :]])
+            has_risen = force_N[rows] * np.sign(level_N) > RISEN * abs(level_N)
+            has_turned = np.cumsum(speed[rows]) * known.period_s > TURNED_MM
+            rises_s.append(float(np.argmax(has_risen)) - float(np.argmax(has_turned)))
+    return float(np.median(rises_s)) * known.period_s if rises_s else math.nan
+
+
+def _hysteresis_N(ticks: Columns) -> float:
+    """Return the force of a closing gap over that of an opening one, of the same model's force."""
+    model_N, gap_mm = ticks["predicted_cf"] / ticks["trim"], _smooth(ticks["reference_gap_mm"], 200)
+    rows = np.column_stack([model_N, model_N**2, -np.sign(np.gradient(gap_mm))])
+    slides = (np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S) & np.isfinite(model_N + ticks["measured_cf"])
+    return float(2.0 * np.linalg.lstsq(rows[slides], ticks["measured_cf"][slides], rcond=None)[0][2])
 
 
 def memory(known: Known) -> Course[list[Finding]]:

@@ -135,7 +135,7 @@ class Firmware:
         self._motion: Retraction | HomingMotion | None = None
         self._drive_counter: int | None = None
         self._drive_s = 0.0
-        self._nonce: int | None = None
+        self._nonce = 0
         self._left_calm_s = 0.0
         self._right_calm_s = 0.0
         self._watch_since_s = 0.0
@@ -384,7 +384,7 @@ class Firmware:
             temperature_C=sensors.temperature_C,
             supply_V=sensors.supply_V,
             drive_counter=self._drive_counter or 0,
-            command_nonce=self._nonce or 0,
+            command_nonce=self._nonce,
         )
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:

@@ -1,0 +1,398 @@
+"""Checks of motion: homing, what a duty does, what ends RUN, how the gap opens, and what silence leads to."""
+
+import math
+from collections import deque
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from firmware_protocol.codec import Clear, DeviceFault, DeviceMode, DriveMode, Sense, State, Status
+from firmware_protocol.conformance.check import Check, Hazard, check
+from firmware_protocol.conformance.host import (
+    ANSWER_S,
+    COLUMNS,
+    INSIDE_MM,
+    NO_FAULT,
+    OPENED_S,
+    PERIOD_S,
+    SEEN_S,
+    STROKE_MM,
+    SWITCH_MM,
+    Host,
+    Unmet,
+    is_homed,
+    is_open,
+    places,
+    positions,
+    shown,
+    unless,
+)
+from firmware_protocol.conformance.taking import DUTY, PLACES, SPARSE_S, Sent, opens_fully, put_off, refused, taken
+from firmware_protocol.conformance.telling import columns
+
+RUNNING: Final = next(place for place in PLACES if place.name == "RUN")
+
+SILENCE, DRIVE = "Who says what when, 6", "Drive"
+ZERO_MM, JUMP_MM, LAST_S = 1.0, 0.2, 8.0
+"""A carriage rests ZERO_MM from its zero at most: behind its switch, where it was braked from a creep. It is braked
+when HOMED shows, so that a State further off than JUMP_MM has the old origin."""
+RAMP_PER_S, MAX_DUTY, MOVED_MM = 1.0, 0.5, 0.3
+AT_STOP_DUTY, AT_STOP_MM, AT_STOP_A = 0.3, 0.1, 0.3
+"A motor that pushes into the stop at AT_STOP_DUTY draws several times AT_STOP_A."
+SLOW_MM_S, BESIDE_MM, SCALE_MM = 2.0, 1.5, 0.02 * STROKE_MM
+SKEW_MM, BOUND_MM, AHEAD_MM = 2.0, 0.3, 1.2
+"BOUND_MM is two Status at SLOW_MM_S, and the sway of a carriage."
+NEAR, PAST = 0.85, 1.15
+"""Shares of the stroke: that is travelled at a brisk speed; and further than any scale is off, so that a device that
+gets there does not watch."""
+MIDDLE_MM, PULSE_S, SETTLED_S = 10.0, 0.08, 0.04
+PAIRED: Final = (
+    *((0.02 * step, 0.12 - 0.02 * step) for step in range(1, 6)),
+    *((0.4, 0.53), (0.55, 0.46), (0.62, 0.71), (0.75, 0.66), (0.79, 0.88), (0.93, 0.83), (0.97, 1.0), (1.0, 0.86)),
+)
+"Left and right duties; the smallest leave a motor at rest."
+MAX_OFF, STARTED_S, STARTED_MM, STARTING_A = 0.015, 0.02, 0.05, (0.5, 10.0)
+"""By MAX_OFF of duty a current may differ from what duty and speed make. A motor that starts at the whole duty draws
+STARTING_A; outside, the unit is wrong."""
+SHORT_S, LONG_S, BORNE_S, NOTICED_S = 0.047, 0.053, 0.0495, 0.0515
+"By the device's clock shorter silences are borne, longer ones noticed, with a tick for tolerance."
+SHORTS, LONGS, HELD_S, HOLDS = 12, 5, 37.0, 3
+"The holds together meet every time modulo 2^16 ms in RUN, and a silence in every 2^15 ms."
+TIMED_OUT: Final = DeviceFault.COMMAND_TIMEOUT
+
+
+@check(
+    Hazard.OPENS,
+    "Homing",
+    "Home to a device without a zero, beside Drive OFF; then again, without any Drive",
+    f"in {LAST_S:g} s IDLE, HOMED, open, no fault; from the first State after HOMED both within {ZERO_MM:g} mm of 0",
+    moves=True,
+    is_gate=True,
+)
+def home_homes(host: Host) -> str:
+    host.without_zero()
+    unless(is_homed(host.status), f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
+    seen = []
+    for beat in (DriveMode.OFF, None):
+        host.forget()
+        seconds, state = host.home(beat), host.last(State)
+        modes = [status.mode for _, status in host.all_of(Status)]
+        homed_s = next((time_s for time_s, status in host.all_of(Status) if is_homed(status)), math.inf)
+        first = next((each for time_s, each in host.all_of(State) if time_s > homed_s), state)
+        jumps_mm = [abs(there - here) for there, here in zip(places(first), places(state), strict=True)]
+        seen.append(f"{seconds:.1f} s, first {positions(first)}, then {positions(state)}")
+        is_off = beat is DriveMode.OFF and (max(map(abs, places(state))) > ZERO_MM or max(jumps_mm) > JUMP_MM)
+        wrong = is_off or DeviceMode.HOMING not in modes or seconds > LAST_S
+        host.shows(DeviceMode.IDLE, homed=True, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=wrong)
+    return "; ".join(seen)
+
+
+@check(
+    Hazard.OPENS,
+    "Modes",
+    "homed, Drive OFF, then Drive RUN; one Drive OFF; Drive RUN again",
+    "RUN; RETRACTING; RUN, because the Drive OFF that ended RUN counts",
+    moves=True,
+)
+def run_is_entered(host: Host) -> str:
+    host.running()
+    host.beat(DriveMode.OFF)
+    host.shows(DeviceMode.RETRACTING, DriveMode.RUN)
+    host.until(lambda: host.status.mode is not DeviceMode.RETRACTING, OPENED_S, DriveMode.RUN)
+    host.pass_time(SEEN_S, DriveMode.RUN)
+    return host.shows(DeviceMode.RUN, DriveMode.RUN)
+
+
+def _duty_moves(side: int, host: Host) -> str:
+    """Let one duty fall until its carriage moves: with a wrong side or sign every safe state closes the gap."""
+    host.running()
+    start, duty, seen = places(host.last(State)), 0.0, ""
+    while duty > -MAX_DUTY:
+        duty -= RAMP_PER_S * PERIOD_S
+        host.beat(DriveMode.RUN, 0.0 if side else duty, duty if side else 0.0)
+        ways_mm = [at - began for at, began in zip(places(host.last(State)), start, strict=True)]
+        sense = host.last(Sense)
+        currents_A = abs(sense.left_current_A), abs(sense.right_current_A)
+        seen = (
+            f"by {ways_mm[0]:+.2f} and {ways_mm[1]:+.2f} mm, {currents_A[0]:.2f} and {currents_A[1]:.2f} A, {duty:.2f}"
+        )
+        if ways_mm[side] <= -MOVED_MM and abs(ways_mm[1 - side]) < MOVED_MM / 2:
+            return unless(currents_A[side] <= currents_A[1 - side], seen)
+        unless(max(map(abs, ways_mm)) >= MOVED_MM, seen)
+    raise Unmet(f"{seen}, {shown(host.status)}")
+
+
+@check(
+    Hazard.WORN,
+    "Modes",
+    f"in RUN, duties of +{AT_STOP_DUTY:g} at both open switches; then one carriage {BESIDE_MM:g} mm in, +{MAX_DUTY:g}",
+    f"at a switch no motion over {AT_STOP_MM:g} mm, no current over {AT_STOP_A:g} A; the other one opens",
+    moves=True,
+)
+def open_switch_stops(host: Host) -> str:
+    host.running()
+    seen = []
+    for inside in ((False, False), (True, False), (False, True)):
+        goals = np.where(inside, -BESIDE_MM, places(host.last(State)))
+        host.bring(goals[0], goals[1])
+        host.pass_time(SEEN_S, DriveMode.RUN)
+        first = len(host.rows)
+        host.pass_time(0.2, DriveMode.RUN, duty=MAX_DUTY if any(inside) else AT_STOP_DUTY)
+        rows = columns(host, first)
+        ways_mm = np.array([rows[name][-1] - rows[name][0] for name in ("left_mm", "right_mm")])
+        most_A = np.array([np.abs(rows[name]).max() for name in ("left_A", "right_A")])
+        seen.append(f"by {ways_mm[0]:+.2f} and {ways_mm[1]:+.2f} mm, {most_A[0]:.2f} and {most_A[1]:.2f} A at most")
+        stirs = (most_A > AT_STOP_A) | (np.abs(ways_mm) > AT_STOP_MM)
+        host.shows(
+            DeviceMode.RUN, DriveMode.RUN, besides=seen[-1], wrong=np.where(inside, ways_mm < MOVED_MM, stirs).any()
+        )
+    return "; ".join(seen)
+
+
+@check(
+    Hazard.MISLED,
+    "Homing",
+    f"in RUN one carriage alone {BESIDE_MM:g} mm in and out at {SLOW_MM_S:g} mm/s, then the other; both at -1, 3 times",
+    f"each open switch changes within {SWITCH_MM:g} mm of its carriage's 0, and Status shows it at once",
+    moves=True,
+)
+def zero_is_at_switch(host: Host) -> str:
+    host.running()
+    for goals in ((-BESIDE_MM, 0.0), (0.0, -BESIDE_MM)):
+        host.bring(*goals, SLOW_MM_S)
+        host.pass_time(SEEN_S, DriveMode.RUN)
+        host.bring(BESIDE_MM, BESIDE_MM, SLOW_MM_S, lambda: is_open(host.status))
+    for _ in range(3):
+        host.running()
+        host.pass_time(0.2, DriveMode.RUN, duty=-1.0)
+    return unless(+host.contradictions, ", ".join(+host.contradictions) or "all changed in their place")
+
+
+@check(
+    Hazard.MISLED,
+    DRIVE,
+    f"in RUN, {MIDDLE_MM:g} mm in, {len(PAIRED)} pairs of duties of 0.02 to 1, in and out, {PULSE_S * 1e3:g} ms each",
+    f"each current that of its duty and speed, to {MAX_OFF:g} of duty",
+    moves=True,
+)
+def duties_make_currents(host: Host) -> str:
+    """I R = d U - v K: finds duties that are clipped, coarse, dead or the other side's, and currents without a sign."""
+    host.running(MIDDLE_MM)
+    pulses: list[list[tuple[float, float, float]]] = [[], []]
+    for left, right in ((sign * one, sign * other) for one, other in PAIRED for sign in (-1.0, 1.0)):
+        host.bring(-MIDDLE_MM, -MIDDLE_MM)
+        host.pass_time(SETTLED_S, DriveMode.RUN)
+        for _ in range(round(PULSE_S / PERIOD_S)):
+            host.beat(DriveMode.RUN, left, right)
+        unless(host.status.mode is not DeviceMode.RUN, f"{left:+.2f} and {right:+.2f}: {shown(host.status)}")
+        rows = columns(host, -round(SETTLED_S / PERIOD_S) * len(COLUMNS))
+        for side, name, duty in ((0, "left", left), (1, "right", right)):
+            mm_s = float(np.polyfit(rows["device_s"] - rows["device_s"][0], rows[f"{name}_mm"], 1)[0])
+            pulses[side].append((duty, mm_s, float(rows[f"{name}_A"].mean())))
+    host.bring(-MIDDLE_MM, -MIDDLE_MM)
+    host.pass_time(SETTLED_S, DriveMode.RUN)
+    start_mm = places(host.last(State))
+    # the second Drive measures what the first began; an answer that lags shows a motor at rest
+    host.pass_time(2 * STARTED_S, DriveMode.RUN, STARTED_S, duty=1.0)
+    sense, way_mm = host.last(Sense), min(np.subtract(places(host.last(State)), start_mm))
+    seen = [f"{sense.left_current_A:+.2f} and {sense.right_current_A:+.2f} A, {way_mm:+.2f} mm at once"]
+    starting_A = np.array((sense.left_current_A, sense.right_current_A))
+    unless(way_mm < STARTED_MM or (starting_A < STARTING_A[0]).any() or (starting_A > STARTING_A[1]).any(), seen[-1])
+    for side, name in enumerate(("left", "right")):
+        duty, mm_s, current_A = np.array(pulses[side]).T
+        (per_duty, per_mm_s), *_ = np.linalg.lstsq(np.column_stack([duty, mm_s]), current_A, rcond=None)
+        off = np.abs(current_A - per_duty * duty - per_mm_s * mm_s) / max(abs(per_duty), 1e-3)
+        seen.append(f"{name} {per_duty:.2f} A a duty, {off.max():.3f} off at {duty[off.argmax()]:+.2f}")
+        unless(per_duty <= 0.0 or off.max() > MAX_OFF, "; ".join(seen))
+    return "; ".join(seen)
+
+
+def _ends_run(fault: DeviceFault, from_share: float, ahead_mm: float, most_mm: float, host: Host) -> str:
+    """Bring the carriages in until one of them goes too far, and then the other."""
+    is_skew, begins_mm = fault is DeviceFault.SKEW, -from_share * host.stroke_mm
+    seen = []
+    for side in (0, 1):
+        host.running(-begins_mm)
+        host.forget()
+        for to_mm in (begins_mm,) if is_skew else (begins_mm, -PAST * host.stroke_mm):
+            goals = [to_mm - ahead_mm * (at == side) for at in (0, 1)]
+            host.bring(goals[0], goals[1], SLOW_MM_S, lambda: _apart_mm(host) > SKEW_MM + BOUND_MM or _has_left(host))
+        innermost_mm = min(places(state)[side] for _, state in host.all_of(State))
+        off_mm = _apart_mm(host) - SKEW_MM if is_skew else innermost_mm + host.stroke_mm
+        seen.append(f"{off_mm:+.2f} mm from where it ends: {shown(host.next_status(DriveMode.RUN))}")
+        unless(host.status.faults != fault or abs(off_mm) > most_mm, "; ".join(seen))
+        seen.append(opens_fully(host, fault))
+    return "; ".join(seen)
+
+
+def _apart_mm(host: Host) -> float:
+    return abs(float(np.subtract(*places(host.last(State)))))
+
+
+def _has_left(host: Host) -> bool:
+    return host.status.mode is not DeviceMode.RUN
+
+
+@check(
+    Hazard.CLOSES,
+    "Modes",
+    f"Retract in RUN, and LATCHED by silence, Clear and Home, Drive RUN of {DUTY:g} going on; then one Drive OFF",
+    "IDLE and still until the Drive OFF, RUN after it",
+    moves=True,
+)
+def let_go_after_all(host: Host) -> str:
+    put_off(host)
+    seen = [_has_to_let_go(host)]
+    host.running(INSIDE_MM)
+    host.pass_time(0.1)
+    host.until(host.is_resting, OPENED_S, DriveMode.RUN)
+    host.obeyed(Clear, DriveMode.RUN)
+    host.home(DriveMode.RUN)
+    return "; ".join([*seen, _has_to_let_go(host)])
+
+
+def _has_to_let_go(host: Host) -> str:
+    keeps_still(host, "before a Drive OFF")
+    host.beat(DriveMode.OFF)
+    host.pass_time(SEEN_S, DriveMode.RUN)
+    return host.shows(DeviceMode.RUN, DriveMode.RUN, besides="IDLE, and after a Drive OFF and Drive RUN again")
+
+
+def keeps_still(host: Host, when: str) -> str:
+    """Send Drive RUN to an idle device that must not run yet."""
+    host.beat(DriveMode.RUN)
+    host.pass_time(ANSWER_S)
+    start = places(host.last(State))
+    host.pass_time(SEEN_S, DriveMode.RUN, duty=DUTY)
+    way_mm = max(abs(at - began) for at, began in zip(places(host.last(State)), start, strict=True))
+    return host.shows(
+        DeviceMode.IDLE, DriveMode.RUN, besides=f"{when} moved by {way_mm:.2f} mm", wrong=way_mm > AT_STOP_MM
+    )
+
+
+def _is_noticed(host: Host, silent_s: float) -> bool:
+    silence_s = host.fall_silent(silent_s)
+    status = host.next_status(DriveMode.RUN)
+    has_ended = status.mode is not DeviceMode.RUN
+    seen = f"after {silence_s * 1e3:.2f} ms on the device's clock: {shown(status)}"
+    unless(silence_s < BORNE_S if has_ended else silence_s > NOTICED_S, seen)
+    unless(status.faults != (TIMED_OUT if has_ended else NO_FAULT), seen)
+    return has_ended
+
+
+@check(
+    Hazard.SHUT,
+    SILENCE,
+    f"in RUN, at random times, {SHORT_S * 1e3:g} ms without a Drive {SHORTS} times; {LONG_S * 1e3:g} ms, "
+    f"then Drive RUN, {LONGS} times, first at the open end, then {INSIDE_MM:g} mm in",
+    "the short ones are borne; after the long ones no RUN, COMMAND_TIMEOUT alone; opens, LATCHED",
+    moves=True,
+)
+def silence_is_noticed(host: Host) -> str:
+    host.running()
+    unless(any(_is_noticed(host, SHORT_S) for _ in range(SHORTS)), f"ends early: {shown(host.status)}")
+    noticed = 0
+    for at in range(LONGS):
+        host.running(INSIDE_MM if at else 0.0)
+        noticed += _is_noticed(host, LONG_S)
+        host.until(host.is_resting, OPENED_S)
+        host.shows(DeviceMode.LATCHED, homed=False, opened=True, fault=TIMED_OUT)
+    return unless(noticed < LONGS - 1, f"{noticed} of {LONGS} noticed, the others too short by the device's clock")
+
+
+@check(
+    Hazard.SHUT,
+    SILENCE,
+    f"in RUN, {2.0 * INSIDE_MM:g} mm in, but for all that RUN refuses, and Hellos, silence; in both orders",
+    "noticed as before",
+    moves=True,
+)
+def only_good_drives_extend(host: Host) -> str:
+    seen = ""
+    for step in (1, -1):
+        host.running(2.0 * INSIDE_MM)
+        host.next_status(DriveMode.RUN)
+        bad = deque([*list(taken(host, RUNNING))[:-2], *refused(host)][::step])
+
+        def chatter(bad: deque[Sent] = bad) -> None:
+            bad[0].send()
+            bad[1].send()
+            bad.rotate(-2)
+
+        silence_s = host.fall_silent(1.2 * LONG_S, chatter)  # a device's delay may take some of it
+        seen = f"after {silence_s * 1e3:.1f} ms"
+        host.shows(DeviceMode.RETRACTING, DriveMode.RUN, fault=TIMED_OUT, besides=seen, wrong=silence_s < NOTICED_S)
+    return seen
+
+
+@check(
+    Hazard.SHUT,
+    SILENCE,
+    f"{HOLDS} times in RUN a Drive every {SPARSE_S * 1e3:g} ms, {HOLDS * HELD_S:g} s in all, then none",
+    "stays RUN; then COMMAND_TIMEOUT alone, whenever",
+    moves=True,
+)
+def any_uptime(host: Host) -> str:
+    """Finds a timeout's counter that overflows at 2^16 ms or changes its sign."""
+    began_s, seen = host.now_s, ""
+    for at in range(1, HOLDS + 1):
+        host.running()
+        while host.now_s < began_s + at * HELD_S:
+            host.beat(DriveMode.RUN, period_s=SPARSE_S)
+            unless(_has_left(host), f"RUN with a Drive every {SPARSE_S * 1e3:g} ms ends: {shown(host.status)}")
+        host.pass_time(SEEN_S, DriveMode.RUN)
+        _is_noticed(host, LONG_S + PERIOD_S)
+        host.until(host.is_resting, OPENED_S)
+        seen = host.shows(DeviceMode.LATCHED, fault=TIMED_OUT)
+    return f"{HOLDS} times: {seen}"
+
+
+SKEW: Final = Check(
+    "skew_opens",
+    Hazard.WORN,
+    "Faults",
+    f"in RUN, one carriage on at {SLOW_MM_S:g} mm/s; then the other one",
+    f"SKEW alone from {SKEW_MM:g} mm on, {BOUND_MM:g} more or less; opens and latches",
+    partial(_ends_run, DeviceFault.SKEW, 0.4, 2.0 * SKEW_MM, BOUND_MM),
+    moves=True,
+    is_gate=False,
+)
+END_STOP: Final = Check(
+    "end_stop_opens",
+    Hazard.WORN,
+    "Faults",
+    f"in RUN at {SLOW_MM_S:g} mm/s to the closed switches, the left carriage {AHEAD_MM:g} mm ahead; then the right one",
+    f"END_STOP alone, {SCALE_MM:g} mm from the stroke's length at most; opens and latches",
+    partial(_ends_run, DeviceFault.END_STOP, NEAR, AHEAD_MM, SCALE_MM),
+    moves=True,
+    is_gate=False,
+)
+CHECKS: Final = (
+    run_is_entered,
+    open_switch_stops,
+    zero_is_at_switch,
+    duties_make_currents,
+    SKEW,
+    END_STOP,
+    let_go_after_all,
+    silence_is_noticed,
+    only_good_drives_extend,
+    any_uptime,
+)
+GATES: Final = (
+    home_homes,
+    *(
+        Check(
+            f"{name}_duty",
+            Hazard.CLOSES,
+            DRIVE,
+            f"in RUN, a {name} duty that falls from 0 to -{MAX_DUTY:g} at most, {other} 0",
+            f"the {name} carriage goes in by {MOVED_MM:g} mm, the {other} one stays; the {name} motor draws more",
+            partial(_duty_moves, side),
+            moves=True,
+            is_gate=True,
+        )
+        for side, name, other in ((0, "left", "right"), (1, "right", "left"))
+    ),
+)

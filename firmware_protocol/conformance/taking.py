@@ -1,0 +1,406 @@
+"""Checks made from the table of rules: a message is sent to a device in a mode, and what it changed is compared.
+
+What must change nothing is sent among Drives of two rates, one message after the other: neither mode, faults, zero,
+nonce, positions, currents nor the number of answers may differ after it. What a mode acts on is sent once a rate.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import chain
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from firmware_protocol.codec import (
+    FUNCTION,
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Retract,
+    Sense,
+    State,
+    Status,
+    crc8,
+    encode,
+)
+from firmware_protocol.conformance.check import Check, Hazard
+from firmware_protocol.conformance.host import (
+    ANSWER_S,
+    HELLO_NONCE,
+    HOMED_S,
+    INSIDE_MM,
+    NO_FAULT,
+    OPENED_S,
+    PERIOD_S,
+    SEEN_S,
+    STATUS_S,
+    Beat,
+    Host,
+    is_homed,
+    places,
+    shown,
+    unless,
+)
+from firmware_protocol.conformance.rules import MODES, REFUSED_COMMANDS, REFUSED_DRIVES, TAKES
+from firmware_protocol.conformance.telling import Array, columns
+
+PAGE: Final = "What each mode takes"
+SPARSE_S: Final = 0.025
+"Drives this seldom still hold RUN, and show what goes on after a message."
+DUTY: Final = -0.4
+STEPS: Final = round(DUTY * 10_000)
+MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
+"A homing that goes in further than it backs off obeys another message."
+BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM = 0.1, 0.2, 0.8, 0.05, 0.6
+"A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
+TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 100
+"A Drive and a Status on their way put a Status behind by more than the beats in TWO_STATUS_S."
+RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
+COMMANDS: Final[dict[str, type[Retract | Home | Clear]]] = {"Retract": Retract, "Home": Home, "Clear": Clear}
+FITS, MISFITS, OFF = "Hello that fits", "Hello that does not", "Drive OFF"
+SILENT: Final = "silence"
+ACTS: Final = TAKES | {SILENT: ("", "RETRACTING, LATCHED with COMMAND_TIMEOUT", "", "", "")}
+CAUSES: Final = {MISFITS: DeviceFault.SCHEMA_MISMATCH, SILENT: DeviceFault.COMMAND_TIMEOUT}
+MIN_SHARE, MAX_SHARE, ENDS_MM, WINDOW = 0.6, 1.15, 3.0, 50
+"""Bounds of a carriage's speed as shares of the device's opening speed: its mean without the ends, and its most over
+WINDOW States."""
+MISFITTING: Final = (
+    *(Hello(SCHEMA_HASH ^ 1 << bit, PROTOCOL_VERSION, HELLO_NONCE) for bit in (0, 7, 8, 15, 16, 23, 24, 31)),
+    *(Hello(SCHEMA_HASH, version, HELLO_NONCE) for version in (0, 2, 129, 255)),
+)
+STAYS: Final = ("", "answered", "refused", "accepted, nothing to do", "accepted, goes on", "Identity")
+
+
+class Sent(NamedTuple):
+    """A message that changes nothing but the nonce, if it is accepted, and that a Hello is answered."""
+
+    name: str
+    send: Callable[[], None]
+    nonce: int | None = None
+    identities: int = 0
+
+
+class Place(NamedTuple):
+    """Where messages are sent: the mode, how it is reached, and the Drives meanwhile."""
+
+    name: str
+    mode: DeviceMode
+    enter: Callable[[Host], object]
+    beat: Beat
+    duty: float
+
+
+def _drive(
+    host: Host,
+    mode: int,
+    left: int = STEPS,
+    right: int = STEPS,
+    ahead: int = 1,
+    crc: int = 0,
+    length: int = 7,
+    body: int = 6,
+) -> bytes:
+    """Return the payload of a Drive that differs from the next good one as REFUSED_DRIVES says."""
+    data = struct.pack("<hhBBx", left, right, mode, (host.counter + ahead) % 256)[:body]
+    whole = data + bytes((crc8(bytes((FUNCTION[Drive],)) + data) ^ crc,))
+    return whole if body != 6 else whole[:length].ljust(length, b"\0")
+
+
+def _command(kind: type[Message], nonce: int) -> bytes:
+    return encode(MISFITTING[0].replaced(nonce=nonce)) if kind is Hello else bytes((nonce,))
+
+
+def _send_drive(host: Host, function: int = FUNCTION[Drive], **differs: int) -> None:
+    host.line.send(function, _drive(host, **differs))
+
+
+def _send_damaged(host: Host, kind: type[Message], mode: int, nonce: int, what: str, at: int) -> None:
+    body = _drive(host, mode) if kind is Drive else _command(kind, nonce)
+    host.line.send_damaged(host.line.damages(FUNCTION[kind], body)[what][at])
+
+
+def refused(host: Host, ahead: int = 1) -> Iterator[Sent]:
+    """Yield the messages that no mode takes."""
+    for mode in (0, 1):
+        for name, differs in REFUSED_DRIVES.items():
+            yield Sent(f"a Drive with {name}", partial(_send_drive, host, **{"mode": mode, "ahead": ahead, **differs}))
+    for kind in (Home, Clear, Retract, Hello):
+        for name, change in REFUSED_COMMANDS.items():
+            if change != 0 or kind is not Hello:
+                body = _command(kind, host.status.command_nonce if change == 0 else host.new_nonce())
+                cut = b"" if change is None else (body + body[-1:])[: len(body) + change]
+                yield Sent(f"{kind.__name__} with {name}", partial(host.line.send, FUNCTION[kind], cut))
+
+
+def damaged(host: Host) -> Iterator[Sent]:
+    """Yield each message of a host with each damage of the carrier."""
+    for kind, mode in ((Drive, 0), (Drive, 1), (Home, 0), (Clear, 0), (Retract, 0), (Hello, 0)):
+        for what, forms in host.line.damages(FUNCTION[kind], _command(kind, 1)).items():
+            for at in range(len(forms)):
+                send = partial(_send_damaged, host, kind, mode, host.new_nonce(), what, at)
+                yield Sent(f"{kind.__name__}: {what}", send)
+
+
+def taken(host: Host, place: Place) -> Iterator[Sent]:
+    """Yield the messages of TAKES that change nothing here."""
+    for name, kind in COMMANDS.items():
+        cell = TAKES[name][place.mode]
+        if cell in STAYS or (kind is Clear and place.name == MISMATCHED):
+            nonce = host.new_nonce()
+            yield Sent(name, partial(host.send, kind(nonce)), nonce if cell.startswith("accepted") else None)
+    if place.beat is DriveMode.OFF and TAKES["Drive RUN"][place.mode] == "answered":
+        yield Sent("Drive RUN", partial(host.drive, DriveMode.RUN, DUTY, DUTY))
+    if place.name != MISMATCHED:
+        for nonce in (host.status.command_nonce, 77, HELLO_NONCE):
+            yield Sent(FITS, partial(host.send, Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce)), nonce, 1)
+
+
+def stays(place: Place, host: Host) -> str:
+    """Send all that changes nothing in this place, at both rates of Drives."""
+    sent = [_stays(host, place, period_s) for period_s in (PERIOD_S, SPARSE_S)]
+    return f"{sent[0]} and {sent[1]} messages changed nothing"
+
+
+def _stays(host: Host, place: Place, period_s: float) -> int:
+    place.enter(host)
+    before, start, sent = host.next_status(place.beat), places(host.last(State)), 0
+    unless(before.mode is not place.mode, f"where it begins: {shown(before)}")
+    host.pass_time(ANSWER_S)
+    unanswered, first = host.drives - host.states, len(host.rows)
+    sources = [taken(host, place), refused(host, 1 if period_s == PERIOD_S else 7)]
+    if place.name in ("IDLE", "RUN") and period_s == PERIOD_S:
+        sources.append(damaged(host))
+    for one in chain(*sources):
+        before = _changes_nothing(host, place, period_s, one, before, start)
+        if host.status.mode is not place.mode:
+            break
+        sent += 1
+    host.pass_time(ANSWER_S)
+    extra = unanswered - (host.drives - host.states)
+    unless(extra, f"{extra:+d} State besides one for each Drive")
+    if place.mode not in RESTING:
+        _ends(host, place, first)
+    return sent
+
+
+def _changes_nothing(
+    host: Host, place: Place, period_s: float, one: Sent, before: Status, start: tuple[float, float]
+) -> Status:
+    """Send a message, compare Status with the one before, unless a motion has ended, and return what it must be."""
+    host.forget()
+    is_still = place.mode in RESTING
+    host.beat(place.beat, place.duty, place.duty, period_s, one.send)
+    seen_s = TWO_STATUS_S if is_still or one.nonce is not None else 0.5 * STATUS_S
+    host.pass_time(seen_s, place.beat, period_s, place.duty)
+    after = before.replaced(command_nonce=before.command_nonce if one.nonce is None else one.nonce)
+    found = _changes(host, one, after) | (_stirs(host, start) if is_still else {})
+    wrong = ", ".join(what for what, is_so in found.items() if is_so)
+    is_wrong = wrong and (is_still or host.status.mode is not DeviceMode.IDLE)
+    unless(is_wrong, f"{one.name}, a Drive every {period_s * 1e3:g} ms: {wrong}, {shown(host.status)}")
+    return after
+
+
+def _changes(host: Host, one: Sent, before: Status) -> dict[str, bool]:
+    """Return what may not change in Status, and whether it did."""
+    after, identities = host.status, len(host.all_of(Identity))
+    behind = [(host.counter - each.drive_counter) % 256 for _, each in host.all_of(Status)]
+    return {
+        "another mode": after.mode is not before.mode,
+        "other faults": after.faults != before.faults,
+        "another HOMED": is_homed(after) is not is_homed(before),
+        f"nonce not {before.command_nonce}": after.command_nonce != before.command_nonce,
+        f"{identities} Identity": identities != one.identities,
+        "drive_counter of no Drive": max(behind, default=0) > MAX_BEHIND,
+    }
+
+
+def _stirs(host: Host, start: tuple[float, float]) -> dict[str, bool]:
+    """Return how far a device at rest moved, and what it drew, and whether that is too much."""
+    moved_mm = max(abs(at - began) for at, began in zip(places(host.last(State)), start, strict=True))
+    senses = [sense for _, sense in host.all_of(Sense)]
+    most_A = max((abs(A) for each in senses for A in (each.left_current_A, each.right_current_A)), default=0.0)
+    return {f"moved by {moved_mm:.2f} mm": moved_mm > MOVED_MM, f"{most_A:.2f} A": most_A > RESTING_A}
+
+
+def _ends(host: Host, place: Place, first: int) -> None:
+    """Let a motion end, which the messages must not have changed."""
+    host.until(host.is_resting, HOMED_S, place.beat)
+    rows = columns(host, first)
+    deepest_mm = min(rows["left_mm"].min(), rows["right_mm"].min())
+    is_deep = deepest_mm < (-HOMING_MM if place.mode is DeviceMode.HOMING else -DEEP_MM - HOMING_MM)
+    seen = f"{deepest_mm:+.2f} mm at the innermost"
+    host.shows(DeviceMode.IDLE, place.beat, homed=True, opened=True, fault=NO_FAULT, besides=seen, wrong=is_deep)
+
+
+def acts(place: Place, name: str, host: Host) -> str:
+    """Send a message that this mode acts on, at both rates of Drives, and compare what it leads to."""
+    return "; ".join([_acts(host, place, name, period_s) for period_s in (PERIOD_S, SPARSE_S)])
+
+
+def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
+    place.enter(host)
+    is_deep = place.mode is DeviceMode.RUN and period_s == PERIOD_S
+    if is_deep:
+        host.running(host.stroke_mm - FAR_MM)
+        host.pass_time(BEGUN_S / 4.0, DriveMode.RUN, duty=-1.0)
+    verdict, start = ACTS[name][place.mode], places(host.last(State))
+    faults = (NO_FAULT if name == "Clear" else host.status.faults) | CAUSES.get(name, NO_FAULT)
+    beat = DriveMode.OFF if name == OFF else place.beat
+    host.forget()
+    _say(host, name, beat, MISFITTING[0 if period_s == PERIOD_S else -1])
+    host.pass_time(BEGUN_S, beat, period_s, -1.0)
+    seen = _begun(host, place, verdict.partition(",")[0], start, COASTED_MM if is_deep else MOVED_MM)
+    if is_deep:
+        return opens_fully(host, faults, beat)
+    host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, beat)
+    is_zero_kept = not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED))
+    mode = DeviceMode.LATCHED if faults else DeviceMode.IDLE
+    return host.shows(mode, beat, homed=is_zero_kept, opened=True, fault=faults, besides=seen)
+
+
+def _say(host: Host, name: str, beat: Beat, misfit: Hello) -> None:
+    if name in COMMANDS:
+        host.obeyed(COMMANDS[name], beat)
+    duty = -1.0 if beat is DriveMode.OFF else 0.0
+    host.beat(beat, duty, duty, besides=partial(host.send, misfit) if name == MISFITS else lambda: None)
+    host.pass_time(2.0 * SILENCE_S if name == SILENT else 0.0)
+
+
+def _begun(host: Host, place: Place, to: str, start: tuple[float, float], inward_mm: float) -> str:
+    """Compare the mode after a message, and what RUN ends with, with what must be."""
+    ways_mm = [at - began for _, state in host.all_of(State) for at, began in zip(places(state), start, strict=True)]
+    modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
+    seen = f"{min(ways_mm):+.2f} mm at the innermost, {min(ways_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
+    is_closing = place.mode is DeviceMode.RUN and (min(ways_mm) < -inward_mm or min(ways_mm[-2:]) < BEGUN_MM)
+    return unless(is_closing or modes[:1] != [to] * (to in MODES), seen)
+
+
+def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> str:
+    """Watch a device open, and judge each carriage's speed on the device's clock."""
+    first = len(host.rows)
+    host.until(host.is_resting, OPENED_S, beat)
+    rows = columns(host, first)
+    means, mosts = zip(*(_speeds(rows["device_s"], rows[name]) for name in ("left_mm", "right_mm")), strict=True)
+    seen = f"{min(means):.1f} mm/s on the way, {max(mosts):.1f} at most"
+    is_wrong = min(means) < MIN_SHARE * host.opening_mm_s or max(mosts) > MAX_SHARE * host.opening_mm_s
+    mode = DeviceMode.LATCHED if fault else DeviceMode.IDLE
+    return host.shows(mode, beat, homed=not fault, opened=True, fault=fault, besides=seen, wrong=is_wrong)
+
+
+def _speeds(times_s: Array, at_mm: Array) -> tuple[float, float]:
+    """Return one carriage's mean speed without ENDS_MM at both ends, and the most over WINDOW States."""
+    most = (at_mm[WINDOW:] - at_mm[:-WINDOW]) / (times_s[WINDOW:] - times_s[:-WINDOW])
+    (way,) = np.nonzero((at_mm > at_mm[0] + ENDS_MM) & (at_mm < -ENDS_MM))
+    mean = (at_mm[way[-1]] - at_mm[way[0]]) / (times_s[way[-1]] - times_s[way[0]]) if len(way) > 1 else 0.0
+    return float(mean), float(np.max(most, initial=0.0))
+
+
+def misfits(host: Host) -> str:
+    """Send an idle device each Hello that does not fit, and mend it."""
+    host.idle()
+    for hello in MISFITTING:
+        seen = f"schema {hello.schema_hash:08X}, version {hello.protocol_version}"
+        host.forget()
+        host.hello(hello.schema_hash, hello.protocol_version)
+        is_silent = len(host.all_of(Identity)) != 1
+        host.shows(DeviceMode.LATCHED, homed=False, fault=DeviceFault.SCHEMA_MISMATCH, besides=seen, wrong=is_silent)
+        unless(host.command(Clear, DriveMode.OFF, SEEN_S), f"{seen}: Clear acknowledged before a Hello that fits")
+        host.hello()
+        host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH, besides=f"{seen}, then a Hello that fits")
+        host.obeyed(Clear)
+        host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT, besides=f"{seen}, mended")
+    return f"{len(MISFITTING)} latched, and were mended"
+
+
+def put_off(host: Host) -> None:
+    """Bring the device to IDLE without letting go."""
+    host.running()
+    host.obeyed(Retract, DriveMode.RUN)
+    host.until(host.is_resting, OPENED_S, DriveMode.RUN)
+
+
+def _deep(host: Host, beat: Beat) -> None:
+    host.running(DEEP_MM)
+    host.obeyed(Retract, beat)
+
+
+def _homing(host: Host, beat: Beat) -> None:
+    """Begin to home; a host that has not let go may send Drive RUN until the end."""
+    (put_off if beat is DriveMode.RUN else Host.homed)(host)
+    host.obeyed(Home, beat)
+
+
+def _mismatched(host: Host) -> None:
+    host.idle()
+    host.hello(SCHEMA_HASH ^ 1)
+
+
+MISMATCHED: Final = "LATCHED by a mismatch"
+PLACES: Final = (
+    Place("IDLE without zero", DeviceMode.IDLE, Host.without_zero, DriveMode.RUN, DUTY),
+    Place(MISMATCHED, DeviceMode.LATCHED, _mismatched, DriveMode.OFF, -1.0),
+    Place("IDLE", DeviceMode.IDLE, Host.homed, DriveMode.OFF, -1.0),
+    Place("IDLE, not let go", DeviceMode.IDLE, put_off, DriveMode.RUN, DUTY),
+    Place("RUN", DeviceMode.RUN, lambda host: host.running(INSIDE_MM), DriveMode.RUN, 0.0),
+    Place("HOMING", DeviceMode.HOMING, partial(_homing, beat=DriveMode.OFF), DriveMode.OFF, -1.0),
+    Place("HOMING beside RUN", DeviceMode.HOMING, partial(_homing, beat=DriveMode.RUN), DriveMode.RUN, DUTY),
+    Place("RETRACTING", DeviceMode.RETRACTING, partial(_deep, beat=DriveMode.OFF), DriveMode.OFF, -1.0),
+    Place("RETRACTING beside RUN", DeviceMode.RETRACTING, partial(_deep, beat=DriveMode.RUN), DriveMode.RUN, -1.0),
+    Place("LATCHED", DeviceMode.LATCHED, Host.latched, DriveMode.RUN, DUTY),
+)
+HAZARDS: Final = {"Home": Hazard.OPENS, "Clear": Hazard.CLOSES, MISFITS: Hazard.CLOSES}
+
+
+def _named(*words: str) -> str:
+    return "_".join(words).lower().replace(",", "").replace(" ", "_")
+
+
+CHECKS: Final = (
+    Check(
+        "misfitting_hello",
+        Hazard.CLOSES,
+        "Who says what when, 1",
+        f"{len(MISFITTING)} Hellos with another schema or version, each time Clear, a Hello that fits, Clear",
+        "LATCHED with SCHEMA_MISMATCH until the second Clear",
+        misfits,
+        moves=False,
+        is_gate=False,
+    ),
+    *(
+        Check(
+            _named(place.name, "stays"),
+            Hazard.CLOSES,
+            PAGE,
+            f"{place.name}: all that this mode refuses or only answers, among Drives every 1 and {SPARSE_S * 1e3:g} ms",
+            "mode, faults, HOMED, nonce, positions, currents as before; one State for each good Drive",
+            partial(stays, place),
+            moves=place.name not in ("IDLE without zero", MISMATCHED),
+            is_gate=False,
+        )
+        for place in PLACES
+    ),
+    *(
+        Check(
+            _named(place.name, message.replace(" that does not", " misfit")),
+            HAZARDS.get(message, Hazard.SHUT),
+            PAGE,
+            f"{place.name}: {message}, among Drives every 1 and {SPARSE_S * 1e3:g} ms",
+            cells[place.mode],
+            partial(acts, place, message),
+            moves=True,
+            is_gate=False,
+        )
+        for place in PLACES
+        for message, cells in ACTS.items()
+        if place.name in MODES and cells[place.mode] not in (*STAYS, "obeyed", "RUN, or answered")
+    ),
+)
