@@ -109,7 +109,7 @@ class Host:
         self.contradictions = Counter[str]()
         self.rows = array("d")
         """A row of COLUMNS for each Sense."""
-        self._unpaired = deque[State](maxlen=8)
+        self._unpaired = deque[State](maxlen=99)
         self.drives = self.states = 0
         """How many Drives that must be answered were sent, and how many State came."""
         self.stalled_s = 0.0

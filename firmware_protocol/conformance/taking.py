@@ -311,11 +311,14 @@ def misfits(host: Host) -> str:
         seen = f"schema {hello.schema_hash:08X}, version {hello.protocol_version}"
         host.forget()
         host.hello(hello.schema_hash, hello.protocol_version)
-        is_silent = len(host.all_of(Identity)) != 1
-        host.shows(DeviceMode.LATCHED, homed=False, fault=DeviceFault.SCHEMA_MISMATCH, besides=seen, wrong=is_silent)
-        unless(host.command(Clear, DriveMode.OFF, SEEN_S), f"{seen}: Clear acknowledged before a Hello that fits")
+        count, fault = len(host.all_of(Identity)), DeviceFault.SCHEMA_MISMATCH
+        host.shows(DeviceMode.LATCHED, homed=False, fault=fault, besides=seen, wrong=count != 1)
+        unless(
+            host.status.command_nonce != HELLO_NONCE or host.command(Clear, DriveMode.OFF, SEEN_S),
+            f"{seen}: its nonce is not shown, or Clear's is, {shown(host.status)}",
+        )
         host.hello()
-        host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH, besides=f"{seen}, then a Hello that fits")
+        host.shows(DeviceMode.LATCHED, fault=fault, besides=f"{seen}, then a Hello that fits")
         host.obeyed(Clear)
         host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT, besides=f"{seen}, mended")
     return f"{len(MISFITTING)} latched, and were mended"

@@ -245,7 +245,7 @@ def clock_runs_on(host: Host) -> str:
     host.pass_time(CLOCKED_S, DriveMode.OFF, FINE_S)
     rows = columns(host, first)
     counters = np.diff(rows["counter"]) % 256
-    unless((counters != 1).any(), f"counters {sorted(set(counters))[:5]} apart")
+    unless((counters != 1).any(), f"counters {sorted(set(counters.astype(int).tolist()))[:5]} apart")
     blocks = [part.min() for part in np.array_split(rows["arrived_s"] - rows["device_s"], len(counters) // BLOCK)]
     drift = (blocks[0] - blocks[-1]) / np.ptp(rows["arrived_s"]) * len(blocks) / (len(blocks) - 1)
     # a host is late only, so that the least delayed State of a block shows the device's clock

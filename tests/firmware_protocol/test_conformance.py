@@ -50,7 +50,7 @@ from firmware_protocol.conformance.examination import BY_HAND, CHECKS, checks_on
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 from firmware_protocol.conformance.rules import MODES, RULES, TAKES
-from firmware_protocol.conformance.taking import MISMATCHED, PLACES
+from firmware_protocol.conformance.taking import MISFITS, MISMATCHED, PLACES
 from firmware_protocol.framing import DELIMITER, FrameDecoder, cobs_decode, cobs_encode, encode_frame
 from tormagd.simulation.can_device import DEVICE, CanDevice
 from tormagd.simulation.can_frame import CanFrame
@@ -748,6 +748,13 @@ PLANTED = (
     rogue("hash reversed", "identity_answers_hello", identity=lambda device: Identity(HASH_REVERSED, 1, 0, 1)),
     rogue("Hello is no nonce", "idle_without_zero_stays", receive=keeps_nonce_at(Hello)),
     rogue("ignores the schema", "misfitting_hello", hears=lambda _, message: fitting(message, schema_hash=SCHEMA_HASH)),
+    rogue(
+        "a misfit's nonce not shown",
+        "misfitting_hello",
+        receive=lambda device, time_s, message, sensors: (
+            keeps_nonce_at(Hello) if called(message) == MISFITS else Rogue.receive
+        )(device, time_s, message, sensors),
+    ),
     rogue("ignores the version", "misfitting_hello", hears=lambda _, message: fitting(message, protocol_version=1)),
     rogue("Clear mends a mismatch", "misfitting_hello", before=sets(Clear, _compatible=True)),
     rogue(
