@@ -172,7 +172,7 @@ def played(plant: Plant, advance: Callable[[TimedSetpoint | None], object]) -> A
         if len(told) % round(PERIOD_S / TICK_S) == 0:
             for sent_s, fields in unit.update(now_s, [plant.truth.handle_mm]):
                 wall = fields.get("contact")
-                wall = wall and Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N)
+                wall = wall and Wall(*msgspec.structs.astuple(wall))
                 setpoint = TimedSetpoint(fields["servo_cf"], sent_s, 1e-3 * VALID_MS, wall=wall)
         advance(setpoint)
         told.append(plant.truth)

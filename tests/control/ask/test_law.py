@@ -63,6 +63,20 @@ def test_the_gap_passes_the_place_of_a_stiff_wall_at_speed(following: Following)
     assert (felt_mm - wall.place_mm) / 30.0 == pytest.approx(at_once_s, abs=0.01)
 
 
+def test_the_less_sure_a_wall_is_the_sooner_the_gap_sets_out_to_it() -> None:
+    places_mm = [*np.arange(-20.0, 12.0, 30.0 * PERIOD_S).tolist(), *[12.0] * 500]
+    at_wall, before_N = places_mm.index(min(places_mm, key=lambda place: abs(place - 10.0))) - PASSES, []
+    for sure in ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1e4, 1.0)):
+        following, wall = Following(), Wall(10.0, 0.5, 0.6, *sure)
+        gap_N = [following.ask(Travel(place, 30.0 * (place < 12.0)), wall=wall).path_N[0] for place in places_mm]
+        before_N.append(max(gap_N[:at_wall]))
+        assert gap_N[-1] == pytest.approx(1.6, abs=0.01)
+        assert max(gap_N) < 1.65
+    assert before_N == sorted(before_N)
+    assert before_N[0] < 0.6 + EARLY_N + 1e-3
+    assert 0.6 + EARLY_N + 0.05 < before_N[1] < 0.6 + EARLY_N + 1.0
+
+
 @pytest.mark.parametrize("learned_N_s", [-0.5, 0.0, 0.5])
 def test_what_is_learned_on_the_way_leaves_the_gap_where_it_is(following: Following, learned_N_s: float) -> None:
     gaps_mm = []

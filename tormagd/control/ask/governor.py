@@ -3,7 +3,7 @@
 now       what the setpoint asks for at the handle's place and way, within what the scene allows and the device gives
 ahead     a wall's forces as the handle moves, or a preview; else the setpoints' slope, and a forecast as far as trusted
 path      where forces ahead are known: those of the gap's path that misses them least; before a wall at most EARLY_N
-          over the force there
+          over the most that is felt there
 blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes
 decay     without a setpoint, or with one that is too old: to the device's least force at the scene's release rate
 passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none
@@ -210,8 +210,8 @@ class Governor:
         over_N = within(within(wall.friction_N, self._allowed) + added_N, bounds) - wall.friction_N + EARLY_N
         most_N: list[Bounds] = []
         for after_s in PATH_S:
-            now_N = wall.force_N(place_mm + rate_mm_s * after_s) + over_N
-            most_N.append((now_N, wall.force_N(place_mm + rate_mm_s * (begins_s + after_s)) + over_N))
+            now_N = wall.most_N(place_mm + rate_mm_s * after_s) + over_N
+            most_N.append((now_N, wall.most_N(place_mm + rate_mm_s * (begins_s + after_s)) + over_N))
         return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
@@ -340,7 +340,7 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
             require_number(name, getattr(setpoint, name) or 0.0)
         require_number("age_s", age_s)
     if setpoint.wall is not None:
-        for name in ("place_mm", "stiffness_N_mm", "friction_N"):
+        for name in ("place_mm", "stiffness_N_mm", "friction_N", "place_sd_mm", "stiffness_share"):
             require_number(name, getattr(setpoint.wall, name))
     if not setpoint.preview_N:
         return
