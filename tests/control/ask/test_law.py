@@ -218,3 +218,21 @@ def test_a_tremor_of_a_held_handle_changes_no_way(pushed: Pushed) -> None:
 
 def test_a_silent_device_keeps_its_place_and_way(pushed: Pushed) -> None:
     assert pushed._way.update(None, 0.0, is_sensor_believed=True) == Travel(5.0, 0.0)
+
+
+@pytest.mark.parametrize("breakthrough", ["off", "decay"])
+def test_a_force_that_gives_way_is_let_go_at_once_or_along_the_ramp_and_comes_back_at_once(breakthrough: str) -> None:
+    following = Following(msgspec.structs.replace(SCENE, breakthrough=breakthrough))
+    pushes = Travel(10.0, 30.0)
+    for force_N in (*np.linspace(0.5, 1.8, 650), *[1.8] * 50):
+        held = following.ask(pushes, force_N)
+    assert (held.force_N, Limit.RATE in held.limits) == (1.8, False)
+    for plan in range(1, 301):
+        ask = following.ask(pushes, 0.5)
+        fallen_N = SCENE.release_N_s * PERIOD_S * plan if breakthrough == "decay" else 1.3
+        assert ask.force_N == pytest.approx(max(1.8 - fallen_N, 0.5))
+        assert (Limit.RATE in ask.limits) == (breakthrough == "decay")
+        assert max(ask.path_N) <= 1.8
+    assert following.ask(pushes, 1.5).force_N == 1.5
+    following.ask(pushes, 0.5)
+    assert following.ask(Travel(10.0, -1.0, is_pushing=False), 0.5, withdraw_N=0.5).force_N == 0.5
