@@ -42,7 +42,7 @@ class Force(Strict, frozen=True):
     standby_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
     "Where the brake waits while less is asked: nearer to the forces that come, and felt as drag."
     breakthrough: Literal["off", "decay"] | UnsetType = UNSET
-    "What a hand that pushes on feels where the force gives way: what is sent (off), or a decay at `release_N_s`."
+    "How a force that gives way is felt while the hand pushes on: as sent (off), or at a quarter of `release_N_s`."
 
     @property
     def waiting_N(self) -> float:

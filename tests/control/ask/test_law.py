@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.governor import EARLY_N, Governor
+from tormagd.control.ask.governor import DECAY, EARLY_N, Governor
 from tormagd.control.ask.way import SLID_MM, Way
 from tormagd.control.believe.strength import UNSEEN, DeviceFit
 from tormagd.control.records import Ask, Handle, Measured, TimedSetpoint, Travel, Wall
@@ -229,10 +229,10 @@ def test_a_force_that_gives_way_is_let_go_at_once_or_along_the_ramp_and_comes_ba
     assert (held.force_N, Limit.RATE in held.limits) == (1.8, False)
     for plan in range(1, 301):
         ask = following.ask(pushes, 0.5)
-        fallen_N = SCENE.release_N_s * PERIOD_S * plan if breakthrough == "decay" else 1.3
+        fallen_N = DECAY * SCENE.release_N_s * PERIOD_S * plan if breakthrough == "decay" else 1.3
         assert ask.force_N == pytest.approx(max(1.8 - fallen_N, 0.5))
         assert (Limit.RATE in ask.limits) == (breakthrough == "decay")
         assert max(ask.path_N) <= 1.8
-    assert following.ask(pushes, 1.5).force_N == 1.5
+    assert following.ask(pushes, 1.6).force_N == 1.6
     following.ask(pushes, 0.5)
     assert following.ask(Travel(10.0, -1.0, is_pushing=False), 0.5, withdraw_N=0.5).force_N == 0.5

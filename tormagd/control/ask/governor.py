@@ -5,7 +5,7 @@ ahead     a wall's forces as the handle moves, or a preview; else the setpoints'
 path      where forces ahead are known: those of the gap's path that misses them least; before a wall at most EARLY_N
           over the most that is felt there
 blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes;
-          from a force that gives way, where the scene says so, while the hand pushes on
+          where the scene has a decay, from any force or wall that gives way while the hand pushes on: at DECAY of it
 decay     without a setpoint, or with one that is too old: to the device's least force at the scene's release rate
 passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none
           (before the first setpoint, while the gap was open or held, after a silence)
@@ -39,6 +39,9 @@ OUTRUN_N: Final = 0.02
 
 EARLY_N: Final = 0.08
 "The gap closes before a wall by this much more than is felt there: 0.1 N with what is not known of a device."
+
+DECAY: Final = 0.25
+"A force that gives way falls more slowly than a gap opens, so that the hand can stop."
 
 Bounds = tuple[float, float]
 
@@ -83,7 +86,7 @@ class Governor:
         self._least_N: Final = force.least_N
         self._allowed: Final = (force.waiting_N, force.most_N)
         self._release_N_s: Final = force.release_N_s
-        self._decays: Final = force.breakthrough == "decay"
+        self._decay_N_s: Final = DECAY * force.release_N_s if force.breakthrough == "decay" else 0.0
         self.forecast = Forecast()
         self.begin(now_s)
 
@@ -177,14 +180,14 @@ class Governor:
     def _blended(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, dt_s: float) -> float:
         """Return `allowed_N`, or a force on the ramp to it after the wall was replaced or removed, or gave way."""
         wall, place_mm = setpoint.wall, travel.place_mm
-        before_N, is_giving_way = self.law_N, self._decays and wall is None
+        before_N, is_giving_way = self.law_N, self._decay_N_s > 0.0 and wall is None
         if before_N is None and (wall is not None or is_giving_way) and self.stamp_s != -math.inf and self.was_pushing:
             before_N = self.last_N
         blended_N = allowed_N
         # a new holder has a ramp of its own, and a hand that draws back is let go at once
         if before_N is not None and travel.is_pushing and setpoint.holder == self.holder:
             moved_N = 0.0 if wall is None else wall.stiffness_N_mm * abs(place_mm - self.law_mm)
-            most_N = self._release_N_s * dt_s + moved_N
+            most_N = (self._decay_N_s if is_giving_way else self._release_N_s) * dt_s + moved_N
             blended_N = within(allowed_N, (before_N - most_N, math.inf if is_giving_way else before_N + most_N))
         self.blend_N = blended_N - allowed_N
         is_over = wall is None and self.blend_N == 0.0
