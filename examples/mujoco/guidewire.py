@@ -3,10 +3,11 @@
     python guidewire.py FOLDER [--seconds S] [--picture FILE.png] [--friction 0.2] [--stiffness-N-mm 0.1]
                         [--route LENGTH_MM:TURN_DEG,...]
 
-FOLDER is where the sockets of an enabled daemon are. The handle pushes the wire onto an elastic lesion, BEHIND_MM before
-the route's end. The axial force at its base, SCALE times as large, is sent as a force until `ContactEstimator` knows the
-lesion, then as its wall. The vessel is flat, and the wire a chain of hinges; more inertia than a real wire has, under 10
-mN at a hand's speed, keeps steps of 2 ms stable.
+FOLDER is where the sockets of an enabled daemon are. The handle, whose place 0 has the tip at the vessel's mouth, pushes
+the wire onto an elastic lesion, BEHIND_MM before the route's end. The axial force at the wire's base, SCALE times as
+large, is sent as a force until `ContactEstimator` knows the lesion, then as its wall. Robot and force follow with a lag
+of FILTER_S each. The vessel is flat, and the wire a chain of hinges; more inertia than a real wire has, under 10 mN at a
+hand's speed, keeps steps of 2 ms stable.
 """
 
 import argparse
@@ -30,6 +31,7 @@ BENDING_N_MM2, FLOPPY = 150.0, 8
 "The wire's flexural rigidity, and the segments at its tip over which it grows to that."
 ROUTE, PIECE_MM, BEHIND_MM = "30:0,40:60,25:-40,40:0", 2.5, 30.0
 MOST_MM, SHARPEST_MM = 190.0, 10.0
+FASTEST_MM = 300.0 * STEP_S
 FRAMES = 5
 
 
@@ -119,16 +121,16 @@ def run(
     """Return a row for each step, and the wire's shapes at FRAMES even times. A row is the time, the place, mm, the
     forces there and felt, N, and whether the wall was known.
     """
-    estimator, rows, shapes_mm, start_mm, place_mm, felt_N = ContactEstimator(), [], [], None, 0.0, math.nan
+    estimator, rows, shapes_mm, handle_mm, place_mm, felt_N = ContactEstimator(), [], [], None, 0.0, math.nan
     began_s = due_s = clock_s()
     while due_s - began_s < seconds:
-        for motion in client.motions():
-            start_mm = motion.handle_mm if start_mm is None else start_mm
-            place_mm = motion.handle_mm - start_mm
+        handle_mm = next((motion.handle_mm for motion in client.motions()[-1:]), handle_mm)
         felt_N = next((state.measured_cf for state in client.telemetry()[-1:]), felt_N)
-        if start_mm is not None:
+        if handle_mm is not None:
+            way_mm = min(max((handle_mm - place_mm) * STEP_S / FILTER_S, -FASTEST_MM), FASTEST_MM)
+            place_mm += way_mm
             force_N = SCALE * wire.push(place_mm)
-            estimator.update(start_mm + place_mm, force_N, place_mm - (rows[-1][1] if rows else place_mm))
+            estimator.update(place_mm, force_N, way_mm)
             contact = estimator.contact
             client.publish(max(force_N, 0.0), withdraw_cf=max(-force_N, 0.0), contact=contact)
             rows.append((due_s - began_s, place_mm, force_N, felt_N, contact is not None))
@@ -143,14 +145,14 @@ def draw(path: str, route: np.ndarray, rows: list[Any], shapes_mm: list[np.ndarr
     from matplotlib.figure import Figure
 
     figure = Figure((13.0, 6.0), layout="constrained")
-    above, below = figure.subfigures(2, 1)
+    above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
     time_s, _, there_N, felt_N, is_known = np.array(rows, float).T
     axes = above.subplots()
     axes.plot(time_s, there_N, color="#222222", linewidth=0.9, label=f"at the wire's base, {SCALE:g} times as large")
     axes.plot(time_s, felt_N, color="#d1495b", label="felt at the handle, as measured")
     axes.fill_between(time_s, 0.0, is_known, color="#2a6f97", alpha=0.15, label="the lesion is known")
     axes.set(xlabel="time, s", ylabel="force, N", title="A guidewire pushed onto a lesion")
-    axes.legend(frameon=False, loc="upper left", ncols=3)
+    above.legend(frameon=False, loc="outside lower center", ncols=3)
     for axes, shape_mm in zip(below.subplots(1, FRAMES, sharey=True), shapes_mm, strict=True):
         for side in sides_of(route, VESSEL_MM):
             axes.plot(*side.T, color="#8d99ae")

@@ -12,7 +12,7 @@ pytest.importorskip("mujoco")
 names = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "mujoco" / "guidewire.py"))
 guidewire = SimpleNamespace(**names)
 ROUTE, LESION_MM = "30:0,20:30,32:0", 52.0
-START_MM, PUSH_MM_S, SECONDS = 7.0, 32.0, 2.0
+PUSH_MM_S, SECONDS = 32.0, 2.0
 
 
 class Played:
@@ -23,7 +23,7 @@ class Played:
         self.published: list[Any] = []
 
     def motions(self) -> list[Any]:
-        return [SimpleNamespace(handle_mm=START_MM + PUSH_MM_S * self.now_s)]
+        return [SimpleNamespace(handle_mm=PUSH_MM_S * self.now_s)]
 
     def telemetry(self) -> list[Any]:
         return [SimpleNamespace(measured_cf=self.published[-1][0])] if self.published else []
@@ -45,7 +45,7 @@ def test_the_wire_meets_a_lesion_which_the_estimator_finds_and_is_drawn(tmp_path
     assert there_N[place_mm < LESION_MM].max() < 0.4
     assert 1.0 < there_N.max() < 3.0
     known = [contact for *_, contact in daemon.published if contact is not None]
-    assert known[-1].handle_mm == pytest.approx(START_MM + LESION_MM, abs=1.0)
+    assert known[-1].handle_mm == pytest.approx(LESION_MM, abs=1.0)
     guidewire.draw(str(tmp_path / "wire.png"), route, rows, shapes_mm)
     assert (tmp_path / "wire.png").stat().st_size > 10_000
 
