@@ -264,18 +264,18 @@ class Bound:
         waiting_N = max(self._core.scene.force.waiting_N, open_N)
         waiting_mm, early_mm = self._gaps_for(np.array([waiting_N, waiting_N + EARLY_N]), strength).tolist()
         left_ticks = -depths_mm[0] / max(PERIOD_S * truth.handle_mm_s, PERIOD_S)
-        self._sets_out = self._sets_out or left_ticks <= self._ticks_to(early_mm, truth.gap_mm)
+        self._sets_out = self._sets_out or self._ticks_to(early_mm, truth.gap_mm, left_ticks) >= left_ticks
         if not self._sets_out:
             return float(waiting_mm)
         soon_mm = truth.handle_mm + truth.handle_mm_s * SPEEDING_UP_S
         most_N = wall.force_N(soon_mm) - wall.friction_N + waiting_N + EARLY_N
         return max(min(path[0], wanted_mm[0]), float(self._gaps_for(np.array(most_N), strength)))
 
-    def _ticks_to(self, closed_mm: float, gap_mm: float) -> int:
-        """Return how many ticks the motors need to close the gap so far."""
+    def _ticks_to(self, closed_mm: float, gap_mm: float, most: float) -> int:
+        """Return how many ticks the motors need to close the gap so far, or at least `most`."""
         assert self._drive is not None
         ticks, speed_mm_s = 0, self._speed_mm_s
-        while gap_mm > closed_mm:
+        while gap_mm > closed_mm and ticks < most:
             speed_mm_s = min(self._drive.lowest_mm_s(gap_mm, min(speed_mm_s, 0.0), PERIOD_S), 0.0)
             gap_mm += PERIOD_S * speed_mm_s
             ticks += 1
