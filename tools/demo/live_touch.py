@@ -124,7 +124,7 @@ def touches(truth: Any, pushes: tuple[int, ...]) -> list[Touch]:
     wall_mm, found = truth["handle_mm"][firsts[0]] + WALL_MM, []
     for first in firsts:
         rows = truth[first : first + round(2.0 * HALF_S / TICK_S)]
-        time_s, force_N = TICK_S * np.arange(len(rows)), rows["force_N"]
+        time_s, force_N = np.linspace(0.0, TICK_S * (len(rows) - 1), len(rows)), rows["force_N"]
         depth_mm = rows["handle_mm"] - wall_mm
         found.append(Touch(time_s, depth_mm, rows["handle_mm_s"], rows["kinetic_N"], force_N, force_N, (), ()))
     return found

@@ -269,7 +269,7 @@ class Bound:
             return float(waiting_mm)
         soon_mm = truth.handle_mm + truth.handle_mm_s * SPEEDING_UP_S
         most_N = wall.force_N(soon_mm) - wall.friction_N + waiting_N + EARLY_N
-        return max(min(path[0], wanted_mm[0]), float(self._gaps_for(np.array(most_N), strength)))
+        return max(min(path[0], float(wanted_mm[0])), float(self._gaps_for(np.array(most_N), strength)))
 
     def _ticks_to(self, closed_mm: float, gap_mm: float, most: float) -> int:
         """Return how many ticks the motors need to close the gap so far, or at least `most`."""
