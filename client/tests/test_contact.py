@@ -40,6 +40,8 @@ class Tip:
         assert contact.handle_mm == pytest.approx(self.wall_mm, abs=within_mm)
         assert contact.stiffness_N_mm == pytest.approx(self.stiffness_N_mm, rel=share)
         assert contact.friction_N == pytest.approx(self.friction_N, abs=0.02)
+        assert 0.0 < contact.place_sd_mm < within_mm
+        assert 0.0 < contact.stiffness_share < share
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -182,6 +182,9 @@ def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> Non
         ({"contact": WALL | {"stiffness_N_mm": 101.0}}, "contact.stiffness_N_mm = 101.0: allowed is 0..100"),
         ({"contact": WALL | {"friction_N": -0.1}}, "contact.friction_N = -0.1: allowed is 0..1000"),
         ({"contact": WALL | {"friction_N": math.inf}}, "contact.friction_N = inf: allowed is 0..1000"),
+        ({"contact": WALL | {"place_sd_mm": -0.1}}, "contact.place_sd_mm = -0.1: allowed is 0..10000"),
+        ({"contact": WALL | {"place_sd_mm": math.nan}}, "contact.place_sd_mm = nan: allowed is 0..10000"),
+        ({"contact": WALL | {"stiffness_share": 1.1}}, "contact.stiffness_share = 1.1: allowed is 0..1"),
     ],
 )
 def test_values_out_of_range_are_named(fields: dict[str, Any], name: str) -> None:

@@ -88,9 +88,10 @@ def test_a_setpoint_is_put_on_the_control_clock(publishing: Publishing) -> None:
 
 
 def test_a_law_of_the_handles_way_is_taken_and_refused_by_name_for_a_pad(publishing: Publishing) -> None:
-    law = {"withdraw_cf": 0.2, "contact": {"handle_mm": -12.5, "stiffness_N_mm": 0.5, "friction_N": 0.1}}
+    wall = {"handle_mm": -12.5, "stiffness_N_mm": 0.5, "friction_N": 0.1, "place_sd_mm": 0.3, "stiffness_share": 0.2}
+    law = {"withdraw_cf": 0.2, "contact": wall}
     assert publishing.send(1, **law)
-    assert (publishing.newest.withdraw_N, publishing.newest.wall) == (0.2, Wall(-12.5, 0.5, 0.1))
+    assert (publishing.newest.withdraw_N, publishing.newest.wall) == (0.2, Wall(-12.5, 0.5, 0.1, 0.3, 0.2))
     assert publishing.send(2, contact={"handle_mm": 3.0, "stiffness_N_mm": 2.0})
     assert (publishing.newest.withdraw_N, publishing.newest.wall) == (None, Wall(3.0, 2.0))
     publishing.inbox.has_way = False

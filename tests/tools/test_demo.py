@@ -1,7 +1,6 @@
 """What `make run` says: its verdict on made-up shows, its live line, and its table, the README's sample."""
 
 import json
-import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +11,7 @@ import pytest
 from demo import live_touch, main as demo, pictures, show
 from demo.pictures import touch_picture
 from judge.following import Case, Followed, rehearse
-from judge.touching import Case as Touching, Touch, ideal, reached_ms
+from judge.touching import Touch
 from machines.host import Host
 
 from tormagd.config import Config, Rates
@@ -174,7 +173,7 @@ def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_cod
     assert [case.label for case in demo.CASES if f"virtual time, {case.label}" not in printed] == []
     assert ("no verdict after 3 shows" in printed) == (exit_code == 3)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert list(summary["touch"]) == [wall.name for wall in live_touch.WALLS]
+    assert list(summary["touch"]) == list(live_touch.TOUCHES)
 
 
 @pytest.fixture
@@ -199,35 +198,35 @@ def test_every_case_of_the_demo_is_played(case: Case) -> None:
     assert len(done.rendered_N) > 250
 
 
-def truth(push: int, wall: live_touch.Wall, most_mm: float, late_ms: int, waiting_N: float = 0.9) -> np.ndarray:
-    first, lasts = round(1e3 * live_touch.begins_s(push)), round(2e3 * live_touch.HALF_S)
-    rows = np.zeros(first + lasts, [(name, float) for name in ("handle_mm", "handle_mm_s", "kinetic_N", "force_N")])
-    pushed_mm = np.minimum(0.02 * np.arange(lasts), wall.place_mm + most_mm)
-    wall_N = wall.stiffness_N_mm * np.maximum(pushed_mm - wall.place_mm, 0.0)
-    rows["handle_mm"] = 1.5
-    rows["handle_mm"][first:] += pushed_mm
-    rows["kinetic_N"] = waiting_N
-    rows["kinetic_N"][first + late_ms :] = np.maximum(wall_N[: lasts - late_ms], waiting_N)
+def truth(late_ms: int = 150, most_mm: float = 4.0, waiting_N: float = 0.9) -> np.ndarray:
+    lasts = round(1e3 * live_touch.begins_s(1)) - round(1e3 * live_touch.begins_s(0))
+    rows = np.zeros(round(1e3 * live_touch.begins_s(3)), [(name, float) for name in ROWS])
+    pushed_mm = np.minimum(0.02 * np.arange(lasts), live_touch.WALL_MM + most_mm)
+    wall_N = live_touch.WALL_N_MM * np.maximum(pushed_mm - live_touch.WALL_MM, 0.0)
+    rows["handle_mm"], rows["kinetic_N"] = 1.5, waiting_N
+    for push in range(3):
+        first = round(1e3 * live_touch.begins_s(push))
+        rows["handle_mm"][first : first + lasts] += pushed_mm
+        rows["kinetic_N"][first + late_ms : first + lasts] = np.maximum(wall_N[: lasts - late_ms], waiting_N)
     rows["force_N"] = rows["kinetic_N"]
     return rows
 
 
-STIFF = tuple(wall._replace(stiffness_N_mm=5.0 * wall.stiffness_N_mm) for wall in live_touch.WALLS)
+ROWS = ("handle_mm", "handle_mm_s", "kinetic_N", "force_N")
+BOUNDS = live_touch.bounds
 
 
-def touched(late_ms: int = 150) -> dict[live_touch.Wall, Touch]:
-    return {wall: live_touch.touch_of(truth(push, wall, 4.0, late_ms), push, wall) for push, wall in enumerate(STIFF)}
-
-
-BOUND_MS = live_touch.bound_ms
+def touched(late_ms: int = 150) -> list[Touch]:
+    return live_touch.touches(truth(late_ms), (0, 1, 2))
 
 
 @pytest.fixture(autouse=True)
-def _bound(monkeypatch) -> None:
-    monkeypatch.setattr(live_touch, "bound_ms", lambda wall: 100.0)
+def _bounds(monkeypatch) -> None:
+    for module in (demo, pictures):
+        monkeypatch.setattr(module, "bounds", lambda: touched(100))
 
 
-def test_a_patient_begins_before_the_push_that_is_his() -> None:
+def test_what_is_ready_in_time_is_there_for_the_next_push() -> None:
     stroke_s = 2.0 * live_touch.HALF_S
     assert [live_touch.next_push(now_s) for now_s in (0.0, 9.0, 9.9, 10.0)] == [0, 0, 1, 1]
     assert live_touch.next_push(10.0 + stroke_s - live_touch.REST_S + live_touch.STAYS_S) == 1
@@ -243,36 +242,37 @@ def test_the_hands_word_is_one_that_the_simulated_device_takes_and_begins_when_t
     assert hand.position_mm(begins_s + live_touch.HALF_S - 1e-3) == live_touch.REACH_MM
 
 
-def test_a_patients_word_is_one_that_it_takes() -> None:
-    for wall in live_touch.WALLS:
-        words = live_touch.patient_of(wall)
-        options = patient.parser().parse_args(words[words.index("tormagd.simulation.patient") + 1 :])
-        assert (options.wall_mm, options.stiffness_N_mm, options.mode) == (wall.place_mm, wall.stiffness_N_mm, "law")
-        assert options.delay_ms == live_touch.ROUND_TRIP_MS / 2.0
+def test_the_patients_words_are_what_it_takes() -> None:
+    options = patient.parser().parse_args(live_touch.PATIENT)
+    assert (options.wall_mm, options.stiffness_N_mm) == (live_touch.WALL_MM, live_touch.WALL_N_MM)
+    assert (options.mode, options.delay_ms) == ("found", live_touch.ROUND_TRIP_MS / 2.0)
 
 
 def test_a_push_is_found_in_what_the_device_wrote_and_told_as_late_as_it_was() -> None:
-    for wall, run in touched().items():
-        assert (run.time_s[0], run.depth_mm[0]) == (0.0, pytest.approx(-wall.place_mm))
-        told = live_touch.figures(wall, run)
-        assert told["felt_later_ms"] == pytest.approx(150.0)
-        assert told["wall_N"] == pytest.approx(told["felt_N"]) == 4.0 * wall.stiffness_N_mm
+    for run, bound in zip(touched(), touched(100), strict=True):
+        assert (run.time_s[0], run.depth_mm[0]) == (0.0, pytest.approx(-live_touch.WALL_MM))
+        told = live_touch.figures(run, bound)
+        assert (told["felt_later_ms"], told["bound_later_ms"]) == (pytest.approx(150.0), pytest.approx(100.0))
+        assert told["wall_N"] == pytest.approx(told["felt_N"]) == 4.0 * live_touch.WALL_N_MM
 
 
 def test_the_hands_lines_are_those_of_the_readme_and_its_picture_is_drawn(tmp_path) -> None:
     _, lines = demo.touch_told(SCENE, touched())
-    (sample,) = re.findall(r"```\n(walls met .*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    figure = re.compile(r"-?\d+\.\d\d N|\d+ ms (late|early)|\d\.\d+ N/mm| +")
+    (sample,) = re.findall(r"```\n(a wall of .*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    figure = re.compile(r"-?\d+\.\d\d N|\d+ ms (late|early)| +")
     assert [figure.sub("", line) for line in lines] == [figure.sub("", line) for line in sample.splitlines()]
     touch_picture(tmp_path / "touch.png", touched(), lines)
     assert (tmp_path / "touch.png").stat().st_size > 10_000
 
 
-def test_ideal_carriages_do_not_know_a_wall_before_it_was_met() -> None:
-    stiff = live_touch.WALLS[1]
-    case = Touching("sample_1", live_touch.HAND_N_MM, stiff.stiffness_N_mm, live_touch.PUSH_MM_S, 120.0, "law_standby")
-    known_ms = reached_ms(ideal(case), stiff.stiffness_N_mm, live_touch.FELT_N)
-    assert (BOUND_MS(stiff) or 0.0) > (known_ms or math.inf) + live_touch.ROUND_TRIP_MS
+def test_each_touch_of_the_wall_is_felt_near_its_own_bound_and_never_before_it() -> None:
+    runs, least = live_touch.in_virtual_time(live_touch.controller), BOUNDS()
+    told = [live_touch.figures(*each) for each in zip(runs, least, strict=True)]
+    for each in told:
+        assert -3.0 <= each["felt_later_ms"] - each["bound_later_ms"] < 60.0
+    assert told[0]["felt_later_ms"] > 600.0
+    assert told[1]["felt_later_ms"] < 450.0
+    assert told[2]["felt_later_ms"] < 110.0
 
 
 def test_the_scene_of_the_hand_is_one_that_its_daemon_takes() -> None:

@@ -1,7 +1,8 @@
-"""The first part of `make run`: a hand that feels the brake pushes into two walls, in real time.
+"""The first part of `make run`: a hand that feels the brake meets one stiff wall three times, in real time.
 
-The hand is the simulated device's own. Behind a network of 100 ms round trip one patient has a soft wall, the next a
-stiff one; each sends it as a law once it is met. What carriages of this speed leave is from virtual time.
+The hand is the simulated device's own, the patient behind a network of 100 ms round trip. It sends the tip's forces at
+first, then the wall that the client's estimator found in them; the third time the scene has its standby. Beside each
+are carriages that are limited by their motors alone, in virtual time, for the same patient and scene.
 """
 
 import contextlib
@@ -9,78 +10,104 @@ import math
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import msgspec
 import numpy as np
-from judge.touching import MASS_KG, Case, Touch, ideal, reached_ms
+from devices import device
+from judge.following import armed
+from judge.touching import MASS_KG, Bound, Touch, reached_ms
 from machines.host import HostWatch
 from machines.own import own_machine
-from machines.processes import end, first_line
+from machines.processes import first_line
 
-from demo.show import PUBLISHER_FIFO, RUN_DIR, Rig, enabled, ended, raise_fault, start, status, told_truth, watch
+from demo.show import (
+    PUBLISHER_FIFO,
+    RUN_DIR,
+    Rig,
+    ShowError,
+    arm,
+    enabled,
+    ended,
+    raise_fault,
+    start,
+    status,
+    told_truth,
+    watch,
+)
 from tormag_lab.arrays import Json
-from tormagd.simulation.hand import PRESSES_AT_S
+from tormag_lab.ideal_carriage import brake_of, drive_of
+from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.records import TimedSetpoint, Wall
+from tormagd.ctl.operate import open_gap
+from tormagd.ctl.scene import use_scene
+from tormagd.scenes.scene import load_scene
+from tormagd.simulation.hand import PRESSES_AT_S, parse_hand
+from tormagd.simulation.ideal_actuator import put_gap
+from tormagd.simulation.patient import FOUND, PERIOD_S, VALID_MS, Patient, Unit
+from tormagd.simulation.plant import Plant
+from tormagd_client import ClientError
 
 SCENE = Path(__file__).parents[2] / "examples" / "scenes" / "touch.toml"
-ROUND_TRIP_MS, ROBOT_LAG_MS = 100.0, 20.0
+ROUND_TRIP_MS = 100.0
+WALL_N_MM, WALL_MM = 0.5, 15.5
+"Its place is from where the handle rests before the first touch."
 HAND_N_MM, PUSH_MM_S, REACH_MM, REST_S = 0.3, 30.0, 26.0, 0.9
 HAND = (
     f"felt=mass_kg={MASS_KG},stiffness_N_mm={HAND_N_MM},damping_N_s_mm=0.0134,push_mm_s={PUSH_MM_S},"
     f"reach_mm={REACH_MM},rest_s={REST_S}"
 )
+PATIENT = [
+    *(str(RUN_DIR), f"--mode={FOUND}", f"--delay-ms={ROUND_TRIP_MS / 2.0}", "--friction-N=0"),
+    *(f"--wall-mm={WALL_MM}", f"--stiffness-N-mm={WALL_N_MM}"),
+]
 HALF_S = REACH_MM / PUSH_MM_S + REST_S
 STAYS_S, READY_S = 0.15, 0.4
-"A patient stays until the handle has been back for so long, and begins at least so long before a push."
-TICKS_HZ = 1000
+"A push is over once the handle has been back for so long; what is ready so long before one is in time for it."
+TICK_S = 1e-3
 FELT_N = 1.2
+TOUCHES = ("first, by forces", "second, by the wall found", "third, with standby")
 
 
-class Wall(NamedTuple):
-    """`place_mm` is from where the handle rests."""
-
-    name: str
-    stiffness_N_mm: float
-    place_mm: float
-
-
-WALLS = (Wall("soft", 0.1, 4.0), Wall("stiff", 0.5, 15.5))
-
-
-def felt(watched: HostWatch) -> dict[Wall, Touch]:
+def felt(watched: HostWatch) -> list[Touch]:
+    without = RUN_DIR / "no_standby.toml"
+    without.write_text("".join(line for line in SCENE.open() if not line.startswith("standby_N")))
     with contextlib.ExitStack() as stack:
-        rig = enabled(stack, watched, str(SCENE), "--hand", HAND)
-        # both are loaded before the first push: there is less than a second between two
-        patients = [start(stack, "patient", *patient_of(wall), is_read=True) for wall in WALLS]
-        pushes = [pushed(rig, *each) for each in zip(WALLS, patients, strict=True)]
+        rig = enabled(stack, watched, str(without), "--hand", HAND)
+        words = own_machine(PUBLISHER_FIFO, "tormagd.simulation.patient", *PATIENT, waits=True)
+        patient = start(stack, "patient", *words, is_read=True)
+        first_line(patient)
+        now_s = time.monotonic() - rig.power_on_s
+        first = next_push(now_s)
+        if first > 0:  # the patient meets the handle where it rests
+            time.sleep(max(begins_s(first) - REST_S + STAYS_S - now_s, 0.0))
+        patient.send_signal(signal.SIGUSR1)
+        print(f"a wall of {WALL_N_MM:g} N/mm over a round trip of {ROUND_TRIP_MS:g} ms, met twice:")
+        pushed(rig, first + 1, patient)
+        try:
+            open_gap(rig.client, "disable", 2.0 * HALF_S, is_waiting=True)
+            use_scene(rig.client, str(SCENE))
+        except ClientError as error:
+            raise ShowError(error.message, error.hint, is_of_time=True) from error
+        arm(rig.client)
+        third = next_push(time.monotonic() - rig.power_on_s)
+        print("the same wall once more, with the scene's standby:")
+        pushed(rig, third, patient)
         raise_fault(status(rig.client))
         rig.end()
-    truth = told_truth()
-    return {wall: touch_of(truth, push, wall) for push, wall in zip(pushes, WALLS, strict=True)}
+    return touches(told_truth(), (first, first + 1, third))
 
 
-def pushed(rig: Rig, wall: Wall, patient: "subprocess.Popen[str]") -> int:
-    first_line(patient)
-    now_s = time.monotonic() - rig.power_on_s
-    push = next_push(now_s)
-    if push > 0:  # one that was missed is no touch of this wall
-        time.sleep(max(begins_s(push) - REST_S + STAYS_S - now_s, 0.0))
-    patient.send_signal(signal.SIGUSR1)
+def pushed(rig: Rig, push: int, patient: "subprocess.Popen[str]") -> None:
+    """Show what happens until this push is over."""
     until_s = rig.power_on_s + begins_s(push + 1) - REST_S + STAYS_S
-    print(f"a {wall.name} wall, {wall.stiffness_N_mm:g} N/mm, over a round trip of {ROUND_TRIP_MS:g} ms:")
     watch(lambda: time.monotonic() >= until_s, rig.daemon, rig.client, until_s - time.monotonic())
     if patient.poll() is not None:
         raise ended("patient")
-    end(patient)
-    return push
-
-
-def patient_of(wall: Wall) -> list[str]:
-    """Return the interpreter's arguments for the patient of this wall, who waits at first."""
-    told = f"--mode=law --delay-ms={ROUND_TRIP_MS / 2.0} --wall-mm={wall.place_mm} --friction-N=0"
-    options = [str(RUN_DIR), *told.split(), f"--stiffness-N-mm={wall.stiffness_N_mm}"]
-    return own_machine(PUBLISHER_FIFO, "tormagd.simulation.patient", *options, waits=True)
 
 
 def begins_s(push: int) -> float:
@@ -91,33 +118,85 @@ def next_push(now_s: float) -> int:
     return max(math.ceil((now_s + READY_S - PRESSES_AT_S) / (2.0 * HALF_S)), 0)
 
 
-def touch_of(truth: Any, push: int, wall: Wall) -> Touch:
-    first = round(TICKS_HZ * begins_s(push))
-    rows = truth[first : first + round(TICKS_HZ * 2.0 * HALF_S)]
-    depth_mm = rows["handle_mm"] - rows["handle_mm"][0] - wall.place_mm
-    time_s, force_N = np.arange(len(rows)) / TICKS_HZ, rows["force_N"]
-    return Touch(time_s, depth_mm, rows["handle_mm_s"], rows["kinetic_N"], force_N, force_N, (), ())
+def touches(truth: Any, pushes: tuple[int, ...]) -> list[Touch]:
+    """Return these pushes of a truth with a row for each millisecond since the device has power."""
+    firsts = [round(begins_s(push) / TICK_S) for push in pushes]
+    wall_mm, found = truth["handle_mm"][firsts[0]] + WALL_MM, []
+    for first in firsts:
+        rows = truth[first : first + round(2.0 * HALF_S / TICK_S)]
+        time_s, force_N = np.linspace(0.0, TICK_S * (len(rows) - 1), len(rows)), rows["force_N"]
+        depth_mm = rows["handle_mm"] - wall_mm
+        found.append(Touch(time_s, depth_mm, rows["handle_mm_s"], rows["kinetic_N"], force_N, force_N, (), ()))
+    return found
 
 
-def figures(wall: Wall, run: Touch) -> Json:
+def figures(run: Touch, bound: Touch) -> Json:
     """Return what was there and what was felt where the handle turns, and how much later it was felt."""
-    turn = int((run.time_s < HALF_S).sum()) - 1
+    turn = round(HALF_S / TICK_S) - 1
     return {
-        "stiffness_N_mm": wall.stiffness_N_mm,
         "deepest_mm": float(run.depth_mm[turn]),
-        "wall_N": wall.stiffness_N_mm * float(run.depth_mm[turn]),
+        "wall_N": WALL_N_MM * float(run.depth_mm[turn]),
         "felt_N": float(run.kinetic_N[turn]),
-        "felt_later_ms": reached_ms(run, wall.stiffness_N_mm, FELT_N),
-        "bound_later_ms": bound_ms(wall),
+        "felt_later_ms": reached_ms(run, WALL_N_MM, FELT_N),
+        "bound_later_ms": reached_ms(bound, WALL_N_MM, FELT_N),
     }
 
 
 @cache
-def bound_ms(wall: Wall) -> float | None:
-    """Return how much later carriages of this speed have it felt, apart from the robot's lag."""
-    late_ms = ROUND_TRIP_MS + ROBOT_LAG_MS
-    case = Case("sample_1", HAND_N_MM, wall.stiffness_N_mm, PUSH_MM_S, late_ms, "law_standby", is_known=False)
-    return reached_ms(ideal(case), wall.stiffness_N_mm, FELT_N)
+def bounds() -> list[Touch]:
+    return in_virtual_time(carriages)
+
+
+def in_virtual_time(begun: Callable[[Core], tuple[Plant, Callable[[TimedSetpoint | None], object]]]) -> list[Touch]:
+    """Return the touches of what `begun` makes of a scene's core: a plant, and what a setpoint does for a tick."""
+    first, second = (played(*begun(core)) for core in cores())
+    return [*touches(first, (0, 1)), touches(second, (0, 1))[1]]
+
+
+def cores() -> list[Core]:
+    scene = load_scene(str(SCENE))
+    force = msgspec.structs.replace(scene.force, standby_N=msgspec.UNSET)
+    config = Config(scene=str(SCENE), rates=Rates(control_hz=1000, inference_hz=500))
+    return [build_core(config, each) for each in (msgspec.structs.replace(scene, force=force), scene)]
+
+
+def played(plant: Plant, advance: Callable[[TimedSetpoint | None], object]) -> Any:
+    """Return the truth of two pushes for a patient that begins before the first."""
+    unit = Unit(
+        Patient(friction_N=0.0, wall_mm=WALL_MM, stiffness_N_mm=WALL_N_MM), FOUND, (5e-4 * ROUND_TRIP_MS, 0.0, 0.0, 1.0)
+    )
+    told = [plant.truth] * round(plant.time_s / TICK_S)
+    setpoint: TimedSetpoint | None = None
+    while len(told) < round(begins_s(2) / TICK_S):
+        now_s = plant.time_s
+        if len(told) % round(PERIOD_S / TICK_S) == 0:
+            for sent_s, fields in unit.update(now_s, [plant.truth.handle_mm]):
+                wall = fields.get("contact")
+                wall = wall and Wall(*msgspec.structs.astuple(wall))
+                setpoint = TimedSetpoint(fields["servo_cf"], sent_s, 1e-3 * VALID_MS, wall=wall)
+        advance(setpoint)
+        told.append(plant.truth)
+    names = ("handle_mm", "handle_mm_s", "kinetic_N", "force_N")
+    rows = [tuple(getattr(truth, name) for name in names) for truth in told]
+    return np.array(rows, [(name, float) for name in names])
+
+
+def carriages(core: Core) -> tuple[Plant, Callable[[TimedSetpoint | None], object]]:
+    parameters = device("sample_1")
+    plant = Plant(parameters, parse_hand(HAND))
+    put_gap(plant, core.scene.insert.gap_open_mm)
+    bound = Bound(core, brake_of(parameters), drive_of(parameters))
+
+    def advance(setpoint: TimedSetpoint | None) -> None:
+        bound.update(plant, setpoint)
+        plant.advance(TICK_S)
+
+    return plant, advance
+
+
+def controller(core: Core) -> tuple[Plant, Callable[[TimedSetpoint | None], object]]:
+    loop = armed(core, device("sample_1"), parse_hand(HAND))
+    return loop.simulated.plant, loop.tick
 
 
 def lateness(later_ms: float | None) -> str:

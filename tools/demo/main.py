@@ -23,7 +23,7 @@ import msgspec
 from judge.following import Case, Rehearsals, Tracking, rehearse
 from judge.touching import Touch
 
-from demo.live_touch import FELT_N, PUSH_MM_S, ROUND_TRIP_MS, Wall, felt, figures, lateness
+from demo.live_touch import FELT_N, PUSH_MM_S, ROUND_TRIP_MS, TOUCHES, WALL_N_MM, bounds, felt, figures, lateness
 from demo.show import (
     MAX_N,
     MIN_N,
@@ -83,7 +83,7 @@ def main() -> int:
     times_s, forces_N = profile()
     config = Config(scene="pulse")
     scene = load_scene(config.scene)
-    print("A hand pushes into two walls and draws back; it feels the brake of a simulated device, through the daemon.")
+    print("A hand meets one wall three times; it feels the brake of a simulated device, through the daemon.")
     with folder("touch"):
         touched = staged(felt)
     print("", *touch_told(scene, touched)[1], "", sep="\n")
@@ -187,7 +187,7 @@ def show_ordered() -> dict[str, Shown | Aborted]:
 
 def conclude(
     scene: Scene,
-    touched: dict[Wall, Touch] | Aborted,
+    touched: list[Touch] | Aborted,
     shown: Shown | Aborted,
     rehearsals: Rehearsals,
     ordered: dict[str, Shown | Aborted],
@@ -209,7 +209,7 @@ def conclude(
     written = [f"figures {RUN_DIR / 'summary.json'}"]
     from demo.pictures import show_picture, touch_picture
 
-    if isinstance(touched, dict):
+    if isinstance(touched, list):
         touch_picture(RUN_DIR / "touch.png", touched, touch_told(scene, touched)[1])
         written = [f"picture {RUN_DIR / 'touch.png'}", *written]
     if isinstance(shown, Shown):
@@ -249,20 +249,20 @@ def virtual_time_checks(scene: Scene, rehearsals: Rehearsals) -> dict[str, bool]
     }
 
 
-def touch_told(scene: Scene, touched: dict[Wall, Touch] | Aborted) -> tuple[Json, list[str]]:
+def touch_told(scene: Scene, touched: list[Touch] | Aborted) -> tuple[Json, list[str]]:
     if isinstance(touched, Aborted):
         _, sentence = judge(scene, touched)
         return {"ended_early": sentence}, [sentence]
-    found = {wall: figures(wall, run) for wall, run in touched.items()}
+    found = [figures(*each) for each in zip(touched, bounds(), strict=True)]
+    width = max(map(len, TOUCHES))
     lines = [
-        f"walls met at {PUSH_MM_S:g} mm/s over a round trip of {ROUND_TRIP_MS:g} ms, as the hand felt them:",
-        f"  {'':15s} {'there':>7s} {'felt':>7s} {f'{FELT_N:g} N felt':>11s}  by ideal carriages",
+        f"a wall of {WALL_N_MM:g} N/mm at {PUSH_MM_S:g} mm/s over a round trip of {ROUND_TRIP_MS:g} ms, met thrice:",
+        f"  {'':{width}s} {'there':>7s} {'felt':>7s} {f'{FELT_N:g} N felt':>11s}  by ideal carriages",
     ]
-    for wall, told in found.items():
+    for name, told in zip(TOUCHES, found, strict=True):
         late, bound = (lateness(told[key]) for key in ("felt_later_ms", "bound_later_ms"))
-        name = f"{wall.name}, {wall.stiffness_N_mm:g} N/mm"
-        lines.append(f"  {name:15s} {told['wall_N']:5.2f} N {told['felt_N']:5.2f} N {late:>11s}  {bound}")
-    return {wall.name: told for wall, told in found.items()}, lines
+        lines.append(f"  {name:{width}s} {told['wall_N']:5.2f} N {told['felt_N']:5.2f} N {late:>11s}  {bound}")
+    return dict(zip(TOUCHES, found, strict=True)), lines
 
 
 def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:

@@ -5,7 +5,17 @@ from pathlib import Path
 from judge.following import Followed, Rehearsals, tracking
 from judge.touching import Touch
 
-from demo.live_touch import FELT_N, HALF_S, PUSH_MM_S, ROUND_TRIP_MS, Wall, figures as touch_figures, lateness
+from demo.live_touch import (
+    FELT_N,
+    HALF_S,
+    PUSH_MM_S,
+    ROUND_TRIP_MS,
+    TOUCHES,
+    WALL_N_MM,
+    bounds,
+    figures as touch_figures,
+    lateness,
+)
 from demo.show import PULSE_START_S, Shown
 from tormag_lab.arrays import Array
 from tormag_lab.pages import stamp, subplots
@@ -34,30 +44,32 @@ def show_picture(path: Path, scene: Scene, shown: Shown, rehearsals: Rehearsals,
     figure.savefig(path, dpi=110, metadata=stamp(figures))
 
 
-def touch_picture(path: Path, touched: dict[Wall, Touch], figures: list[str]) -> None:
-    figure, axes = subplots((13.0, 5.2), 1, len(touched), sharey=True)
+def touch_picture(path: Path, touched: list[Touch], figures: list[str]) -> None:
+    figure, axes = subplots((13.0, 5.2), 1, len(TOUCHES), sharey=True)
     figure.suptitle(
-        f"A hand pushes into a wall at {PUSH_MM_S:g} mm/s and draws back, over a round trip of {ROUND_TRIP_MS:g} ms",
+        f"A hand meets a wall of {WALL_N_MM:g} N/mm at {PUSH_MM_S:g} mm/s, over a round trip of {ROUND_TRIP_MS:g} ms",
         fontsize=14,
     )
-    for each, (wall, run) in zip(axes, touched.items(), strict=True):
-        _touch(each, wall, run)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    for each, name, run, bound in zip(axes, TOUCHES, touched, bounds(), strict=True):
+        _touch(each, name, run, bound)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=110, metadata=stamp(figures))
 
 
-def _touch(axes: Axes, wall: Wall, run: Touch) -> None:
-    time_s = run.time_s - run.time_s[(run.depth_mm > 0.0).argmax()]
+def _touch(axes: Axes, name: str, run: Touch, bound: Touch) -> None:
+    time_s, bound_s = (each.time_s - each.time_s[(each.depth_mm > 0.0).argmax()] for each in (run, bound))
     turn_s, end_s = float(time_s[0]) + HALF_S, float(time_s[-1])
     axes.axvspan(turn_s, end_s, color="#eef0f4", zorder=0)
     axes.text(turn_s, 0.02, " the hand draws back", color=QUIET, transform=axes.get_xaxis_transform())
     axes.plot(time_s, run.force_N, color=QUIET, linewidth=1.0, label="on the handle (negative: resists the way back)")
+    axes.plot(bound_s, bound.kinetic_N, color=OTHER, linewidth=1.2, linestyle="--", label="felt by ideal carriages")
     axes.plot(time_s, run.kinetic_N, color=RENDERED, linewidth=1.6, label="felt while the handle slides")
-    wall_N = wall.stiffness_N_mm * run.depth_mm.clip(0.0)
+    wall_N = WALL_N_MM * run.depth_mm.clip(0.0)
     axes.plot(time_s, wall_N, color=ASKED, linewidth=1.4, label="the wall's, at the handle's place")
     axes.set_xlim(float(time_s[0]), end_s)
-    late, bound = (lateness(touch_figures(wall, run)[key]) for key in ("felt_later_ms", "bound_later_ms"))
-    title = f"A {wall.name} wall, {wall.stiffness_N_mm:g} N/mm: {FELT_N:g} N felt {late} (ideal carriages: {bound})"
+    told = touch_figures(run, bound)
+    late, least = (lateness(told[key]) for key in ("felt_later_ms", "bound_later_ms"))
+    title = f"{name.capitalize()}: {FELT_N:g} N felt {late}\n(by ideal carriages {least})"
     _dress(axes, title, "force, N", "time since the handle met the wall, s")
 
 

@@ -20,7 +20,7 @@ from judge.hands import Legs, WaitingHand
 from tormag_lab.arrays import Array
 from tormag_lab.ideal_carriage import Brake, Drive, brake_of, drive_of
 from tormagd.config import Config, Rates
-from tormagd.control.ask.path import FLATTEST_N_MM, TIMES_S, nearest_path_mm
+from tormagd.control.ask.path import FLATTEST_N_MM, SPEEDING_UP_S, TIMES_S, nearest_path_mm
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
@@ -229,7 +229,7 @@ class Bound:
         self._gap_mm = np.arange(brake.gap_mm[0], brake.gap_mm[-1], GRID_MM)
         moment_Tm = np.interp(self._gap_mm, brake.gap_mm, brake.moment_Tm)
         self._fresh_N = np.interp(moment_Tm, brake.strength_Tm, brake.fresh_N)
-        self._speed_mm_s, self._is_pushing = 0.0, True
+        self._speed_mm_s, self._is_pushing, self._sets_out = 0.0, True, False
         self._offset_N, self._scale = 0.0, 1.0
 
     def update(self, plant: Plant, setpoint: TimedSetpoint | None) -> None:
@@ -251,6 +251,7 @@ class Bound:
         travel = Travel(truth.handle_mm, truth.handle_mm_s, self._is_pushing)
         wall = None if setpoint is None else setpoint.wall
         if wall is None or not self._is_pushing or self._drive is None:
+            self._sets_out = False
             asked_N = 0.0 if setpoint is None else setpoint.asked_N(travel)
             return float(self._gaps_for(np.array(asked_N), strength))
         depths_mm = truth.handle_mm - wall.place_mm + truth.handle_mm_s * np.array(TIMES_S)
@@ -261,8 +262,24 @@ class Bound:
         path = nearest_path_mm(truth.gap_mm, PERIOD_S, TIMES_S, wanted_mm.tolist(), weights.tolist(), speed_mm_s, 1)
         open_N = self._scale * float(self._fresh_N[-1]) * strength + self._offset_N
         waiting_N = max(self._core.scene.force.waiting_N, open_N)
-        most_N = wall.force_N(truth.handle_mm) - wall.friction_N + waiting_N + EARLY_N
-        return max(path[0], float(self._gaps_for(np.array(most_N), strength)))
+        waiting_mm, early_mm = self._gaps_for(np.array([waiting_N, waiting_N + EARLY_N]), strength).tolist()
+        left_ticks = -depths_mm[0] / max(PERIOD_S * truth.handle_mm_s, PERIOD_S)
+        self._sets_out = self._sets_out or self._ticks_to(early_mm, truth.gap_mm, left_ticks) >= left_ticks
+        if not self._sets_out:
+            return float(waiting_mm)
+        soon_mm = truth.handle_mm + truth.handle_mm_s * SPEEDING_UP_S
+        most_N = wall.force_N(soon_mm) - wall.friction_N + waiting_N + EARLY_N
+        return max(min(path[0], float(wanted_mm[0])), float(self._gaps_for(np.array(most_N), strength)))
+
+    def _ticks_to(self, closed_mm: float, gap_mm: float, most: float) -> int:
+        """Return how many ticks the motors need to close the gap so far, or at least `most`."""
+        assert self._drive is not None
+        ticks, speed_mm_s = 0, self._speed_mm_s
+        while gap_mm > closed_mm and ticks < most:
+            speed_mm_s = min(self._drive.lowest_mm_s(gap_mm, min(speed_mm_s, 0.0), PERIOD_S), 0.0)
+            gap_mm += PERIOD_S * speed_mm_s
+            ticks += 1
+        return ticks
 
     def _moved(self, gap_mm: float, wanted_mm: float) -> float:
         drive = self._drive

@@ -16,15 +16,31 @@ from tormagd.hardware.measurement import DeviceRequest
 
 @final
 class Wall(Value):
-    """An elastic wall on the handle's way. A handle that pushes on in front of it feels `friction_N`."""
+    """An elastic wall on the handle's way. A handle that pushes on in front of it feels `friction_N`.
+    `stiffness_share` is the stiffness's standard deviation as a share of it.
+    """
 
-    def __init__(self, place_mm: float, stiffness_N_mm: float, friction_N: float = 0.0) -> None:
+    def __init__(
+        self,
+        place_mm: float,
+        stiffness_N_mm: float,
+        friction_N: float = 0.0,
+        place_sd_mm: float = 0.0,
+        stiffness_share: float = 0.0,
+    ) -> None:
         self.place_mm: Final = place_mm
         self.stiffness_N_mm: Final = stiffness_N_mm
         self.friction_N: Final = friction_N
+        self.place_sd_mm: Final = place_sd_mm
+        self.stiffness_share: Final = stiffness_share
 
     def force_N(self, handle_mm: float) -> float:
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
+
+    def most_N(self, handle_mm: float) -> float:
+        """Return the force of a wall that is nearer and stiffer by a standard deviation."""
+        stiffness_N_mm = self.stiffness_N_mm * (1.0 + self.stiffness_share)
+        return self.friction_N + stiffness_N_mm * max(handle_mm - self.place_mm + self.place_sd_mm, 0.0)
 
 
 @final

@@ -10,6 +10,8 @@ import shlex
 from collections import deque
 from typing import NamedTuple
 
+import msgspec
+
 from tormagd.config import Sources
 from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.control.safety.codes import Explanation, Limit
@@ -213,7 +215,7 @@ class SetpointInbox:
             self._number,
             (*others, *source.found),
             withdraw_cf,
-            None if wall is None else Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
+            None if wall is None else Wall(*msgspec.structs.astuple(wall)),
         )
         if playout_s > 0.0:
             held_s = max(due_s - now_s, 0.0)

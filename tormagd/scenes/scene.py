@@ -41,6 +41,8 @@ class Force(Strict, frozen=True):
     "The limit whatever fails."
     standby_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
     "Where the brake waits while less is asked: nearer to the forces that come, and felt as drag."
+    breakthrough: Literal["off", "decay"] | UnsetType = UNSET
+    "How a force that gives way is felt while the hand pushes on: as sent (off), or at a quarter of `release_N_s`."
 
     @property
     def waiting_N(self) -> float:
@@ -215,8 +217,9 @@ class Scene(Strict, frozen=True):
             value = getattr(self.insert, key)
             if value != getattr(usual, key):
                 raise ValueError(f"insert.{key} = {value:g}: allowed only where element is torque")
-        if self.force.standby_N is not UNSET:
-            raise ValueError(f"force.standby_N = {self.force.standby_N:g}: allowed only where element is torque")
+        for key in ("standby_N", "breakthrough"):
+            if (stated := getattr(self.force, key)) is not UNSET:
+                raise ValueError(f"force.{key} = {stated}: allowed only where element is torque")
         if self.handle != Handle():
             raise ValueError("handle: allowed only where element is torque, [finger] tells how a pad is pressed")
 

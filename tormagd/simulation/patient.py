@@ -18,20 +18,25 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 from tormagd.element.physics.friction import Friction
 from tormagd.ground.terminal import interrupted_by
 from tormagd_client import Client, ClientError
+from tormagd_client.contact import ContactEstimator
+from tormagd_client.messages import Contact
 
 T = TypeVar("T")
 PERIOD_S: Final = 2e-3
 VALID_MS: Final = 100.0
-FORCE, WAY, LAW = MODES = ("force", "way", "law")
-"The tip's force, the force of each way, or the law by which the force follows the handle."
+FORCE, WAY, LAW, FOUND = MODES = ("force", "way", "law", "found")
+"The tip's force, the force of each way, the wall once it is met, or once a touch has shown it to the estimator."
 VESSEL: Final = Friction(presliding_stiffness_N_mm=2.0, viscous_N_s_mm=0.0, static_ratio=1.2, stribeck_speed_mm_s=2.0)
 "An assumption: the tip sticks, and slips at less force."
 
 
 class Felt(NamedTuple):
-    """Forces at the tip. `force_N` resists the way in, `friction_N` is the vessel's while the tip slides."""
+    """Forces at the tip, which has gone on by `way_mm`. `force_N` resists the way in, `friction_N` is the vessel's
+    while the tip slides.
+    """
 
     tip_mm: float
+    way_mm: float
     force_N: float
     wall_N: float
     friction_N: float
@@ -85,12 +90,14 @@ class Patient:
         if wall_N > 0.0:
             self._contact_mm = wall_mm
         force_N = min(wall_N + self._rubbing_N, self._buckling_N)
-        return Felt(tip_mm, force_N, wall_N, self._friction_N, self._stiffness_N_mm, self._contact_mm)
+        return Felt(
+            tip_mm, tip_mm - before_mm, force_N, wall_N, self._friction_N, self._stiffness_N_mm, self._contact_mm
+        )
 
 
 def setpoint_of(felt: Felt, mode: str) -> dict[str, Any]:
     """Return the fields of a setpoint that says what the tip feels."""
-    if mode == FORCE:
+    if mode in (FORCE, FOUND):
         return {"servo_cf": abs(felt.force_N)}
     fields: dict[str, Any] = {"servo_cf": felt.wall_N + felt.friction_N}
     if mode == WAY:
@@ -143,29 +150,54 @@ class NetworkDelay(Generic[T]):
         return found
 
 
+class Unit:
+    """The patient's unit at the far end of a network."""
+
+    def __init__(self, patient: Patient, mode: str, network: tuple[float, float, float, float]) -> None:
+        self._patient, self._mode = patient, mode
+        self._there: NetworkDelay[float] = NetworkDelay(*network, seed=1)
+        self._back: NetworkDelay[dict[str, Any]] = NetworkDelay(*network, seed=2)
+        self._estimator = ContactEstimator()
+        self._wall: Contact | None = None
+        self._handle, self._sent_s = (-math.inf, 0.0), -math.inf
+
+    def update(self, now_s: float, handle_mm: Sequence[float]) -> list[tuple[float, dict[str, Any]]]:
+        """Send the handle's places there and a setpoint back; return what has come, with the time of sending."""
+        for place_mm in handle_mm:
+            self._there.send(now_s, place_mm)
+        self._handle = max([self._handle, *self._there.arrived(now_s)])
+        if self._handle[0] > -math.inf:
+            self._back.send(now_s, self._setpoint(self._patient.update(now_s, self._handle[1])))
+        arrived = []
+        for sent_s, fields in self._back.arrived(now_s):
+            if sent_s > self._sent_s:  # what was overtaken is of no use
+                arrived.append((sent_s, fields))
+                self._sent_s = sent_s
+        return arrived
+
+    def _setpoint(self, felt: Felt) -> dict[str, Any]:
+        fields = setpoint_of(felt, self._mode)
+        if self._mode == FOUND:
+            self._estimator.update(felt.tip_mm, felt.force_N, felt.way_mm)
+            self._wall = self._estimator.contact
+            if self._wall is not None:
+                fields["contact"] = self._wall
+        return fields
+
+
 def run(
     client: Any,
-    patient: Patient,
-    mode: str,
-    there: NetworkDelay[float],
-    back: NetworkDelay[dict[str, Any]],
+    unit: Unit,
     is_over: Callable[[float], bool],
     clock_s: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Run `patient` until `is_over`: every PERIOD_S send the handle's motions `there`, and setpoints `back`."""
-    began_ns, due_s = time.time_ns() - round(1e9 * clock_s()), clock_s()
-    newest, newest_s, published = (-math.inf, 0.0), -math.inf, 0
+    """Run the unit every PERIOD_S until `is_over`; return how many setpoints it has published."""
+    began_ns, due_s, published = time.time_ns() - round(1e9 * clock_s()), clock_s(), 0
     while not is_over(now_s := clock_s()):
-        for motion in client.motions():
-            there.send(now_s, motion.handle_mm)
-        newest = max([newest, *there.arrived(now_s)])
-        if newest[0] > -math.inf:
-            back.send(now_s, setpoint_of(patient.update(now_s, newest[1]), mode))
-        for sent_s, fields in back.arrived(now_s):
-            if sent_s > newest_s:  # what was overtaken is of no use
-                client.publish(fields.pop("servo_cf"), VALID_MS, began_ns + round(1e9 * sent_s), **fields)
-                newest_s, published = sent_s, published + 1
+        for sent_s, fields in unit.update(now_s, [motion.handle_mm for motion in client.motions()]):
+            client.publish(fields.pop("servo_cf"), VALID_MS, began_ns + round(1e9 * sent_s), **fields)
+            published += 1
         due_s = max(due_s + PERIOD_S, now_s)
         wait(max(due_s - clock_s(), 0.0))
     return published
@@ -192,9 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command.parse_args(arguments)
     try:
         patient = Patient(friction_N=options.friction_N, wall_mm=options.wall_mm, stiffness_N_mm=options.stiffness_N_mm)
-        network = 1e-3 * options.delay_ms, 1e-3 * options.jitter_ms, options.loss, 3.0
-        there: NetworkDelay[float] = NetworkDelay(*network, seed=1)
-        back: NetworkDelay[dict[str, Any]] = NetworkDelay(*network, seed=2)
+        unit = Unit(patient, options.mode, (1e-3 * options.delay_ms, 1e-3 * options.jitter_ms, options.loss, 3.0))
     except ValueError as error:
         command.error(str(error))
     ends_s = time.monotonic() + options.seconds
@@ -202,7 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             with Client.local(options.folder, 5.0, "patient") as client:
                 ends = lambda now_s: is_stopped() or now_s >= ends_s  # noqa: E731 it is asked in every period
-                published = run(client, patient, options.mode, there, back, ends)
+                published = run(client, unit, ends)
         except (ClientError, ValueError) as error:
             print(f"{command.prog}: {error}", file=sys.stderr)
             return 1

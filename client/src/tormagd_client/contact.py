@@ -39,8 +39,13 @@ class ContactEstimator:
         is_known = slope_sd <= MAX_SHARE * slope_N_mm and place_sd_mm <= MAX_MM
         if not (is_known and abs(place_mm) <= MAX_PLACE_MM):
             return None
-        stiffness_N_mm = min(slope_N_mm, MAX_STIFFNESS_N_MM)
-        return Contact(handle_mm=place_mm, stiffness_N_mm=stiffness_N_mm, friction_N=max(self.friction_N, 0.0))
+        return Contact(
+            handle_mm=place_mm,
+            stiffness_N_mm=min(slope_N_mm, MAX_STIFFNESS_N_MM),
+            friction_N=max(self.friction_N, 0.0),
+            place_sd_mm=place_sd_mm,
+            stiffness_share=slope_sd / slope_N_mm,
+        )
 
     def update(self, tip_mm: float, force_N: float, way: float) -> None:
         """Take one sample. `tip_mm` counts as the handle's place does; `force_N` resists the way in. Raises ValueError

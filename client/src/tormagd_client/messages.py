@@ -49,16 +49,22 @@ def _require_force(key: str, force_N: float | None) -> None:
 
 
 class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """An elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on."""
+    """An elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on. How sure it is:
+    standard deviations of its place and, as a share of it, of its stiffness.
+    """
 
     handle_mm: float
     stiffness_N_mm: float
     friction_N: float = 0.0
+    place_sd_mm: float = 0.0
+    stiffness_share: float = 0.0
 
     def __post_init__(self) -> None:
         _require_within("contact.handle_mm", self.handle_mm, -MAX_PLACE_MM, MAX_PLACE_MM)
         _require_within("contact.stiffness_N_mm", self.stiffness_N_mm, 0.0, MAX_STIFFNESS_N_MM)
         _require_within("contact.friction_N", self.friction_N, 0.0, MAX_FORCE_N)
+        _require_within("contact.place_sd_mm", self.place_sd_mm, 0.0, MAX_PLACE_MM)
+        _require_within("contact.stiffness_share", self.stiffness_share, 0.0, 1.0)
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -184,7 +184,7 @@ def _contact(fields: Mapping[str, float]) -> Contact:
     try:
         return Contact(**fields)
     except TypeError as error:
-        allowed = "handle_mm, stiffness_N_mm and friction_N, numbers"
+        allowed = f"{', '.join(Contact.__struct_fields__)}, numbers"
         raise ValueError(f"contact = {fields!r}: allowed are {allowed}") from error
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.governor import EARLY_N, Governor
+from tormagd.control.ask.governor import DECAY, EARLY_N, Governor
 from tormagd.control.ask.way import SLID_MM, Way
 from tormagd.control.believe.strength import UNSEEN, DeviceFit
 from tormagd.control.records import Ask, Handle, Measured, TimedSetpoint, Travel, Wall
@@ -61,6 +61,20 @@ def test_the_gap_passes_the_place_of_a_stiff_wall_at_speed(following: Following)
     gap_N = [following.ask(Travel(place_mm, 30.0), wall=wall).path_N[0] for place_mm in places_mm]
     felt_mm = next(place for place, each_N in zip(places_mm, gap_N, strict=True) if each_N > 0.8 + EARLY_N)
     assert (felt_mm - wall.place_mm) / 30.0 == pytest.approx(at_once_s, abs=0.01)
+
+
+def test_the_less_sure_a_wall_is_the_sooner_the_gap_sets_out_to_it() -> None:
+    places_mm = [*np.arange(-20.0, 12.0, 30.0 * PERIOD_S).tolist(), *[12.0] * 500]
+    at_wall, before_N = places_mm.index(min(places_mm, key=lambda place: abs(place - 10.0))) - PASSES, []
+    for sure in ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1e4, 1.0)):
+        following, wall = Following(), Wall(10.0, 0.5, 0.6, *sure)
+        gap_N = [following.ask(Travel(place, 30.0 * (place < 12.0)), wall=wall).path_N[0] for place in places_mm]
+        before_N.append(max(gap_N[:at_wall]))
+        assert gap_N[-1] == pytest.approx(1.6, abs=0.01)
+        assert max(gap_N) < 1.65
+    assert before_N == sorted(before_N)
+    assert before_N[0] < 0.6 + EARLY_N + 1e-3
+    assert 0.6 + EARLY_N + 0.05 < before_N[1] < 0.6 + EARLY_N + 1.0
 
 
 @pytest.mark.parametrize("learned_N_s", [-0.5, 0.0, 0.5])
@@ -204,3 +218,21 @@ def test_a_tremor_of_a_held_handle_changes_no_way(pushed: Pushed) -> None:
 
 def test_a_silent_device_keeps_its_place_and_way(pushed: Pushed) -> None:
     assert pushed._way.update(None, 0.0, is_sensor_believed=True) == Travel(5.0, 0.0)
+
+
+@pytest.mark.parametrize("breakthrough", ["off", "decay"])
+def test_a_force_that_gives_way_is_let_go_at_once_or_along_the_ramp_and_comes_back_at_once(breakthrough: str) -> None:
+    following = Following(msgspec.structs.replace(SCENE, breakthrough=breakthrough))
+    pushes = Travel(10.0, 30.0)
+    for force_N in (*np.linspace(0.5, 1.8, 650), *[1.8] * 50):
+        held = following.ask(pushes, force_N)
+    assert (held.force_N, Limit.RATE in held.limits) == (1.8, False)
+    for plan in range(1, 301):
+        ask = following.ask(pushes, 0.5)
+        fallen_N = DECAY * SCENE.release_N_s * PERIOD_S * plan if breakthrough == "decay" else 1.3
+        assert ask.force_N == pytest.approx(max(1.8 - fallen_N, 0.5))
+        assert (Limit.RATE in ask.limits) == (breakthrough == "decay")
+        assert max(ask.path_N) <= 1.8
+    assert following.ask(pushes, 1.6).force_N == 1.6
+    following.ask(pushes, 0.5)
+    assert following.ask(Travel(10.0, -1.0, is_pushing=False), 0.5, withdraw_N=0.5).force_N == 0.5

@@ -3,8 +3,9 @@
 now       what the setpoint asks for at the handle's place and way, within what the scene allows and the device gives
 ahead     a wall's forces as the handle moves, or a preview; else the setpoints' slope, and a forecast as far as trusted
 path      where forces ahead are known: those of the gap's path that misses them least; before a wall at most EARLY_N
-          over the force there
-blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes
+          over the most that is felt there
+blend     from one wall to another or to none: at the scene's release rate, besides what the handle's motion changes;
+          where the scene has a decay, from any force or wall that gives way while the hand pushes on: at DECAY of it
 decay     without a setpoint, or with one that is too old: to the device's least force at the scene's release rate
 passing   to a publisher's forces at the release rate: from another publisher's, or from a force that followed none
           (before the first setpoint, while the gap was open or held, after a silence)
@@ -38,6 +39,9 @@ OUTRUN_N: Final = 0.02
 
 EARLY_N: Final = 0.08
 "The gap closes before a wall by this much more than is felt there: 0.1 N with what is not known of a device."
+
+DECAY: Final = 0.25
+"A force that gives way falls more slowly than a gap opens, so that the hand can stop."
 
 Bounds = tuple[float, float]
 
@@ -82,6 +86,7 @@ class Governor:
         self._least_N: Final = force.least_N
         self._allowed: Final = (force.waiting_N, force.most_N)
         self._release_N_s: Final = force.release_N_s
+        self._decay_N_s: Final = DECAY * force.release_N_s if force.breakthrough == "decay" else 0.0
         self.forecast = Forecast()
         self.begin(now_s)
 
@@ -173,17 +178,17 @@ class Governor:
         self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
 
     def _blended(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, dt_s: float) -> float:
-        """Return `allowed_N`, or a force on the ramp to it after the wall was replaced or removed."""
+        """Return `allowed_N`, or a force on the ramp to it after the wall was replaced or removed, or gave way."""
         wall, place_mm = setpoint.wall, travel.place_mm
-        before_N = self.law_N
-        if before_N is None and wall is not None and self.stamp_s != -math.inf and self.was_pushing:
+        before_N, is_giving_way = self.law_N, self._decay_N_s > 0.0 and wall is None
+        if before_N is None and (wall is not None or is_giving_way) and self.stamp_s != -math.inf and self.was_pushing:
             before_N = self.last_N
         blended_N = allowed_N
         # a new holder has a ramp of its own, and a hand that draws back is let go at once
         if before_N is not None and travel.is_pushing and setpoint.holder == self.holder:
             moved_N = 0.0 if wall is None else wall.stiffness_N_mm * abs(place_mm - self.law_mm)
-            most_N = self._release_N_s * dt_s + moved_N
-            blended_N = within(allowed_N, (before_N - most_N, before_N + most_N))
+            most_N = (self._decay_N_s if is_giving_way else self._release_N_s) * dt_s + moved_N
+            blended_N = within(allowed_N, (before_N - most_N, math.inf if is_giving_way else before_N + most_N))
         self.blend_N = blended_N - allowed_N
         is_over = wall is None and self.blend_N == 0.0
         self.law_N = None if is_over or not travel.is_pushing else blended_N
@@ -210,8 +215,8 @@ class Governor:
         over_N = within(within(wall.friction_N, self._allowed) + added_N, bounds) - wall.friction_N + EARLY_N
         most_N: list[Bounds] = []
         for after_s in PATH_S:
-            now_N = wall.force_N(place_mm + rate_mm_s * after_s) + over_N
-            most_N.append((now_N, wall.force_N(place_mm + rate_mm_s * (begins_s + after_s)) + over_N))
+            now_N = wall.most_N(place_mm + rate_mm_s * after_s) + over_N
+            most_N.append((now_N, wall.most_N(place_mm + rate_mm_s * (begins_s + after_s)) + over_N))
         return self._best_path(wanted_N, dt_s, force_N, bounds, device, lag_s, most_N)
 
     def _feed_forecast(self, stamp_s: float, allowed_N: float, soon_s: float) -> float:
@@ -340,7 +345,7 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
             require_number(name, getattr(setpoint, name) or 0.0)
         require_number("age_s", age_s)
     if setpoint.wall is not None:
-        for name in ("place_mm", "stiffness_N_mm", "friction_N"):
+        for name in ("place_mm", "stiffness_N_mm", "friction_N", "place_sd_mm", "stiffness_share"):
             require_number(name, getattr(setpoint.wall, name))
     if not setpoint.preview_N:
         return
