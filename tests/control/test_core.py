@@ -26,8 +26,7 @@ def test_enabling_is_bumpless(running) -> None:
     running.command("disable")
     running.step(count=3)
     running.command("enable")
-    for _ in range(20):
-        assert running.step().left_duty == pytest.approx(0.0, abs=1e-9)
+    assert [running.step().left_duty for _ in range(20)] == pytest.approx([0.0] * 20, abs=1e-9)
     assert running.move.left.integral == pytest.approx(0.0, abs=1e-12)
 
 
@@ -266,8 +265,7 @@ def test_a_silent_device_is_held_where_it_is_and_named(running) -> None:
     newest, integral = running.measure(running.ticks), running.move.left.integral
     running.silent(newest, count=round(BLIND_S / PERIOD_S) + 1)
     held = plain(running.move)
-    for _ in range(30):
-        assert (running.silent(newest).limits, running.is_held) == ((Limit.DEVICE_SILENT,), True)
+    assert {(running.silent(newest).limits, running.is_held) for _ in range(30)} == {((Limit.DEVICE_SILENT,), True)}
     assert plain(running.move) == held
     assert abs(running.move.left.integral - integral) < 0.05
     back = running.step()
