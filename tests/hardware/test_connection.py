@@ -31,7 +31,7 @@ from firmware_protocol.codec import (
 from tormagd.config import Device
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
-from tormagd.hardware.link import SILENT_S, LinkState
+from tormagd.hardware.link import LinkState
 from tormagd.hardware.measurement import DeviceRequest
 from tormagd.record.journal import Journal
 from tormagd_client.messages import LinkReport
@@ -252,16 +252,6 @@ def test_a_device_that_was_reset_is_a_loss_without_closing_the_port(bench: Bench
     assert "reset" in bench.connection.report().last_loss
 
 
-def test_the_core_is_told_of_a_loss_once_and_within_a_tenth_of_a_second(bench: Bench) -> None:
-    bench.running().is_mute = True
-    bench.pass_ms(round(SILENT_S * 1e3) - 20)
-    assert bench.losses == 0, "the last Status came up to 20 ms before"
-    bench.pass_ms(100 - round(SILENT_S * 1e3) + 20)
-    assert bench.losses == 1
-    bench.pass_ms(5_000)
-    assert bench.losses == bench.connection.losses == 1
-
-
 def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(bench: Bench) -> None:
     bench.running().pass_ms(500, is_stalled=True)
     bench.ms += 1
@@ -291,34 +281,6 @@ def test_waiting_grows_to_a_second_and_starts_anew_with_the_next_device(bench: B
     bench.unplug()
     bench.pass_ms(60)
     assert bench.attempts_s[-1] - lost_s == pytest.approx(FIRST_BACK_OFF_S, abs=2e-3)
-
-
-def test_opening_the_gap_waits_for_a_device_that_went_before_it_had_heard(bench: Bench) -> None:
-    bench.running()
-    bench.is_armed, bench.is_mute = False, True
-    bench.ask(DeviceRequest.RETRACT)
-    bench.pass_ms(20)
-    assert Retract in bench.sent
-    bench.pass_ms(3_000)
-    heal(bench)
-    bench.pass_ms(1_200)
-    assert bench.firmware.accepted == [Retract]
-
-
-@pytest.mark.parametrize(("request_", "kind"), [(DeviceRequest.HOME, Home), (DeviceRequest.CLEAR, Clear)])
-def test_a_command_is_for_the_device_that_runs_when_it_is_given(
-    bench: Bench, request_: DeviceRequest, kind: type[Message]
-) -> None:
-    bench.running().ask(request_)
-    bench.pass_ms(40)
-    assert bench.firmware.accepted == [kind]
-    bench.is_armed, bench.is_mute = False, True
-    bench.pass_ms(200)
-    bench.ask(request_)
-    bench.pass_ms(20)
-    heal(bench)
-    bench.pass_ms(1_200)
-    assert (bench.connection.state, bench.firmware.accepted) == (LinkState.RUNNING, [kind])
 
 
 def test_a_backend_that_shows_no_stream_has_no_frames_in_a_black_box(bench: Bench) -> None:
