@@ -34,7 +34,7 @@ def test_a_fault_and_silence_are_rung_for_every_two_seconds_until_they_are_over(
     assert cue.due([state()], 10.2) == []
 
 
-# -- the blinded trials: balanced, in a drawn order, and counted as told -----------------------------------------------
+# -- the trials --------------------------------------------------------------------------------------------------------
 
 
 names = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "python" / "trials.py"))

@@ -264,7 +264,7 @@ def test_a_hold_of_a_day_and_a_recording_at_1_khz_are_taken(write, tmp_path: Pat
     assert of_path(write(signal__file='"fast.csv"')).missed.rms_N < 1e-3
 
 
-# -- the force over time: what a scene's keys mean in numbers, and which recordings are none ---------------------------
+# -- the signal --------------------------------------------------------------------------------------------------------
 
 
 RANGE_N = (0.5, 2.0)

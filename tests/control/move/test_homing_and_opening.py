@@ -137,7 +137,7 @@ def test_the_next_homing_begins_anew(home: Home) -> None:
     assert not home.faults
 
 
-# -- the opening: it begins, goes on, keeps to the device's speed, and ends open ---------------------------------------
+# -- the opening -------------------------------------------------------------------------------------------------------
 
 
 CONFIG = Config()
