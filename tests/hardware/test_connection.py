@@ -283,6 +283,34 @@ def test_waiting_grows_to_a_second_and_starts_anew_with_the_next_device(bench: B
     assert bench.attempts_s[-1] - lost_s == pytest.approx(FIRST_BACK_OFF_S, abs=2e-3)
 
 
+def test_opening_the_gap_waits_for_a_device_that_went_before_it_had_heard(bench: Bench) -> None:
+    bench.running()
+    bench.is_armed, bench.is_mute = False, True
+    bench.ask(DeviceRequest.RETRACT)
+    bench.pass_ms(20)
+    assert Retract in bench.sent
+    bench.pass_ms(3_000)
+    heal(bench)
+    bench.pass_ms(1_200)
+    assert bench.firmware.accepted == [Retract]
+
+
+@pytest.mark.parametrize(("request_", "kind"), [(DeviceRequest.HOME, Home), (DeviceRequest.CLEAR, Clear)])
+def test_a_command_is_for_the_device_that_runs_when_it_is_given(
+    bench: Bench, request_: DeviceRequest, kind: type[Message]
+) -> None:
+    bench.running().ask(request_)
+    bench.pass_ms(40)
+    assert bench.firmware.accepted == [kind]
+    bench.is_armed, bench.is_mute = False, True
+    bench.pass_ms(200)
+    bench.ask(request_)
+    bench.pass_ms(20)
+    heal(bench)
+    bench.pass_ms(1_200)
+    assert (bench.connection.state, bench.firmware.accepted) == (LinkState.RUNNING, [kind])
+
+
 def test_a_backend_that_shows_no_stream_has_no_frames_in_a_black_box(bench: Bench) -> None:
     journal = bench.connection.traffic = Journal()
     bench.running()
