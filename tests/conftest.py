@@ -19,11 +19,18 @@ import pytest
 from machines.host import HostWatch
 
 from firmware_protocol.c.build import BuildError, compiler, load_library
+from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.ground.scheduling import ask_for_slices
 
 ATTEMPTS = 3
 WATCHED_ABOVE = 51
 WATCHED = pytest.StashKey[HostWatch]()
+
+
+@pytest.fixture(scope="session")
+def core() -> Core:
+    return build_core(Config())
 
 
 @pytest.fixture(scope="session")

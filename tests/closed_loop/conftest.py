@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from tormagd.config import Config
-from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
@@ -17,11 +17,6 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 OPEN_MM = 95.0
 VALID_S = 0.2
 Maker = Callable[..., ClosedLoop]
-
-
-@pytest.fixture(scope="session")
-def core() -> Core:
-    return build_core(Config())
 
 
 @pytest.fixture(scope="session")

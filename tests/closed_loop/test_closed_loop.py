@@ -90,12 +90,6 @@ def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
     assert sliding_N == pytest.approx([1.0] * len(sliding_N), abs=0.02)
 
 
-def test_without_a_publisher_the_gap_stays_open(armed: ClosedLoop) -> None:
-    samples = list(armed.run(0.5))
-    assert all(sample.plan.limits == (Limit.NO_SETPOINT,) for sample in samples)
-    assert min(sample.truth.gap_mm for sample in samples) > OPEN_MM - 1.0
-
-
 def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Core) -> None:
     publish(armed, lambda time_s: 1.4, 1.0)
     at_s = armed.now_s

@@ -1,4 +1,4 @@
-"""Extremes of the loop on the simulated device: uneven screws, an uneven clock, targets that flip, magnets that pull.
+"""Extremes of the loop on the simulated device: uneven screws and clocks, targets that flip, magnets that pull.
 
 All data here are synthetic: the device is the simulator's.
 """
@@ -11,11 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from tormagd.config import Config
-from tormagd.control.assembly.build import build_core
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.core import Stepper
 from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
 from tormagd.control.move.reference import Reference
-from tormagd.control.safety.operating_state import OperatingState
+from tormagd.control.records import Duty, TimedSetpoint
+from tormagd.control.safety.operating_state import Conditions, OperatingState
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.closed_loop import Array, ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
@@ -179,10 +180,61 @@ def test_lively_motors_are_asked_for_more_and_weak_ones_for_no_less(
     assert resting[-1] == resting[250]
 
 
-def test_what_a_lost_device_showed_is_not_asked_of_the_next(arm, hold_gap) -> None:
-    loop = arm("sample_3", AT_REST, planned=False)
-    for gap_mm in (60.0, 80.0):
-        hold_gap(loop, gap_mm, 0.8)
-    assert loop.stepper.move.acceleration_scale > 1.0
-    loop.stepper.lose_link()
-    assert loop.stepper.move.acceleration_scale == 1.0
+# -- rollovers ---------------------------------------------------------------------------------------------------------
+
+
+LASTS_S, BEFORE_S = 1.5, 0.7
+"How long a repeated run takes, and how long before the rollover it begins."
+SENT_HZ = 137.3
+"Out of step with the forecast's grid, where the last digit of a stamp would decide."
+SAME_DUTY = 1e-4
+"One step on the wire: a clock of coarser floats may change as much."
+READY = Conditions(True, True, True, False, False)
+
+
+def swinging(now_s: float) -> TimedSetpoint:
+    at_s = math.floor(now_s * SENT_HZ) / SENT_HZ
+    return TimedSetpoint(1.3 + 0.4 * math.sin(3.0 * at_s), at_s, 0.1)
+
+
+@pytest.fixture(scope="module")
+def recorded(arm) -> list[Sample]:
+    return list(arm().run(LASTS_S, swinging))
+
+
+def duties(core: Core, recorded: list[Sample], device_s: float, host_s: float) -> list[Duty]:
+    begins_s = host_s + recorded[0].time_s
+    stepper, planner = core.stepper(begins_s), core.planner(begins_s)
+    found: list[Duty] = []
+    for tick, sample in enumerate(recorded):
+        now_s, setpoint = host_s + sample.time_s, swinging(sample.time_s)
+        shifted = sample.measurement.replaced(
+            received_s=host_s + sample.measurement.received_s,
+            sensed_s=host_s + sample.measurement.sensed_s,
+            reported_s=host_s + sample.measurement.reported_s,
+            device_time_s=device_s + sample.measurement.device_time_s,
+        )
+        found.append(stepper.step(now_s, shifted, planner.planned))
+        if tick == 3:
+            stepper.command("enable", now_s, READY)
+        if tick % 4 == 0:
+            planner.plan(now_s, setpoint.replaced(stamp_s=host_s + setpoint.stamp_s), stepper.measured)
+            planner.foresee()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("device_s", "host_s"),
+    [
+        pytest.param(2.0**32 * 1e-6, BEFORE_S, id="device clock through 2^32 us"),
+        pytest.param(2.0**32 * 1e-3, BEFORE_S, id="device clock through 2^32 ms"),
+        pytest.param(BEFORE_S, 2.0**32 * 1e-6, id="host clock through 2^32 us"),
+        pytest.param(BEFORE_S, 2.0**53 * 1e-9, id="host clock through 2^53 ns"),
+        pytest.param(2.0**53 * 1e-9, 2.0**53 * 1e-9, id="both through 2^53 ns"),
+    ],
+)
+def test_a_rollover_changes_no_duty(core: Core, recorded: list[Sample], device_s: float, host_s: float) -> None:
+    usual = duties(core, recorded, 0.0, 0.0)
+    assert max(abs(duty.left_duty) for duty in usual) > 0.1
+    for ours, duty in zip(duties(core, recorded, device_s - BEFORE_S, host_s - BEFORE_S), usual, strict=True):
+        assert (ours.left_duty, ours.right_duty) == pytest.approx((duty.left_duty, duty.right_duty), abs=SAME_DUTY)

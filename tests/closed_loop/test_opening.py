@@ -83,19 +83,6 @@ def test_a_retract_that_does_not_begin_is_named(closed: Opens, bus: str, ends: C
     assert loop.simulated.truth.gap_mm < HALF_MM + 2.0
 
 
-def test_a_retract_that_stops_half_way_is_named(closed: Opens) -> None:
-    loop = closed("serial")
-    loop.command("disable")
-    begins_s, stopped_s = loop.now_s, []
-
-    def stops(device: MessageDevice, time_s: float) -> None:
-        if device.truth.gap_mm > 80.0 and device.firmware.mode is DeviceMode.RETRACTING:
-            stopped_s.append(time_s - begins_s)
-            never_begins(device, time_s)
-
-    assert named_s(loop, stops) - stopped_s[0] <= NAMED_S
-
-
 @pytest.mark.parametrize(("bus", "percent"), [("serial", -100), ("can", -200)])
 def test_motors_that_do_not_open_or_press_shut_are_named(closed: Opens, bus: str, percent: int) -> None:
     loop = closed(bus, faults=[f"opening={percent}%"])
@@ -104,13 +91,6 @@ def test_motors_that_do_not_open_or_press_shut_are_named(closed: Opens, bus: str
     while not faults and loop.now_s < begins_s + NAMED_S:
         faults = held(loop, CLOSED_MM, 1e-3)[0].safety.faults
     assert set(faults) & {Fault.NOT_OPENING, Fault.DEVICE_RETRACT_FAILED, Fault.DEVICE_UNCOMMANDED_MOTION}
-
-
-@pytest.mark.parametrize(("bus", "percent"), [("serial", -60), ("can", -35)])
-def test_a_retract_that_is_too_slow_is_named(closed: Opens, bus: str, percent: int) -> None:
-    loop = closed(bus, faults=[f"opening={percent}%"])
-    loop.command("disable")
-    assert named_s(loop) <= SHOULD_S + NAMED_S
 
 
 def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_and_opened(core: Core) -> None:

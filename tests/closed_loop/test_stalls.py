@@ -5,8 +5,6 @@ from collections.abc import Iterable
 import pytest
 
 from firmware_protocol.codec import DeviceMode
-from tormagd.control.move.carriages import Carriages
-from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState
 from tormagd.simulation.closed_loop import ClosedLoop, Sample
@@ -22,10 +20,6 @@ LONG_MS = [60, 400]
 def holding(armed: ClosedLoop, render) -> ClosedLoop:
     assert render(armed, FORCE_N, 1.6)[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
     return armed
-
-
-def ticks(loop: ClosedLoop, force_N: float, duration_s: float) -> Iterable[Sample]:
-    return loop.run(duration_s, lambda now_s: TimedSetpoint(force_N, now_s, 0.2))
 
 
 def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
@@ -66,23 +60,14 @@ def limits_of(samples: Iterable[Sample]) -> set[Limit]:
 
 
 @pytest.mark.parametrize("stall_ms", SHORT_MS)
-def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedLoop, stall_ms: int) -> None:
-    move = holding.stepper.move
-    assert isinstance(move, Carriages)
-    before = move.left.integral
+def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedLoop, stall_ms: int, render) -> None:
     forces_N = stall(holding, stall_ms)
-    seen = [
-        (sample, holding.stepper.measure.sight.is_blind, move.left.integral) for sample in ticks(holding, FORCE_N, 0.6)
-    ]
-    samples, are_blind, integrals = zip(*seen, strict=True)
+    samples = render(holding, FORCE_N, 0.6)
     assert samples[-1].safety.faults == ()
     assert Limit.HOST_STALL in limits_of(samples)
     assert not samples[-1].output.limits
     forces_N += [sample.truth.force_N for sample in samples]
     assert max(abs(force_N - FORCE_N) for force_N in forces_N) < ALLOWED_N
-    # the integral has moved no more than holding moves it
-    assert sum(are_blind) <= 2
-    assert integrals[2] == pytest.approx(before, abs=0.02)
 
 
 @pytest.mark.parametrize("stall_ms", [8, 47])
@@ -93,13 +78,6 @@ def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int, r
     assert samples[-1].safety.faults == ()
     assert max(sample.truth.force_N for sample in samples) < 1.7 + ALLOWED_N
     assert all(sample.truth.force_N == pytest.approx(1.7, abs=ALLOWED_N) for sample in samples[400:])
-
-
-def test_stalls_one_after_the_other(holding: ClosedLoop, render) -> None:
-    for stall_ms in (45, 6, 30, 47, 10, 20):
-        stall(holding, stall_ms)
-        samples = render(holding, FORCE_N, 0.05)
-        assert (samples[-1].safety.faults, samples[-1].truth.force_N) == ((), pytest.approx(FORCE_N, abs=ALLOWED_N))
 
 
 @pytest.mark.parametrize("stall_ms", LONG_MS)
@@ -146,15 +124,11 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(
 ) -> None:
     render(armed, 1.2, 0.8)
     armed.device.messages._home_m -= 2e-4
-    move = armed.stepper.move
-    assert isinstance(move, Carriages)
-    seen = [(sample, move.left.integral, move.right.integral) for sample in ticks(armed, force_N, 3.0)]
-    samples, left, right = zip(*seen, strict=True)
+    samples = render(armed, force_N, 3.0)
     assert samples[-1].safety.faults == ()
     assert Limit.F_MIN in samples[-1].plan.limits
     assert OPEN_MM - 0.5 < samples[-1].truth.gap_mm < OPEN_MM - 0.02
     assert Limit.SATURATED not in limits_of(samples[1_500:])
-    assert max(*left[1_500:], *right[1_500:]) < 0.1
     forces_N = [sample.truth.force_N for sample in render(armed, 1.2, 1.5)]
     assert max(forces_N) < 1.2 + ALLOWED_N
     assert forces_N[-1] == pytest.approx(1.2, abs=0.06)

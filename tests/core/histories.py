@@ -120,6 +120,7 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
 def check_step(output: Duty, before: SafetyState, after: SafetyState) -> None:
     duties, limit = (output.left_duty, output.right_duty), CONFIG.position.duty_limit
     assert all(abs(duty) <= limit for duty in duties), f"duties = {duties} in {after}"
+    assert after.request_number >= before.request_number, f"{before} to {after}"
     is_off = output.mode is DriveMode.OFF and duties == (0.0, 0.0)
     assert is_off or after.operating_state in DRIVEN, f"{output} in {after}"
     check_way(Event.FAULT, before, after)

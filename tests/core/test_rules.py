@@ -7,8 +7,7 @@ from types import ModuleType
 import msgspec
 import pytest
 
-from tormagd.config import Config
-from tormagd.control.assembly.build import build_core
+from tormagd.control.assembly.build import Core
 from tormagd.control.safety.operating_state import Event, OperatingState
 
 
@@ -27,16 +26,14 @@ def histories() -> ModuleType:
     return module
 
 
-def test_no_hostile_history_breaks_a_rule(histories: ModuleType) -> None:
-    histories.hostile(build_core(Config()), Unseen(), episodes=270)
+def test_no_hostile_history_breaks_a_rule(core: Core, histories: ModuleType) -> None:
+    histories.hostile(core, Unseen(), episodes=270)
 
 
-def test_a_broken_rule_is_seen(histories: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = Config()
-    core = build_core(config)
-    weak = msgspec.structs.replace(config.position, duty_limit=0.01)
+def test_a_broken_rule_is_seen(core: Core, histories: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    weak = msgspec.structs.replace(core.config.position, duty_limit=0.01)
     with monkeypatch.context() as patch:
-        patch.setattr(histories, "CONFIG", msgspec.structs.replace(config, position=weak))
+        patch.setattr(histories, "CONFIG", msgspec.structs.replace(core.config, position=weak))
         with pytest.raises(AssertionError, match="duties = "):
             histories.hostile(core, Unseen())
     with monkeypatch.context() as patch:

@@ -212,8 +212,7 @@ def test_telemetry_is_typed_and_each_topic_has_its_own(client):
     assert client.motions(PATIENCE_S)[0] == Motion(v=1, t_ns=7, device_s=0.5, handle_mm=3.0, handle_mm_s=-20.0)
     (verdict, *_) = client.verdicts(PATIENCE_S)
     assert (verdict.source, verdict.seq, verdict.outcome, verdict.arrives_ms) == ("me", 3, "cannot", None)
-    for _ in range(3):
-        assert client.telemetry(PATIENCE_S)[0].seq >= newest[0].seq
+    assert all(client.telemetry(PATIENCE_S)[0].seq >= newest[0].seq for _ in range(3))
 
 
 @pytest.mark.parametrize("call", [lambda it: it.request("status"), lambda it: it.publish(1.0)])

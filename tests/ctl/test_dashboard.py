@@ -586,8 +586,7 @@ async def test_stop_is_within_reach_and_everything_else_asks_first(fake_daemon: 
 
 
 @needs_chromium
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-async def test_axe_finds_nothing(fake_daemon: Any, recorded: Recorded, tmp_path: Path, scheme: str) -> None:
+async def test_axe_finds_nothing(fake_daemon: Any, recorded: Recorded, tmp_path: Path) -> None:
     axe = (importlib.resources.files(pytest.importorskip("axe_core_python")) / "axe.min.js").read_text(encoding="utf-8")
     (tmp_path / "a.html").write_text(report([recorded._file]), encoding="utf-8")
     (tmp_path / "browser").mkdir()
@@ -597,12 +596,13 @@ async def test_axe_finds_nothing(fake_daemon: Any, recorded: Recorded, tmp_path:
         served(recorded) as then,
         browser(tmp_path / "browser") as page,
     ):
-        await page.tell("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-        for url, is_ready in (
+        pages = (
             (f"{now.make_url('/')}#{SECRET}", "document.querySelector('#state')?.textContent === 'ENABLED'"),
             (str(then.make_url("/")), "document.querySelector('#state')?.textContent === 'FAULT'"),
             ((tmp_path / "a.html").as_uri(), "document.querySelector('h2') !== null"),
-        ):
+        )
+        for scheme, (url, is_ready) in itertools.product(("light", "dark"), pages):
+            await page.tell("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
             await page.tell("Page.navigate", url=url)
             await page.until(is_ready)
             await page.ask("document.querySelector('[data-command=arm]')?.click()")
@@ -610,7 +610,7 @@ async def test_axe_finds_nothing(fake_daemon: Any, recorded: Recorded, tmp_path:
             await page.resize(390, 844)
             await page.until(FITS)
             found = "axe.run().then((it) => it.violations.map((each) => each.id + each.nodes[0].html))"
-            assert await page.ask(found) == [], url
+            assert await page.ask(found) == [], (scheme, url)
 
 
 @needs_chromium

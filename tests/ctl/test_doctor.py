@@ -1,6 +1,5 @@
 import resource
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -34,7 +33,7 @@ GOOD = {
 
 
 @pytest.fixture
-def good(machine: Any, monkeypatch: pytest.MonkeyPatch) -> Path:
+def good(machine, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(checks, "settle", lambda: Build(True, ""))
     machine.write(GOOD)
     (machine.root / "dev/tormag").symlink_to("ttyUSB0")

@@ -2,7 +2,6 @@ import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import msgpack
 import pytest
@@ -19,7 +18,7 @@ from tormagd_client.messages import VERSION
 
 
 @pytest.fixture
-def keys(tmp_path: Path, ctl: Any) -> Path:
+def keys(tmp_path: Path, ctl) -> Path:
     ctl("keys", "generate", str(tmp_path / "keys"), "--operate", "console", "--publish", "robot").ended(0)
     return tmp_path / "keys"
 
@@ -34,7 +33,7 @@ def test_one_command_makes_the_server_its_clients_and_the_lists(keys: Path) -> N
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)
 
 
-def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, ctl: Any) -> None:
+def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, ctl) -> None:
     before = (keys / "server.key_secret").read_bytes()
     printed = ctl("--json", "keys", "generate", str(keys), "--observe", "screen").ended(0)
     assert [made["name"] for made in printed.result["made"]] == ["screen"]
@@ -43,7 +42,7 @@ def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, ctl: Any)
     assert (keys / "server.key_secret").read_bytes() == before
 
 
-def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, ctl: Any) -> None:
+def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, ctl) -> None:
     printed = ctl("--json", "keys", "generate", str(tmp_path / "mine"), "--client", "robot").ended(0)
     assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == ["robot.key", "robot.key_secret"]
     (made,) = printed.result["made"]
@@ -53,7 +52,7 @@ def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, ctl: A
     assert not list(tmp_path.glob("*.key*"))
 
 
-def test_a_folder_of_keys_is_shown(keys: Path, ctl: Any) -> None:
+def test_a_folder_of_keys_is_shown(keys: Path, ctl) -> None:
     assert ctl("keys", "show", str(keys / "publish")).ended(0).out.endswith("  robot\n")
 
 
@@ -89,7 +88,7 @@ def guarded(keys: Path) -> Iterator[str]:
 
 
 def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
-    keys: Path, guarded: str, ctl: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    keys: Path, guarded: str, ctl, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     mine, server = str(keys / "console.key_secret"), str(keys / "server.key")
     patient = ("--wait", "20")
@@ -105,9 +104,7 @@ def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
     ctl(*patient, "--endpoint", guarded, "disable", "--no-wait").ended(0)
 
 
-def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
-    keys: Path, guarded: str, ctl: Any
-) -> None:
+def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(keys: Path, guarded: str, ctl) -> None:
     for arguments in ((), ("--key", str(keys / "robot.key_secret"), "--server-key", str(keys / "server.key"))):
         error = ctl("--endpoint", guarded, "--wait", "0.3", "--json", *arguments, "disable", "--no-wait").ended(3).error
         assert (error["code"], "--key and --server-key" in error["hint"]) == ("unreachable", True)
@@ -135,7 +132,7 @@ async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever
     ],
     ids=range(4),
 )
-def test_a_key_that_is_no_good_is_a_usage_error(keys: Path, ctl: Any, arguments: tuple[str, ...], named: str) -> None:
+def test_a_key_that_is_no_good_is_a_usage_error(keys: Path, ctl, arguments: tuple[str, ...], named: str) -> None:
     placed = [each.replace("KEYS", str(keys)) for each in arguments]
     error = ctl("--endpoint", "tcp://192.0.2.1:5555", "--json", *placed, "status").ended(2).error
     assert named in error["message"] + error["hint"]

@@ -5,7 +5,6 @@ import sys
 import tty
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -21,7 +20,7 @@ ON_BOARD = SimpleNamespace(device="/dev/ttyS0", description="n/a", vid=None, pid
 
 
 @pytest.fixture
-def root(machine: Any) -> Path:
+def root(machine) -> Path:
     timer = "sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
     machine.write({"dev/ttyUSB0": "", "dev/ttyS0": "", timer: "16\n", "proc/locks": ""})
     (machine.root / "dev/tormag").symlink_to("ttyUSB0")
@@ -35,7 +34,7 @@ def test_the_configured_port_is_known_by_where_its_name_leads(root: Path) -> Non
     assert (board.is_configured, board.usb_id, board.latency_ms) == (False, None, None)
 
 
-def test_open_files_and_locks_name_the_holders(root: Path, machine: Any) -> None:
+def test_open_files_and_locks_name_the_holders(root: Path, machine) -> None:
     machine.process(4242, "minicom", "/dev/null", "/dev/ttyUSB0")
     machine.process(77, "tormagd")  # of another user: its lock is seen, its files are not
     inode = machine.inode("dev/ttyUSB0")
@@ -46,7 +45,7 @@ def test_open_files_and_locks_name_the_holders(root: Path, machine: Any) -> None
     assert chip.holders == (Holder(77, "tormagd", True), Holder(4242, "minicom", False))
 
 
-def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root: Path, machine: Any) -> None:
+def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root: Path, machine) -> None:
     machine.write({"dev/pts/3": ""})
     (root / "dev/tormag").unlink()
     (root / "dev/tormag").symlink_to("pts/3")
@@ -56,7 +55,7 @@ def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root:
     assert survey(Config(), Machine(root), [], []).serial == ()
 
 
-def test_can_channels_say_whether_they_are_up(root: Path, machine: Any) -> None:
+def test_can_channels_say_whether_they_are_up(root: Path, machine) -> None:
     machine.write({f"sys/class/net/{name}/operstate": state for name, state in (("can0", "up"), ("can1", "down"))})
     channels = (("socketcan", "can0"), ("socketcan", "can1"), ("udp_multicast", "239.74.163.2"))
     detected = [{"interface": interface, "channel": channel} for interface, channel in channels]
@@ -64,7 +63,7 @@ def test_can_channels_say_whether_they_are_up(root: Path, machine: Any) -> None:
     assert [(each.channel, each.is_up) for each in found] == [("can0", True), ("can1", False), ("239.74.163.2", None)]
 
 
-def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(root: Path, machine: Any) -> None:
+def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(root: Path, machine) -> None:
     machine.write({"tmp/can": ""})
     device = Device(backend="can", port="/tmp/can", options={"interface": "tormagsim"})
     other = {"interface": "tormagsim", "channel": "/tmp/tormagsim-1/can"}
@@ -77,7 +76,7 @@ def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(ro
         ]
 
 
-def test_the_text_says_what_it_cannot_see(root: Path, machine: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_text_says_what_it_cannot_see(root: Path, machine, monkeypatch: pytest.MonkeyPatch) -> None:
     machine.process(4242, "minicom", "/dev/ttyUSB0")
     machine.process(5, "secret")
     listing, of_another = Path.iterdir, Mock(side_effect=PermissionError)
@@ -100,7 +99,7 @@ def test_a_configured_port_that_is_not_there_is_said(root: Path, monkeypatch: py
     assert "no serial port" in ports(Config(device=Device(port="can0")), root).text
 
 
-def test_a_real_lock_of_a_real_process_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ctl: Any) -> None:
+def test_a_real_lock_of_a_real_process_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ctl) -> None:
     far, near = os.openpty()
     tty.setraw(near)
     path = os.ttyname(near)

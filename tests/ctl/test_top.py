@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-from typing import Any
 from unittest.mock import Mock
 
 import msgspec
@@ -183,7 +182,7 @@ def in_terminal(control: str, end: bytes | signal.Signals, **settings: str) -> t
         os.close(far)
 
 
-def test_a_narrow_terminal_without_colours_and_with_ascii_alone_is_drawn_on(fake_daemon: Any) -> None:
+def test_a_narrow_terminal_without_colours_and_with_ascii_alone_is_drawn_on(fake_daemon) -> None:
     settings = {"COLUMNS": "40", "NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
     code, text = in_terminal(fake_daemon.control, b"q", **settings)
     assert (code, text.isascii(), "Traceback" in text) == (0, True, False)
@@ -193,7 +192,7 @@ def test_a_narrow_terminal_without_colours_and_with_ascii_alone_is_drawn_on(fake
 
 
 @pytest.mark.parametrize("end", [b"q", signal.SIGINT, signal.SIGTERM], ids=["q", "Ctrl-C", "SIGTERM"])
-def test_it_is_ended_by_a_key_or_a_signal_and_only_looks(fake_daemon: Any, end: bytes | signal.Signals) -> None:
+def test_it_is_ended_by_a_key_or_a_signal_and_only_looks(fake_daemon, end: bytes | signal.Signals) -> None:
     code, text = in_terminal(fake_daemon.control, end)
     assert "ENABLED" in text
     assert (code, set(fake_daemon.commands), fake_daemon.setpoints) == (0, {"status"}, [])

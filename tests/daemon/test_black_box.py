@@ -5,7 +5,6 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock, patch
 
 import msgspec
@@ -48,7 +47,7 @@ class Rig:
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
         self.box.begin(self.stepper, self.planner, connection)
 
-    def start(self, _module: str, its: socket.socket) -> Any:
+    def start(self, _module: str, its: socket.socket):
         self.its = its.dup()
         self.its.setblocking(False)
         return self.process

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import os
+import random
 import re
 import shutil
 import socket
@@ -20,7 +21,9 @@ import zmq
 
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
-from tormagd.daemon.requests import WAITING_PER_CLIENT
+from tormagd.daemon.listeners import PEERS as MOST_LISTENERS, TOPICS, Listeners
+from tormagd.daemon.peers import PEERS, Allowance, Peer
+from tormagd.daemon.requests import FIRST, WAITING, WAITING_PER_CLIENT, Requests, Waiting, may_go_first
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import (
     MOTION_TOPIC,
@@ -202,15 +205,6 @@ def test_a_message_that_is_too_large_is_not_read_and_its_publisher_is_heard_agai
 
 
 # -- telemetry and recording ---------------------------------------------------------------------------------------
-
-
-def test_telemetry_reaches_a_subscriber_and_is_sent_without_one(rig: Rig) -> None:
-    for _ in range(3_000):
-        rig.endpoint.publish(TELEMETRY)
-    subscriber = rig.connect(zmq.SUB, "telemetry")
-    subscriber.subscribe(b"")
-    rig.until(lambda: subscriber.poll(5) > 0, rig.tell)
-    assert decode(subscriber.recv(), Telemetry) == TELEMETRY
 
 
 def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
@@ -598,3 +592,106 @@ def test_a_directory_that_cannot_be_made_is_named_with_its_endpoint(tmp_path: Pa
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=f"^endpoints.setpoint = .* {tmp_path}/file cannot be made: .*File exists"):
         Endpoint(Endpoints(setpoint=f"ipc://{tmp_path}/file/setpoint"))
+
+
+# -- requests that wait ------------------------------------------------------------------------------------------------
+
+
+def waiting(client: str, number: int = 0, opens: int = 0) -> Waiting:
+    return Waiting([client.encode()], str(number).encode(), Peer(""), 0, opens)
+
+
+def taken(requests: Requests) -> list[str]:
+    return [f"{each.envelope[0].decode()}{each.data.decode()}" for each in iter(requests.next, None)]
+
+
+def test_every_client_has_its_turn_and_each_keeps_its_order() -> None:
+    requests = Requests()
+    asked = [waiting("a", 0), waiting("a", 1), waiting("a", 2), waiting("b"), waiting("c")]
+    assert all(requests.put(each) for each in asked)
+    assert taken(requests) == ["a0", "b0", "c0", "a1", "a2"]
+
+
+def test_one_client_takes_no_place_of_another() -> None:
+    requests = Requests()
+    assert [requests.put(waiting("a", number)) for number in range(WAITING_PER_CLIENT + 3)].count(True) == 64
+    assert requests.put(waiting("b"))
+    assert taken(requests)[:3] == ["a0", "b0", "a1"]
+    assert requests.put(waiting("a"))
+
+
+def test_all_together_are_bounded() -> None:
+    requests = Requests()
+    assert sum(requests.put(waiting(f"c{number}")) for number in range(WAITING + 5)) == WAITING
+    assert requests.next() is not None
+    assert requests.put(waiting("late"))
+
+
+@pytest.mark.parametrize("command", FIRST)
+def test_no_packing_of_a_first_command_is_overlooked(command: str) -> None:
+    for header in (bytes([0xA0 | len(command)]), b"\xd9", b"\xda", b"\xdb"):
+        size = {0xD9: 1, 0xDA: 2, 0xDB: 4}.get(header[0])
+        text = header + (b"" if size is None else len(command).to_bytes(size, "big")) + command.encode()
+        data = b"\x83" + msgpack.packb("v") + b"\x01" + msgpack.packb("id") + b"\x01" + msgpack.packb("command") + text
+        assert msgpack.unpackb(data)["command"] == command
+        assert may_go_first(data)
+    assert not may_go_first(msgpack.packb({"v": 1, "id": 1, "command": "status"}))
+
+
+def test_a_peer_may_send_a_burst_and_then_its_rate() -> None:
+    allowance = Allowance(100.0, 10.0)
+    asked = (("a", 0.0, 15), ("a", 0.05, 9), ("b", 0.05, 10), ("a", 9.0, 15))
+    granted = [sum(allowance.grants(Peer(name), now_s) for _ in range(asks)) for name, now_s, asks in asked]
+    assert granted == [10, 5, 10, 10]
+
+
+def test_more_peers_than_are_kept_apart_cost_the_one_that_was_silent_longest() -> None:
+    allowance = Allowance(1.0, 1.0)
+    assert all(allowance.grants(Peer(f"p{number}"), float(number) * 1e-3) for number in range(PEERS))
+    later = (("p0", 0.5), ("new", 0.6), ("p0", 0.6), ("p1", 0.6))
+    assert [allowance.grants(Peer(name), now_s) for name, now_s in later] == [False, True, False, True]
+
+
+# -- who listens -------------------------------------------------------------------------------------------------------
+
+
+ON, OFF = b"\x01", b"\x00"
+GONE = None
+A, B = Peer("a"), Peer("b")
+
+
+def test_subscribers_to_everything_or_to_something_else_are_none() -> None:
+    listeners = Listeners()
+    for word in (ON, ON + b"mot", ON + MOTION_TOPIC + b"X", ON + b"\xde", b"", b"motion", ON + b"x" * 10_000):
+        listeners.hear(word, A)
+    assert not any(map(listeners.has, TOPICS))
+
+
+def test_who_came_and_went_is_counted_for_each_topic_and_nobody_ends_it_for_another() -> None:
+    listeners = Listeners()
+    listeners.hear(ON + MOTION_TOPIC, A)
+    for _ in range(100):
+        listeners.hear(OFF + MOTION_TOPIC, B)
+    assert listeners.has(MOTION_TOPIC)
+    listeners.hear(ON + MOTION_TOPIC, B)
+    listeners.hear(ON + VERDICT_TOPIC, A)
+    listeners.hear(OFF + MOTION_TOPIC, A)
+    assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (True, True)
+    listeners.hear(OFF + MOTION_TOPIC, GONE)
+    assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (False, True)
+    listeners.hear(OFF + VERDICT_TOPIC, A)
+    assert not listeners.has(VERDICT_TOPIC)
+
+
+def test_however_many_come_and_go_what_is_kept_is_bounded_and_none_is_left() -> None:
+    listeners, draw = Listeners(), random.Random(1)
+    here: list[int] = []
+    for number in range(2_000):
+        if here and draw.random() < 0.5:
+            here.pop()
+            listeners.hear(OFF + MOTION_TOPIC, GONE)
+        else:
+            here.append(number)
+            listeners.hear(ON + MOTION_TOPIC, Peer(f"peer {number}"))
+        assert listeners.has(MOTION_TOPIC) == bool(here)
+        assert len(listeners._asked[MOTION_TOPIC]) <= MOST_LISTENERS + 1

@@ -1,4 +1,5 @@
 import random
+from collections.abc import Callable
 from typing import Any
 
 import msgpack
@@ -7,6 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tormagd.config import Sources
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.control.safety.operating_state import RefusedError
@@ -84,7 +86,7 @@ def test_a_setpoint_is_put_on_the_control_clock(publishing: Publishing) -> None:
     assert publishing.send(1, 1.5, "a", 0.02, at_s=7.0, rate_mm_s=30.0)
     newest = publishing.newest
     found = newest.stamp_s, newest.force_N, newest.valid_for_s, newest.rate_mm_s
-    assert found == (pytest.approx(6.98), 1.5, 0.05, 30.0)
+    assert found == (pytest.approx(6.98, abs=1e-9), 1.5, 0.05, 30.0)
 
 
 def test_a_law_of_the_handles_way_is_taken_and_refused_by_name_for_a_pad(publishing: Publishing) -> None:
@@ -103,7 +105,7 @@ def test_a_law_of_the_handles_way_is_taken_and_refused_by_name_for_a_pad(publish
 
 def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over(publishing: Publishing) -> None:
     publishing.send(1_000)
-    assert not publishing.send(0, 2.0, at_s=0.049)
+    assert (publishing.send(0, 2.0, at_s=0.049), publishing.counters()) == (False, (1, 0, 1))
     assert (publishing.send(0, 2.0, at_s=0.051), publishing.force_N) == (True, 2.0)
 
 
@@ -292,6 +294,18 @@ def test_a_clock_that_was_never_set_is_corrected_and_named(publishing: Publishin
     assert publishing.of("a").cause == "its clock: it was never set (it says 1970), and is corrected"
 
 
+@pytest.mark.parametrize(("behind_s", "said"), [(1.0, "behind"), (-1.0, "ahead of")])
+def test_a_wrong_clock_is_corrected_and_named(publishing: Publishing, behind_s: float, said: str) -> None:
+    noise = random.Random(1)
+    for number in range(1_000):
+        publishing.send(number, 1.5, "a", behind_s + noise.expovariate(500.0), at_s=number * 0.002)
+    found = publishing.of("a")
+    assert publishing.age_s == pytest.approx(0.0, abs=0.02)
+    assert found.clock_behind_ms == pytest.approx(1e3 * behind_s, abs=4.0)
+    assert f"{said} this machine's, and is corrected" in found.cause
+    assert "chrony" in found.remedy
+
+
 def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -> None:
     noise, drifts_ppm = random.Random(1), []
     for tick in range(800):
@@ -360,6 +374,7 @@ def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> No
         {"session": 2**63},
         {"session": "1"},
         {"seq": -1},
+        {"seq": 2**63},
         {"seq": None},
         {"stamp_ns": 1.5},
         {"rate_mm_s": float("nan")},
@@ -441,3 +456,119 @@ def test_every_message_is_counted_once_and_no_source_takes_the_brake_from_one_th
                 assert publishing.now_s - before.stamp_s > before.valid_for_s
                 assert publishing.newest.holder == before.holder + 1
     assert sum(publishing.counters()) == len(events)
+
+
+# -- playout -----------------------------------------------------------------------------------------------------------
+
+
+TICK_S = 1e-3
+PERIOD_S = 0.01
+
+
+class Listening:
+    """What is in force in each tick: (now_s, stamp_s, force_N)."""
+
+    def __init__(self, playout_ms: float, valid_for_ms: float = 500.0) -> None:
+        self.inbox, self.valid_for_ms = SetpointInbox(Sources(playout_ms=playout_ms)), valid_for_ms
+        self.followed: list[tuple[float, float, float]] = []
+
+    def take(self, now_s: float, seq: int, sent_s: float, source: str = "a") -> bool:
+        message = {"v": 1, "source": source, "seq": seq, "stamp_ns": START_NS + round(sent_s * 1e9)}
+        fields = message | {"servo_cf": 1.0 + 1e-3 * seq, "valid_for_ms": self.valid_for_ms}
+        return self.inbox.take(msgpack.packb(fields), now_s, START_NS + round(now_s * 1e9))
+
+    def listen(self, delay_s: Callable[[int], float], lasts_s: float) -> None:
+        arrives_s, coming = 0.0, []
+        for seq in range(round(lasts_s / PERIOD_S)):
+            arrives_s = max(arrives_s, seq * PERIOD_S + delay_s(seq))
+            coming.append((arrives_s, seq))
+        for tick in range(round(lasts_s / TICK_S)):
+            now_s, before = tick * TICK_S, self.inbox.newest
+            while coming and coming[0][0] <= now_s:
+                _, seq = coming.pop(0)
+                self.take(now_s, seq, seq * PERIOD_S)
+            self.inbox.hand_on(now_s)
+            newest = self.inbox.newest
+            if newest is not None and newest is not before:
+                self.followed.append((now_s, self.inbox.in_force.stamp_s, newest.force_N))
+
+
+@given(seed=st.integers(0, 2**32), playout_ms=st.sampled_from([5.0, 60.0, 200.0]))
+def test_each_setpoint_is_followed_a_stated_time_after_its_stamp(seed: int, playout_ms: float) -> None:
+    noise, listening = random.Random(seed), Listening(playout_ms)
+    listening.listen(lambda seq: noise.uniform(0.0, playout_ms * 1e-3 - TICK_S), 1.0)
+    found = [(now_s - stamp_s, round((force_N - 1.0) * 1e3)) for now_s, stamp_s, force_N in listening.followed]
+    assert [seq for _, seq in found] == list(range(len(found)))
+    assert len(found) >= (1.0 - playout_ms * 1e-3) / PERIOD_S - 1.0
+    assert all(-1e-9 <= late_s - playout_ms * 1e-3 < TICK_S + 1e-9 for late_s, _ in found)
+    report = listening.inbox.report(1.0).playout
+    assert (report.playout_ms, report.setpoints, report.late) == (playout_ms, listening.inbox.accepted, 0)
+
+
+def test_what_is_held_back_is_for_the_planner_as_if_it_had_been_meant_that_much_later() -> None:
+    held, at_once = Listening(60.0), Listening(0.0)
+    assert not held.take(5.0, 1, 4.99)
+    assert at_once.take(5.0, 1, 4.99)
+    assert held.inbox.hand_on(5.0501)
+    meant, played = at_once.inbox.newest, held.inbox.newest
+    assert (played.stamp_s, played.valid_for_s) == pytest.approx((meant.stamp_s + 0.06, meant.valid_for_s - 0.06))
+    assert meant.replaced(stamp_s=played.stamp_s, valid_for_s=played.valid_for_s) == played
+    assert held.inbox.in_force.stamp_s == meant.stamp_s
+
+
+def test_what_comes_too_late_is_followed_at_once_and_counted() -> None:
+    listening = Listening(30.0)
+    listening.listen(lambda seq: 0.0805 if seq % 20 == 10 else 0.01 + 0.004 * (seq % 2), 4.0)
+    listening.inbox.refresh(4.0)
+    report = listening.inbox.report(4.0).playout
+    # the late one delays those behind it: 81, 71, .. 31 ms after their stamps
+    assert (report.setpoints, report.late, report.held_us.p50, report.jitter_us) == (
+        399,
+        20 * 6,
+        pytest.approx(16e3, rel=0.05),
+        pytest.approx(4e3, rel=0.5),
+    )
+    # of a burst only the newest is followed
+    late_s = [now_s - stamp_s for now_s, stamp_s, _ in listening.followed]
+    assert (min(late_s), max(late_s)) == pytest.approx((0.03, 0.031), abs=1.1 * TICK_S)
+
+
+def test_a_setpoint_that_is_not_valid_for_so_long_is_stale_and_says_why() -> None:
+    listening = Listening(60.0, valid_for_ms=50.0)
+    listening.listen(lambda seq: 0.01, 1.0)
+    why = listening.inbox.told(1.0)[Limit.STALE]
+    assert "followed from 60 ms after their stamp on, and are valid for 50 ms" in why.cause
+    assert "lower sources.playout_ms" in why.remedy
+
+
+def test_jitter_names_the_playout_that_takes_it_out_and_is_gone_with_it() -> None:
+    def way_s(seq: int) -> float:
+        return 0.02 + 0.028 * (seq % 10 == 0)
+
+    listening = Listening(0.0)
+    listening.listen(way_s, 2.5)
+    assert listening.inbox.told(2.5)[Limit.SOURCE_JITTER].remedy.startswith("set sources.playout_ms = 50,")
+    listening = Listening(50.0)
+    listening.listen(way_s, 2.5)
+    assert listening.inbox.newest.limits == ()
+
+
+def test_nothing_that_waits_outlives_a_scene_or_another_holder(core: Core) -> None:
+    listening = Listening(50.0)
+    inbox = listening.inbox
+    assert not listening.take(0.0, 1, 0.0)
+    inbox.begin_scene(core.scene)
+    assert not inbox.hand_on(0.06)
+    assert not listening.take(0.1, 2, 0.1)
+    inbox.sources = Sources(priority=("b",), playout_ms=0.0)
+    assert listening.take(0.11, 1, 0.11, "b"), "a playout that was taken away holds nothing that comes"
+    assert inbox.in_force.source == "b"
+    assert not inbox.hand_on(0.2)
+
+
+def test_a_flood_is_held_in_bounds() -> None:
+    listening = Listening(200.0)
+    for seq in range(5_000):
+        listening.take(seq * 1e-5, seq, seq * 1e-5)
+    assert listening.inbox.hand_on(0.3)
+    assert listening.inbox.in_force.seq == 4_999

@@ -106,9 +106,11 @@ def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
     assert is_kept in path.read_bytes()
 
 
-def test_a_folder_that_no_file_can_have_is_refused_by_name() -> None:
-    with pytest.raises(ProfileError, match="no file can have this name"):
-        keep(Path("a\0b"), 7)
+@pytest.mark.parametrize(("name", "said"), [("a\0b", "no file can have this name"), ("file", "File exists")])
+def test_a_folder_that_cannot_be_one_is_refused_by_name(tmp_path: Path, name: str, said: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ProfileError, match=said):
+        keep(tmp_path / name, 7)
 
 
 def test_a_refusal_is_over_when_a_profile_has_been_kept(rig: Rig, tmp_path: Path) -> None:
@@ -167,12 +169,6 @@ def test_a_wrong_file_is_named_and_nothing_is_believed_of_it(
     rig.look(7, False)
     assert rig.learned == NOTHING_LEARNED
     assert says in rig.profiles.report().refusal
-
-
-def test_a_folder_that_cannot_be_written_keeps_nothing_and_says_so(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(ProfileError, match="File exists"):
-        keep(tmp_path / "file", 7)
 
 
 def test_without_a_folder_nothing_is_kept(new_rig: NewRig) -> None:

@@ -7,11 +7,10 @@ import pytest
 
 from tormagd.config import Config, Rates
 from tormagd.control.aim.aim import OLDEST_ANSWER_S
-from tormagd.control.aim.portrait import LAW_SHARE
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.search_process import SearchProcess
-from tormagd.element.inverse.solution import Answer, FieldSolution, Question, Reach
+from tormagd.element.inverse.solution import Answer, Question
 from tormagd.element.physics.errors import DomainError
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -55,16 +54,6 @@ def test_a_plan_uses_the_newest_answer_asks_anew_and_says_how_old_it_is(core: Co
         assert planner.question != question
     assert plan.governed_N == pytest.approx(1.5)
     assert plan.gap_mm == pytest.approx(core.portrait.gap_mm_at(1.5), abs=2.0)  # of another handle
-
-
-def test_the_force_law_guards_every_plan_whatever_was_answered(core: Core) -> None:
-    planner, law = core.planner(0.0), core.element.law
-    assert law is not None
-    for field_mT in (0.0, 5_000.0):
-        planner.answered(Answer(0.0, FieldSolution(field_mT, 1.5, 1.0, 1, Reach.INSIDE)))
-        plan = planner.plan(0.01, setpoint(1.5, 0.01), None)
-        assert abs(plan.field_mT / law.field_mT(1.5) - 1.0) <= LAW_SHARE + 1e-9
-        assert [each.quantity for each in plan.outside] == ["field_mT"]
 
 
 def test_without_an_answer_for_long_planning_fails_and_begins_anew(core: Core) -> None:

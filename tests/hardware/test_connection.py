@@ -31,7 +31,7 @@ from firmware_protocol.codec import (
 from tormagd.config import Device
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
-from tormagd.hardware.link import SILENT_S, LinkState
+from tormagd.hardware.link import LinkState
 from tormagd.hardware.measurement import DeviceRequest
 from tormagd.record.journal import Journal
 from tormagd_client.messages import LinkReport
@@ -250,16 +250,6 @@ def test_a_device_that_was_reset_is_a_loss_without_closing_the_port(bench: Bench
         1,
     )
     assert "reset" in bench.connection.report().last_loss
-
-
-def test_the_core_is_told_of_a_loss_once_and_within_a_tenth_of_a_second(bench: Bench) -> None:
-    bench.running().is_mute = True
-    bench.pass_ms(round(SILENT_S * 1e3) - 20)
-    assert bench.losses == 0, "the last Status came up to 20 ms before"
-    bench.pass_ms(100 - round(SILENT_S * 1e3) + 20)
-    assert bench.losses == 1
-    bench.pass_ms(5_000)
-    assert bench.losses == bench.connection.losses == 1
 
 
 def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(bench: Bench) -> None:

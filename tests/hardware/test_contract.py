@@ -37,7 +37,7 @@ from leaves import leaves
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from tormagd.config import Config, Device
-from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState
 from tormagd.hardware.backend import Backend, BackendError, choose
@@ -341,11 +341,6 @@ class Tap:
 
     def send(self, message: Message) -> None:
         self._line.send(self.now_s, message)
-
-
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(CONFIG)
 
 
 def a_device() -> VirtualDevice:

@@ -1,7 +1,6 @@
 """The conversation with the firmware: who it is, what it was asked, and positions without wrap-around."""
 
 import math
-from itertools import pairwise
 
 import pytest
 from hypothesis import given, strategies as st
@@ -13,7 +12,6 @@ from firmware_protocol.codec import (
     Clear,
     DeviceFault,
     DeviceMode,
-    Drive,
     DriveMode,
     Hello,
     Home,
@@ -168,12 +166,6 @@ def test_a_repetition_is_none_the_less_one_before_the_device_is_known(unmet: Dev
     assert (unmet.measurement, unmet.repeated) == (None, 1)
     unmet.receive(0.001, State(0.0, 0.0, 0.0, 6))
     assert unmet.measurement is not None
-
-
-def test_drive_counters_go_round(link: DeviceLink) -> None:
-    counters = [link.drive(0.1, -0.2, DriveMode.RUN).counter for _ in range(600)]
-    assert all((after - before) % 256 == 1 for before, after in pairwise(counters))
-    assert link.drive(0.1, -0.2, DriveMode.RUN) == Drive(0.1, -0.2, DriveMode.RUN, (counters[-1] + 1) % 256)
 
 
 # -- what it was asked ---------------------------------------------------------------------------------------------

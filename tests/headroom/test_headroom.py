@@ -11,7 +11,7 @@ import uvloop
 
 from firmware_protocol.build import Build
 from tormagd.config import Config, RealTime
-from tormagd.control.assembly.build import build_core
+from tormagd.control.assembly.build import Core
 from tormagd.ground import machine_loop
 from tormagd.headroom import __main__ as program, core_cost
 from tormagd.headroom.bare_timer import beat, lateness
@@ -39,8 +39,7 @@ def test_what_the_kernel_refuses_is_said() -> None:
     assert "realtime.cpus" in found.not_granted[0]
 
 
-def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again() -> None:
-    core = build_core(Config())
+def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again(core: Core) -> None:
     made: Any = core_cost.calls(Config(), core, 0.05)
     steps, plans = made
     assert (len(steps), len(plans)) == (50, 50)

@@ -2,7 +2,6 @@
 
 import datetime
 import math
-import subprocess
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -495,10 +494,3 @@ def test_a_scene_may_name_its_search() -> None:
     scene = load_scene(shipped_scenes()[0])
     choice = choose_solver(msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2)))
     assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)
-
-
-def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
-    loaded = "import sys, tormagd.control.core, tormagd.element.inverse.choice; print(*sys.modules)"
-    found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
-    assert "tormagd.element.inverse.newton" in found
-    assert not {"torch", "scipy", "sklearn", "matplotlib"} & set(found)

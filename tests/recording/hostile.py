@@ -5,7 +5,6 @@ import json
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import msgpack
 import zstandard
@@ -28,7 +27,7 @@ def written(fill: Callable[[Writer], None]) -> bytes:
     return file.getvalue()
 
 
-def messages(*data: bytes, topic: str = "/ticks", t_ns: int = 1, encoding: str = "json", **metadata: Any) -> bytes:
+def messages(*data: bytes, topic: str = "/ticks", t_ns: int = 1, encoding: str = "json", **metadata) -> bytes:
     def fill(writer: Writer) -> None:
         for name, known in metadata.items():
             writer.add_metadata({"header": "black_box", "about": "tormagd"}[name], known)
@@ -39,7 +38,7 @@ def messages(*data: bytes, topic: str = "/ticks", t_ns: int = 1, encoding: str =
     return written(fill)
 
 
-def record(*things: Any) -> bytes:
+def record(*things) -> bytes:
     builder = RecordBuilder()
     for thing in things:
         thing.write(builder)
@@ -50,7 +49,7 @@ def chunk(data: bytes, size: int) -> bytes:
     return MAGIC + record(Channel(1, "/ticks", "json", {}, 0), Chunk("zstd", data, 1, 1, 0, size))
 
 
-def ended(body: bytes, *summary: Any, at: int | None = None) -> bytes:
+def ended(body: bytes, *summary, at: int | None = None) -> bytes:
     data = MAGIC + body
     return data + record(*summary, Footer(len(data) if at is None else at, 0, 0)) + MAGIC
 

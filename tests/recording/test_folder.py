@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from mcap.writer import MCAP0_MAGIC
@@ -105,7 +104,7 @@ def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> N
     assert marked.exists()
 
 
-def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, monkeypatch) -> None:
     folder = RecordingFolder(tmp_path, BUDGET)
     for day in range(1, 7):
         (tmp_path / f"2026-11-0{day}T00-00-00.marked.mcap").write_bytes(bytes(100_000))

@@ -1,13 +1,9 @@
 """One core, and one flight that ended with a fault."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from flight import Flight, asked
 
 from tormagd.config import Config
@@ -20,11 +16,6 @@ from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
 
 Fly = Callable[..., Flight]
-
-
-@pytest.fixture(scope="session")
-def core() -> Core:
-    return build_core(Config())
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from tormagd.config import Config, Rates, load_config
@@ -15,7 +16,8 @@ from tormagd.element.model.features import FEATURES
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
 from tormagd.scenes.measured import OperatingPoint, measured
-from tormagd.scenes.scene import EVERY_TERM, Scene, Terms, load_scene, scene_path, shipped_scenes
+from tormagd.scenes.scene import EVERY_TERM, Scene, Signal, Terms, load_scene, scene_path, shipped_scenes
+from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
 BASE = {
@@ -270,3 +272,37 @@ def test_a_share_is_scaled_to_the_machine_and_to_the_plans_that_a_publisher_caus
     assert taken == pytest.approx([file.share(way).daemon for way in (few, many)])
     assert file.daemon_share(few, 2.0 * file.machine_us) == pytest.approx(2.0 * taken[0])
     assert file.daemon_share(OperatingPoint(500, 83, "thesis"), file.machine_us, 500.0) is None
+
+
+# -- the signal --------------------------------------------------------------------------------------------------------
+
+
+RANGE_N = (0.5, 2.0)
+
+
+def test_up_and_down_by_half_cosines_with_rests(tmp_path: Path) -> None:
+    time_s, force_N = asked(Signal(bandwidth_hz=0.5, hold_s=1.0), tmp_path, RANGE_N, 100.0, 100)
+    assert len(time_s) == len(force_N) == 400
+    assert force_N[[0, 50, 100, 150, 200, 250, 300, 399]] == pytest.approx([0.5, 1.25, 2.0, 2.0, 2.0, 1.25, 0.5, 0.5])
+    # pi f times the range is the steepest slope of such a cosine
+    assert np.abs(np.diff(force_N)).max() * 100 == pytest.approx(np.pi * 0.5 * 1.5, rel=1e-3)
+
+
+def test_steps_divide_the_range_evenly(tmp_path: Path) -> None:
+    _, force_N = asked(Signal(bandwidth_hz=5.0, step_N=0.4, hold_s=0.4), tmp_path, RANGE_N, 100.0, 100)
+    held_N = np.unique(np.round(force_N[1:][np.diff(force_N) == 0.0], 6))
+    assert (held_N, len(force_N)) == (pytest.approx([0.5, 0.875, 1.25, 1.625, 2.0]), 8 * 50)
+
+
+def test_a_long_hold_is_cut_where_nobody_looks_any_more(tmp_path: Path) -> None:
+    time_s, force_N = asked(Signal(bandwidth_hz=1.0, hold_s=86_400.0), tmp_path, RANGE_N, 30.0, 100)
+    assert (len(time_s), force_N[-1]) == (3_000, 2.0)
+
+
+def test_a_recording_is_smooth_between_its_rows_and_keeps_to_the_range(tmp_path: Path) -> None:
+    rows_s = np.arange(0.0, 2.001, 0.02)
+    lines = [f"{time + 7.0:.3f},{1.2 + 0.9 * np.sin(2.0 * np.pi * time):.6f}" for time in rows_s]
+    (tmp_path / "mine.csv").write_text("t_s,force_N\n" + "\n".join(lines) + "\n")
+    time_s, force_N = asked(Signal(file="mine.csv"), tmp_path, RANGE_N, 100.0, 500)
+    assert time_s[-1] == pytest.approx(2.0, abs=0.003)
+    assert force_N == pytest.approx(np.clip(1.2 + 0.9 * np.sin(2.0 * np.pi * time_s), *RANGE_N), abs=5e-4)

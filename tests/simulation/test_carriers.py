@@ -97,21 +97,6 @@ def test_handle_and_force_are_those_of_the_plant_in_sensor_steps() -> None:
     )
 
 
-def test_corrupt_and_foreign_payloads_are_counted_and_dropped() -> None:
-    device = MessageDevice(SAMPLE_1, SteadyHand())
-    drive = encode(Drive(0.5, 0.5, DriveMode.RUN, 1))
-    for function, payload in (
-        (FUNCTION[Drive], bytes((drive[0] ^ 1, *drive[1:]))),
-        (99, b"\x00"),
-        (FUNCTION[Drive], b""),
-        (FUNCTION[State], encode(State(0.0, 0.0, 0.0, 0))),
-    ):
-        device.receive(0.001, function, payload)
-    device.advance(0.01)
-    assert device.undecodable == 3
-    assert not device.outbox
-
-
 def test_a_flood_is_bounded_and_the_device_recovers() -> None:
     device = a_device()
     noise = random.Random(1)

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import can
 import pytest
@@ -47,7 +46,7 @@ STATUS = can_identifier(FUNCTION[Status])
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
-def descriptor(backend: Any) -> int:
+def descriptor(backend) -> int:
     return int(backend._fd)
 
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -359,7 +358,7 @@ def beats_N(time_s: float) -> float:
     return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
 
 
-def beaten(seconds: float, **keywords: Any) -> Governor:
+def beaten(seconds: float, **keywords) -> Governor:
     following = governor(**keywords)
     for tick in range(1, round(500 * seconds) + 1):
         decide(following, tick / 500, at(beats_N, tick / 500))
@@ -368,12 +367,12 @@ def beaten(seconds: float, **keywords: Any) -> Governor:
 
 
 @pytest.fixture(scope="module")
-def learned_once() -> Any:
+def learned_once():
     return plain(beaten(10.0))
 
 
 @pytest.fixture
-def learned(learned_once: Any) -> Governor:
+def learned(learned_once) -> Governor:
     following = governor()
     restore(following, learned_once, KNOWN)
     return following

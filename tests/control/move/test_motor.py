@@ -1,7 +1,6 @@
 """H(z) of motor and screw, and the stability margins, against scipy and against a bisection of their own."""
 
 import math
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -212,7 +211,7 @@ TOO_WEAK = r"coulomb_V = .* pull_V = .* to open the gap from .* allowed is"
         (Motor(supply_V=3.0, coulomb_V=1.4), TOO_WEAK),
     ],
 )
-def test_gains_that_would_oscillate_and_motors_too_weak_for_the_pull_give_no_core(section: Any, said: str) -> None:
+def test_gains_that_would_oscillate_and_motors_too_weak_for_the_pull_give_no_core(section, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         build_core(Config(**{type(section).__name__.lower(): section}))
 

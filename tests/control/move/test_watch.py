@@ -5,7 +5,7 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Config
-from tormagd.control.move.watch import SENSE_FAULT_S, SENSOR_FAULT_S, STARTING_S, STATUS_FAULT_S
+from tormagd.control.move.watch import SENSE_FAULT_S, STARTING_S, STATUS_FAULT_S
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.sight import UNSENSED_S
 from tormagd.hardware.link_quality import LinkQuality
@@ -16,21 +16,26 @@ TIMEOUT_S = CONFIG.device.measurement_timeout_ms * 1e-3
 
 
 @pytest.mark.parametrize("bit", DeviceFault)
-def test_a_fault_of_the_device_is_ours(running, bit: DeviceFault) -> None:
-    assert running.run_into(Fault(f"DEVICE_{bit.name}"), faults=bit, mode=DeviceMode.RETRACTING) == 1
+def test_a_fault_of_the_device_is_ours_while_disabled_too(running, make_bench, bit: DeviceFault) -> None:
+    for bench in (running, make_bench()):
+        assert bench.run_into(Fault(f"DEVICE_{bit.name}"), faults=bit, mode=DeviceMode.RETRACTING) == 1
 
 
-@pytest.mark.parametrize("bit", DeviceFault)
-def test_a_fault_of_the_device_is_ours_while_disabled_too(bench, bit: DeviceFault) -> None:
-    bench.step(faults=bit)
-    assert bench.faults == (Fault(f"DEVICE_{bit.name}"),)
-
-
-@pytest.mark.parametrize("mode", [DeviceMode.IDLE, DeviceMode.LATCHED, DeviceMode.HOMING, DeviceMode.RETRACTING])
-def test_a_device_that_stopped_running(running, mode: DeviceMode) -> None:
-    running.step(count=round(STARTING_S / PERIOD_S))
+@pytest.mark.parametrize(
+    ("fault", "borne", "wrong"),
+    [
+        *(
+            (Fault.DEVICE_NOT_RUNNING, {}, {"mode": mode})
+            for mode in (DeviceMode.IDLE, DeviceMode.LATCHED, DeviceMode.HOMING, DeviceMode.RETRACTING)
+        ),
+        # a slow line
+        (Fault.MEASUREMENT_STALE, {"delay_s": TIMEOUT_S - 1e-3}, {"delay_s": TIMEOUT_S + 1e-3}),
+    ],
+)
+def test_a_device_that_stopped_running_or_answers_late(running, fault: Fault, borne: dict, wrong: dict) -> None:
+    running.step(count=round(STARTING_S / PERIOD_S), **borne)
     assert not running.faults
-    assert running.run_into(Fault.DEVICE_NOT_RUNNING, mode=mode) == 1
+    assert running.run_into(fault, **wrong) == 1
 
 
 def test_a_device_may_take_a_moment_to_start(bench) -> None:
@@ -38,20 +43,6 @@ def test_a_device_may_take_a_moment_to_start(bench) -> None:
     bench.step(count=round(STARTING_S / PERIOD_S) - 1, mode=DeviceMode.IDLE)
     assert not bench.faults
     assert bench.run_into(Fault.DEVICE_NOT_RUNNING, mode=DeviceMode.IDLE) <= 3
-
-
-def test_a_stale_measurement(running) -> None:
-    newest = running.measure(running.ticks)
-    running.silent(newest, count=round(TIMEOUT_S / PERIOD_S) - 1)
-    assert not running.faults
-    running.silent(newest)
-    assert running.opened_for == (Fault.MEASUREMENT_STALE,)
-
-
-def test_a_measurement_over_a_slow_line(running) -> None:
-    running.step(count=5, delay_s=TIMEOUT_S - 1e-3)
-    assert not running.faults
-    assert running.run_into(Fault.MEASUREMENT_STALE, delay_s=TIMEOUT_S + 1e-3) == 1
 
 
 def test_a_sense_that_stops_is_a_limit_and_then_a_fault_where_the_scene_needs_it(running) -> None:
@@ -76,12 +67,6 @@ def test_a_status_that_stops_is_a_fault(running) -> None:
     running.step(count=round(STATUS_FAULT_S / PERIOD_S) - 1, reported_s=last_s)
     assert not running.faults
     assert running.run_into(Fault.STATUS_STALE, reported_s=last_s) == 1
-
-
-def test_a_sensor_that_stays_doubted_is_a_fault(running) -> None:
-    running.step(running.plan(80.0, sensor_doubted_s=SENSOR_FAULT_S))
-    assert not running.faults
-    assert running.run_into(Fault.SENSOR, running.plan(80.0, sensor_doubted_s=1.01 * SENSOR_FAULT_S)) == 1
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
