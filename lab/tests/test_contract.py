@@ -41,7 +41,7 @@ for name in sys.argv[1:]:
     except SystemExit as ended:
         assert ended.code == 0, name
 """
-LIGHT = ("characterise", "identify-motor", "optimise-design", "tune-position")
+LIGHT = ("identify-motor", "optimise-design", "tune-position")
 
 
 def without_heavy(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -79,7 +79,6 @@ FORCES, MOTOR, ROWS = (
 GOOD = ROWS + "".join(f"{0.02 * k},{k},{100 + k * k % 7},40,{1 + 0.1 * k}\n" for k in range(40))
 TRAIN = ("train-model", "--element", "torque", "--insert", "MRE-50-40", "--hidden", "5", "--epochs", "5")
 REFUSED: list[tuple[tuple[str, ...], str, str]] = [
-    (("characterise", "compression", "absent"), "", "absent: cannot be read: No such file"),
     (("optimise-design", "--region", "1", "1", "1", "1"), "", "most_N = 1"),
     (("optimise-design", "--region", "1", "1", "2", "2", "--dask", "no://one"), "", "--dask no://one: unknown address"),
     (("tune-position", "--config", "absent.toml"), "", "absent.toml"),
@@ -169,7 +168,6 @@ DESIGN, SWEEP = ("optimise-design", "--region", "1", "1", "2", "2"), ("bench-swe
         ),
         (("reproduce-thesis", "--gap-speed", "0"), "mm/s"),
         (("tactile-hold", "--seconds", "0"), "1..1e+06 s"),
-        (("characterise", "tension", "x", "--delimiter", "ab"), "';'"),
     ],
 )
 def test_an_option_outside_its_range_is_refused_before_anything_runs(arguments, allowed, capsys, tmp_path, monkeypatch):
@@ -186,7 +184,7 @@ def test_a_console_without_torch_has_the_light_commands():
 
 
 def test_the_law_and_a_fitted_grey_box_need_no_torch():
-    rooms = "characterisation.constitutive, tormag_lab.training.grey_box, tormag_lab.thesis.errata"
+    rooms = "training.grey_box, tormag_lab.thesis.errata"
     line = f"import sys, tormag_lab.{rooms}; assert not set({HEAVY!r}) & set(sys.modules)"
     subprocess.run([sys.executable, "-P", "-c", line], check=True, timeout=60)
 

@@ -49,7 +49,7 @@ def computed_log(tmp_path_factory):
     volts = (MASS * acceleration + VISCOUS * speed + COULOMB * np.sign(speed) + OFFSET) / GAIN
     sent = np.interp(t + DELAY_S, t, volts) + np.random.default_rng(0).normal(0.0, 0.05, len(t))
     rows = "\n".join(f"{a:.3f},{b:.6f},{c * 1e3:.6f}" for a, b, c in zip(t, sent, position, strict=True))
-    path.write_text(f"t_s,input_V,position_mm\n{rows}\n")
+    path.write_text(f"Bench;3\nt_s, input_V ,position_mm\n{rows}\n")
     return read_log(path)
 
 

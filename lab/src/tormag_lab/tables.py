@@ -22,7 +22,6 @@ def read_columns(
     names: tuple[str, ...],
     optional: tuple[str, ...] = (),
     *,
-    delimiter: str = ",",
     allowed: Mapping[str, tuple[float, float]] | None = None,
     is_exact: bool = False,
 ) -> dict[str, Array]:
@@ -30,7 +29,7 @@ def read_columns(
     try:
         require_regular(path, MAX_TABLE_BYTES)
         with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, delimiter=delimiter, strict=is_exact)
+            reader = csv.reader(file, strict=is_exact)
             try:
                 rows = ((reader.line_num, [cell.strip() for cell in row]) for row in reader)
                 return _columns(path, rows, names, optional, allowed or {}, is_exact)
