@@ -5,11 +5,9 @@ with newtons per second, and punishes a portrait larger than the task. Ours is c
 least volume of elastomer, then the smallest open gap, which may cost `SLACK` of coverage. The elastomer must bear the
 field of the closed gap (lambda1 >= 0.05).
 
-Both solvers are scipy's. "local" is SLSQP, like the thesis's fmincon, and ends in the minimum that the start leads to.
-"global" is differential evolution, with the start in its first generation, followed by COBYQA.
+The solver is scipy's differential evolution, with the start in its first generation, followed by COBYQA.
 """
 
-import itertools
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -18,7 +16,7 @@ from typing import Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
-from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differential_evolution, minimize
+from scipy.optimize import Bounds, NonlinearConstraint, differential_evolution, minimize
 
 from tormag_lab.arrays import Array
 from tormag_lab.design.brake import Brake
@@ -30,7 +28,6 @@ from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment
 
 Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
 "Coverage by the trapezoid or the true boundary, or the thesis's cost."
-Solver: TypeAlias = Literal["local", "global"]
 
 SLACK = 1e-4
 "Coverage that a smaller elastomer may cost."
@@ -101,11 +98,10 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class Run(msgspec.Struct, frozen=True):
-    """One start of one solver on one problem: all that its outcome depends on."""
+    """One start on one problem: all that its outcome depends on."""
 
     problem: Problem
     start: Design
-    solver: Solver
     seed: int = 1
 
 
@@ -114,16 +110,6 @@ def coverage(problem: Problem, design: Design) -> float:
     if problem.measure == "true":
         return portrait.true_coverage(problem.region)
     return portrait.trapezoid_coverage(problem.region)
-
-
-def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
-    """Return the least coverage where each dimension may be off by `share` of it."""
-    factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
-    made = [
-        Design(*(value * factor for value, factor in zip(msgspec.structs.astuple(design), each, strict=True)))
-        for each in factors
-    ]
-    return min(coverage(problem, each) if problem.load_margin(each) >= 0.0 else 0.0 for each in made)
 
 
 def corner_cost(problem: Problem, design: Design) -> float:
@@ -141,11 +127,11 @@ def corner_cost(problem: Problem, design: Design) -> float:
 def solve(run: Run) -> Outcome:
     began_s = time.thread_time()
     search = _Search(run.problem)
-    cost = search.corner_cost if run.problem.measure == "corners" else search.miss
     first = search.scaled(run.start)
-    best = search.global_minimum(cost, first, run.seed) if run.solver == "global" else search.local_minimum(cost, first)
-    if run.problem.measure != "corners" and run.solver == "global":
-        best = search.smallest(best, run.seed)
+    if run.problem.measure == "corners":
+        best = search.minimum(search.corner_cost, first, run.seed)
+    else:
+        best = search.smallest(search.minimum(search.miss, first, run.seed), run.seed)
     design = search.design(best)
     if run.problem.load_margin(design) < 0.0:
         raise DomainError("shear_modulus_Pa", run.problem.shear_modulus_Pa, "an elastomer that bears the closed gap")
@@ -187,9 +173,7 @@ class _Search:
         volume = self.problem.volume_mm3(self.design(x)) / self.problem.volume_mm3(self.problem.upper)
         return volume + _GAP_WEIGHT * float(x[2])
 
-    def global_minimum(
-        self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
-    ) -> Array:
+    def minimum(self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint) -> Array:
         """Return the point (3) of least `cost`, by differential evolution with `start` in it, then COBYQA."""
         limits = [*also, self._margin]
         result = differential_evolution(
@@ -206,33 +190,23 @@ class _Search:
         )
         return self._refine(cost, np.asarray(result.x), limits)
 
-    def local_minimum(self, cost: Callable[[Array], float], start: Array) -> Array:
-        """Return the minimum that SLSQP reaches from `start`, or `start` where that is as good."""
-        margin = {"type": "ineq", "fun": self._margin.fun}
-        result = minimize(cost, start, method="SLSQP", bounds=self._bounds, constraints=[margin])
-        return _better(cost, start, result)
-
     def smallest(self, best: Array, seed: int) -> Array:
         """Return the smallest design that covers as much as `best` less SLACK, or `best` itself."""
         allowed = self.miss(best) + SLACK
-        found = self.global_minimum(self.size, best, seed, NonlinearConstraint(self.miss, -np.inf, allowed))
+        found = self.minimum(self.size, best, seed, NonlinearConstraint(self.miss, -np.inf, allowed))
         return found if self.miss(found) <= allowed else best
 
     def _refine(self, cost: Callable[[Array], float], start: Array, limits: list[Any]) -> Array:
         options = {"initial_tr_radius": 0.05, "final_tr_radius": 1e-5, "maxfev": 100}
         result = minimize(cost, start, method="COBYQA", bounds=self._bounds, constraints=limits, options=options)
         is_kept = all(limit.lb <= limit.fun(result.x) <= limit.ub for limit in limits)
-        return _better(cost, start, result) if is_kept else start
+        return np.asarray(result.x) if is_kept and cost(result.x) < cost(start) else start
 
     def _at(self, function: Callable[[Problem, Design], float], x: Array, impossible: float) -> float:
         """Return a function of the design, or `impossible` where the elastomer would not bear the field."""
         self.evaluations += 1
         design = self.design(x)
         return function(self.problem, design) if self.problem.load_margin(design) >= 0.0 else impossible
-
-
-def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult) -> Array:
-    return np.asarray(result.x) if cost(result.x) < cost(start) else start
 
 
 def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
