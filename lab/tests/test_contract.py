@@ -101,14 +101,14 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
     (("twin", "given", "--prior", "sample_9"), "no recording", "sample_9"),
     (("twin", "given", "--plot", "x.mp3"), "no recording", "allowed is a name that ends with .png"),
     (("twin", *["given"] * 11), "no recording", "11 recordings: allowed are 10"),
-    (("identify-motor", "absent"), "", "absent: cannot be read"),
+    (("identify-motor", "absent"), "", "absent: No such file"),
     (("identify-motor", "given"), "t_s,input_V\n0,1\n", "position_mm"),
     (("identify-motor", "given", "--plot", "x.mp3"), MOTOR, "allowed is a name that ends with .png"),
     *(
         (("identify-motor", "given"), MOTOR + text, reason)
         for text, reason in (
             ("0,1,x\n", "row 2"),
-            ("".join(f"{k * 1e-3},0,nan\n" for k in range(200)), "finite"),
+            ("".join(f"{k * 1e-3},0,nan\n" for k in range(200)), "row 2 lacks one"),
             ("".join(f"{k * k * 1e-3},0,0\n" for k in range(200)), "steps by"),
             ("".join(f"{k * 0.1},0,0\n" for k in range(200)), "Hz"),
             ("".join(f"{k * 1e-3:.3f},0,5\n" for k in range(5000)), "moves too little"),
@@ -118,8 +118,8 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
     *(
         ((*TRAIN, data, "--out", "m.safetensors", *more), text, reason)
         for data, text, more, reason in (
-            ("given", ROWS + "0,0,nan,40,1\n", (), "row 2, field_mT: 'nan'"),
-            ("absent", "", (), "absent: cannot be read: No such file"),
+            ("given", ROWS + "0,0,nan,40,1\n", (), "row 2 lacks one"),
+            ("absent", "", (), "absent: No such file"),
             ("given", GOOD, ("--out", "absent/m.safetensors"), "cannot write"),
             ("given", GOOD, ("--out", "."), "cannot write .: allowed is a file"),
             ("given", GOOD, ("--hidden", "0"), "hidden = 0"),

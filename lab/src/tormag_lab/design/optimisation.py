@@ -1,4 +1,4 @@
-"""Structural optimisation (Eq. 39-42, table 3.2): outer radius, thickness and open gap for the portrait of a task.
+"""Find a brake for a task (Eq. 39-42, table 3.2): outer radius, thickness and open gap, from several starts.
 
 The thesis's cost (Eq. 39) adds the squared distances of the portrait's four corners from the task's. It mixes newtons
 with newtons per second, and punishes a portrait larger than the task. Ours is coverage of the required region, then the
@@ -8,7 +8,9 @@ field of the closed gap (lambda1 >= 0.05).
 The solver is scipy's differential evolution, with the start in its first generation, followed by COBYQA.
 """
 
+import argparse
 import math
+import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
@@ -18,10 +20,12 @@ import msgspec
 import numpy as np
 from scipy.optimize import Bounds, NonlinearConstraint, differential_evolution, minimize
 
-from tormag_lab.arrays import Array
+from tormag_lab.arrays import Array, Json
 from tormag_lab.design.brake import Brake
 from tormag_lab.design.phase_portrait import PhasePortrait, Region
-from tormag_lab.executors import finished
+from tormag_lab.executors import add_options as add_executors, chosen, finished
+from tormag_lab.main import GAP_SPEED, SEED, Found, whole
+from tormagd.config import Position
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import PowerFieldLaw
 from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
@@ -84,19 +88,6 @@ class Problem(msgspec.Struct, frozen=True):
         return math.pi * (design.outer_radius_mm**2 - self.inner_radius_mm**2) * design.thickness_mm
 
 
-class Outcome(msgspec.Struct, frozen=True):
-    """A design that a solver found. `coverage` is by the true boundary where that was the measure, else by the
-    trapezoid."""
-
-    design: Design
-    coverage: float
-    corner_cost: float
-    volume_mm3: float
-    evaluations: int
-    seconds: float
-    """Processor time of the solving thread."""
-
-
 class Run(msgspec.Struct, frozen=True):
     """One start on one problem: all that its outcome depends on."""
 
@@ -124,7 +115,8 @@ def corner_cost(problem: Problem, design: Design) -> float:
     )
 
 
-def solve(run: Run) -> Outcome:
+def solve(run: Run) -> Json:
+    """Return the best design. `coverage` is by the true boundary where that was the measure, else by the trapezoid."""
     began_s = time.thread_time()
     search = _Search(run.problem)
     first = search.scaled(run.start)
@@ -135,14 +127,14 @@ def solve(run: Run) -> Outcome:
     design = search.design(best)
     if run.problem.load_margin(design) < 0.0:
         raise DomainError("shear_modulus_Pa", run.problem.shear_modulus_Pa, "an elastomer that bears the closed gap")
-    return Outcome(
-        design=design,
-        coverage=coverage(run.problem, design),
-        corner_cost=corner_cost(run.problem, design),
-        volume_mm3=run.problem.volume_mm3(design),
-        evaluations=search.evaluations,
-        seconds=time.thread_time() - began_s,
-    )
+    return {
+        "design": design,
+        "coverage": coverage(run.problem, design),
+        "corner_cost": corner_cost(run.problem, design),
+        "volume_mm3": run.problem.volume_mm3(design),
+        "evaluations": search.evaluations,
+        "seconds": time.thread_time() - began_s,  # of this thread's processor time
+    }
 
 
 class _Search:
@@ -209,7 +201,44 @@ class _Search:
         return function(self.problem, design) if self.problem.load_margin(design) >= 0.0 else impossible
 
 
-def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
+def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Json]:
     wanted = list(dict.fromkeys(runs))
     outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}
     return {run: outcomes[run] for run in wanted}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--region",
+        required=True,
+        type=float,
+        nargs=4,
+        metavar=("MIN_N", "MIN_RATE", "MAX_N", "MAX_RATE"),
+        help="required forces, N, and rates, N/s",
+    )
+    parser.add_argument("--measure", choices=("true", "trapezoid", "corners"), default="true")
+    parser.add_argument(
+        "--gap-speed",
+        type=GAP_SPEED,
+        default=Position().gap_speed_mm_s,
+        help="mm/s (what the controller was measured at)",
+    )
+    parser.add_argument("--starts", type=whole(1, 10_000), default=5, help="random ones")
+    parser.add_argument("--seed", type=SEED, default=1)
+    add_executors(parser, os.cpu_count() or 1, needed="tormagd[lab]")
+
+
+def run(options: argparse.Namespace) -> Found:
+    with chosen(options) as executor:
+        outcomes = sweep(_runs(options), executor)
+    by_cost = options.measure == "corners"
+    rows = [msgspec.to_builtins(outcome) for outcome in outcomes.values()]
+    rows.sort(key=lambda row: (row["corner_cost"] if by_cost else -row["coverage"], row["volume_mm3"]))
+    return Found({"outcomes": rows})
+
+
+def _runs(options: argparse.Namespace) -> list[Run]:
+    problem = Problem(Region(*options.region), options.measure, options.gap_speed)
+    low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
+    drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))
+    return [Run(problem, Design(*start), options.seed) for start in drawn.tolist()]

@@ -13,7 +13,7 @@ import numpy as np
 
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
-from tormag_lab.design.optimisation import Design, Outcome, Problem, Run, coverage, sweep
+from tormag_lab.design.optimisation import Design, Problem, Run, coverage, sweep
 from tormag_lab.design.phase_portrait import PhasePortrait
 from tormag_lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
 from tormag_lab.human_pulse import pulse_profile
@@ -49,14 +49,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gap-speed", type=GAP_SPEED, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=WORKERS, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=SEED, default=1)
-    parser.add_argument("--quick", action="store_true", help="one start, few rows and epochs: shows only that it runs")
 
 
 def run(options: argparse.Namespace) -> Found:
     with ProcessPoolExecutor(options.workers) as pool:
-        learned = pool.submit(chapter_4, options.quick)
+        learned = pool.submit(chapter_4)
         steps = [pool.submit(step_test, insert(name), options.seed) for name in STEP_INSERTS]
-        runs = table_3_2_runs(options.gap_speed, options.seed, starts=1 if options.quick else None)
+        runs = table_3_2_runs(options.gap_speed, options.seed)
         outcomes = sweep(runs.values(), pool)
         tests = [step.result() for step in steps]
         told = learned.result()
@@ -80,11 +79,10 @@ def run(options: argparse.Namespace) -> Found:
     return Found(result, page.sections(result))
 
 
-def chapter_4(is_quick: bool) -> Json:
-    from tormag_lab.tactile.experiment import contract
-    from tormag_lab.tactile.models import FULL, QUICK
+def chapter_4() -> Json:
+    from tormag_lab.tactile.experiment import FULL, contract
 
-    found, *_ = contract(QUICK if is_quick else FULL)
+    found, *_ = contract(FULL)
     return found
 
 
@@ -288,13 +286,13 @@ RunKey = tuple[int, int, str]
 """Use case, start, objective."""
 
 
-def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
-    runs = {}
-    for number, case in USE_CASES.items():
-        for objective, problem in _problems(number, gap_speed_mm_s).items():
-            for index, line in enumerate(case.starts[:starts], start=1):
-                runs[number, index, objective] = Run(problem, line.start, seed)
-    return runs
+def table_3_2_runs(gap_speed_mm_s: float, seed: int) -> dict[RunKey, Run]:
+    return {
+        (number, index, objective): Run(problem, line.start, seed)
+        for number, case in USE_CASES.items()
+        for objective, problem in _problems(number, gap_speed_mm_s).items()
+        for index, line in enumerate(case.starts, start=1)
+    }
 
 
 def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
@@ -307,22 +305,19 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
     }
 
 
-def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
+def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Json], gap_speed_mm_s: float) -> Json:
     """Return the optima by each measure and by the thesis's cost, beside the thesis's designs."""
-    rows: list[Json] = []
-    for (use_case, start, objective), run in runs.items():
-        outcome = outcomes[run]
-        row = {
+    rows: list[Json] = [
+        {
             "use_case": use_case,
             "start": start,
             "objective": objective,
-            "design": _design(outcome.design),
-            "coverage": outcome.coverage,
-            "corner_cost": outcome.corner_cost,
-            "volume_cm3": 1e-3 * outcome.volume_mm3,
-            "seconds": outcome.seconds,
+            "design": _design(outcomes[run]["design"]),
+            "volume_cm3": 1e-3 * outcomes[run]["volume_mm3"],
+            **{name: outcomes[run][name] for name in ("coverage", "corner_cost", "seconds")},
         }
-        rows.append(row)
+        for (use_case, start, objective), run in runs.items()
+    ]
     starts = [row for row in rows if row["objective"] != "corners"]
     designs = []
     for number, case in USE_CASES.items():
