@@ -80,7 +80,8 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def chapter_4() -> Json:
-    from tormag_lab.tactile.experiment import FULL, contract
+    from tormag_lab.tactile.experiment import contract
+    from tormag_lab.tactile.models import FULL
 
     found, *_ = contract(FULL)
     return found

@@ -65,9 +65,7 @@ def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float
 
 
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Json:
-    """Judge an insert for a task, with a gap that moves in steps of `gap_resolution_mm`: what it reaches, its largest
-    force change of one step there, and why it does not serve.
-    """
+    """Return what an insert reaches of a task with a gap that moves in such steps, and why it does not serve."""
     least, most, width_N = brake.least_N, brake.most_N, task.most_N - task.least_N
     low, high = max(least, task.least_N), min(most, task.most_N)
     if low >= high:
