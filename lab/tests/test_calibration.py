@@ -60,7 +60,7 @@ def table(sweeps, tmp_path):
 
 
 def rows(table):
-    return training_rows(table, insert(INSERT), 4.0)
+    return training_rows(table, insert(INSERT))
 
 
 def column(name):
@@ -191,9 +191,9 @@ def test_displacement_is_what_the_daemon_calls_it():
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("a,b\n1,2\n", "header"),
+        ("a,b\n1,2\n", "no column is time_s"),
         (",".join(SWEEP_COLUMNS) + "\n1,2,3,4,5,x\n", "x"),
-        (",".join(SWEEP_COLUMNS) + "\n1,2,3,4,5,nan\n1,2,3,4,5,6\n", "only numbers -1000 to 1000"),
+        (",".join(SWEEP_COLUMNS) + "\n1,2,3,4,5,1e6\n1,2,3,4,5,6\n", "only numbers -1000 to 1000"),
     ],
 )
 def test_a_sweep_file_that_is_none_says_why(tmp_path, text, told):

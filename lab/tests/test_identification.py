@@ -11,7 +11,7 @@ from devices import drawn_device
 
 from tormag_lab.errors import LabError
 from tormag_lab.main import main
-from tormag_lab.motor import command, fit, identification
+from tormag_lab.motor import command, fit
 from tormag_lab.motor.log import Log, read_log
 from tormag_lab.twin.command import figures_of
 from tormag_lab.twin.estimate import keys_of, value_at
@@ -49,12 +49,12 @@ def computed_log(tmp_path_factory):
     volts = (MASS * acceleration + VISCOUS * speed + COULOMB * np.sign(speed) + OFFSET) / GAIN
     sent = np.interp(t + DELAY_S, t, volts) + np.random.default_rng(0).normal(0.0, 0.05, len(t))
     rows = "\n".join(f"{a:.3f},{b:.6f},{c * 1e3:.6f}" for a, b, c in zip(t, sent, position, strict=True))
-    path.write_text(f"t_s,input_V,position_mm\n{rows}\n")
+    path.write_text(f"Bench;3\nt_s, input_V ,position_mm\n{rows}\n")
     return read_log(path)
 
 
 def test_known_parameters_are_found(computed_log):
-    result = identification.identify(computed_log, GAIN)
+    result = command.identify(computed_log, GAIN)
     truth = {"mass_kg": MASS, "viscous_N_s_m": VISCOUS, "coulomb_N": COULOMB, "offset_N": OFFSET, "delay_s": DELAY_S}
     for name, value in truth.items():
         found = result["parameters"][name]
@@ -65,7 +65,7 @@ def test_known_parameters_are_found(computed_log):
 
 
 def test_without_a_gain_only_ratios(computed_log):
-    result = identification.identify(computed_log, None)
+    result = command.identify(computed_log, None)
     assert (result["parameters"]["mass_kg"], result["ratios_to_gain"]["mass_V_s2_m"]["value"]) == (
         None,
         pytest.approx(MASS / GAIN, rel=0.03),
@@ -88,8 +88,8 @@ def test_emps_is_within_the_published_values_and_drawn(recordings, capsys, tmp_p
 
 def compare(log: Log) -> dict:
     true = truth(load_plant("sample_3"), "left", 2e3 * log.position_m[fit.motion(log).sign != 0.0])
-    result = identification.identify(log, None if log.current_A is not None else true["gain_N_V"])
-    identified = {**(result["motor"] or {}), **result["parameters"], "time_constant_s": result["time_constant_s"]}
+    result = command.identify(log, None if log.current_A is not None else true["gain_N_V"])
+    identified = {**(result["motor"] or {}), **result["parameters"]}
     return {
         name: {**found, "true": true[name], "inside": abs(found["value"] - true[name]) <= found["ci95"]}
         for name, found in identified.items()
@@ -162,7 +162,6 @@ def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, fl
         "coulomb_N": float((opening - closing).mean()) / 2.0,
         "offset_N": float((opening + closing).mean()) / 2.0,
         "delay_s": 1.5 * 1e-3 - 0.5e-6 * plant.firmware.reply_jitter_us,
-        "time_constant_s": mass * motor.resistance_Ohm / k**2,
     }
 
 
@@ -180,11 +179,11 @@ def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log
     assert found["back_emf_V_s_m"]["ci95"] < 0.01 * found["back_emf_V_s_m"]["true"]
     for name, share in (("mass_kg", 0.15), ("gear_efficiency", 0.15), ("coulomb_N", 0.3), ("gain_N_V", 0.15)):
         assert found[name]["ci95"] < share * found[name]["true"]
-    assert set(without_current) == {*identification.PARAMETERS, "delay_s", "time_constant_s"}
+    assert set(without_current) == {*command.PARAMETERS, "delay_s"}
 
 
 def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
-    result = identification.identify(sample_log, None)
+    result = command.identify(sample_log, None)
     path = tmp_path / "motor.toml"
     command.write_config(path, result, Config())
     written, true = load_config(path).motor, load_plant("sample_3")

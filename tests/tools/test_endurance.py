@@ -38,7 +38,7 @@ def test_cases_in_real_time_hold_on_one_stand_one_after_the_other() -> None:
     [
         (["nobody"], "invalid choice: 'nobody'"),
         (["endure", "nobody"], "invalid choice: 'nobody'"),
-        (["endure", "fuzz", "--count", "0"], "0: allowed is at least 1"),
+        (["endure", "fuzz", "--count", "0"], "'0': allowed is a whole number 1.."),
     ],
 )
 def test_a_wrong_command_line_is_refused(wrong: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:

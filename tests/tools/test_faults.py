@@ -102,15 +102,12 @@ def within_N_s(item: Injection) -> float:
 )
 def test_a_fault_is_named_and_ends_safe_and_not_at_once(item: Injection, bus: str) -> None:
     _, cell = faults.inject(item, fastest_plant(item), bus, SAMPLED_S)
-    assert (cell.bus, cell.fault) == (bus, item.name)
-    assert cell.named, cell
-    assert cell.safe, cell
-    assert cell.in_time, cell
-    assert cell.loss_N_s <= within_N_s(item)
-    if cell.expected == OPENS:
-        assert cell.open_ms is not None
-        assert cell.below_1N_ms is not None
-        assert cell.below_1N_ms < 1_000.0
+    assert (cell["bus"], cell["fault"]) == (bus, item.name)
+    assert [verdict for verdict in ("named", "safe", "in_time") if not cell[verdict]] == [], cell
+    assert cell["loss_N_s"] <= within_N_s(item)
+    if cell["expected"] == OPENS:
+        assert cell["open_ms"] is not None
+        assert cell["below_1N_ms"] < 1_000.0
 
 
 @pytest.mark.parametrize("item", [NAMED[name] for name in LOSING], ids=lambda item: item.name)
@@ -120,15 +117,15 @@ def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection) -> None:
         watch.see(sample)
         if rig.loop.simulated.truth.gap_mm > OPEN_MM:
             break
-    assert watch.cell(item, item.buses[0]).loss_N_s <= within_N_s(item)
+    assert watch.cell(item, item.buses[0])["loss_N_s"] <= within_N_s(item)
 
 
 def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None:
     stuck = NAMED["left encoder stuck"]._replace(names=("SENSOR",), within_ms=10.0)
     _, unnamed = faults.inject(stuck, "sample_1", watched_s=JUDGED_S)
-    assert (unnamed.named, unnamed.safe, unnamed.in_time) == (False, True, False)
+    assert (unnamed["named"], unnamed["safe"], unnamed["in_time"]) == (False, True, False)
     _, unsafe = faults.inject(NAMED["motor supply fails"]._replace(safe=OPENS), "sample_1", watched_s=JUDGED_S)
-    assert (unsafe.named, unsafe.safe) == (True, False)
+    assert (unsafe["named"], unsafe["safe"]) == (True, False)
 
 
 RECOVERED = (
@@ -145,14 +142,14 @@ def test_what_leads_out_of_a_fault_does_so_when_its_cause_has_gone(
     name: str, tried: str, recovery: tuple[str, ...]
 ) -> None:
     cell = faults.recover(NAMED[name], *faults.inject(NAMED[name], "sample_1", watched_s=SAMPLED_S))
-    assert (cell.tried, cell.recovery, cell.recovered) == (tried, recovery, True)
+    assert (cell["tried"], cell["recovery"], cell["recovered"]) == (tried, recovery, True)
 
 
 def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.MonkeyPatch) -> None:
     hot = NAMED["device too hot"]
     rig, cell = faults.inject(hot, "sample_1", watched_s=JUDGED_S)
     monkeypatch.setattr(rig, "mend", lambda: None)
-    assert not faults.recover(hot, rig, cell).recovered
+    assert not faults.recover(hot, rig, cell)["recovered"]
 
 
 def test_names_are_codes_and_faults_stand_once() -> None:

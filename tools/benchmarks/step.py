@@ -8,7 +8,7 @@ import argparse
 import gc
 import math
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -36,15 +36,6 @@ SETTLING_BAND = 0.05
 TICK_S = 1e-3
 
 
-class Step(NamedTuple):
-    rise_s: float
-    overshoot: float
-    settling_5pct_s: float
-    steady_error_um: float
-    true_error_um: float
-    skew_um: float
-
-
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     config, parameters = Config(), load_plant(options.plant)
     gc.collect()
@@ -60,9 +51,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     nominal = margins(config.motor, config.position, TICK_S)
     return {
         "plant": options.plant,
-        **{name: max(getattr(found, name) for found in steps) for name in Step._fields},
+        **{name: max(found[name] for found in steps) for name in steps[0]},
         "overshoot_over_stroke": over_stroke,
-        "rise_over_time_optimal": max(found.rise_s / s for found, s in zip(steps, fastest_s, strict=True)),
+        "rise_over_time_optimal": max(found["rise_s"] / s for found, s in zip(steps, fastest_s, strict=True)),
         "stroke_ratio": stroke_s / time_optimal(parameters, STROKE_MM[0], STROKE_MM[1] - STROKE_MM[0])[1],
         "gain_margin_dB": nominal.gain_margin_dB,
         "phase_margin_deg": nominal.phase_margin_deg,
@@ -81,7 +72,7 @@ def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
     return loop
 
 
-def step(loop: ClosedLoop, target_mm: float) -> Step:
+def step(loop: ClosedLoop, target_mm: float) -> dict[str, float]:
     before = loop.stepper.measured
     if before is None:
         raise RuntimeError("the loop has no measurement")
@@ -92,14 +83,14 @@ def step(loop: ClosedLoop, target_mm: float) -> Step:
     gap = np.array([estimate.gap_mm for estimate in estimates])
     share = (gap - start_mm) / (target_mm - start_mm)
     outside = np.flatnonzero(np.abs(share - 1.0) > SETTLING_BAND)
-    return Step(
-        rise_s=_rise(time_s, share),
-        overshoot=max(0.0, float(share.max()) - 1.0),
-        settling_5pct_s=float(time_s[outside[-1]]) if outside.size else 0.0,
-        steady_error_um=abs(float(gap[-1]) - target_mm) * 1e3,
-        true_error_um=abs(samples[-1].truth.gap_mm - target_mm) * 1e3,
-        skew_um=max(abs(estimate.skew_mm) for estimate in estimates) * 1e3,
-    )
+    return {
+        "rise_s": _rise(time_s, share),
+        "overshoot": max(0.0, float(share.max()) - 1.0),
+        "settling_5pct_s": float(time_s[outside[-1]]) if outside.size else 0.0,
+        "steady_error_um": abs(float(gap[-1]) - target_mm) * 1e3,
+        "true_error_um": abs(samples[-1].truth.gap_mm - target_mm) * 1e3,
+        "skew_um": max(abs(estimate.skew_mm) for estimate in estimates) * 1e3,
+    }
 
 
 def stroke(loop: ClosedLoop) -> float:
@@ -115,7 +106,7 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
     for gap_mm, target_mm in [(gap_mm, gap_mm + way) for gap_mm in STROKE_GAPS_MM for way in (STEP_MM, -STEP_MM)]:
         if target_mm >= STROKE_GAPS_MM[0]:
             drive(loop, gap_mm, 0.8)
-            worst = max(worst, step(loop, target_mm).overshoot)
+            worst = max(worst, step(loop, target_mm)["overshoot"])
     return worst
 
 

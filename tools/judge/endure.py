@@ -24,8 +24,8 @@ from mcap.reader import make_reader
 from tqdm import tqdm
 
 from judge import fuzz, siege
-from judge.frame import count as at_least_one
 from judge.stand import FIFO_PRIORITY, PATIENCE_S, Figures, Stand, is_at_rest, used
+from tormag_lab.main import whole
 from tormagd.record.writer import TICKS_TOPIC
 from tormagd_client import Client
 
@@ -263,7 +263,7 @@ CASES = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     counts = ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items())
     parser.add_argument("case", choices=CASES)
-    parser.add_argument("--count", type=at_least_one, help=f"default: {counts}")
+    parser.add_argument("--count", type=whole(1, 10**9), help=f"default: {counts}")
     parser.add_argument("--seed", type=int, default=1, help="of what is drawn (1)")
 
 

@@ -69,17 +69,6 @@ class Case(NamedTuple):
     rate_mm_s: float | None = None
 
 
-class Figures(NamedTuple):
-    over_N: float
-    under_N: float
-    peak_N: float
-    settled: tuple[tuple[float, float, float], ...]
-    slow_N: tuple[float, ...]
-    steps_N: tuple[float, float, float] | None
-    faults: tuple[str, ...]
-    limits: dict[str, float]
-
-
 def cases() -> Iterator[Case]:
     for name in judging(DRAWS):
         for hand in HANDS:
@@ -91,7 +80,7 @@ def cases() -> Iterator[Case]:
                 yield Case(name, hand, "1 N", *said)
 
 
-def run(case: Case) -> Figures:
+def run(case: Case) -> Json:
     plant, legs, levels = device(case.device), HANDS[case.hand](), FORCES[case.forces]
     loop, force_N = armed_at_rest(plant, legs), asked_at(levels)
     start_s = loop.now_s
@@ -104,9 +93,9 @@ def run(case: Case) -> Figures:
 
     lasts_s = min(sum(lasts for lasts, _ in levels), sum(lasts for lasts, _ in legs))
     followed = follow(loop, publish, lasts_s, start_s)
-    found = judged(followed, brake_of(plant).open_N)
     is_of_steps = (case.hand, case.forces) == ("42 mm/s", "steps")
-    return found._replace(steps_N=step_figures(followed)) if is_of_steps else found
+    steps_N = step_figures(followed) if is_of_steps else None
+    return judged(followed, brake_of(plant).open_N) | {"steps_N": steps_N}
 
 
 def step_figures(found: Followed) -> tuple[float, float, float] | None:
@@ -118,7 +107,7 @@ def step_figures(found: Followed) -> tuple[float, float, float] | None:
     return first, again, float(along_N[begins[0] : begins[0] + 3000].max() - 2.0)
 
 
-def judged(found: Followed, open_N: Callable[[float], float]) -> Figures:
+def judged(found: Followed, open_N: Callable[[float], float]) -> Json:
     asked_N, speed_mm_s = found.asked_N, found.handle_mm_s
     floor_N = np.array([open_N(speed) for speed in np.abs(speed_mm_s).round(1).tolist()])
     error_N = found.along_N - np.maximum(asked_N, floor_N)
@@ -133,16 +122,15 @@ def judged(found: Followed, open_N: Callable[[float], float]) -> Figures:
     steady = np.flatnonzero(slides & is_reached & (waited_s > SETTLED_S) & (even_s > SETTLED_S))[::100]
     points = np.abs(speed_mm_s[steady]).tolist(), asked_N[steady].tolist(), error_N[steady].tolist()
     settled = list(zip(*points, strict=True))
-    return Figures(
-        over_N=lasting_N(np.where(arrived, error_N, -np.inf)),
-        under_N=lasting_N(np.where(arrived & is_reached, -error_N, -np.inf)),
-        peak_N=float(np.abs(found.rendered_N[np.abs(speed_mm_s) > SLIDING_MM_S]).max(initial=0.0)),
-        settled=tuple(point for point in settled if point[0] >= SLOWEST_MM_S),
-        slow_N=tuple(error for speed, _, error in settled if speed < SLOWEST_MM_S),
-        steps_N=None,
-        faults=found.faults,
-        limits=found.limits,
-    )
+    return {
+        "over_N": lasting_N(np.where(arrived, error_N, -np.inf)),
+        "under_N": lasting_N(np.where(arrived & is_reached, -error_N, -np.inf)),
+        "peak_N": float(np.abs(found.rendered_N[np.abs(speed_mm_s) > SLIDING_MM_S]).max(initial=0.0)),
+        "settled": tuple(point for point in settled if point[0] >= SLOWEST_MM_S),
+        "slow_N": tuple(error for speed, _, error in settled if speed < SLOWEST_MM_S),
+        "faults": found.faults,
+        "limits": found.limits,
+    }
 
 
 def lasting_N(excess_N: Array) -> float:
@@ -189,16 +177,16 @@ def measure(options: argparse.Namespace) -> Json:
     faults = [(*hold, wrong) for hold, wrong in zip(holds, low, strict=True)]
     second = [(case, figures) for case, figures in every if case.device == SECOND]
     found = [(case, figures) for case, figures in every if case.device != SECOND]
-    stepped = [figures.steps_N for case, figures in found if figures.steps_N and case.device.startswith("draw")]
+    stepped = [of["steps_N"] for case, of in found if of["steps_N"] and case.device.startswith("draw")]
     first, again, overshoot = (np.array(part) for part in zip(*stepped, strict=True))
     result: Json = {
         **worst(found),
-        "over_sample_1_N": max(figures.over_N for case, figures in found if case.device == "sample_1"),
+        "over_sample_1_N": max(of["over_N"] for case, of in found if case.device == "sample_1"),
         "low_hold_faults": sum(bool(wrong) for *_, wrong in faults),
         "step_error_at_1s_N": {"median": float(np.median(np.abs(first))), "worst": float(np.abs(first).max())},
         "step_again_N": float(np.abs(again).max()),
         "overshoot_N": float(overshoot.max()),
-        "slow_error_N": max(abs(error) for case, figures in found if case.hand == "1 mm/s" for error in figures.slow_N),
+        "slow_error_N": max(abs(error) for case, of in found if case.hand == "1 mm/s" for error in of["slow_N"]),
         "cases": len(every) + len(holds),
         "second": {name: figure for name, figure in worst(second).items() if name != "peak_N"},
         "low_holds": [f"{name} at {force} N: {', '.join(wrong)}" for name, force, wrong in faults if wrong],
@@ -211,32 +199,32 @@ def measure(options: argparse.Namespace) -> Json:
     return result | {"passed": not (result["missed"] or result["faults"])}
 
 
-def worst(found: list[tuple[Case, Figures]]) -> Json:
+def worst(found: list[tuple[Case, Json]]) -> Json:
     return {
-        "over_N": max(figures.over_N for _, figures in found),
-        "under_N": max(figures.under_N for _, figures in found),
-        "peak_N": max(figures.peak_N for _, figures in found),
+        **{name: max(of[name] for _, of in found) for name in ("over_N", "under_N", "peak_N")},
         "settled_N": max(abs(error) for _, _, error in settled(found)),
         "faults": [
-            f"{case.device}, {case.hand}, {case.forces}: {', '.join(f.faults)}" for case, f in found if f.faults
+            f"{case.device}, {case.hand}, {case.forces}: {', '.join(of['faults'])}"
+            for case, of in found
+            if of["faults"]
         ],
     }
 
 
-def settled(found: list[tuple[Case, Figures]]) -> list[tuple[float, float, float]]:
-    as_it_is = [figures for case, figures in found if case.displacement_mm is None and case.rate_mm_s is None]
-    return [point for figures in as_it_is for point in figures.settled]
+def settled(found: list[tuple[Case, Json]]) -> list[tuple[float, float, float]]:
+    as_it_is = [of for case, of in found if case.displacement_mm is None and case.rate_mm_s is None]
+    return [point for of in as_it_is for point in of["settled"]]
 
 
 def missed(result: Json) -> list[str]:
     return [f"{name} = {result[name]:.3f}: allowed is {most}" for name, most in BOUNDS.items() if result[name] > most]
 
 
-def row(case: Case, figures: Figures) -> Json:
-    return case._asdict() | {name: getattr(figures, name) for name in ("over_N", "under_N", "peak_N", "limits")}
+def row(case: Case, of: Json) -> Json:
+    return case._asdict() | {name: of[name] for name in ("over_N", "under_N", "peak_N", "limits")}
 
 
-def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None:
+def picture(path: Path, result: Json, found: list[tuple[Case, Json]]) -> None:
     figure, (own, others) = subplots((11.0, 5.0), 1, 2, sharex=True, sharey=True)
     for axes, title, is_own in ((own, "sample 1", True), (others, "samples 2, 3 and draws", False)):
         points = settled([(case, figures) for case, figures in found if (case.device == "sample_1") is is_own])

@@ -12,7 +12,6 @@ the fault be named all the while. Afterwards the force must be followed again.
 
 import argparse
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from tqdm import tqdm
 
@@ -41,30 +40,8 @@ MAX_CLOSED_MM = 3.0
 REFUSED_MS = 100.0
 
 
-class Cell(NamedTuple):
-    """One row of the matrix. A time is null if it did not come to that within 6 s."""
-
-    bus: str
-    fault: str
-    host_faults: tuple[str, ...]
-    device_faults: tuple[str, ...]
-    limits: tuple[str, ...]
-    reaction: str
-    noticed_ms: float | None
-    below_1N_ms: float | None
-    open_ms: float | None
-    loss_N_s: float
-    expected: str
-    named: bool
-    safe: bool
-    seconds: float | None
-    must_be_named: tuple[str, ...]
-    stated_ms: float | None
-    reacted_ms: float | None
-    in_time: bool
-    tried: str = ""
-    recovery: tuple[str, ...] = ()
-    recovered: bool = False
+Cell = Json
+"One row of the matrix. A time is null if it did not come to that within 6 s."
 
 
 class Watch:
@@ -123,26 +100,26 @@ class Watch:
         noticed_ms = self._since("noticed")
         is_safe, safe_ms = self._ended(injection.safe, noticed_ms)
         stated_ms, reacted_ms = self._stated_ms(injection), self._reacted_ms(injection)
-        return Cell(
-            bus,
-            injection.name,
-            tuple(self._host),
-            tuple(self._device),
-            (*self._limits, *([self._refusal] if self._refusal else [])),
-            f"daemon {state}, device {mode}",
-            noticed_ms,
-            self._since("below"),
-            self._since("open"),
-            round(max(self._loss_N_s(), 0.0), 2),
-            injection.safe,
-            self._is_named(injection.names),
-            is_safe,
-            None if safe_ms is None else round(safe_ms * 1e-3, 4),
-            injection.names,
-            stated_ms,
-            reacted_ms,
-            stated_ms is None or (reacted_ms is not None and reacted_ms <= stated_ms),
-        )
+        return {
+            "bus": bus,
+            "fault": injection.name,
+            "host_faults": tuple(self._host),
+            "device_faults": tuple(self._device),
+            "limits": (*self._limits, *filter(None, [self._refusal])),
+            "reaction": f"daemon {state}, device {mode}",
+            "noticed_ms": noticed_ms,
+            "below_1N_ms": self._since("below"),
+            "open_ms": self._since("open"),
+            "loss_N_s": round(max(self._loss_N_s(), 0.0), 2),
+            "expected": injection.safe,
+            "named": self._is_named(injection.names),
+            "safe": is_safe,
+            "seconds": None if safe_ms is None else round(safe_ms * 1e-3, 4),
+            "must_be_named": injection.names,
+            "stated_ms": stated_ms,
+            "reacted_ms": reacted_ms,
+            "in_time": stated_ms is None or (reacted_ms is not None and reacted_ms <= stated_ms),
+        }
 
     def _stated_ms(self, injection: Injection) -> float | None:
         """Return when the reaction must have begun, by the table of the code that was told."""
@@ -229,8 +206,8 @@ def measure(options: argparse.Namespace) -> Json:
     steps = tqdm(todo, desc="faults", unit="fault", disable=None)
     boot = FIRMWARES[options.firmware]
     cells = [recover(injection, *inject(injection, options.plant, bus, boot=boot)) for injection, bus in steps]
-    passed = all(cell.named and cell.safe and cell.in_time and cell.recovered for cell in cells)
-    return {"plant": options.plant, "cells": [cell._asdict() for cell in cells], "passed": passed}
+    passed = all(cell[verdict] for cell in cells for verdict in ("named", "safe", "in_time", "recovered"))
+    return {"plant": options.plant, "cells": cells, "passed": passed}
 
 
 def shown(figures: Json) -> Iterator[str]:
@@ -296,11 +273,11 @@ def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
     trouble = armed(rig, PATIENCE_S)
     is_held, told = _follow(rig)
     is_back = not trouble and not rig.safety.faults and is_held and not _named(injection, told)
-    return cell._replace(
-        tried=tried,
-        recovery=tuple(map(str, commands)),
-        recovered=is_held_back and is_back,
-    )
+    return cell | {
+        "tried": tried,
+        "recovery": tuple(map(str, commands)),
+        "recovered": is_held_back and is_back,
+    }
 
 
 def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:

@@ -50,9 +50,3 @@ def each(run: Callable[..., Found], what: str, *cases: Collection[Any], workers:
     # a fresh interpreter for each, so that the same seed gives the same cases everywhere
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         return list(tqdm(pool.map(run, *cases), desc=what, total=len(cases[0]), disable=None))
-
-
-def count(text: str) -> int:
-    if (number := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f"{text}: allowed is at least 1")
-    return number

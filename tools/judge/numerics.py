@@ -14,9 +14,8 @@ error is allowed, nothing travelled, and the domain ends where it should.
 import argparse
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import mpmath as mp
 import numpy as np
@@ -24,11 +23,12 @@ from digits import DIGITS, Batch, draw_batch, reference
 from numpy.typing import NDArray
 
 from judge.ends import became, drawn_ends, summed
-from judge.frame import count, each
+from judge.frame import each
 from judge.stage_table import stages
-from judge.stages import Row, tried
+from judge.stages import tried
 from tormag_lab.arrays import Array, Json, Mask
 from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
+from tormag_lab.main import whole
 from tormagd.element.physics.errors import FloatArray
 from tormagd.element.physics.field import ThesisFieldLaw
 from tormagd.element.physics.force import brake_force_N, max_radial_moment_Tm
@@ -46,34 +46,25 @@ STIFF = 0.7
 COUNTS = ("cases", "reference_cases", "nonfinite", "refused", "misjudged")
 
 
-class Worst(NamedTuple):
-    """The largest error where the plain bound holds, and the largest share of what is allowed anywhere."""
-
-    error: float = 0.0
-    over_allowed: float = 0.0
-
-
-@dataclass
 class Tally:
-    """Counts of one chunk or of all, and the worst errors by precision and quantity."""
+    """Counts of one chunk or of all. `worst` is by precision and quantity: the largest error where the plain bound
+    holds, and the largest share of what is allowed anywhere.
+    """
 
-    counts: Counter[str] = field(default_factory=Counter)
-    worst: dict[tuple[str, str], Worst] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.worst: dict[tuple[str, str], Array] = {}
 
     def note(self, precision: str, quantity: str, errors: Array, plain: float, well: Array) -> None:
         """Note errors; allowed is `plain`, or `well`, the rounding of the case, if that is more."""
         allowed = np.maximum(plain, well)
-        worst = float(errors[allowed == plain].max(initial=0.0)), float((errors / allowed).max(initial=0.0))
-        self._raise_to((precision, quantity), Worst(*worst))
+        self.raise_to(
+            (precision, quantity),
+            np.array([errors[allowed == plain].max(initial=0.0), (errors / allowed).max(initial=0.0)]),
+        )
 
-    def add(self, other: "Tally") -> None:
-        self.counts.update(other.counts)
-        for kind, worst in other.worst.items():
-            self._raise_to(kind, worst)
-
-    def _raise_to(self, kind: tuple[str, str], worst: Worst) -> None:
-        mine = self.worst.get(kind, Worst())
-        self.worst[kind] = Worst(max(mine.error, worst.error), max(mine.over_allowed, worst.over_allowed))
+    def raise_to(self, kind: tuple[str, str], worst: Array) -> None:
+        self.worst[kind] = np.maximum(self.worst.get(kind, 0.0), worst)
 
 
 def evaluate(batch: Batch, x: FloatArray) -> tuple[Mask, dict[str, FloatArray]]:
@@ -182,7 +173,7 @@ def _compare_with_reference(
                 tally.note("float64", quantity, np.array([error]), FLOAT64_ALLOWED, well)
 
 
-def stage_row(place: int, episodes: int, seed: int) -> Row:
+def stage_row(place: int, episodes: int, seed: int) -> Json:
     return tried(stages()[place], episodes, seed)
 
 
@@ -197,11 +188,11 @@ def of_core(options: argparse.Namespace) -> Json:
     told = each(row, "stages", places, workers=options.workers)
     came = each(partial(became, seconds=options.seconds), "configurations", ends, workers=options.workers)
     of_ends = summed(came)
-    travelled = sum(row.nonfinite + row.swallowed + row.unnamed for row in told) + of_ends["wrong"]
+    travelled = sum(row["nonfinite"] + row["swallowed"] + row["unnamed"] for row in told) + of_ends["wrong"]
     return {
-        "stage_cases": sum(row.cases for row in told),
+        "stage_cases": sum(row["cases"] for row in told),
         "travelled": travelled,
-        "stages": [row._asdict() for row in told],
+        "stages": told,
         "configurations": of_ends,
         "passed": travelled == 0,
     }
@@ -214,12 +205,14 @@ def of_physics(options: argparse.Namespace) -> Json:
     check = partial(check_chunk, references=-(-options.reference // devices))
     tally = Tally()
     for found in each(check, "physics", seeds, chunks, workers=options.workers):
-        tally.add(found)
-    worst = {name: [found for (kind, _), found in tally.worst.items() if kind == name] for name in PRECISIONS}
+        tally.counts.update(found.counts)
+        for kind, errors in found.worst.items():
+            tally.raise_to(kind, errors)
+    worst = {name: [errors for (kind, _), errors in tally.worst.items() if kind == name] for name in PRECISIONS}
     return {name: tally.counts[name] for name in COUNTS} | {
-        "worst_rel_error": {name: max((it.error for it in found), default=0.0) for name, found in worst.items()},
-        "over_allowed": {f"{precision}, {name}": it.over_allowed for (precision, name), it in tally.worst.items()},
-        "passed": max(it.over_allowed for it in tally.worst.values()) <= 1.0
+        "worst_rel_error": {name: max((float(of[0]) for of in found), default=0.0) for name, found in worst.items()},
+        "over_allowed": {", ".join(kind): float(share) for kind, (_, share) in tally.worst.items()},
+        "passed": all(share <= 1.0 for _, share in tally.worst.values())
         and tally.counts["nonfinite"] == tally.counts["misjudged"] == 0,
     }
 
@@ -233,5 +226,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("seed", 1, "of what is drawn"),
         ("workers", 2, "processes"),
     ):
-        parser.add_argument(f"--{name}", type=count, default=default, help=f"{says} (%(default)s)")
+        parser.add_argument(f"--{name}", type=whole(1, 10**9), default=default, help=f"{says} (%(default)s)")
     parser.add_argument("--seconds", type=float, default=10.0, help="that each configuration runs (%(default)s)")

@@ -79,21 +79,11 @@ class Stage(NamedTuple):
     period_s: float = 0.0
 
 
-class Row(NamedTuple):
-    """The outcome of a stage: steps with hostile inputs, those refused by name, and those with a limit or a fault."""
-
-    stage: str
-    border: str
-    cases: int
-    refused: int
-    stated: int
-    nonfinite: int
-    swallowed: int
-    unnamed: int
-    told: list[str]
+COUNTED = ("cases", "refused", "stated", "nonfinite", "swallowed", "unnamed")
+"Steps with hostile inputs, those refused by name, those with a limit or a fault, and what must not be."
 
 
-def tried(stage: Stage, episodes: int, seed: int) -> Row:
+def tried(stage: Stage, episodes: int, seed: int) -> dict[str, Any]:
     rng = random.Random(f"{seed} {stage.name}")
     counts: Counter[str] = Counter()
     told: list[str] = []
@@ -127,8 +117,8 @@ def tried(stage: Stage, episodes: int, seed: int) -> Row:
                     _tell(counts, told, "nonfinite", f"{path} = {value}")
                     fed = stage.make()
                     break
-    kinds = {name: counts[name] for name in ("cases", "refused", "stated", "nonfinite", "swallowed", "unnamed")}
-    return Row(stage.name, stage.border, **kinds, told=told)
+    counted = {name: counts[name] for name in COUNTED}
+    return {"stage": stage.name, "border": stage.border, **counted, "told": told}
 
 
 def _tell(counts: Counter[str], told: list[str], kind: str, what: str) -> None:

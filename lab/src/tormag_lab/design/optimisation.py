@@ -1,16 +1,16 @@
-"""Structural optimisation (Eq. 39-42, table 3.2): outer radius, thickness and open gap for the portrait of a task.
+"""Find a brake for a task (Eq. 39-42, table 3.2): outer radius, thickness and open gap, from several starts.
 
 The thesis's cost (Eq. 39) adds the squared distances of the portrait's four corners from the task's. It mixes newtons
 with newtons per second, and punishes a portrait larger than the task. Ours is coverage of the required region, then the
 least volume of elastomer, then the smallest open gap, which may cost `SLACK` of coverage. The elastomer must bear the
 field of the closed gap (lambda1 >= 0.05).
 
-Both solvers are scipy's. "local" is SLSQP, like the thesis's fmincon, and ends in the minimum that the start leads to.
-"global" is differential evolution, with the start in its first generation, followed by COBYQA.
+The solver is scipy's differential evolution, with the start in its first generation, followed by COBYQA.
 """
 
-import itertools
+import argparse
 import math
+import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
@@ -18,19 +18,20 @@ from typing import Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
-from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differential_evolution, minimize
+from scipy.optimize import Bounds, NonlinearConstraint, differential_evolution, minimize
 
-from tormag_lab.arrays import Array
+from tormag_lab.arrays import Array, Json
 from tormag_lab.design.brake import Brake
 from tormag_lab.design.phase_portrait import PhasePortrait, Region
-from tormag_lab.executors import finished
+from tormag_lab.executors import add_options as add_executors, chosen, finished
+from tormag_lab.main import GAP_SPEED, SEED, Found, whole
+from tormagd.config import Position
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import PowerFieldLaw
 from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
 Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
 "Coverage by the trapezoid or the true boundary, or the thesis's cost."
-Solver: TypeAlias = Literal["local", "global"]
 
 SLACK = 1e-4
 "Coverage that a smaller elastomer may cost."
@@ -87,25 +88,11 @@ class Problem(msgspec.Struct, frozen=True):
         return math.pi * (design.outer_radius_mm**2 - self.inner_radius_mm**2) * design.thickness_mm
 
 
-class Outcome(msgspec.Struct, frozen=True):
-    """A design that a solver found. `coverage` is by the true boundary where that was the measure, else by the
-    trapezoid."""
-
-    design: Design
-    coverage: float
-    corner_cost: float
-    volume_mm3: float
-    evaluations: int
-    seconds: float
-    """Processor time of the solving thread."""
-
-
 class Run(msgspec.Struct, frozen=True):
-    """One start of one solver on one problem: all that its outcome depends on."""
+    """One start on one problem: all that its outcome depends on."""
 
     problem: Problem
     start: Design
-    solver: Solver
     seed: int = 1
 
 
@@ -114,16 +101,6 @@ def coverage(problem: Problem, design: Design) -> float:
     if problem.measure == "true":
         return portrait.true_coverage(problem.region)
     return portrait.trapezoid_coverage(problem.region)
-
-
-def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
-    """Return the least coverage where each dimension may be off by `share` of it."""
-    factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
-    made = [
-        Design(*(value * factor for value, factor in zip(msgspec.structs.astuple(design), each, strict=True)))
-        for each in factors
-    ]
-    return min(coverage(problem, each) if problem.load_margin(each) >= 0.0 else 0.0 for each in made)
 
 
 def corner_cost(problem: Problem, design: Design) -> float:
@@ -138,25 +115,26 @@ def corner_cost(problem: Problem, design: Design) -> float:
     )
 
 
-def solve(run: Run) -> Outcome:
+def solve(run: Run) -> Json:
+    """Return the best design. `coverage` is by the true boundary where that was the measure, else by the trapezoid."""
     began_s = time.thread_time()
     search = _Search(run.problem)
-    cost = search.corner_cost if run.problem.measure == "corners" else search.miss
     first = search.scaled(run.start)
-    best = search.global_minimum(cost, first, run.seed) if run.solver == "global" else search.local_minimum(cost, first)
-    if run.problem.measure != "corners" and run.solver == "global":
-        best = search.smallest(best, run.seed)
+    if run.problem.measure == "corners":
+        best = search.minimum(search.corner_cost, first, run.seed)
+    else:
+        best = search.smallest(search.minimum(search.miss, first, run.seed), run.seed)
     design = search.design(best)
     if run.problem.load_margin(design) < 0.0:
         raise DomainError("shear_modulus_Pa", run.problem.shear_modulus_Pa, "an elastomer that bears the closed gap")
-    return Outcome(
-        design=design,
-        coverage=coverage(run.problem, design),
-        corner_cost=corner_cost(run.problem, design),
-        volume_mm3=run.problem.volume_mm3(design),
-        evaluations=search.evaluations,
-        seconds=time.thread_time() - began_s,
-    )
+    return {
+        "design": design,
+        "coverage": coverage(run.problem, design),
+        "corner_cost": corner_cost(run.problem, design),
+        "volume_mm3": run.problem.volume_mm3(design),
+        "evaluations": search.evaluations,
+        "seconds": time.thread_time() - began_s,  # of this thread's processor time
+    }
 
 
 class _Search:
@@ -187,9 +165,7 @@ class _Search:
         volume = self.problem.volume_mm3(self.design(x)) / self.problem.volume_mm3(self.problem.upper)
         return volume + _GAP_WEIGHT * float(x[2])
 
-    def global_minimum(
-        self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint
-    ) -> Array:
+    def minimum(self, cost: Callable[[Array], float], start: Array, seed: int, *also: NonlinearConstraint) -> Array:
         """Return the point (3) of least `cost`, by differential evolution with `start` in it, then COBYQA."""
         limits = [*also, self._margin]
         result = differential_evolution(
@@ -206,23 +182,17 @@ class _Search:
         )
         return self._refine(cost, np.asarray(result.x), limits)
 
-    def local_minimum(self, cost: Callable[[Array], float], start: Array) -> Array:
-        """Return the minimum that SLSQP reaches from `start`, or `start` where that is as good."""
-        margin = {"type": "ineq", "fun": self._margin.fun}
-        result = minimize(cost, start, method="SLSQP", bounds=self._bounds, constraints=[margin])
-        return _better(cost, start, result)
-
     def smallest(self, best: Array, seed: int) -> Array:
         """Return the smallest design that covers as much as `best` less SLACK, or `best` itself."""
         allowed = self.miss(best) + SLACK
-        found = self.global_minimum(self.size, best, seed, NonlinearConstraint(self.miss, -np.inf, allowed))
+        found = self.minimum(self.size, best, seed, NonlinearConstraint(self.miss, -np.inf, allowed))
         return found if self.miss(found) <= allowed else best
 
     def _refine(self, cost: Callable[[Array], float], start: Array, limits: list[Any]) -> Array:
         options = {"initial_tr_radius": 0.05, "final_tr_radius": 1e-5, "maxfev": 100}
         result = minimize(cost, start, method="COBYQA", bounds=self._bounds, constraints=limits, options=options)
         is_kept = all(limit.lb <= limit.fun(result.x) <= limit.ub for limit in limits)
-        return _better(cost, start, result) if is_kept else start
+        return np.asarray(result.x) if is_kept and cost(result.x) < cost(start) else start
 
     def _at(self, function: Callable[[Problem, Design], float], x: Array, impossible: float) -> float:
         """Return a function of the design, or `impossible` where the elastomer would not bear the field."""
@@ -231,11 +201,44 @@ class _Search:
         return function(self.problem, design) if self.problem.load_margin(design) >= 0.0 else impossible
 
 
-def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult) -> Array:
-    return np.asarray(result.x) if cost(result.x) < cost(start) else start
-
-
-def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Outcome]:
+def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Json]:
     wanted = list(dict.fromkeys(runs))
     outcomes = {run: future.result() for run, future in finished(executor, solve, wanted, "run")}
     return {run: outcomes[run] for run in wanted}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--region",
+        required=True,
+        type=float,
+        nargs=4,
+        metavar=("MIN_N", "MIN_RATE", "MAX_N", "MAX_RATE"),
+        help="required forces, N, and rates, N/s",
+    )
+    parser.add_argument("--measure", choices=("true", "trapezoid", "corners"), default="true")
+    parser.add_argument(
+        "--gap-speed",
+        type=GAP_SPEED,
+        default=Position().gap_speed_mm_s,
+        help="mm/s (what the controller was measured at)",
+    )
+    parser.add_argument("--starts", type=whole(1, 10_000), default=5, help="random ones")
+    parser.add_argument("--seed", type=SEED, default=1)
+    add_executors(parser, os.cpu_count() or 1, needed="tormagd[lab]")
+
+
+def run(options: argparse.Namespace) -> Found:
+    with chosen(options) as executor:
+        outcomes = sweep(_runs(options), executor)
+    by_cost = options.measure == "corners"
+    rows = [msgspec.to_builtins(outcome) for outcome in outcomes.values()]
+    rows.sort(key=lambda row: (row["corner_cost"] if by_cost else -row["coverage"], row["volume_mm3"]))
+    return Found({"outcomes": rows})
+
+
+def _runs(options: argparse.Namespace) -> list[Run]:
+    problem = Problem(Region(*options.region), options.measure, options.gap_speed)
+    low, high = (np.array(msgspec.structs.astuple(bound)) for bound in (problem.lower, problem.upper))
+    drawn = np.random.default_rng(options.seed).uniform(low, high, (options.starts, 3))
+    return [Run(problem, Design(*start), options.seed) for start in drawn.tolist()]

@@ -9,7 +9,6 @@ Coverage of a point cloud is a share of its points.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,20 +46,6 @@ class Region(msgspec.Struct, frozen=True):
     def rate_N_s(self, force_N: FloatArray) -> FloatArray:
         share = (force_N - self.least_N) / (self.most_N - self.least_N)
         return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
-
-
-class CloudCoverage(NamedTuple):
-    """Which points of a recorded task a brake renders, and why not the others."""
-
-    covered: Mask
-    below_least_force: Mask
-    above_most_force: Mask
-    too_fast: Mask
-    """Within the forces, but beyond the rate."""
-
-    @property
-    def share(self) -> float:
-        return float(np.mean(self.covered))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,17 +105,13 @@ class PhasePortrait:
         smaller = np.minimum(region.rate_N_s(forces), offered.rate_N_s(forces))
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
-    def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """Judge a task's points, force and rate (n each), by the true boundary."""
+    def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:
+        """Return which points of a task, force and rate (n each), the true boundary covers."""
         inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
-        limit = np.zeros_like(force_N)
+        limit = np.full_like(force_N, -1.0)
         limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
-        return self._judge(force_N, rate_N_s, limit)
+        return np.abs(rate_N_s) <= limit
 
-    def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
-
-    def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:
-        below, above = force_N < self.brake.least_N, force_N > self.brake.most_N
-        fast = ~below & ~above & (np.abs(rate_N_s) > limit_N_s)
-        return CloudCoverage(~(below | above | fast), below, above, fast)
+    def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:
+        inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
+        return inside & (np.abs(rate_N_s) <= self.trapezoid().rate_N_s(force_N))

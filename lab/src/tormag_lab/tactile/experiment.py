@@ -1,7 +1,4 @@
-"""Chapter 4 on a synthetic tactile pad: table 4.1, the pulse experiment of section 4.3, holds.
-
-`--branches` measures instead what the neighbours of the k-nearest search decide, on the shipped models.
-"""
+"""Chapter 4 on a synthetic tactile pad: table 4.1, the pulse experiment of section 4.3, holds."""
 
 import argparse
 from pathlib import Path
@@ -13,8 +10,7 @@ from tqdm import tqdm
 from tormag_lab.arrays import Array
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
-from tormag_lab.tactile import branches
-from tormag_lab.tactile.models import FULL, QUICK, Effort, Trained, table_4_1, train
+from tormag_lab.tactile.models import FULL, Effort, Trained, table_4_1, train
 from tormag_lab.tactile.pulse import hold, pulse
 from tormag_lab.tactile.report import sections, write_report
 
@@ -42,17 +38,13 @@ def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="few rows and epochs: shows that it runs, not how well")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write learned_inverse.md and images/ there")
-    parser.add_argument("--branches", action="store_true", help="what neighbours decide, on the shipped models")
 
 
 def run(options: argparse.Namespace) -> Found:
-    if options.branches:
-        return Found(branches.measured())
     if options.out is not None and not options.out.is_dir():
         raise LabError(f"cannot write to {options.out}: not a directory")
-    figures, trained, traces = contract(QUICK if options.quick else FULL)
+    figures, trained, traces = contract(FULL)
     if options.out is not None:
         write_report(options.out, figures, trained, traces)
     return Found(figures, sections(figures))

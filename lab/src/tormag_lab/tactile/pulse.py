@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tormag_lab.arrays import Array, Mask
-from tormag_lab.human_pulse import pulse_profile, recorded, scaled
+from tormag_lab.human_pulse import pulse_profile, scaled
 from tormag_lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
 from tormag_lab.tactile.pads import PADS, Program, drawn_pad
 from tormag_lab.training.grey_box import GreyBoxMemory
@@ -38,17 +38,6 @@ TEN_MINUTES_S = 600.0
 def pulse_shape(duration_s: float, rate_hz: int) -> Array:
     """Return a measured pulse (n) between 0 and 1."""
     return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1]
-
-
-def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
-    """Return measured arterial pulses (n) between 0 and 1 by file name, repeated to `duration_s`."""
-    shapes = {}
-    for path in recorded("aac_nibp_pulse"):
-        time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
-        # six beats that end as they began
-        looped = np.interp(np.arange(round(duration_s * rate_hz)) / rate_hz, time_s, pressure, period=time_s[-1])
-        shapes[path.stem] = scaled(looped, 0.0, 1.0)
-    return shapes
 
 
 def program(shape: Array) -> Program:
@@ -156,11 +145,9 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
     strangers = [course(drawn_pad(pad, seed), shape, every) for seed in OTHER_PADS]
-    arterial = {name: course(pad, other, every) for name, other in recorded_shapes(HELD_S, RATE_HZ).items()}
     rendered = [pulse_on(own, trained) for trained in trainings]
     for trained, (scores, _) in zip(trainings, rendered, strict=True):
         scores["other_pads"] = [along.scores(aware_fields(trained, along)) for along in strangers]
-        scores["other_pulses"] = {name: along.scores(aware_fields(trained, along)) for name, along in arterial.items()}
     top, traces = rendered[0]
     kept = ("mlp", "mlp_thesis_search", "relaxation_aware", "noise_bound_mae_mT", "scored_share")
     by_noise = {str(trained.noise_N): scores for trained, (scores, _) in zip(trainings, rendered, strict=True)}

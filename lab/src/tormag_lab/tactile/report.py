@@ -96,7 +96,6 @@ def _pulse(pulse: Json) -> str:
         named += [
             (f"with relaxation, other pad {index}", part) for index, part in enumerate(scores["other_pads"], start=1)
         ]
-        named += [(f"with relaxation, arterial pressure {name}", part) for name, part in scores["other_pulses"].items()]
         for label, part in named:
             rows.setdefault(label, [label]).extend(
                 (

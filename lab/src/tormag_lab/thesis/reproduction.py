@@ -13,16 +13,16 @@ import numpy as np
 
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
-from tormag_lab.design.optimisation import Design, Outcome, Problem, Run, coverage, sweep
+from tormag_lab.design.optimisation import Design, Problem, Run, coverage, sweep
 from tormag_lab.design.phase_portrait import PhasePortrait
 from tormag_lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
 from tormag_lab.human_pulse import pulse_profile
 from tormag_lab.main import GAP_SPEED, SEED, WORKERS, Found
 from tormag_lab.pages import write_page
 from tormag_lab.thesis import page
-from tormag_lab.thesis.errata import errata, table_2_4_errors
+from tormag_lab.thesis.errata import errata
 from tormag_lab.thesis.step_test import StepTest, step_test
-from tormag_lab.thesis.table_2_5 import COLUMNS, readings, table_2_5
+from tormag_lab.thesis.table_2_5 import table_2_5
 from tormag_lab.thesis.values import (
     AS_BUILT,
     FIGURE_2_5_MEASURED_N,
@@ -33,7 +33,6 @@ from tormag_lab.thesis.values import (
     TABLE_2_4_MEAN_PERCENT,
     USE_CASES,
 )
-from tormag_lab.told import table
 from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.element.physics.force import Elastomer
 from tormagd.element.physics.inserts import INSERTS, Insert, insert
@@ -50,18 +49,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gap-speed", type=GAP_SPEED, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=WORKERS, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=SEED, default=1)
-    parser.add_argument("--quick", action="store_true", help="one start, few rows and epochs: shows only that it runs")
-    parser.add_argument("--table-2-5", action="store_true", help="print table 2.5 in both its readings, and no more")
 
 
 def run(options: argparse.Namespace) -> Found:
-    if options.table_2_5:
-        found = table_2_5()
-        return Found(found, table(dict(zip(COLUMNS, row, strict=True)) for row in readings(found)))
     with ProcessPoolExecutor(options.workers) as pool:
-        learned = pool.submit(chapter_4, options.quick)
+        learned = pool.submit(chapter_4)
         steps = [pool.submit(step_test, insert(name), options.seed) for name in STEP_INSERTS]
-        runs = table_3_2_runs(options.gap_speed, options.seed, starts=1 if options.quick else None)
+        runs = table_3_2_runs(options.gap_speed, options.seed)
         outcomes = sweep(runs.values(), pool)
         tests = [step.result() for step in steps]
         told = learned.result()
@@ -85,11 +79,11 @@ def run(options: argparse.Namespace) -> Found:
     return Found(result, page.sections(result))
 
 
-def chapter_4(is_quick: bool) -> Json:
+def chapter_4() -> Json:
     from tormag_lab.tactile.experiment import contract
-    from tormag_lab.tactile.models import FULL, QUICK
+    from tormag_lab.tactile.models import FULL
 
-    found, *_ = contract(QUICK if is_quick else FULL)
+    found, *_ = contract(FULL)
     return found
 
 
@@ -121,7 +115,6 @@ def table_2_4() -> Json:
         "power_field_law": {name: value for name, value in beside.items() if name != "rows"},
         "thesis": {"mean_rel_error": TABLE_2_4_MEAN_PERCENT / 100, "max_rel_error": TABLE_2_4_MAX_PERCENT / 100},
         "registry": _registry_errors(),
-        "thesis_errors": table_2_4_errors(),
         "measure": "F(45 mm) - F(95 mm) against the measured range of table 2.4; one friction coefficient per matrix, "
         "chosen for the least mean relative error; field law Eq. 7",
     }
@@ -273,21 +266,13 @@ def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
     for speed in gap_speeds_mm_s:
         portrait = PhasePortrait(brake, speed)
         true, trapezoid = (judge(forces_N, rates_N_s) for judge in (portrait.true_cloud, portrait.trapezoid_cloud))
-        failing = np.flatnonzero(~true.covered)
-        worst = failing[np.argsort(-np.abs(rates_N_s[failing]))][:5]
         rows.append(
             {
                 "gap_speed_mm_s": speed,
-                "true": true.share,
-                "trapezoid": trapezoid.share,
+                "true": float(true.mean()),
+                "trapezoid": float(trapezoid.mean()),
                 "points": len(forces_N),
-                "too_fast": int(true.too_fast.sum()),
-                "below_least_force": int(true.below_least_force.sum()),
-                "above_most_force": int(true.above_most_force.sum()),
-                "worst": [
-                    {"t_s": float(t), "force_N": float(f), "rate_N_s": float(r)}
-                    for t, f, r in zip(times_s[worst], forces_N[worst], rates_N_s[worst], strict=True)
-                ],
+                "too_fast": int((~true).sum()),
             }
         )
     return {
@@ -298,18 +283,17 @@ def _pulse_cloud(gap_speeds_mm_s: tuple[float, ...]) -> Json:
     }
 
 
-RunKey = tuple[int, int, str, str]
-"""Use case, start, objective, solver."""
+RunKey = tuple[int, int, str]
+"""Use case, start, objective."""
 
 
-def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
-    runs = {}
-    for number, case in USE_CASES.items():
-        for objective, problem in _problems(number, gap_speed_mm_s).items():
-            for index, line in enumerate(case.starts[:starts], start=1):
-                runs[(number, index, objective, "global")] = Run(problem, line.start, "global", seed)
-                runs[(number, index, objective, "local")] = Run(problem, line.start, "local", seed)
-    return runs
+def table_3_2_runs(gap_speed_mm_s: float, seed: int) -> dict[RunKey, Run]:
+    return {
+        (number, index, objective): Run(problem, line.start, seed)
+        for number, case in USE_CASES.items()
+        for objective, problem in _problems(number, gap_speed_mm_s).items()
+        for index, line in enumerate(case.starts, start=1)
+    }
 
 
 def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
@@ -322,25 +306,20 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
     }
 
 
-def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
-    """Return the optima by each solver and by the thesis's cost, beside the thesis's designs."""
-    rows: dict[RunKey, Json] = {}
-    for (use_case, start, objective, solver), run in runs.items():
-        outcome = outcomes[run]
-        rows[use_case, start, objective, solver] = {
+def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Json], gap_speed_mm_s: float) -> Json:
+    """Return the optima by each measure and by the thesis's cost, beside the thesis's designs."""
+    rows: list[Json] = [
+        {
             "use_case": use_case,
             "start": start,
             "objective": objective,
-            "design": _design(outcome.design),
-            "coverage": outcome.coverage,
-            "corner_cost": outcome.corner_cost,
-            "volume_cm3": 1e-3 * outcome.volume_mm3,
-            "seconds": outcome.seconds,
+            "design": _design(outcomes[run]["design"]),
+            "volume_cm3": 1e-3 * outcomes[run]["volume_mm3"],
+            **{name: outcomes[run][name] for name in ("coverage", "corner_cost", "seconds")},
         }
-    starts, local = (
-        [row for (*_, objective, by), row in rows.items() if by == solver and objective != "corners"]
-        for solver in ("global", "local")
-    )
+        for (use_case, start, objective), run in runs.items()
+    ]
+    starts = [row for row in rows if row["objective"] != "corners"]
     designs = []
     for number, case in USE_CASES.items():
         found = [
@@ -360,10 +339,7 @@ def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_m
         groups.setdefault((each["use_case"], each["objective"]), []).append(each["coverage"])
     return {
         "starts": starts,
-        "local_starts": local,
-        "corner_cost_starts": [
-            row | {"solver": solver} for (*_, objective, solver), row in rows.items() if objective == "corners"
-        ],
+        "corner_cost_starts": [row for row in rows if row["objective"] == "corners"],
         "thesis_designs": designs,
         "best": [
             {"use_case": number, "objective": objective, "coverage": max(values), "spread": max(values) - min(values)}

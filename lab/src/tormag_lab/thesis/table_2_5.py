@@ -4,16 +4,19 @@ The thesis matches the width of an insert's force *range* to the task's, whereve
 from its own least force on, and a passive brake does not reach 0 N.
 """
 
-import math
+from collections.abc import Mapping
+
+import numpy as np
 
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, Brake
-from tormag_lab.design.selection import ForceTask, Verdict, rank
-from tormag_lab.thesis.values import TABLE_2_5
+from tormag_lab.design.force_law import radial_moment_for_force_Tm
+from tormag_lab.thesis.values import TABLE_2_5, ForceTask
 from tormagd.element.physics.inserts import INSERTS
 
 GAP_RESOLUTION_MM = 0.1
 "Reach of a plain position loop against the screws' backlash; the thesis's table implies a little less."
+_POINTS = 201
 COLUMNS = (
     "task",
     "insert the thesis names",
@@ -42,7 +45,7 @@ def table_2_5() -> Json:
                 "range_N": [task.least_N, task.most_N],
                 "resolution_N": task.resolution_N,
                 "thesis_mN": named,
-                "ranked": [_row(verdict, task) for verdict in rank(brakes, task, GAP_RESOLUTION_MM)],
+                "ranked": rank(brakes, task, GAP_RESOLUTION_MM),
             }
             for task, named in TABLE_2_5
         ],
@@ -54,19 +57,55 @@ def table_2_5() -> Json:
     }
 
 
-def _row(verdict: Verdict, task: ForceTask) -> Json:
-    measured_N = INSERTS[verdict.insert].force_range.measured_N
-    return {
-        "insert": verdict.insert,
-        "measured_range_N": measured_N,
-        "matched_share": min(measured_N / (task.most_N - task.least_N), 1.0),
-        "serves": not verdict.reasons,
-        "force_N": [verdict.least_N, verdict.most_N],
-        "resolution_mN": 1e3 * verdict.resolution_N,
-        "served_share": verdict.served_share,
-        "reasons": list(verdict.reasons),
-        "sufficient_gap_mm": None if math.isnan(verdict.sufficient_gap_mm) else verdict.sufficient_gap_mm,
+def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Json]:
+    rows = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
+    return sorted(
+        rows, key=lambda row: (not row["serves"], -row["served_share"] * bool(row["reasons"]), row["resolution_mN"])
+    )
+
+
+def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Json:
+    """Return what an insert reaches of a task with a gap that moves in such steps, and why it does not serve."""
+    least, most, width_N = brake.least_N, brake.most_N, task.most_N - task.least_N
+    low, high = max(least, task.least_N), min(most, task.most_N)
+    if low >= high:
+        # no gap gives any force of the task, so the insert's finest step is the fairest figure left
+        gaps = np.array([brake.open_mm])
+    else:
+        gaps = np.clip(np.linspace(brake.gap_mm(high), brake.gap_mm(low), _POINTS), brake.closed_mm, brake.open_mm)
+    resolution_N = gap_resolution_mm * float(np.max(brake.slope_N_mm(gaps)))
+    lacks = {
+        f"least force {least:.2f} N is above {task.least_N:g} N by more than {task.resolution_N:g} N": (
+            least > task.least_N + task.resolution_N
+        ),
+        f"most force {most:.2f} N is below {task.most_N:g} N": most < task.most_N,
+        f"one gap step changes {1e3 * resolution_N:.1f} mN, more than {1e3 * task.resolution_N:g} mN": (
+            resolution_N > task.resolution_N
+        ),
     }
+    reasons = [reason for reason, is_so in lacks.items() if is_so]
+    measured_N = INSERTS[insert].force_range.measured_N
+    return {
+        "insert": insert,
+        "measured_range_N": measured_N,
+        "matched_share": min(measured_N / width_N, 1.0),
+        "serves": not reasons,
+        "force_N": [least, most],
+        "resolution_mN": 1e3 * resolution_N,
+        "served_share": max(high - low, 0.0) / width_N,
+        "reasons": reasons,
+        "sufficient_gap_mm": _sufficient_gap_mm(brake, task),
+    }
+
+
+def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float | None:
+    """Return the gap, the open one or wider, that gives the task's least force plus its resolution."""
+    tolerated_N = task.least_N + task.resolution_N
+    if tolerated_N >= brake.least_N:
+        return brake.open_mm
+    moment_Tm = radial_moment_for_force_Tm(tolerated_N, brake.elastomer, brake.geometry)
+    is_given = moment_Tm >= brake.field.radial_moment_Tm(brake.field.gap_range_mm[1])
+    return brake.field.gap_mm(moment_Tm) if is_given else None
 
 
 def readings(table: Json) -> list[tuple[str, ...]]:

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 from tormag_lab.design.optimisation import Design
 from tormag_lab.design.phase_portrait import Region
-from tormag_lab.design.selection import ForceTask
 
 TABLE_2_3_MASSES_G = {
     10: {"matrix": 83.2, "cip": 78.7, "slacker": 4.9, "thinner": 4.9},
@@ -30,6 +29,14 @@ TABLE_2_4_ERRORS = {
 }
 "The two error columns: N and percent."
 TABLE_2_4_MEAN_PERCENT, TABLE_2_4_MAX_PERCENT = 10.2, 14.7
+
+
+class ForceTask(NamedTuple):
+    name: str
+    least_N: float
+    most_N: float
+    resolution_N: float
+
 
 TABLE_2_5 = (
     (ForceTask("cardiovascular", 0.0, 1.4, 0.1), {"MRE-10-20": 7.0}),

@@ -18,13 +18,14 @@ import numpy as np
 
 from tormag_lab.arrays import Array
 from tormag_lab.errors import LabError
-from tormag_lab.main import Found, within
+from tormag_lab.main import Found
 from tormag_lab.tables import read_columns
 from tormag_lab.training.dataset import ALLOWED, Dataset, fit_metrics, write_csv
 from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.element.model.features import FEATURES, FIELD, Element
 from tormagd.element.model.model_file import ForceModel, save_model
 from tormagd.element.physics.field import PowerFieldLaw, flux_density_T
+from tormagd.element.physics.force import TORMAG
 from tormagd.element.physics.inserts import Insert, insert
 from tormagd.ground.files import in_place_of
 
@@ -50,7 +51,6 @@ MAX_MAE_SHARE = 0.02
 MAX_MAE_OVER_NOISE = 3.0
 MEAN_OVER_SIGMA = math.sqrt(2.0 / math.pi)
 "Mean absolute value of Gaussian noise over its standard deviation."
-RADIUS = within(1e-3, 100.0, "mm")
 
 
 class CalibrationError(LabError):
@@ -61,7 +61,7 @@ class CalibrationError(LabError):
         self.code = code
 
 
-def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
+def training_rows(table: Array, fitted: Insert) -> Dataset:
     """Return the rows of sweeps (n x 6, as COLUMNS) in which the handle moves."""
     _, sweep, _, handle_mm, rate_mm_s, _ = table.T
     rate_mm_s = np.abs(rate_mm_s)
@@ -91,7 +91,7 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
         displacement_mm = np.full_like(displacement_mm, MOBILISED_MM)
     time_s, sweep, gap_mm, _, _, force_N = table.T
     moment_Tm = np.asarray(PowerFieldLaw().radial_moment_Tm(gap_mm))
-    field_mT = 1e3 * flux_density_T(moment_Tm, fitted.elastomer.relative_permeability, 1e-3 * inner_radius_mm)
+    field_mT = 1e3 * flux_density_T(moment_Tm, fitted.elastomer.relative_permeability, TORMAG.inner_radius_m)
     cip_percent = np.full_like(rate_mm_s, 100.0 * fitted.cip_fraction)
     features = np.column_stack((displacement_mm, rate_mm_s, field_mT, cip_percent))
     return Dataset(features, force_N, sweep.astype(np.int64), time_s)
@@ -220,20 +220,19 @@ def require_rising(model: ForceModel) -> None:
 
 
 def read_sweeps(path: Path) -> Array:
-    return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED, is_exact=True).values()))
+    return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED).values()))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sweeps", type=Path, metavar="SWEEPS.csv", help=f"columns {','.join(COLUMNS)}")
     parser.add_argument("--insert", required=True, help="the insert that was swept, such as MRE-50-40")
-    parser.add_argument("--inner-radius-mm", type=RADIUS, default=4.0, help="where the field is stated (4)")
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL.safetensors")
     parser.add_argument("--csv", type=Path, metavar="TRAINING.csv", help="write the training data too")
     parser.add_argument("--law", action="store_true", help="fit the law of the brake, without torch")
 
 
 def run(options: argparse.Namespace) -> Found:
-    data = training_rows(read_sweeps(options.sweeps), insert(options.insert), options.inner_radius_mm)
+    data = training_rows(read_sweeps(options.sweeps), insert(options.insert))
     require_usable(data)
     model = fit(data, options.insert, datetime.date.today(), by_law=options.law)
     with nullcontext() if options.csv is None else in_place_of(options.csv) as beside:

@@ -127,7 +127,7 @@ def times_of(data: Dataset) -> Array:
 
 def read_csv(path: Path) -> Dataset:
     """Read training data, with its columns in any order; `cycle` and `time_s` are optional."""
-    named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, allowed=ALLOWED, is_exact=True)
+    named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, ALLOWED)
     cycle = named.get("cycle", np.zeros(0))
     for row in np.flatnonzero(cycle != np.floor(cycle))[:1].tolist():
         raise LabError(f"{path}: row {row + 2}, cycle: '{cycle[row]:g}' is not allowed, only whole numbers")

@@ -18,11 +18,11 @@ from tormag_lab.arrays import Array, Mask
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found, within
 from tormag_lab.pages import subplots
+from tormag_lab.tables import MAX_TABLE_BYTES
 from tormag_lab.training.dataset import ALLOWED, Dataset, records, write_csv
 from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.ground.table import MIN_ROWS, QUANTITIES, Table, Wanted, read_table
 
-MAX_FILE_BYTES = 1 << 28
 NEEDED, MOTION = ("force_N", "field_mT"), ("rate_mm_s", "time_s", "displacement_mm")
 SIGN_SHARE = 0.95
 "Least share of the rows beyond the noise that agree on the force's sign."
@@ -131,7 +131,7 @@ def _read(path: Path, stated: Mapping[str, str]) -> Table:
     needed = {name: QUANTITIES[name] for name in NEEDED}
     optional = {name: each for name, each in QUANTITIES.items() if name not in needed}
     option = {name: f"--column {name}=" for name in QUANTITIES}
-    table = read_table(path, Wanted(needed, optional, stated, option), MAX_FILE_BYTES)
+    table = read_table(path, Wanted(needed, optional, stated, option), MAX_TABLE_BYTES)
     if "time_s" in table.values:
         _require_rising(path, table)
     return table

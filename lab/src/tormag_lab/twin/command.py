@@ -37,8 +37,8 @@ SLOWLY = "turn the handle to and fro from a stop up to 40 mm/s, ten times"
 DATASHEET = "no motion tells it: take it from its data sheet"
 MOTIONS: Mapping[str, str] = {
     "elastomer.kinetic_friction": SLIDE,
-    "elastomer.shear_modulus_kPa": "no motion tells it from the field's exponent: characterise the insert",
-    "elastomer.relative_permeability": "no motion tells it from the strength: characterise the insert",
+    "elastomer.shear_modulus_kPa": "no motion tells it from the field's exponent: press a sample of the insert",
+    "elastomer.relative_permeability": "no motion tells it from the strength: magnetise a sample of the insert",
     "field.coefficient": "no motion tells it from the strength: measure the field at a gap of 67 mm",
     "field.exponent": STEPS,
     "field.hysteresis_percent": STEPS,

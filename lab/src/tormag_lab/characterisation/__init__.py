@@ -1,1 +1,0 @@
-"""From a laboratory's records to the physics room's constants; needs the `lab` extra."""
