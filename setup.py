@@ -33,7 +33,8 @@ COMPILED = {
         *("core",),
     ),
     "tormagd/control/believe": (
-        *("strength", "slow_friction", "sensor_zero", "freshness", "sensor", "carriage_lag", "handle", "memory", "believe"),
+        *("strength", "slow_friction", "sensor_zero", "freshness", "anchor", "ripple", "sensor", "carriage_lag", "handle", "memory"),
+        "believe",
     ),
     "tormagd/control/ask": ("skill", "forecast", "path", "way", "governor"),
     "tormagd/control/aim": ("portrait", "floors", "aim"),

@@ -29,7 +29,7 @@ from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, SafetyState
 from tormagd_client.messages import TickRecord
 
-FORMAT = 14
+FORMAT = 15
 "Version of the entries and their states: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),

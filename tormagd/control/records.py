@@ -173,6 +173,9 @@ class Belief(Value):
         predicted_N: float | None,
         limits: tuple[Limit, ...],
         sensor_doubted_s: float,
+        anchor_N: float | None = None,
+        ripple: float = 1.0,
+        ripple_1_s: float = 0.0,
     ) -> None:
         self.device: Final = device
         self.at_speed: Final = at_speed
@@ -181,6 +184,9 @@ class Belief(Value):
         self.predicted_N: Final = predicted_N
         self.limits: Final = limits
         self.sensor_doubted_s: Final = sensor_doubted_s
+        self.anchor_N: Final = anchor_N
+        self.ripple: Final = ripple
+        self.ripple_1_s: Final = ripple_1_s
 
 
 @final

@@ -11,13 +11,15 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.config import Config
+from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.sensor import Disputed, SensorTrust
-from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
+from tormagd.control.believe.ripple import MOST, Ripple
+from tormagd.control.believe.sensor import SLACK_N, Disputed, SensorTrust
+from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, WAY_VARIANCE, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
-from tormagd.control.believe.strength import UNSEEN, DeviceFit, Strength, device_bounds
+from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Belief, Measured
 from tormagd.control.sight import unsensed_s
@@ -43,6 +45,10 @@ CONTRADICTED_N: Final = 0.4
 "A reading further off than this contradicts a fit from another day: no rest, warmth or zero explains it."
 MIN_FORESIGHT: Final = 0.5
 "With less foresight a plan's gap leaps, and any carriages come late: no lag is learned."
+OVER_N: Final = 0.15
+"The device as it first showed itself gives no more than the scene's greatest force and this."
+AHEAD_S: Final = 0.03
+"The ripple is told so far ahead."
 
 
 @final
@@ -94,7 +100,10 @@ class Believe:
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
-        self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
+        self._leash: Final = trim.leash
+        self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
+        self.ripple = Ripple(scene.insert.roller_radius_mm)
+        self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
@@ -108,12 +117,7 @@ class Believe:
 
     @property
     def device(self) -> DeviceFit:
-        """Return the fit of the device's force to the model's without memory, at speed, with the element as relaxed as
-        now."""
-        fit, lead_N = self.strength.fit, self.sensor.lead_N
-        if lead_N > 0.0:
-            fit = fit.times(1.0 + lead_N / max(fit.force_N(self.heard_N), MIN_EXPECTED_N))
-        return fit.relaxed(self.memory.relaxed_N)
+        return self.strength.fit.relaxed(self.memory.relaxed_N)
 
     @property
     def min_N(self) -> float:
@@ -121,7 +125,7 @@ class Believe:
 
     def knows_zero(self, now_s: float) -> bool:
         """Tell whether the sensor's zero is known to within what the scene tolerates: else readings teach nothing."""
-        return self.zero.sd_N(now_s) <= self._unknown_sd_N
+        return not self.sensor.is_disputed and self.zero.sd_N(now_s) <= self._unknown_sd_N
 
     def learned(self) -> Learned:
         """Return what is known of this device now, to `teach` on another day."""
@@ -132,7 +136,8 @@ class Believe:
         """Replace all that is known of the device by `learned`, and begin its estimators anew."""
         self.strength.forget(learned.device)
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
-        self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
+        self.sensor, self.carriages = SensorTrust(self._bounds, self._leash, learned.device), CarriageLag()
+        self.ripple.forget()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
@@ -175,12 +180,29 @@ class Believe:
         predicted_N: float | None = None
         if measured is not None and slid_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-            predicted_N = self.strength.fit.force_N(slid_N) * slow
+            predicted_N = self.strength.fit.force_N(slid_N) * slow * self._ripple(measured, 0.0)
         is_unseen = self.is_prior and not self.sensor.has_slid
         unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
+        ripple, ripple_1_s = 1.0, 0.0
+        anchor_N: float | None = None
+        if self.sensor.has_slid:
+            slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
+            anchor_N = self.sensor.anchor.model_N(self._surely_N / slow) + self.memory.relaxed_N
+        if measured is not None:
+            ripple = self._ripple(measured, 0.0)
+            ripple_1_s = (self._ripple(measured, AHEAD_S) - ripple) / AHEAD_S
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
-        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, self.sensor.doubted_s)
+        doubted_s = self.sensor.doubted_s
+        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, doubted_s, anchor_N, ripple, ripple_1_s)
+
+    def _ripple(self, measured: Measured, after_s: float) -> float:
+        """Return the friction over its mean, of a handle that goes on as it does for `after_s`."""
+        handle, share = measured.handle, 0.0
+        if self._nominal.contact.slides:
+            onward_mm = handle.turn.direction * handle.rate_mm_s * after_s
+            share = self.ripple.share(measured.handle_mm + onward_mm) + self.zero.way * handle.turn.direction
+        return 1.0 + min(max(share, -MOST), MOST)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
         """Learn from the newest reading, with the model's force `model_N` at the measured gap."""
@@ -208,7 +230,7 @@ class Believe:
         handle = measured.handle
         if abs(handle.quick_mm_s) >= STOPPING_MM_S:
             return False
-        reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
+        reading_N = (measured.force_N - handle.turn.direction * self.zero.zero_N) / self._ripple(measured, 0.0)
         return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
 
     def _hear_at_creep(self, now_s: float, measured: Measured, dt_s: float, is_mobilised: bool) -> None:
@@ -222,7 +244,7 @@ class Believe:
         if not is_creep or not SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S:
             return
         expected_N = self.strength.fit.force_N(self.slow.followed_N)
-        reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
+        reading_N = (measured.force_N - handle.turn.direction * self.zero.zero_N) / self._ripple(measured, 0.0)
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
         is_lesson = self.knows_zero(now_s) and (is_mobilised or reading_N > expected_N)
         if expected_N > MIN_EXPECTED_N and is_lesson:
@@ -232,56 +254,59 @@ class Believe:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit."""
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
-        reading_N, zero_sd_N = measured.force_N - direction * zero.zero_N, zero.sd_N(now_s)
+        ripple, angle = self._ripple(measured, 0.0), 1.0 + self.ripple.share(measured.handle_mm)
+        reading_N = (measured.force_N - direction * zero.zero_N) / ripple
+        zero_sd_N = zero.sd_N(now_s)
         self.heard_N = model_N
         zero.begin(now_s)
-        known_N = zero.zero_N
+        was_disputed, is_first = (
+            sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
+            zero.way_variance == WAY_VARIANCE,
+        )
+        known_N, unrippled_N = zero.zero_N + zero.way * fit.force_N(model_N), measured.force_N / angle
         if self.learns and zero.update(
-            now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd
+            now_s,
+            direction,
+            unrippled_N,
+            model_N,
+            rate_mm_s,
+            dt_s,
+            fit.scale,
+            fit.scale_sd,
+            is_disputed=was_disputed,
         ):
-            self.strength.shift(sensor.zero_moved(zero.zero_N - known_N))
-        was_disputed = sensor.is_disputed
-        sensor.update(fit, model_N, rate_mm_s, direction, reading_N, zero_sd_N, dt_s)
+            if is_first and not was_disputed:
+                # the anchor is of the way before, and was misread
+                sensor.anchor.values[1] += direction * (zero.zero_N + zero.way * fit.force_N(model_N) - known_N)
+            self.strength.settle()
+        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
         self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
-        if sensor.is_disputed:
-            self.strength.settle()
-            if sensor.is_named or sensor.is_doubted:
-                self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
-        elif not zero_sd_N <= self._unknown_sd_N:
-            self.strength.settle()
-            sensor.compare(fit, model_N)
+        if sensor.is_doubted or sensor.is_named:
+            self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
+        unknown_N = 0.0
+        if not (zero_sd_N <= self._unknown_sd_N or sensor.is_disputed):
+            unknown_N = SURE * zero_sd_N + SLACK_N
             self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
-        else:
-            self._fit(model_N, rate_mm_s, reading_N, dt_s)
-        if sensor.is_disputed and not was_disputed:
-            self._dispute(model_N, rate_mm_s)
-        elif was_disputed and not sensor.is_disputed:
-            zero.trust()
-
-    def _dispute(self, model_N: float, rate_mm_s: float) -> None:
-        """Take the device for what it was before the readings left the fit, and the zero for unknown."""
-        self.zero.doubt()
-        before_N = self.strength.fit.force_N(model_N)
-        if self.sensor.has_slid:
-            self.strength.shift(self.sensor.back_N)
-        else:
-            self.strength.forget(self.taught)  # all else known of the device came from this sensor
-        self.slow.rescale(before_N, self.strength.fit.force_N(model_N), rate_mm_s)
+        # of a zero that is not known only a force that it does not explain teaches
+        is_explained = unknown_N > 0.0 and (not sensor.has_slid or reading_N - unknown_N < fit.force_N(model_N))
+        if taught_N is None or is_explained:
+            self.strength.settle()
+            return
+        if not self.strength.is_held:
+            self.ripple.update(measured.handle_mm, model_N, sensor.measured_N, sensor.anchor)
+        self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing."""
-        if self.sensor.freshness.is_stale or self.sensor.wrong_s > 0.0:
-            return  # the reading may be old or wrong
         if not (self.learns and self._fits):
-            self.sensor.compare(self.strength.fit, model_N)
             return
         before_N = self.strength.fit.force_N(model_N)
         if self.is_prior and not self.sensor.has_slid and abs(reading_N - before_N) > CONTRADICTED_N:
             self.is_prior, self.is_contradicted = False, True
             self.strength.forget()
+            self.sensor.anchor = Anchor(UNSEEN)
         self.strength.update(model_N, reading_N, dt_s)
         after_N = self.strength.fit.force_N(model_N)
-        self.sensor.fit_moved(after_N - before_N, after_N, dt_s)
         # the force at a slower creep stays while scale and offset are learned
         self.slow.rescale(before_N, after_N, rate_mm_s)
         if self.strength.is_held:
@@ -291,7 +316,6 @@ class Believe:
         """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
         if not self.sensor.is_disputed:
             return
+        known = self.strength.fit if wrong == "device" else self.sensor.anchor.line(self.heard_N)
+        self.strength.forget(known.unsure())
         self.sensor.confirm(wrong)
-        if wrong == "device":
-            self.zero.trust()
-            self.strength.forget(self.strength.fit.unsure())

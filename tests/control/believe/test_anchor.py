@@ -1,0 +1,43 @@
+"""What a device first showed: a curve that readings teach, and forgets nothing (synthetic)."""
+
+import pytest
+
+from tormagd.control.believe.anchor import MIDDLE_N, Anchor
+from tormagd.control.believe.sensor import KNOWN_N
+from tormagd.control.believe.strength import UNSEEN
+
+PERIOD_S = 0.004
+
+
+def device_N(model_N: float) -> float:
+    """A device of another field law than the model's."""
+    return 1.1 * model_N - 0.05 + 0.07 * (model_N - 1.2) ** 2
+
+
+@pytest.fixture
+def known() -> Anchor:
+    anchor = Anchor(UNSEEN)
+    for model_N in (0.6, 1.3, 2.0):
+        for _ in range(900):
+            anchor.learn(model_N, device_N(model_N), PERIOD_S)
+    return anchor
+
+
+def test_the_curve_of_a_device_is_learned(known: Anchor) -> None:
+    for model_N in (0.6, 0.9, 1.3, 1.7, 2.0):
+        assert known.force_N(model_N) == pytest.approx(device_N(model_N), abs=0.01)
+        assert known.deviation_N(model_N) < KNOWN_N
+        assert known.model_N(known.force_N(model_N)) == pytest.approx(model_N)
+        assert known.line(model_N).force_N(model_N) == pytest.approx(known.force_N(model_N))
+
+
+def test_at_another_force_it_is_less_sure() -> None:
+    anchor = Anchor(UNSEEN)
+    for _ in range(900):
+        anchor.learn(0.8, device_N(0.8), PERIOD_S)
+    assert anchor.deviation_N(0.8) < KNOWN_N < 0.1 < anchor.deviation_N(2.0)
+
+
+def test_a_force_that_the_curve_never_gives_is_beyond_where_it_gives_most(known: Anchor) -> None:
+    known.values[2] = -0.2
+    assert known.model_N(50.0) > MIDDLE_N + 0.5 * known.values[0] / 0.2
