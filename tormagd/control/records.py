@@ -174,8 +174,6 @@ class Belief(Value):
         limits: tuple[Limit, ...],
         sensor_doubted_s: float,
         anchor_N: float | None = None,
-        ripple: float = 1.0,
-        ripple_1_s: float = 0.0,
     ) -> None:
         self.device: Final = device
         self.at_speed: Final = at_speed
@@ -185,8 +183,6 @@ class Belief(Value):
         self.limits: Final = limits
         self.sensor_doubted_s: Final = sensor_doubted_s
         self.anchor_N: Final = anchor_N
-        self.ripple: Final = ripple
-        self.ripple_1_s: Final = ripple_1_s
 
 
 @final

@@ -16,7 +16,7 @@ from tormagd.control.aim.floors import CEILING, lawful_mT, least_mm
 from tormagd.control.aim.portrait import LawOfField, Portrait
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.strength import device_bounds
+from tormagd.control.believe.strength import DeviceFit, device_bounds
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
@@ -97,7 +97,7 @@ class Aim:
     ) -> Plan:
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
-        wanted_N = device.model_N(ask.path_N[0] / belief.ripple)
+        wanted_N = device.model_N(ask.path_N[0])
         solution = self._solution(now_s, curve, wanted_N)
         element_mT = lawful_mT(self._law, wanted_N, solution.field_mT)
         if element_mT != solution.field_mT:
@@ -139,7 +139,7 @@ class Aim:
         limits: tuple[Limit, ...],
         outside: tuple[Outside, ...],
     ) -> Plan:
-        speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief)
+        speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
             number=self.number,
@@ -185,15 +185,13 @@ class Aim:
                 limits = (*limits, reached)
         return limits
 
-    def _motion_ahead(self, path_N: list[float], belief: Belief) -> tuple[float, float]:
+    def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
         """Return the gap's speed and acceleration at the start of a path of forces, by a fitted parabola."""
         # along the portrait: a difference of two solutions would amplify the solver's grain
-        device, ripple, ripple_1_s = belief.device, belief.ripple, belief.ripple_1_s
-        start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0] / ripple))
+        start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))
         speed, acceleration = 0.0, 0.0
         for place, force_N in enumerate(path_N):
-            rippled_N = force_N / (ripple + ripple_1_s * PATH_S[place])
-            away_mm = self._portrait.gap_mm_at(device.model_N(rippled_N)) - start_mm
+            away_mm = self._portrait.gap_mm_at(device.model_N(force_N)) - start_mm
             speed += _TO_SPEED[place] * away_mm
             acceleration += _TO_ACCELERATION[place] * away_mm
         top, hardest = self._top_speed_mm_s, self._max_mm_s2

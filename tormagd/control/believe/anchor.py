@@ -46,11 +46,6 @@ class Anchor:
         terms = _terms(model_N)
         return math.sqrt(max(_dot([_dot(row, terms) for row in self.covariance], terms), 0.0))
 
-    def line(self, model_N: float) -> DeviceFit:
-        """Return the tangent at the model's force `model_N`, as uncertain as an unseen device."""
-        slope = self.values[0] + 2.0 * self.values[2] * (model_N - MIDDLE_N)
-        return DeviceFit(slope, self.force_N(model_N) - slope * model_N)
-
     def learn(self, model_N: float, reading_N: float, dt_s: float) -> None:
         """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`."""
         terms = _terms(model_N)

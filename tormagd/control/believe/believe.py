@@ -15,9 +15,9 @@ from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.ripple import MOST, Ripple
+from tormagd.control.believe.ripple import Ripple
 from tormagd.control.believe.sensor import SLACK_N, Disputed, SensorTrust
-from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, WAY_VARIANCE, SensorZero
+from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
 from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
 from tormagd.control.nominal import Nominal
@@ -47,8 +47,8 @@ MIN_FORESIGHT: Final = 0.5
 "With less foresight a plan's gap leaps, and any carriages come late: no lag is learned."
 OVER_N: Final = 0.15
 "The device as it first showed itself gives no more than the scene's greatest force and this."
-AHEAD_S: Final = 0.03
-"The ripple is told so far ahead."
+MOST_RIPPLE: Final = 0.15
+"No friction varies by a greater share over angle and way."
 
 
 @final
@@ -85,12 +85,10 @@ class Believe:
     "The model's force at the newest reading at speed."
     limits: tuple[Limit, ...] = ()
     "What is wrong with the sensor or with the fit, as the newest reading at speed shows."
-    taught: DeviceFit = UNSEEN
-    "The fit from another day that was taught; UNSEEN without one."
     is_prior: bool = False
     "Whether a fit from another day was taught, and no reading has contradicted it."
     is_contradicted: bool = False
-    "Whether the first slide has shown another device than `taught`."
+    "Whether the first slide has shown another device than the one taught."
 
     def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
         """Begin with an unseen device."""
@@ -102,7 +100,7 @@ class Believe:
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self._leash: Final = trim.leash
         self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
-        self.ripple = Ripple(scene.insert.roller_radius_mm)
+        self.ripple, self._radius_mm = Ripple(), scene.insert.roller_radius_mm
         self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
@@ -137,11 +135,10 @@ class Believe:
         self.strength.forget(learned.device)
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self.sensor, self.carriages = SensorTrust(self._bounds, self._leash, learned.device), CarriageLag()
-        self.ripple.forget()
+        self.ripple = Ripple()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
-        self.taught = learned.device
         self.is_prior, self.is_contradicted = learned.device is not UNSEEN, False
 
     def forget(self) -> None:
@@ -176,33 +173,29 @@ class Believe:
     def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
         """Return the belief, and change nothing."""
         at_speed = self.device
-        device = at_speed.times(self.slow.factor_at(self.slow.creep_mm_s)) if self._has_creep else at_speed
         predicted_N: float | None = None
         if measured is not None and slid_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-            predicted_N = self.strength.fit.force_N(slid_N) * slow * self._ripple(measured, 0.0)
+            predicted_N = self.strength.fit.force_N(slid_N) * slow * self._ripple(measured)
         is_unseen = self.is_prior and not self.sensor.has_slid
         unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
-        ripple, ripple_1_s = 1.0, 0.0
+        slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
         anchor_N: float | None = None
         if self.sensor.has_slid:
-            slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
             anchor_N = self.sensor.anchor.model_N(self._surely_N / slow) + self.memory.relaxed_N
-        if measured is not None:
-            ripple = self._ripple(measured, 0.0)
-            ripple_1_s = (self._ripple(measured, AHEAD_S) - ripple) / AHEAD_S
+        device = at_speed.times(slow if measured is None else slow * self._ripple(measured))
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
         doubted_s = self.sensor.doubted_s
-        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, doubted_s, anchor_N, ripple, ripple_1_s)
+        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, doubted_s, anchor_N)
 
-    def _ripple(self, measured: Measured, after_s: float) -> float:
-        """Return the friction over its mean, of a handle that goes on as it does for `after_s`."""
-        handle, share = measured.handle, 0.0
+    def _ripple(self, measured: Measured) -> float:
+        """Return the friction at the handle's place and way, over its mean."""
+        share = 0.0
         if self._nominal.contact.slides:
-            onward_mm = handle.turn.direction * handle.rate_mm_s * after_s
-            share = self.ripple.share(measured.handle_mm + onward_mm) + self.zero.way * handle.turn.direction
-        return 1.0 + min(max(share, -MOST), MOST)
+            share = self.ripple.share(measured.handle_mm / self._radius_mm)
+            share += self.zero.way * measured.handle.turn.direction
+        return 1.0 + min(max(share, -MOST_RIPPLE), MOST_RIPPLE)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
         """Learn from the newest reading, with the model's force `model_N` at the measured gap."""
@@ -216,24 +209,21 @@ class Believe:
         dt_s = min(now_s - self.read_s, MAX_DT_S)
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
+        reading_N = (measured.force_N - measured.handle.turn.direction * self.zero.zero_N) / self._ripple(measured)
         is_mobilised = self._nominal.contact.is_known(measured)
-        is_slow = slides and (
-            rate_mm_s < MOVING_MM_S or self._is_stuck(measured, model_N) or self.handle.moved_gap_at_rest(model_N)
-        )
-        if is_mobilised and not is_slow:
-            self._hear_at_speed(now_s, measured, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
+        # a hand that meets a wall stops within 10 ms
+        is_stuck = abs(measured.handle.quick_mm_s) < STOPPING_MM_S
+        is_stuck = is_stuck and reading_N < self.strength.fit.force_N(model_N) - STUCK_N
+        if is_mobilised and not (
+            slides and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
+        ):
+            self._hear_at_speed(now_s, measured, reading_N, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
         else:
-            self._hear_at_creep(now_s, measured, dt_s, is_mobilised)
+            self._hear_at_creep(now_s, measured, reading_N, dt_s, is_mobilised)
 
-    def _is_stuck(self, measured: Measured, model_N: float) -> bool:
-        """Tell whether the handle has stopped, with a force that is less than friction by more than STUCK_N."""
-        handle = measured.handle
-        if abs(handle.quick_mm_s) >= STOPPING_MM_S:
-            return False
-        reading_N = (measured.force_N - handle.turn.direction * self.zero.zero_N) / self._ripple(measured, 0.0)
-        return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
-
-    def _hear_at_creep(self, now_s: float, measured: Measured, dt_s: float, is_mobilised: bool) -> None:
+    def _hear_at_creep(
+        self, now_s: float, measured: Measured, reading_N: float, dt_s: float, is_mobilised: bool
+    ) -> None:
         """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise."""
         self.strength.settle()
         if not (self._has_creep and self.learns) or self.sensor.is_disputed:
@@ -244,56 +234,45 @@ class Believe:
         if not is_creep or not SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S:
             return
         expected_N = self.strength.fit.force_N(self.slow.followed_N)
-        reading_N = (measured.force_N - handle.turn.direction * self.zero.zero_N) / self._ripple(measured, 0.0)
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
         is_lesson = self.knows_zero(now_s) and (is_mobilised or reading_N > expected_N)
         if expected_N > MIN_EXPECTED_N and is_lesson:
             self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
 
-    def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
+    def _hear_at_speed(self, now_s: float, measured: Measured, reading_N: float, model_N: float, dt_s: float) -> None:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit."""
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
-        ripple, angle = self._ripple(measured, 0.0), 1.0 + self.ripple.share(measured.handle_mm)
-        reading_N = (measured.force_N - direction * zero.zero_N) / ripple
-        zero_sd_N = zero.sd_N(now_s)
+        angle, zero_sd_N = measured.handle_mm / self._radius_mm, zero.sd_N(now_s)
         self.heard_N = model_N
         zero.begin(now_s)
-        was_disputed, is_first = (
-            sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
-            zero.way_variance == WAY_VARIANCE,
-        )
-        known_N, unrippled_N = zero.zero_N + zero.way * fit.force_N(model_N), measured.force_N / angle
-        if self.learns and zero.update(
-            now_s,
-            direction,
-            unrippled_N,
-            model_N,
-            rate_mm_s,
-            dt_s,
-            fit.scale,
-            fit.scale_sd,
-            is_disputed=was_disputed,
-        ):
-            if is_first and not was_disputed:
-                # the anchor is of the way before, and was misread
-                sensor.anchor.values[1] += direction * (zero.zero_N + zero.way * fit.force_N(model_N) - known_N)
-            self.strength.settle()
+        if self.learns:
+            # an anchor that was learned one way only was misread
+            sensor.anchor.values[1] += zero.update(
+                now_s,
+                direction,
+                measured.force_N / (1.0 + self.ripple.share(angle)),
+                model_N,
+                rate_mm_s,
+                dt_s,
+                fit.scale,
+                fit.scale_sd,
+                is_disputed=sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
+            )
         taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
         self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
         if sensor.is_doubted or sensor.is_named:
             self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
-        unknown_N = 0.0
-        if not (zero_sd_N <= self._unknown_sd_N or sensor.is_disputed):
-            unknown_N = SURE * zero_sd_N + SLACK_N
-            self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
         # of a zero that is not known only a force that it does not explain teaches
+        unknown_N = 0.0 if zero_sd_N <= self._unknown_sd_N or sensor.is_disputed else SURE * zero_sd_N + SLACK_N
+        if unknown_N > 0.0:
+            self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
         is_explained = unknown_N > 0.0 and (not sensor.has_slid or reading_N - unknown_N < fit.force_N(model_N))
         if taught_N is None or is_explained:
             self.strength.settle()
             return
         if not self.strength.is_held:
-            self.ripple.update(measured.handle_mm, model_N, sensor.measured_N, sensor.anchor)
+            self.ripple.update(angle, sensor.measured_N, max(sensor.anchor.force_N(model_N), MIN_EXPECTED_N))
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
@@ -316,6 +295,10 @@ class Believe:
         """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
         if not self.sensor.is_disputed:
             return
-        known = self.strength.fit if wrong == "device" else self.sensor.anchor.line(self.heard_N)
-        self.strength.forget(known.unsure())
-        self.sensor.confirm(wrong)
+        fit = self.strength.fit
+        if wrong == "device":
+            self.sensor = SensorTrust(self._bounds, self._leash)
+        else:
+            fit = fit.shifted(self.sensor.anchor.force_N(self.heard_N) - fit.force_N(self.heard_N))
+            self.sensor.is_doubted = True
+        self.strength.forget(fit.unsure())

@@ -134,15 +134,6 @@ class SensorTrust:
         self._give_way(fit.force_N(model_N) / max(force_N, SLACK_N), self.share * force_N - unsure_N, dt_s)
         return max(reading_N, self.share * force_N - unsure_N)
 
-    def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word on readings outside the leash: the `device` is learned anew, or the `sensor` is
-        wrong."""
-        if wrong == "device":
-            self.known_s = self.outside_s = self.doubted_s = self.wrong_s = 0.0
-            self.is_doubted, self.share, self.anchor = False, 1.0, Anchor(UNSEEN)
-        else:
-            self.is_doubted = True
-
     def _give_way(self, believed: float, low_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share that is `believed`."""
         self.low_s = self.low_s + dt_s if self.measured_N < low_N else 0.0

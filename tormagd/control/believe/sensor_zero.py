@@ -107,18 +107,18 @@ class SensorZero:
         scale_sd: float,
         *,
         is_disputed: bool,
-    ) -> bool:
-        """Take one reading, and return whether a reversal has told the zero just now."""
+    ) -> float:
+        """Take one reading, and return by how much those of the way before the first reversal were too small."""
         level = self.level
         if level is None or direction != self.direction:
             # a mean over too short a time is no level
             self.before = level if level is not None and level.heard_s >= LEVEL_S else None
             self.level, self.direction = Level(reading_N, model_N, rate_mm_s, dt_s, now_s), direction
-            return False
+            return 0.0
         began_s = now_s - level.heard_s
         level = self.level = level.heard(reading_N, model_N, rate_mm_s, dt_s, now_s)
         if self.before is None or level.heard_s < LEVEL_S:
-            return False
+            return 0.0
         before, self.before = self.before, None
         return self._compare(now_s, before, level, began_s - before.until_s, scale, scale_sd, is_disputed)
 
@@ -131,12 +131,12 @@ class SensorZero:
         scale: float,
         scale_sd: float,
         is_disputed: bool,
-    ) -> bool:
-        """Learn the zero from the levels before and after a reversal, and return whether they told it."""
+    ) -> float:
+        """Learn zero and way from the levels before and after a reversal."""
         by_model_N = level.model_N - before.model_N
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - scale * by_model_N)
         if between_s > LONGEST_TURN_S or abs(found_N) > MAX_ZERO_N:
-            return False
+            return 0.0
         by_scale_N = 0.5 * scale_sd * by_model_N
         by_speed_N = 0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s)
         by_time_N = 0.5 * RELAXES_N_S * between_s
@@ -144,13 +144,14 @@ class SensorZero:
         # at one force a friction that differs by the way looks like a zero
         force_N, zero_N2 = 0.5 * scale * (level.model_N + before.model_N), self.sd_N(now_s) ** 2
         error_N, way_N2 = found_N - self.zero_N - force_N * self.way, force_N * force_N * self.way_variance
-        if is_disputed or error_N * error_N > SURE * SURE * (zero_N2 + way_N2 + read_N2):
+        if error_N * error_N > SURE * SURE * (zero_N2 + way_N2 + read_N2):
             zero_N2 = MAX_SD_N * MAX_SD_N  # neither a drift nor a way explains it
         known_N2 = zero_N2 + read_N2
-        error_N /= known_N2 + way_N2
-        self.zero_N += zero_N2 * error_N
-        self.way = min(max(self.way + force_N * self.way_variance * error_N, -MAX_WAY), MAX_WAY)
+        share = error_N / (known_N2 + way_N2)
+        is_first = self.way_variance == WAY_VARIANCE and not is_disputed
+        self.zero_N += zero_N2 * share
+        self.way = min(max(self.way + force_N * self.way_variance * share, -MAX_WAY), MAX_WAY)
         # halved: a way stays, and what drifts afterwards is the zero
         self.way_variance *= 0.5 * known_N2 / (known_N2 + way_N2)
         self.variance_N2, self.told_s = zero_N2 * read_N2 / known_N2, now_s
-        return True
+        return self.direction * share * (zero_N2 + way_N2) if is_first else 0.0
