@@ -28,7 +28,6 @@ def test_the_curve_of_a_device_is_learned(known: Anchor) -> None:
         assert known.force_N(model_N) == pytest.approx(device_N(model_N), abs=0.01)
         assert known.deviation_N(model_N) < KNOWN_N
         assert known.model_N(known.force_N(model_N)) == pytest.approx(model_N)
-        assert known.line(model_N).force_N(model_N) == pytest.approx(known.force_N(model_N))
 
 
 def test_at_another_force_it_is_less_sure() -> None:

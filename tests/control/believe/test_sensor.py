@@ -36,7 +36,6 @@ def force_N(believe: Believe) -> float:
 
 @pytest.fixture
 def known(planner: Planner, hear: Callable[..., Planner], moving) -> Planner:
-    """A device that has slid for four seconds, and is as the model says."""
     return hear(planner, 4.0, moving())
 
 
@@ -130,6 +129,14 @@ def test_a_device_that_has_not_slid_is_learned_within_the_bounds(
     believe = hear(planner, 1.0, moving(force_N=share * MODEL_N)).believe
     assert (force_N(believe) == pytest.approx(share * MODEL_N, abs=0.03)) is is_learned
     assert (Limit.SENSOR in planner.planned.limits) is not is_learned
+
+
+def test_what_has_fallen_at_a_known_force_has_fallen_at_a_new_one(core, known, hear, moving) -> None:
+    hear(known, 2.0, moving(force_N=0.93 * MODEL_N))
+    known.believe.handle = HandleWatch()
+    here_N = core.portrait.force_N_at(60.0)
+    believe = hear(known, 4.0, moving(force_N=0.93 * here_N, **{**CLOSER, "gap_mm": 60.0})).believe
+    assert believe.sensor.anchor.force_N(here_N) == pytest.approx(here_N, abs=0.02)
 
 
 @pytest.mark.parametrize(("seconds", "is_known"), [(4.0, True), (0.3, False)])

@@ -180,10 +180,12 @@ class Believe:
         is_unseen = self.is_prior and not self.sensor.has_slid
         unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
         slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
+        ripple = self._ripple(measured) if measured is not None else 1.0
         anchor_N: float | None = None
         if self.sensor.has_slid:
-            anchor_N = self.sensor.anchor.model_N(self._surely_N / slow) + self.memory.relaxed_N
-        device = at_speed.times(slow if measured is None else slow * self._ripple(measured))
+            most_N = self._surely_N / (slow * max(ripple, 1.0))
+            anchor_N = self.sensor.anchor.model_N(most_N) + self.memory.relaxed_N
+        device = at_speed.times(slow * ripple)
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
         doubted_s = self.sensor.doubted_s
@@ -272,7 +274,7 @@ class Believe:
             self.strength.settle()
             return
         if not self.strength.is_held:
-            self.ripple.update(angle, sensor.measured_N, max(sensor.anchor.force_N(model_N), MIN_EXPECTED_N))
+            self.ripple.update(angle, model_N, sensor.measured_N, sensor.anchor)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:

@@ -10,6 +10,8 @@ over the angle count, so a force that falls all the while is no ripple: over a t
 import math
 from typing import Final, final
 
+from tormagd.control.believe.anchor import Anchor
+
 HARMONICS: Final = (1, 2, 3)
 LEARNS: Final = 0.2
 "A turn leaves exp(-pi LEARNS) of a wave."
@@ -21,6 +23,8 @@ LONGEST_RAD: Final = 0.3
 "Without a reading for a greater angle, none is."
 STEEPEST: Final = 0.045
 "No ripple changes by a greater share over STEP_RAD, nor moves the gap by as much."
+LEAST_N: Final = 0.1
+"Least force that a share is of."
 
 
 @final
@@ -31,10 +35,10 @@ class Ripple:
     "a_1, b_1, a_2, b_2, a_3, b_3."
     at_rad: float = math.inf
     "The angle at which the last change ended."
-    over: float = 0.0
-    "By which share the reading was over the force there."
-    force_N: float = 0.0
-    "That force."
+    reading_N: float = 0.0
+    "The reading there."
+    model_N: float = 0.0
+    "The model's force there."
 
     def __init__(self) -> None:
         self.shares = [0.0] * 6
@@ -48,15 +52,16 @@ class Ripple:
             share += believed * (a * math.cos(k * angle) + b * math.sin(k * angle))
         return share
 
-    def update(self, angle: float, reading_N: float, force_N: float) -> None:
-        """Take a mean of readings beside the force, `force_N` > 0, that the device first showed."""
-        step_rad, over = angle - self.at_rad, reading_N / force_N - 1.0
+    def update(self, angle: float, model_N: float, reading_N: float, anchor: Anchor) -> None:
+        """Take a mean of readings at the handle's `angle`, the known ripple taken off."""
+        step_rad = angle - self.at_rad
         if abs(step_rad) < STEP_RAD:
             return
-        learned, moved = LEARNS * math.copysign(over - self.over, (over - self.over) * step_rad), self.force_N - force_N
-        self.at_rad, self.over, self.force_N = angle, over, force_N
-        if abs(step_rad) > LONGEST_RAD or max(abs(learned) / LEARNS, abs(moved) / force_N) > STEEPEST:
+        force_N, before_N = max(anchor.force_N(model_N), LEAST_N), max(anchor.force_N(self.model_N), LEAST_N)
+        changed = math.copysign(1.0, step_rad) * (reading_N / force_N - self.reading_N / before_N)
+        self.at_rad, self.model_N, self.reading_N = angle, model_N, reading_N
+        if abs(step_rad) > LONGEST_RAD or max(abs(changed), abs(before_N / force_N - 1.0)) > STEEPEST:
             return
         for k in HARMONICS:
-            self.shares[2 * k - 2] -= learned / k * math.sin(k * (angle - 0.5 * step_rad))
-            self.shares[2 * k - 1] += learned / k * math.cos(k * (angle - 0.5 * step_rad))
+            self.shares[2 * k - 2] -= LEARNS * changed / k * math.sin(k * (angle - 0.5 * step_rad))
+            self.shares[2 * k - 1] += LEARNS * changed / k * math.cos(k * (angle - 0.5 * step_rad))

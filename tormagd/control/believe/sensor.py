@@ -26,7 +26,7 @@ FILTER_S: Final = 0.01
 LEARNS_S: Final = 0.5
 "A device that has not slid for so long has shown nothing: it has no leash. What is over sooner moves no leash."
 KNOWN_N: Final = 0.02
-"An anchor that is known so well at a force, as a standard deviation, learns no more there, nor up to twice as near it."
+"An anchor that is known so well at a force, as a standard deviation, learns no more there."
 SLACK_N: Final = 0.05
 "Noise, hysteresis, a creep and a kelvin move a force by so much."
 VISCOUS_N_S_MM: Final = 6e-4
@@ -53,8 +53,8 @@ class SensorTrust:
     "Mean of the readings over FILTER_S."
     rate_mm_s: float = 0.0
     "Mean of the handle's rate while the anchor was learned."
-    is_learning: bool = True
-    "Whether the anchor is not known yet at the present force."
+    fallen: float = 1.0
+    "Share of the anchor that the fit gave where the anchor was last known."
     share: float = 1.0
     "Share of the anchor to which the fit may fall."
     low_s: float = 0.0
@@ -122,13 +122,14 @@ class SensorTrust:
         is_taken = self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
         if not (is_taken and weakest_N <= reading_N <= strongest_N):
             return None
-        self.is_learning = deviation_N > (KNOWN_N if self.is_learning else 2.0 * KNOWN_N)
-        # at the leash's end it is the fall of the readings, not what was asked, that leads to a new force
-        at_end = self.share <= 1.0 - self._leash
-        if learns and self.is_learning and not at_end and zero_sd_N <= UNKNOWN_SD_N:
+        if deviation_N <= KNOWN_N:
+            self.fallen = min(max(fit.force_N(model_N) / max(force_N, SLACK_N), 1.0 - self._leash), 1.0)
+        elif learns and zero_sd_N <= UNKNOWN_SD_N:
             self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
             surely_N = SURE * deviation_N if self.has_slid else math.inf
-            anchor.learn(model_N, min(max(reading_N, force_N - surely_N), force_N + surely_N), dt_s)
+            # what has fallen at the forces that are known has fallen here, too
+            shown_N = reading_N / self.fallen
+            anchor.learn(model_N, min(max(shown_N, force_N - surely_N), force_N + surely_N), dt_s)
         if not self.has_slid:
             return reading_N
         self._give_way(fit.force_N(model_N) / max(force_N, SLACK_N), self.share * force_N - unsure_N, dt_s)
