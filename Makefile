@@ -115,12 +115,12 @@ model: $(VENV)/.dev
 	    $(BIN)/tormag-lab bench-sweep --plant sample_1 --insert $$inserts --out build/mre_$$matrix.csv && \
 	    $(BIN)/tormag-lab train-model build/mre_$$matrix.csv --element torque --insert $$inserts --without-memory \
 	        --rising --hidden 50 --epochs 200 --validation-share 0.2 \
-	        --out tormagd/model/models/torque_mre_$$matrix.safetensors || exit 1; \
+	        --out tormagd/element/model/models/torque_mre_$$matrix.safetensors || exit 1; \
 	done
 
 # the shipped model of the tactile pad: cycles and holds of the simulated pad 1 on the bench, then training
 tactile-model: $(VENV)/.dev
-	$(BIN)/tormag-lab tactile-model --out tormagd/model/models/tactile_mre_c.safetensors
+	$(BIN)/tormag-lab tactile-model --out tormagd/element/model/models/tactile_mre_c.safetensors
 
 # docs/reproduction.md and docs/learned_inverse.md with their plots: the thesis's tables and figures beside ours
 reproduction: $(VENV)/.dev

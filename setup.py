@@ -21,35 +21,43 @@ from setuptools.command.build_ext import build_ext
 # the hot rooms, in the order data flows: whatever a setpoint, a tick or a plan runs, and the simulated device
 COMPILED = {
     "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
-    "tormagd/physics": ("friction", "relaxation"),
-    "tormagd/model": ("displacement", "force_curve"),
-    "tormagd/inverse": ("solution", "newton"),
+    "tormagd/element/physics": ("friction", "relaxation"),
+    "tormagd/element/model": ("displacement", "force_curve"),
+    "tormagd/element/inverse": ("solution", "newton"),
     "tormagd/hardware": (
         *("serial_port", "frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
     ),
-    "tormagd/safety": ("operating_state",),
-    "tormagd/control": (
-        *("filter", "interpolation", "field_of_gap", "records", "contact", "nominal", "sight", "plausible", "measure"),
-        *("core",),
-    ),
+    "tormagd/control/safety": ("operating_state",),
+    "tormagd/control": (*("interpolation", "records", "contact", "nominal", "sight", "plausible", "measure", "core"),),
     "tormagd/control/believe": (
-        *("strength", "slow_friction", "sensor_zero", "freshness", "anchor", "ripple", "sensor", "carriage_lag", "handle", "memory"),
-        "believe",
+        *(
+            "strength",
+            "slow_friction",
+            "sensor_zero",
+            "freshness",
+            "anchor",
+            "ripple",
+            "sensor",
+            "carriage_lag",
+            "handle",
+            "memory",
+            "believe",
+        ),
     ),
-    "tormagd/control/ask": ("skill", "forecast", "path", "way", "governor"),
-    "tormagd/control/aim": ("portrait", "floors", "aim"),
+    "tormagd/control/ask": ("forecast", "path", "way", "governor"),
+    "tormagd/control/aim": ("portrait", "aim"),
     "tormagd/control/move": ("motor", "pid", "reference", "homing", "opening", "watch", "actuator", "carriages"),
-    "tormagd/assembly": ("conditions", "journal"),
+    "tormagd/control/assembly": ("conditions",),
+    "tormagd/record": ("journal", "telemetry"),
     "tormagd/simulation": (
-        *("curve", "axis", "gap_field", "warmth", "element", "second_element", "tactile_pad"),
-        *("pressed_pad", "hand", "plant", "motion", "firmware", "device"),
+        *("curve", "gap_field", "axis", "element", "second_element", "tactile_pad"),
+        *("pressed_pad", "hand", "plant", "motion", "firmware", "device", "closed_loop"),
     ),
     "tormagd/daemon": (
-        *("rate_group", "beat", "source", "inbox", "tally", "allowance", "arrivals", "requests", "telemetry", "way", "topics"),
+        *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay", "topics"),
         *("control_loop", "inference_loop", "black_box", "telemetry_loop"),
     ),
     "tormagd/lab": ("ideal_actuator",),
-    "tormagd": ("closed_loop",),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]
 GROUP = "firmware_protocol.core"

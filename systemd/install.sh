@@ -19,7 +19,7 @@ for program in daemon:tormagd ctl:tormagctl lab:tormag-lab; do
     # children, such as the fitting of a calibration, find the library by the same variable
     cat > "$root$prefix/bin/${program#*:}" <<END
 #!/bin/sh
-PYTHONPATH='$library' exec $python -P -s -c 'import sys; from tormagd.entry import ${program%:*}; sys.exit(${program%:*}())' "\$@"
+PYTHONPATH='$library' exec $python -P -s -c 'import sys; from tormagd.ground.entry import ${program%:*}; sys.exit(${program%:*}())' "\$@"
 END
     chmod 755 "$root$prefix/bin/${program#*:}"
 done

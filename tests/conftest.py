@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, settings
 from machines.host import HostWatch
 
 from firmware_protocol.c.build import BuildError, compiler, load_library
-from tormagd.slices import ask_for_slices
+from tormagd.ground.scheduling import ask_for_slices
 
 # No test asserts a wall-clock duration. One commit has one verdict: a property's cases are drawn from its source, and
 # `make search` draws others, whose finds become an `@example`

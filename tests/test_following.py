@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tormagd.daemon.verdict import HOLDING
-from tormagd.following import NOT_FOLLOWED, Following
-from tormagd.recording.overview import OverviewBuilder
+from tormagd.record.force_following import NOT_FOLLOWED, Following
+from tormagd.record.overview import OverviewBuilder
 
 HZ = 50
 FOLLOWED: dict[str, Any] = {"operating_state": "ENABLED", "limits": (), "handle_rate_mm_s": 20.0}

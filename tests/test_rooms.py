@@ -8,77 +8,27 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LOWEST = {"firmware_protocol", "config"}
-FILES = {"bounded_file", "named_file", "toml_file"}
-DECIDES = {"firmware_protocol", "config", "physics", "model", "inverse", "scenes", "safety", "hardware"}
 NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
+BASE = {"client", "firmware_protocol", "ground"}
+DECIDES = BASE | {"config", "element", "scenes", "hardware"}
 MAY_IMPORT = {
+    "client": set(),
     "firmware_protocol": set(),
-    "bounded_file": set(),
-    "named_file": set(),
-    "toml_file": {"bounded_file", "named_file"},
-    "force_file": {"bounded_file"},
-    "config": {"toml_file"},
-    "output": set(),
-    "command_line": {"named_file", "output"},
-    "drawing": set(),
-    "exact": set(),
-    "following": set(),
-    "keeping": set(),
-    "slices": set(),
-    "interrupt": set(),
-    "keys": FILES | {"config"},
-    "entry": set(),  # it loads the daemon or tormagctl by name, never both
-    "physics": FILES,
-    "model": FILES | {"physics"},
-    "inverse": {"firmware_protocol", "physics", "model"},
-    "scenes": {"named_file", "toml_file", "config", "force_file"},
-    "safety": {"firmware_protocol"},
-    "hardware": LOWEST | {"named_file", "exact", "safety"},
+    "ground": {"client", "firmware_protocol"},
+    "config": BASE,
+    "element": BASE,
+    "scenes": BASE | {"config"},
+    "hardware": BASE | {"config"},
     "control": DECIDES,
-    "assembly": DECIDES | {"exact", "keeping", "control"},
-    "daemon": LOWEST
-    | FILES
-    | {"command_line", "following", "output", "keys", "keeping", "slices"}
-    | {"inverse", "scenes", "safety", "hardware", "control", "assembly"},
-    "recording": FILES | {"drawing", "following", "output", "keeping"},
-    "dashboard": {"following", "output", "recording", "safety"},
-    "commission": {"config", "control", "dashboard", "safety"},
-    "ctl": FILES
-    | {
-        "commission",
-        "safety",
-        "command_line",
-        "dashboard",
-        "following",
-        "force_file",
-        "config",
-        "output",
-        "interrupt",
-        "keys",
-        "scenes",
-        "recording",
-    },
-    "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices", "interrupt"},
-    "headroom": {"config", "output", "daemon", "control", "assembly", "simulation", "closed_loop"},
-    "replay": LOWEST
-    | {
-        "exact",
-        "keeping",
-        "output",
-        "recording",
-        "model",
-        "inverse",
-        "scenes",
-        "safety",
-        "hardware",
-        "control",
-        "daemon",
-    }
-    | {"assembly", "simulation", "closed_loop"},
-    "closed_loop": LOWEST | {"inverse", "control", "assembly", "hardware", "safety", "simulation"},
+    "record": DECIDES | {"control"},
+    "commission": DECIDES | {"control"},
+    "daemon": DECIDES | {"control", "record"},
+    "simulation": DECIDES | {"control", "record"},
+    "view": BASE | {"control", "record", "commission"},
+    "ctl": DECIDES | {"control", "record", "commission", "view"},
+    "headroom": DECIDES | {"control", "daemon", "simulation"},
 }
-MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"entry"}
+MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"headroom"}
 """Nothing imports the laboratory."""
 TOOLS = ROOT / "tools"
 TOOL_ROOMS = {

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from tormagd.slices import SHORTEST_NS
+from tormagd.ground.scheduling import SHORTEST_NS
 
 TOLD = """
 import threading
-from tormagd.slices import ask_for_slices
+from tormagd.ground.scheduling import ask_for_slices
 
 def told():
     with open("/proc/thread-self/sched") as lines:
@@ -30,7 +30,7 @@ told()
 """
 NICE = """
 import os
-from tormagd.slices import ask_for_slices
+from tormagd.ground.scheduling import ask_for_slices
 
 os.nice(1)
 before = os.getpriority(os.PRIO_PROCESS, 0), os.sched_getscheduler(0)

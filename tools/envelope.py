@@ -28,11 +28,11 @@ from rendering.models import models, models_table
 from tqdm import tqdm
 
 from tormagd.control.records import TimedSetpoint
+from tormagd.control.safety.codes import Limit
 from tormagd.lab.arrays import Array, Json, Mask
 from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
 from tormagd.lab.pages import stamp, subplots
 from tormagd.lab.told import lines
-from tormagd.safety.codes import Limit
 
 DRAWS = 40
 SETPOINT_S = 0.002

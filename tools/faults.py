@@ -19,9 +19,9 @@ from fault_matrix.rig import Rig
 from fault_matrix.watch import MAX_OFF_N, MAX_OVER_N, Cell, Watch
 from tqdm import tqdm
 
+from tormagd.control.safety.operating_state import OperatingState, RefusedError, next_commands
 from tormagd.daemon.arming import Arming
 from tormagd.lab.told import table
-from tormagd.safety.operating_state import OperatingState, RefusedError, next_commands
 from tormagd.simulation.__main__ import FIRMWARES
 from tormagd.simulation.device import FirmwareKind
 from tormagd.simulation.firmware import Firmware

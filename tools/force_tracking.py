@@ -44,9 +44,9 @@ from rendering.signals import (
 )
 from tqdm import tqdm
 
-from tormagd.assembly.build import build_core
-from tormagd.assembly.profile import profile_of
 from tormagd.config import Config
+from tormagd.control.assembly.build import build_core
+from tormagd.control.assembly.profile import profile_of
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Json

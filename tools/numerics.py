@@ -30,12 +30,12 @@ from extremes.table import stages
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from tormagd.element.physics.errors import FloatArray
+from tormagd.element.physics.field import ThesisFieldLaw
+from tormagd.element.physics.force import brake_force_N, max_radial_moment_Tm
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 from tormagd.lab.told import lines
-from tormagd.physics.errors import FloatArray
-from tormagd.physics.field import ThesisFieldLaw
-from tormagd.physics.force import brake_force_N, max_radial_moment_Tm
 
 BATCH = 500
 CHUNK = 20

@@ -1,7 +1,7 @@
 """Writes docs/states.md, docs/fault-matrix.md and docs/risk.html.
 
-They come from the tables of `tormagd/safety`, docs/evidence/faults.json, the conformance kit and the test tree. Run
-`python tools/safety_pages.py` after a change; tests compare. It names the risk page's red rows.
+They come from the tables of `tormagd/control/safety`, docs/evidence/faults.json, the conformance kit and the test
+tree. Run `python tools/safety_pages.py` after a change; tests compare. It names the risk page's red rows.
 """
 
 import json
@@ -15,9 +15,10 @@ from risk.named_tests import named_tests
 from risk.page import page, red_rows
 from risk.rows import Row, judgement, rows
 
+from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
+from tormagd.control.safety.operating_state import ROWS, Event, OperatingState, Refusal, Transition
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd.lab.pages import table
-from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
-from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, OperatingState, Refusal, Transition
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import checked as checked, convert, convert_as, placed, table_in as table_in
+from tormagd.ground.toml_file import checked as checked, convert, convert_as, placed, table_in as table_in
 from tormagd_client.endpoints import ConfigError, Endpoints, Strict, require_usable
 from tormagd_client.printable import require
 

@@ -8,7 +8,8 @@ import msgspec
 import pytest
 from hypothesis import example, given, strategies as st
 
-from tormagd.assembly.profile import (
+from tormagd.config import Config
+from tormagd.control.assembly.profile import (
     MAX_BYTES,
     ZERO_LASTS_S,
     Profile,
@@ -17,7 +18,6 @@ from tormagd.assembly.profile import (
     profile_of,
     read_profile,
 )
-from tormagd.config import Config
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
 from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit, device_bounds

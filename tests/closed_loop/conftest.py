@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterable, Iterator
 import msgspec
 import pytest
 
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.training.bench_sweep import gap_plan
+from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, SteadyHand

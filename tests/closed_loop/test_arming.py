@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import pytest
 
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import Conditions, OperatingState, RefusedError, SafetyState, latch
 from tormagd.daemon.arming import MOVES_S, PATIENCE_S, Arming
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import Conditions, OperatingState, RefusedError, SafetyState, latch
+from tormagd.simulation.closed_loop import ClosedLoop, Sample
 
 ASKED_N = 1.5
 OVER_S = 0.05

@@ -12,11 +12,11 @@ import msgpack
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Sources
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.daemon.inbox import SetpointInbox
-from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 
 REALTIME_NS = 1_800_000_000 * 10**9

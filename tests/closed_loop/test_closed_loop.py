@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from firmware_protocol.codec import DriveMode
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
+from tormagd.control.safety.codes import Fault, Limit
 from tormagd.lab.tactile.held import Case, hold
-from tormagd.safety.codes import Fault, Limit
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
 from tormagd.simulation.hand import PressingHand, RecordedHand, ReversingHand
 
 OPEN_MM = 95.0

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from tormagd.assembly.build import build_core
-from tormagd.closed_loop import Array, ClosedLoop, Sample
 from tormagd.config import Config
+from tormagd.control.assembly.build import build_core
 from tormagd.control.core import Stepper
 from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
 from tormagd.control.move.reference import Reference
+from tormagd.control.safety.operating_state import OperatingState
 from tormagd.lab.training.bench_sweep import gap_plan
-from tormagd.safety.operating_state import OperatingState
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.closed_loop import Array, ClosedLoop, Sample
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import RecordedHand, SteadyHand

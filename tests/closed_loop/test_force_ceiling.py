@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from fault_matrix.rig import Lie, LyingSensor
 
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import Governor
+from tormagd.control.assembly.build import Core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import OperatingState, RefusedError
+from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.hand import RecordedHand, ReversingHand
 
 CONFIG = Config(scene="coronary")

@@ -6,14 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.assembly.belief import beliefs
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
+from tormagd.control.assembly.belief import beliefs
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.records import TimedSetpoint
 from tormagd.scenes.scene import EVERY_TERM, Terms, load_scene
+from tormagd.simulation.closed_loop import ClosedLoop, stream
 from tormagd.simulation.hand import ReversingHand
 
 VALID_S = 0.2

@@ -10,12 +10,12 @@ from benchmarks.step import drive as held
 from fault_matrix.bad_lines import BadSerialLine, losing
 
 from firmware_protocol.codec import DeviceMode
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import ClosedLoop, VirtualBus
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Fault
 from tormagd.lab.training.bench_sweep import gap_plan
-from tormagd.safety.codes import Fault
 from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.closed_loop import ClosedLoop, VirtualBus
 from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.firmware import Firmware

@@ -4,11 +4,11 @@ import math
 
 import pytest
 
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import Sample
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import Duty, TimedSetpoint
+from tormagd.control.safety.operating_state import Conditions
 from tormagd.daemon.inbox import SetpointInbox
-from tormagd.safety.operating_state import Conditions
+from tormagd.simulation.closed_loop import Sample
 from tormagd_client.messages import Setpoint, encode
 
 LASTS_S, BEFORE_S = 1.5, 0.7

@@ -9,14 +9,14 @@ from typing import NamedTuple
 import msgpack
 import pytest
 
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Sources
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Limit
+from tormagd.daemon.force_delay import Way
 from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
 from tormagd.daemon.source import SETTLED_S
-from tormagd.daemon.way import Way
-from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Budget
+from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd_client.messages import SourceReport
 
 START_NS = 1_800_000_000_000_000_000

@@ -5,11 +5,11 @@ from collections.abc import Iterable
 import pytest
 
 from firmware_protocol.codec import DeviceMode
-from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.control.move.carriages import Carriages
 from tormagd.control.records import TimedSetpoint
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import OperatingState
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import OperatingState
+from tormagd.simulation.closed_loop import ClosedLoop, Sample
 
 FORCE_N = 1.4
 ALLOWED_N = 0.1

@@ -26,13 +26,14 @@ from firmware_protocol.codec import (
     Status,
 )
 from firmware_protocol.framing import DELIMITER, cobs_decode
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import COMMANDS, OperatingState, RefusedError
 from tormagd.daemon.arming import Arming
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import COMMANDS, DeviceRequest, OperatingState, RefusedError
+from tormagd.hardware.measurement import DeviceRequest
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import SerialDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault

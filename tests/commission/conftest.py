@@ -7,16 +7,16 @@ import msgspec
 import pytest
 
 from firmware_protocol.codec import Message
-from tormagd.assembly.build import build_core
-from tormagd.closed_loop import ClosedLoop
-from tormagd.commission.course import COLUMNS, PREVIEW_STEP_S, Asked, Course, Found, Heard, Known, drive
 from tormagd.commission.finding import Finding
+from tormagd.commission.procedure import COLUMNS, PREVIEW_STEP_S, Asked, Course, Found, Heard, Known, drive
 from tormagd.commission.sequence import STEPS, Step, Stopped, due, sequence
 from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
-from tormagd.daemon.telemetry import tick_record
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.safety.operating_state import RefusedError
+from tormagd.record.telemetry import tick_record
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, ReversingHand

@@ -8,15 +8,15 @@ import pytest
 from rendering.device_draws import drawn_device
 
 from firmware_protocol.codec import Sense, State
-from tormagd.assembly.build import build_core
 from tormagd.commission.calibration import calibration
 from tormagd.commission.finding import finding
-from tormagd.commission.page import page_of
 from tormagd.commission.sequence import STEPS, Report, Stopped, begun
 from tormagd.config import Config, Rates, load_calibration
+from tormagd.control.assembly.build import build_core
 from tormagd.control.move.motor import margins
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import load_plant, with_insert
+from tormagd.view.commission_page import page_of
 
 CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
 SAMPLE = load_plant("sample_1")

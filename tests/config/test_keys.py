@@ -12,7 +12,7 @@ import pytest
 import zmq
 
 from tormagd.config import Config
-from tormagd.keys import KeyRing, load_folder, require_own
+from tormagd.ground.access_keys import KeyRing, load_folder, require_own
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.keys import MAX_KEY_FILE_BYTES, fingerprint, generate, load_pair, load_public
 

@@ -9,16 +9,16 @@ import msgspec
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
-from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.records import Duty, Handle, Measured, Plan, TimedSetpoint
-from tormagd.hardware.measurement import Measurement
-from tormagd.model.displacement import MOBILISED_MM, Turn
-from tormagd.model.memory import NO_MEMORY
-from tormagd.model.model_file import ForceModel, load_model
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, RefusedError
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import Conditions, OperatingState, RefusedError
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.element.model.memory import NO_MEMORY
+from tormagd.element.model.model_file import ForceModel, load_model
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.scenes.scene import Scene
 
 MeasurementMaker = Callable[..., Measurement]
@@ -31,7 +31,7 @@ def config() -> Config:
     return Config()
 
 
-LOADED = "tormagd.assembly.build.load_model"
+LOADED = "tormagd.control.assembly.build.load_model"
 
 
 def load_forgetful(path: Path, **meant: str) -> ForceModel:

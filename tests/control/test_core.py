@@ -10,13 +10,13 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
 from tormagd.control.move.watch import STARTING_S
 from tormagd.control.plausible import LEAP_MM
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import CLEARING_S, OperatingState, RefusedError
 from tormagd.control.sight import BLIND_S
-from tormagd.exact import plain
+from tormagd.element.physics.errors import DomainError
+from tormagd.ground.plain_values import plain
 from tormagd.hardware.link_quality import LinkQuality
-from tormagd.hardware.measurement import Measurement
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import CLEARING_S, DeviceRequest, OperatingState, RefusedError
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 PERIOD_S = 1e-3
 CONFIG = Config()

@@ -8,8 +8,8 @@ from hypothesis import given, strategies as st
 from firmware_protocol.codec import Switches
 from tormagd.control.measure import Measure
 from tormagd.control.records import Measured
+from tormagd.element.model.displacement import MOBILISED_MM, TURN_MM
 from tormagd.hardware.measurement import Measurement
-from tormagd.model.displacement import MOBILISED_MM, TURN_MM
 
 COUNT_MM = 8.0 / 4480.0
 HANDLE_COUNT_MM = 2.0 * math.pi * 20.0 / 16384.0

@@ -5,15 +5,15 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from tormagd.assembly.build import SEVERAL_BRANCHES, Core, build_core, choose_solver
 from tormagd.config import Config
+from tormagd.control.assembly.build import SEVERAL_BRANCHES, Core, build_core, choose_solver
 from tormagd.control.contact import PRESSED, Pressing
 from tormagd.control.core import Planner
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
-from tormagd.exact import plain
-from tormagd.model.displacement import Turn
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.model.displacement import Turn
+from tormagd.ground.plain_values import plain
 from tormagd.scenes.scene import EVERY_TERM, load_scene, scene_path
 from tormagd_client.endpoints import ConfigError
 

@@ -5,16 +5,16 @@ import math
 import msgspec
 import pytest
 
-from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
 from tormagd.control.ask.forecast import Forecast
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.strength import UNSEEN
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle, Plan, TimedSetpoint
-from tormagd.exact import plain
-from tormagd.model.displacement import MOBILISED_MM, Turn
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.ground.plain_values import plain
 from tormagd.scenes.scene import EVERY_TERM, TERMS, Scene, Terms, load_scene
 
 pytestmark = pytest.mark.usefixtures("forgetful")

@@ -23,16 +23,11 @@ BUILD = settle()  # before anything of the core is imported
 from firmware_protocol.codec import decode, encode  # noqa: E402
 from firmware_protocol.framing import FrameDecoder, encode_frame  # noqa: E402
 from firmware_protocol.layouts import LAYOUTS  # noqa: E402
-from tormagd.assembly.build import Core, build_core  # noqa: E402
 from tormagd.config import Config  # noqa: E402
+from tormagd.control.assembly.build import Core, build_core  # noqa: E402
 from tormagd.control.records import Duty, Plan, TimedSetpoint  # noqa: E402
-from tormagd.exact import packed, plain  # noqa: E402
-from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
-from tormagd.hardware.link import DeviceLink  # noqa: E402
-from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
-from tormagd.hardware.measurement import Measurement  # noqa: E402
-from tormagd.safety.codes import Fault  # noqa: E402
-from tormagd.safety.operating_state import (  # noqa: E402
+from tormagd.control.safety.codes import Fault  # noqa: E402
+from tormagd.control.safety.operating_state import (  # noqa: E402
     ROWS,
     Conditions,
     Event,
@@ -41,6 +36,11 @@ from tormagd.safety.operating_state import (  # noqa: E402
     SafetyState,
     Transition,
 )
+from tormagd.ground.plain_values import packed, plain  # noqa: E402
+from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
+from tormagd.hardware.link import DeviceLink  # noqa: E402
+from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
+from tormagd.hardware.measurement import Measurement  # noqa: E402
 
 CONFIG = Config()
 VECTORS = Path(firmware_protocol.__file__).parent / "vectors"

@@ -7,9 +7,9 @@ from types import ModuleType
 import msgspec
 import pytest
 
-from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.safety.operating_state import Event, OperatingState
+from tormagd.control.assembly.build import build_core
+from tormagd.control.safety.operating_state import Event, OperatingState
 
 
 class Unseen:

@@ -14,12 +14,11 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from tormagd.assembly.build import build_core
-from tormagd.closed_loop import ClosedLoop
-from tormagd.commission import course
+from tormagd.commission import procedure as course
 from tormagd.commission.finding import Finding
 from tormagd.commission.sequence import STEPS, Stopped, begun
 from tormagd.config import Config
+from tormagd.control.assembly.build import build_core
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.ctl import (
@@ -32,13 +31,13 @@ from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, agree, up_and_down, wri
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
 from tormagd.ctl.calibrate_run import Progress, Range
 from tormagd.ctl.outcome import CommandError
+from tormagd.element.model.displacement import MOVING_MM_S, Turn
+from tormagd.element.model.model_file import ForceModel, load_model, model_path
+from tormagd.element.physics.inserts import insert
 from tormagd.lab.training import calibration
 from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
 from tormagd.lab.training.dataset import Dataset
-from tormagd.model.displacement import MOVING_MM_S, Turn
-from tormagd.model.model_file import ForceModel, load_model
-from tormagd.model.shipped import model_path
-from tormagd.physics.inserts import insert
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant

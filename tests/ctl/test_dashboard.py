@@ -21,15 +21,15 @@ from aiohttp import ClientResponse, ClientSession, ClientWebSocketResponse
 from aiohttp.test_utils import TestClient, TestServer
 from hypothesis import given, settings, strategies as st
 
-from tormagd.dashboard.frame import SHOWN_S, Frame, late_counts
-from tormagd.dashboard.live import WAITING, Live
-from tormagd.dashboard.recorded import Recorded
-from tormagd.dashboard.server import application
-from tormagd.recording.overview import LATE_US
-from tormagd.recording.reader import RecordingFile
-from tormagd.recording.ticks import TickBatch
-from tormagd.recording.writer import RecordingWriter
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.record.overview import LATE_US
+from tormagd.record.reader import RecordingFile
+from tormagd.record.ticks import TickBatch
+from tormagd.record.writer import RecordingWriter
+from tormagd.view.frame import SHOWN_S, Frame, late_counts
+from tormagd.view.live import WAITING, Live
+from tormagd.view.recorded import Recorded
+from tormagd.view.server import application
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import in_folder
 from tormagd_client.messages import BeliefReport, Description, ProfileReport, Status, encode

@@ -19,8 +19,8 @@ import pytest
 from prometheus_client.metrics_core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
+from tormagd.control.safety.codes import Fault, Limit
 from tormagd.ctl.main import main
-from tormagd.safety.codes import Fault, Limit
 
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "examples/grafana.json"

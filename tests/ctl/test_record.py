@@ -12,7 +12,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from tormagd.recording.reader import RecordingFile
+from tormagd.record.reader import RecordingFile
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_rubbish_is_counted_and_left_out(fake_daemon, ctl, file):
 def test_a_full_disk_ends_a_recording_that_can_still_be_read(
     fake_daemon, tmp_path, limit_bytes, program, said, is_told, file
 ):
-    program = f"from tormagd.recording import writer; {program}import sys, tormagd.ctl.main as it; sys.exit(it.main())"
+    program = f"from tormagd.record import writer; {program}import sys, tormagd.ctl.main as it; sys.exit(it.main())"
     command = [sys.executable, "-c", program, *fake_daemon.at, "--wait", "20", "--json"]
     ended = subprocess.run(
         [*command, "record", str(file), "--duration", "60"],

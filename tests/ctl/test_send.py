@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 from tormagd.ctl.outcome import CommandError
 from tormagd.ctl.watch import held_back
 from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
-from tormagd.force_file import ForceFileError
+from tormagd.ground.force_file import ForceFileError
 from tormagd_client.messages import Setpoint, Status
 
 

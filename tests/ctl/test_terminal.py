@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tormagd.ctl.outcome import Colour
-from tormagd.daemon.log import LogFormatter
-from tormagd.output import write_line
+from tormagd.ground.terminal import LogFormatter, write_line
 from tormagd_client.printable import printable
 
 # -- text --------------------------------------------------------------------------------------------------------------

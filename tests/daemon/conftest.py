@@ -5,8 +5,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 
 
 @pytest.fixture(scope="session")

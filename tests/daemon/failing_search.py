@@ -1,8 +1,8 @@
 """A core whose plans fail when a test says so."""
 
-from tormagd.assembly.build import Core
-from tormagd.inverse.solution import FieldSolution
-from tormagd.model.force_curve import ForceCurve
+from tormagd.control.assembly.build import Core
+from tormagd.element.inverse.solution import FieldSolution
+from tormagd.element.model.force_curve import ForceCurve
 
 
 class FailingSearch:

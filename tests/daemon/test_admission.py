@@ -17,7 +17,7 @@ from tormagd.config import Config, Sources
 from tormagd.daemon import admission
 from tormagd.daemon.admission import AT_ONCE, PLAIN
 from tormagd.daemon.endpoint import Endpoint
-from tormagd.keys import KeyRing
+from tormagd.ground.access_keys import KeyRing
 from tormagd_client.endpoints import Curve, Endpoints
 from tormagd_client.keys import KeyPair, fingerprint, generate, load_pair
 from tormagd_client.messages import VERSION, Reply, Request, decode, encode

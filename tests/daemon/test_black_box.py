@@ -11,19 +11,19 @@ import msgspec
 import pytest
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Hello
-from tormagd.assembly.build import Core
-from tormagd.assembly.journal import MAX_ENTRIES, TEACH, Journal
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.black_box import MAX_REQUESTED, PART_TICKS, BlackBox
 from tormagd.daemon.profiles import state_folder
-from tormagd.daemon.telemetry import tick_record
-from tormagd.exact import plain
+from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.keeping import Begin, End, Part, Said, Write, Written
-from tormagd.safety.operating_state import RefusedError
+from tormagd.record.journal import MAX_ENTRIES, TEACH, Journal
+from tormagd.record.keeper_messages import Begin, End, Part, Said, Write, Written
+from tormagd.record.telemetry import tick_record
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
@@ -42,7 +42,7 @@ class Rig:
         self.process = Mock()
         self.stepper, self.planner = core.stepper(), core.planner()
         self.output = self.stepper.step(1.0, None, self.planner.planned)
-        with patch("tormagd.daemon.beside.start_beside", self.start):
+        with patch("tormagd.daemon.child_process.start_beside", self.start):
             self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000)
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
         self.box.begin(self.stepper, self.planner, connection)
@@ -192,7 +192,11 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     ("name", "fails", "says"),
     [
-        ("tormagd.daemon.beside.start_beside", Mock(side_effect=OSError(11, "Try again")), "did not start: Try again"),
+        (
+            "tormagd.daemon.child_process.start_beside",
+            Mock(side_effect=OSError(11, "Try again")),
+            "did not start: Try again",
+        ),
         ("importlib.util.find_spec", lambda _name: None, "mcap is not installed: pip install 'tormagd[record]'"),
     ],
 )

@@ -18,9 +18,9 @@ import msgpack
 import pytest
 import zmq
 
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
 from tormagd.daemon.requests import WAITING_PER_CLIENT
-from tormagd.safety.operating_state import RefusedError
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import (
     MOTION_TOPIC,

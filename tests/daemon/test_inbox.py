@@ -8,10 +8,10 @@ from hypothesis import given, strategies as st
 
 from tormagd.config import Sources
 from tormagd.control.records import TimedSetpoint, Wall
+from tormagd.control.safety.codes import Limit
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
 from tormagd.daemon.source import AHEAD_S, FACTORS, SETTLED_S
-from tormagd.safety.codes import Limit
-from tormagd.safety.operating_state import RefusedError
 from tormagd_client.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, SourceReport, decode, encode
 
 PRIORITY = ("patient", "console")

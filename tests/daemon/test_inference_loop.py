@@ -4,13 +4,13 @@ from unittest.mock import Mock
 import pytest
 from failing_search import FailingSearch
 
-from tormagd.assembly.build import Core
-from tormagd.assembly.journal import AFRESH, PLAN, Journal
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.physics.errors import DomainError
+from tormagd.element.physics.errors import DomainError
+from tormagd.record.journal import AFRESH, PLAN, Journal
 
 US = 1_000
 TICK_NS = 1_000 * US

@@ -1,7 +1,7 @@
 import random
 
 from tormagd.daemon.listeners import PEERS, TOPICS, Listeners
-from tormagd.daemon.tally import Peer
+from tormagd.daemon.peers import Peer
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC
 
 ON, OFF = b"\x01", b"\x00"

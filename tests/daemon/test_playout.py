@@ -7,10 +7,10 @@ import msgpack
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.assembly.build import Core
 from tormagd.config import Sources
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Limit
 from tormagd.daemon.inbox import SetpointInbox
-from tormagd.safety.codes import Limit
 
 START_NS = 1_800_000_000_000_000_000
 TICK_S = 1e-3

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tormagd.assembly.build import Core
-from tormagd.assembly.profile import ProfileError, profile_of
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core
+from tormagd.control.assembly.profile import ProfileError, profile_of
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.believe.strength import DeviceFit, device_bounds
 from tormagd.daemon.profiles import ProfileFolder, Profiles

@@ -1,9 +1,8 @@
 import msgpack
 import pytest
 
-from tormagd.daemon.allowance import PEERS, Allowance
+from tormagd.daemon.peers import PEERS, Allowance, Peer
 from tormagd.daemon.requests import FIRST, WAITING, WAITING_PER_CLIENT, Requests, Waiting, may_go_first
-from tormagd.daemon.tally import Peer
 
 
 def waiting(client: str, number: int = 0, opens: int = 0) -> Waiting:

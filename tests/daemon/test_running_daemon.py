@@ -19,15 +19,15 @@ from failing_search import FailingSearch
 
 from firmware_protocol.build import settle
 from firmware_protocol.codec import Message
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import VirtualPort
 from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, load_calibration
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.daemon import daemon as daemon_module, telemetry_loop
 from tormagd.daemon.beat import KERNEL, Beat, Delay
 from tormagd.daemon.daemon import Daemon
+from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.backend import BackendError
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.simulation.closed_loop import VirtualPort
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant

@@ -5,15 +5,15 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import SEARCH_S, ClosedLoop
 from tormagd.config import Config, Rates
 from tormagd.control.aim.aim import OLDEST_ANSWER_S
-from tormagd.control.aim.floors import LAW_SHARE
+from tormagd.control.aim.portrait import LAW_SHARE
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.search_process import SearchProcess
-from tormagd.inverse.solution import Answer, FieldSolution, Question, Reach
-from tormagd.physics.errors import DomainError
+from tormagd.element.inverse.solution import Answer, FieldSolution, Question, Reach
+from tormagd.element.physics.errors import DomainError
+from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

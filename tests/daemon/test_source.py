@@ -8,6 +8,7 @@ import msgpack
 import pytest
 from hypothesis import assume, given, strategies as st
 
+from tormagd.control.safety.codes import Limit
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.source import (
     AHEAD_S,
@@ -23,7 +24,6 @@ from tormagd.daemon.source import (
     Sequence,
     SourceClock,
 )
-from tormagd.safety.codes import Limit
 
 # -- numbers -----------------------------------------------------------------------------------------------------------
 

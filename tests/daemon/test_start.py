@@ -8,15 +8,15 @@ from unittest.mock import Mock
 
 import pytest
 
-from tormagd import entry
 from tormagd.daemon import main as daemon_main
+from tormagd.ground import entry
 
 # -- Ctrl-C until a command runs ---------------------------------------------------------------------------------------
 
 
 COMMANDS = {
-    "tormagd": "import tormagd.entry; sys.exit(tormagd.entry.daemon())",
-    "tormagctl": "import tormagd.entry; sys.argv[1:] = ['status']; sys.exit(tormagd.entry.ctl())",
+    "tormagd": "import tormagd.ground.entry; sys.exit(tormagd.ground.entry.daemon())",
+    "tormagctl": "import tormagd.ground.entry; sys.argv[1:] = ['status']; sys.exit(tormagd.ground.entry.ctl())",
     "simulation": "import runpy; sys.argv[1:] = ['--pty']; runpy.run_module('tormagd.simulation', run_name='__main__')",
 }
 SIGNALLED_AT = """
@@ -51,11 +51,11 @@ def test_what_is_slow_to_load_is_not_loaded_before_that():
     [
         ("tormagd", "tormagd.daemon.main"),
         ("tormagd", "uvloop"),
-        ("tormagd", "tormagd.assembly.build"),
+        ("tormagd", "tormagd.control.assembly.build"),
         ("tormagctl", "tormagd.ctl.main"),
         ("tormagctl", "tormagd.config"),
         ("simulation", "numpy"),
-        ("simulation", "tormagd.simulation.pty_door"),
+        ("simulation", "tormagd.simulation.pty_port"),
     ],
 )
 def test_a_signal_in_the_middle_of_loading_ends_a_command_without_a_word(
@@ -78,36 +78,14 @@ def test_ctrl_c_between_loading_and_running_is_quiet_too(monkeypatch: pytest.Mon
 
 LOADED = """
 import sys
-import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.assembly.build
+import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.control.assembly.build
 import tormagd.hardware.serial_backend, tormagd.hardware.can_backend
 names = sorted(sys.modules)
 ours = [name for name in names if name.startswith(("tormagd.", "tormagd_client.", "firmware_protocol."))]
 print(*[name for name in ours if "__mypyc" not in name])
 print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
 """
-ROOMS = {
-    "assembly",
-    "bounded_file",
-    "command_line",
-    "config",
-    "control",
-    "daemon",
-    "exact",
-    "following",
-    "force_file",
-    "hardware",
-    "inverse",
-    "keeping",
-    "keys",
-    "model",
-    "named_file",
-    "output",
-    "physics",
-    "safety",
-    "scenes",
-    "slices",
-    "toml_file",
-}
+ROOMS = {"config", "control", "daemon", "element", "ground", "hardware", "record", "scenes"}
 LIBRARIES = (
     "can",
     "matplotlib",
@@ -130,19 +108,17 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
         [sys.executable, "-P", "-c", LOADED, *LIBRARIES], capture_output=True, text=True, check=True, timeout=60
     ).stdout.splitlines()
     assert {name.split(".")[1] for name in ours.split() if name.startswith("tormagd.")} == ROOMS
-    rooms = ("tormagd.inverse.", "tormagd.model.", "tormagd_client.")
+    rooms = ("tormagd.element.inverse.", "tormagd.element.model.", "tormagd_client.")
     assert {name for name in ours.split() if name.startswith(rooms)} == {
-        "tormagd.inverse.choice",
-        "tormagd.inverse.nearest",
-        "tormagd.inverse.newton",
-        "tormagd.inverse.solution",
-        "tormagd.model.displacement",
-        "tormagd.model.features",
-        "tormagd.model.force_curve",
-        "tormagd.model.memory",
-        "tormagd.model.model_file",
-        "tormagd.model.rising",
-        "tormagd.model.shipped",
+        "tormagd.element.inverse.choice",
+        "tormagd.element.inverse.nearest",
+        "tormagd.element.inverse.newton",
+        "tormagd.element.inverse.solution",
+        "tormagd.element.model.displacement",
+        "tormagd.element.model.features",
+        "tormagd.element.model.force_curve",
+        "tormagd.element.model.memory",
+        "tormagd.element.model.model_file",
         "tormagd_client.endpoints",
         "tormagd_client.keys",
         "tormagd_client.messages",
@@ -155,7 +131,7 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
 # -- the log -----------------------------------------------------------------------------------------------------------
 
 
-SAY = "import logging, tormagd.daemon.log as log; log.log_to_stderr(); logging.getLogger('room').warning('a\\x1b[2J')"
+SAY = "import logging, tormagd.ground.terminal as t; t.log_to_stderr(); logging.getLogger('room').warning('a\\x1b[2J')"
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,12 @@ from tormagd.config import Config
 from tormagd.control.core import Stepper
 from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, Outside, Plan
-from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
-from tormagd.daemon.way import Way
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import OperatingState, SafetyState
+from tormagd.daemon.force_delay import Way
 from tormagd.hardware.link_quality import LinkQuality
-from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
+from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.record.telemetry import limits_held, snapshot, tick_record
 from tormagd.scenes.scene import Budget, load_scene
 from tormagd_client.messages import BeliefReport, Telemetry, decode, encode, encode_ticks
 

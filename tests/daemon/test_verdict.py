@@ -3,13 +3,13 @@ from typing import Any
 
 import pytest
 
-from tormagd.assembly.build import Core
+from tormagd.control.assembly.build import Core
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Outside, Plan
+from tormagd.control.safety.codes import Limit
+from tormagd.control.safety.operating_state import OperatingState
 from tormagd.daemon.verdict import ARRIVES, CANNOT, FIELD, RENDERED, Judged, judged
-from tormagd.model.features import FEATURES
-from tormagd.safety.codes import Limit
-from tormagd.safety.operating_state import OperatingState
+from tormagd.element.model.features import FEATURES
 
 CARRIAGES = {"gap_speed_mm_s": 40.0, "lag_s": 0.01, "tolerance_N": 0.05, "release_N_s": 2.0}
 STRONG = DeviceFit(scale=1.25)

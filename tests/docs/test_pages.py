@@ -13,15 +13,15 @@ from PIL import Image
 from reference_pages import commands_page, configuration_page, keys, subparsers, tables
 
 from firmware_protocol.conformance import __main__ as conformance
-from tormagd.command_line import UsageError
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
 from tormagd.ctl.commands import COMMANDS
 from tormagd.daemon import main as daemon
+from tormagd.ground.command_line import UsageError
+from tormagd.ground.toml_file import toml_tables
 from tormagd.lab.pages import KEY, figures_of, stamp
 from tormagd.scenes.measured import measured
 from tormagd.simulation import __main__ as simulation
-from tormagd.toml_file import toml_tables
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "RELEASING.md"]

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
+from tormagd.element.model.model_file import load_model
 from tormagd.lab.training.dataset import read_csv
-from tormagd.model.model_file import load_model
 
 pytestmark = pytest.mark.live
 

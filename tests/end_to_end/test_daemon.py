@@ -18,7 +18,7 @@ from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
 from tormagd.ctl.main import main
-from tormagd.recording.reader import Seen, read_recording
+from tormagd.record.reader import Seen, read_recording
 
 pytestmark = pytest.mark.live
 
@@ -136,7 +136,7 @@ def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
     rig.client.request("stop")
     rig.until(lambda: rig.status()["black_box"]["newest"].endswith("-STOPPED.mcap"), "written")
     box = rig.status()["black_box"]
-    command = [sys.executable, "-m", "tormagd.replay", str(rig.folder / "boxes" / box["newest"])]
+    command = [sys.executable, "-m", "tormagd.record.replay", str(rig.folder / "boxes" / box["newest"])]
     result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0).stdout)
     assert (result["reason"], result["differences"]) == ("STOPPED", [])
     assert result["rerun"]["difference"] is None

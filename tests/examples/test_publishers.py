@@ -15,7 +15,7 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.recording.writer import TELEMETRY_TOPIC, TICK_SCHEMA, TICKS_TOPIC, plain_schema
+from tormagd.record.writer import TELEMETRY_TOPIC, TICK_SCHEMA, TICKS_TOPIC, plain_schema
 from tormagd_client.messages import Setpoint, Telemetry, decode
 
 ROOT = Path(__file__).parents[2]

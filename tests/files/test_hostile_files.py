@@ -14,18 +14,18 @@ from pathlib import Path
 
 import pytest
 
-from tormagd.assembly.profile import ProfileError
-from tormagd.bounded_file import in_place_of, read_bounded
 from tormagd.config import Config, load_calibration, load_config
+from tormagd.control.assembly.profile import ProfileError
 from tormagd.control.believe.strength import device_bounds
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
-from tormagd.force_file import ForceFileError, read_forces
-from tormagd.model.model_file import ModelFileError, load_model
+from tormagd.element.model.model_file import ModelFileError, load_model
+from tormagd.ground.files import in_place_of, read_bounded
+from tormagd.ground.force_file import ForceFileError, read_forces
+from tormagd.ground.toml_file import LONGEST_LINE, TomlError, toml_tables
 from tormagd.scenes.scene import load_scene
 from tormagd.scenes.signal import recorded
 from tormagd.simulation.parameters import PlantError, load_plant
-from tormagd.toml_file import LONGEST_LINE, TomlError, toml_tables
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import load_pair
 from tormagd_client.printable import printable

@@ -28,12 +28,12 @@ from firmware_protocol.codec import (
     Switches,
     period,
 )
-from tormagd.assembly.journal import Journal
 from tormagd.config import Device
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import SILENT_S, LinkState
-from tormagd.safety.operating_state import DeviceRequest
+from tormagd.hardware.measurement import DeviceRequest
+from tormagd.record.journal import Journal
 from tormagd_client.messages import LinkReport
 
 TICK_S = 1e-3

@@ -36,23 +36,24 @@ from fault_matrix.bad_lines import (
 )
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Device
+from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import OperatingState
 from tormagd.hardware.backend import Backend, BackendError, choose
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import DeviceRequest, OperatingState
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd.simulation.can_device import DEVICE, CanDevice
 from tormagd.simulation.can_frame import CanFrame, from_socket, to_socket
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import parse_hand
 from tormagd.simulation.parameters import load_plant
 from tormagd.simulation.plant import Truth
-from tormagd.simulation.pty_door import Pty, PtyDoor
-from tormagd.simulation.slcan_door import SlcanDoor
+from tormagd.simulation.pty_port import Pty, PtyDoor
+from tormagd.simulation.slcan_port import SlcanDoor
 
 CONFIG = Config()
 PATIENCE_S = 10.0

@@ -39,8 +39,7 @@ from tormagd.hardware.link import (
     LinkState,
 )
 from tormagd.hardware.link_quality import LinkQuality
-from tormagd.hardware.measurement import Measurement
-from tormagd.safety.operating_state import DeviceRequest
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 US = Identity(SCHEMA_HASH, 1, 2, 77)
 POSITION_SPAN_MM = period(State, "left_position_mm")

@@ -10,8 +10,8 @@ import pytest
 import uvloop
 
 from firmware_protocol.build import Build
-from tormagd.assembly.build import build_core
 from tormagd.config import Config, RealTime
+from tormagd.control.assembly.build import build_core
 from tormagd.headroom import __main__ as program, core_cost, machine_loop
 from tormagd.headroom.bare_timer import beat, lateness
 

@@ -15,17 +15,17 @@ import torch
 from hypothesis import example, given, strategies as st
 from scipy.optimize import brentq
 
-from tormagd.assembly.build import build_core, choose_solver
 from tormagd.config import Config
-from tormagd.inverse import choice, ordered
-from tormagd.inverse.choice import RUNTIME_SOLVERS, build, mean_error_N, named
-from tormagd.inverse.nearest import NearestFieldSearch, field_grid
-from tormagd.inverse.newton import ACCURACY_MT, MAX_EVALUATIONS, RisingSearch
-from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
-from tormagd.model.features import LARGEST, UNITS, Element, Scaling
-from tormagd.model.force_curve import ForceCurve, Known, Network
-from tormagd.model.model_file import ForceModel, ModelMetadata
-from tormagd.physics.errors import DomainError
+from tormagd.control.assembly.build import build_core, choose_solver
+from tormagd.element.inverse import choice, ordered
+from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, mean_error_N, named
+from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.inverse.newton import ACCURACY_MT, MAX_EVALUATIONS, RisingSearch
+from tormagd.element.inverse.solution import FieldSolution, FieldSolver, Reach
+from tormagd.element.model.features import LARGEST, UNITS, Element, Scaling
+from tormagd.element.model.force_curve import ForceCurve, Known, Network
+from tormagd.element.model.model_file import ForceModel, ModelMetadata
+from tormagd.element.physics.errors import DomainError
 from tormagd.scenes.measured import measured
 from tormagd.scenes.scene import Solver, load_scene, shipped_scenes
 
@@ -463,8 +463,8 @@ def test_without_torch_the_scene_is_refused_and_the_package_named(
     rising: ForceModel, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "tormagd.inverse.ordered")
-    monkeypatch.delattr("tormagd.inverse.ordered")
+    monkeypatch.delitem(sys.modules, "tormagd.element.inverse.ordered")
+    monkeypatch.delattr("tormagd.element.inverse.ordered")
     with pytest.raises(DomainError, match=f"'{name}', which needs the package torch.*newton, nearest"):
         build(named(name), RANGE_MT, rising, rises=True)
 
@@ -498,7 +498,7 @@ def test_a_scene_may_name_its_search() -> None:
 
 
 def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
-    loaded = "import sys, tormagd.control.core, tormagd.inverse.choice; print(*sys.modules)"
+    loaded = "import sys, tormagd.control.core, tormagd.element.inverse.choice; print(*sys.modules)"
     found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
-    assert "tormagd.inverse.newton" in found
+    assert "tormagd.element.inverse.newton" in found
     assert not {"torch", "scipy", "sklearn", "matplotlib"} & set(found)

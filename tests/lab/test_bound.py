@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.core import Stepper
 from tormagd.control.records import TimedSetpoint
+from tormagd.element.physics.relaxation import PronySeries
 from tormagd.lab.arrays import rms
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.ideal_actuator import ideal_stepper
@@ -29,7 +29,7 @@ from tormagd.lab.ideal_carriage import (
     no_delay_mm,
 )
 from tormagd.lab.main import main
-from tormagd.physics.relaxation import PronySeries
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import SteadyHand

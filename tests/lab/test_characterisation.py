@@ -12,6 +12,9 @@ import pytest
 import torch
 from hypothesis import assume, given, settings, strategies as st
 
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.relaxation import PronySeries
 from tormagd.lab.characterisation.compression import (
     CompressionRecord,
     Sample,
@@ -40,9 +43,6 @@ from tormagd.lab.design.force_law import stretch_minus_one
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
 from tormagd.lab.tables import read_columns
-from tormagd.physics.errors import DomainError
-from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N
-from tormagd.physics.relaxation import PronySeries
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

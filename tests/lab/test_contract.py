@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tormagd import __version__
+from tormagd.element.model.model_file import load_model
 from tormagd.lab import errors
 from tormagd.lab.main import COMMANDS, main
-from tormagd.model.model_file import load_model
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [path for folder in ("tormagd", "firmware_protocol") for path in sorted((ROOT / folder).rglob("*.py"))]

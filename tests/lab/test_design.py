@@ -13,6 +13,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.inserts import INSERTS
 from tormagd.lab.design import optimisation
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.optimisation import (
@@ -36,10 +40,6 @@ from tormagd.lab.design.range_fit import (
 from tormagd.lab.design.selection import ForceTask, Verdict, judge, rank
 from tormagd.lab.thesis import page, table_2_5
 from tormagd.lab.thesis.values import TABLE_2_5
-from tormagd.physics.errors import DomainError
-from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.physics.inserts import INSERTS
 
 BRAKE = Brake.as_built(Elastomer(300e3, 3.8, 0.2))
 USE_CASE_1, USE_CASE_2 = Region(0.0, 0.0, 2.5, 1.0), Region(0.5, 0.25, 3.0, 1.0)

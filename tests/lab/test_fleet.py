@@ -16,8 +16,8 @@ from tormagd.commission.finding import Finding
 from tormagd.commission.sequence import Report
 from tormagd.lab.consoles.summary import Console, Drift, Summary, consoles, files, read, read_all
 from tormagd.lab.main import main
-from tormagd.recording.ticks import TickBatch
-from tormagd.recording.writer import RecordingWriter
+from tormagd.record.ticks import TickBatch
+from tormagd.record.writer import RecordingWriter
 
 DAY_S = 86_400
 START_S = 1_790_000_000

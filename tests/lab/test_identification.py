@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from rendering.device_draws import drawn_device
 
-from tormagd.assembly.build import build_core
-from tormagd.closed_loop import ClosedLoop
-from tormagd.commission.course import Columns
+from tormagd.commission.procedure import Columns
 from tormagd.config import Config, Rates, load_config
+from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
 from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
-from tormagd.daemon.telemetry import tick_record
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
 from tormagd.lab.motor import command, fit, identification
@@ -26,8 +24,10 @@ from tormagd.lab.twin.estimate import keys_of, value_at
 from tormagd.lab.twin.excerpt import Excerpt, excerpt_of
 from tormagd.lab.twin.fit import COMBINATIONS, twin_of
 from tormagd.lab.twin.force import STRENGTH
-from tormagd.recording.ticks import decode_ticks
-from tormagd.recording.writer import RecordingWriter
+from tormagd.record.telemetry import tick_record
+from tormagd.record.ticks import decode_ticks
+from tormagd.record.writer import RecordingWriter
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant

@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tormagd.assembly.build import build_core
 from tormagd.config import Config
+from tormagd.control.assembly.build import build_core
+from tormagd.element.model.model_file import load_model, model_path, save_model
+from tormagd.element.physics.errors import DomainError
 from tormagd.lab.errors import LabError
 from tormagd.lab.tactile import branches, experiment, held, models, report, shipped
 from tormagd.lab.tactile.models import QUICK
 from tormagd.lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
 from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
-from tormagd.model.model_file import load_model, save_model
-from tormagd.model.shipped import model_path
-from tormagd.physics.errors import DomainError
 from tormagd.scenes.scene import scene_path
 from tormagd.simulation.tactile_pad import TactilePad, cycling_program, worked_pad
 

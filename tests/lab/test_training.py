@@ -10,7 +10,16 @@ import pytest
 import torch
 from hypothesis import given, strategies as st
 
-from tormagd.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.element.model.features import FIELD
+from tormagd.element.model.memory import NO_MEMORY, Memory
+from tormagd.element.model.model_file import load_model
+from tormagd.element.model.network import ForceNetwork
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.inserts import insert
+from tormagd.element.physics.relaxation import PronySeries
 from tormagd.lab.arrays import rms
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
@@ -31,15 +40,6 @@ from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, 
 from tormagd.lab.training.law import Law, fit_law, fit_law_model
 from tormagd.lab.training.levenberg_marquardt import jacobian, train
 from tormagd.lab.training.unremembered import identify
-from tormagd.model.displacement import MOBILISED_MM
-from tormagd.model.features import FIELD
-from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.model.model_file import load_model
-from tormagd.model.network import ForceNetwork
-from tormagd.physics.errors import DomainError
-from tormagd.physics.friction import Friction
-from tormagd.physics.inserts import insert
-from tormagd.physics.relaxation import PronySeries
 
 HEADER = "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N"
 GOOD = "0.5,10,300,40,1.5"

@@ -17,21 +17,27 @@ import torch
 from hypothesis import given, strategies as st
 from safetensors import safe_open
 
-from tormagd.assembly.build import build_core
 from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import build_core
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.records import Handle, Measured
+from tormagd.element.model import model_file
+from tormagd.element.model.displacement import Turn
+from tormagd.element.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
+from tormagd.element.model.force_curve import LARGEST_EXPONENT, Known, Network
+from tormagd.element.model.memory import NO_MEMORY, Memory
+from tormagd.element.model.model_file import (
+    ForceModel,
+    ModelFileError,
+    ModelMetadata,
+    load_model,
+    model_path,
+    save_model,
+)
+from tormagd.element.model.network import to_network
+from tormagd.element.physics.errors import DomainError
 from tormagd.lab.training.dataset import Dataset, fit_metrics, not_rising_share
 from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
-from tormagd.model import model_file
-from tormagd.model.displacement import Turn
-from tormagd.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
-from tormagd.model.force_curve import LARGEST_EXPONENT, Known, Network
-from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
-from tormagd.model.network import to_network
-from tormagd.model.shipped import model_path
-from tormagd.physics.errors import DomainError
 
 
 @pytest.fixture(scope="session")

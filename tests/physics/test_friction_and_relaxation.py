@@ -6,8 +6,8 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.physics.friction import Friction
-from tormagd.physics.relaxation import PronySeries
+from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.relaxation import PronySeries
 
 FRICTION = Friction(presliding_stiffness_N_mm=8.0, viscous_N_s_mm=0.0005, static_ratio=1.15, stribeck_speed_mm_s=5.0)
 frictions = st.builds(

@@ -14,19 +14,19 @@ import pytest
 from extremes.cases import Batch, reference
 from hypothesis import example, given, strategies as st
 
-from tormagd.lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
-from tormagd.physics.errors import DomainError, require
-from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw, flux_density_T
-from tormagd.physics.force import (
+from tormagd.element.physics.errors import DomainError, require
+from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw, flux_density_T
+from tormagd.element.physics.force import (
     TORMAG,
     Elastomer,
     Geometry,
     brake_force_N,
     max_radial_moment_Tm,
 )
-from tormagd.physics.inserts import INSERTS, Insert, MeasuredForceRange, insert, relative_permeability
-from tormagd.physics.magnets import CuboidMagnet, attraction_N
-from tormagd.physics.relaxation import PronySeries
+from tormagd.element.physics.inserts import INSERTS, Insert, MeasuredForceRange, insert, relative_permeability
+from tormagd.element.physics.magnets import CuboidMagnet, attraction_N
+from tormagd.element.physics.relaxation import PronySeries
+from tormagd.lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 
 LAWS: list[FieldLaw] = [ThesisFieldLaw(), PowerFieldLaw(), PowerFieldLaw(coefficient=0.462, exponent=-1.33)]
 

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, Schema
 from mcap.writer import MCAP0_MAGIC as MAGIC, Writer
 
-from tormagd.recording.writer import OVERVIEW
+from tormagd.record.writer import OVERVIEW
 
 NESTED = b"[" * 100_000 + b"]" * 100_000
 

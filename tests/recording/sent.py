@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tormagd.recording.reader import Seen, read_recording
-from tormagd.recording.ticks import TickBatch
+from tormagd.record.reader import Seen, read_recording
+from tormagd.record.ticks import TickBatch
 from tormagd_client.messages import Telemetry, Tick
 
 START_NS = 1_790_000_000_000_000_000

@@ -17,9 +17,9 @@ from sent import START_NS, batch, telemetry
 
 from tormagd.config import Recordings
 from tormagd.ctl.record import budget_of
-from tormagd.recording.folder import Budget, RecordingFolder, mark, segment_of
-from tormagd.recording.reader import RecordingFile, damage_in
-from tormagd.recording.writer import RecordingWriter
+from tormagd.record.folder import Budget, RecordingFolder, mark, segment_of
+from tormagd.record.reader import RecordingFile, damage_in
+from tormagd.record.writer import RecordingWriter
 from tormagd_client.messages import Mark
 
 DAY_S = 86_400.0
@@ -199,7 +199,7 @@ def deadly(function, is_before):
             os.kill(os.getpid(), signal.SIGKILL)
         return result
     return call
-from tormagd.recording import writer
+from tormagd.record import writer
 room, name = {
     "rotate": (writer.RecordingWriter, "_rotate"), "begin": (writer.RecordingWriter, "_begin"),
     "prune": (Path, "unlink"), "mark": (Path, "rename"), "flush": (writer.Writer, "flush"),

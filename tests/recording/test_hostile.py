@@ -16,8 +16,8 @@ MAX_MB = 200
 READ = """
 import json, sys
 from pathlib import Path
-from tormagd.recording.black_box import read_black_box
-from tormagd.recording.reader import RecordingError, RecordingFile, read_recording as read, summary_of
+from tormagd.record.black_box import read_black_box
+from tormagd.record.reader import RecordingError, RecordingFile, read_recording as read, summary_of
 
 def read_recording(path):
     read(path, dict[str, object], lambda seen: None)

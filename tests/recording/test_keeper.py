@@ -11,9 +11,9 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
-from tormagd.recording.black_box import is_tick, read_black_box
-from tormagd.recording.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring
+from tormagd.record.black_box import is_tick, read_black_box
+from tormagd.record.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring
+from tormagd.record.keeper_messages import KEEPER, Begin, End, Part, Said, Write, Written
 
 PATIENCE_S = 60.0
 HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}

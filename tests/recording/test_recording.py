@@ -19,11 +19,11 @@ from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 from sent import COLUMNS, START_NS, Back, back, batch, telemetry
 
-from tormagd.recording.overview import MAX_STRETCHES, Codes, Curves, Glance, OverviewBuilder, unpacked
-from tormagd.recording.plot import figure, save_plot
-from tormagd.recording.reader import RecordingError, RecordingFile, damage_in, summary_of
-from tormagd.recording.ticks import decode_ticks
-from tormagd.recording.writer import THINNED, RecordingWriter
+from tormagd.record.overview import MAX_STRETCHES, Codes, Curves, Glance, OverviewBuilder, unpacked
+from tormagd.record.reader import RecordingError, RecordingFile, damage_in, summary_of
+from tormagd.record.ticks import decode_ticks
+from tormagd.record.writer import THINNED, RecordingWriter
+from tormagd.view.plot import figure, save_plot
 from tormagd_client.messages import Mark, MessageError, encode
 
 

@@ -10,10 +10,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from flight import Flight, asked
 
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import VirtualBus
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.closed_loop import VirtualBus
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import ReversingHand

@@ -8,24 +8,24 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from tormagd.assembly.build import Core
-from tormagd.assembly.journal import Journal, Packer
-from tormagd.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import TimedSetpoint
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.black_box import header
 from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.telemetry import tick_record
-from tormagd.inverse.solution import Answer, Question
-from tormagd.keeping import Part
-from tormagd.recording.black_box import is_tick, write_black_box
-from tormagd.recording.keeper import Ring
-from tormagd.replay.rerun import Rerun, rerun
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import RefusedError
+from tormagd.element.inverse.solution import Answer, Question
+from tormagd.record.black_box import is_tick, write_black_box
+from tormagd.record.journal import Journal, Packer
+from tormagd.record.keeper import Ring
+from tormagd.record.keeper_messages import Part
+from tormagd.record.replay.rerun import Rerun, rerun
+from tormagd.record.telemetry import tick_record
+from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
 from tormagd_client.messages import TickRecord
 

@@ -12,17 +12,17 @@ from flight import asked
 from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import Switches
-from tormagd.assembly.build import Core
-from tormagd.assembly.journal import KNOWN
+from tormagd.control.assembly.build import Core
 from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.believe.strength import UNSEEN
 from tormagd.control.records import Outside
-from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restore, restored
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import SafetyState
+from tormagd.element.model.displacement import Turn
+from tormagd.ground.plain_values import InexactError, first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link_statistics import RoundTrip
-from tormagd.model.displacement import Turn
-from tormagd.replay import conversation
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import SafetyState
+from tormagd.record.journal import KNOWN
+from tormagd.record.replay import conversation
 
 ROOT = Path(__file__).parents[2]
 FLOATS = st.one_of(st.floats(), st.sampled_from([-0.0, math.nan, -math.inf, 5e-324]))

@@ -11,16 +11,16 @@ from mcap.reader import make_reader
 
 from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier, decode
 from firmware_protocol.framing import FrameDecoder
-from tormagd.assembly.build import Core
 from tormagd.config import Config, Limits
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Fault
 from tormagd.ctl.main import main
 from tormagd.ctl.replay import _instead
-from tormagd.recording.black_box import BlackBoxFile, read_black_box
-from tormagd.replay.__main__ import main as run
-from tormagd.replay.rebuild import ReplayError, rebuilt, recorded
-from tormagd.replay.rehearse import changed, rehearse, script
-from tormagd.replay.rerun import ticks_of
-from tormagd.safety.codes import Fault
+from tormagd.record.black_box import BlackBoxFile, read_black_box
+from tormagd.record.replay.__main__ import main as run
+from tormagd.record.replay.rebuild import ReplayError, rebuilt, recorded
+from tormagd.record.replay.rerun import ticks_of
+from tormagd.simulation.rehearse import changed, main as run_changed, rehearse, script
 
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5
 "And the newest snapshot before it, one of two a second."
@@ -152,7 +152,7 @@ def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(
 def test_a_limit_that_was_too_narrow(fly: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     narrow = Config(limits=Limits(skew_warning_mm=0.02, skew_fault_mm=0.02))
     path = fly("drag_left=+300%@2.5", until_s=3.6, config=narrow).write(tmp_path / "narrow.mcap")
-    assert run([str(path), "--set", "limits.skew_fault_mm=2", "--fault", "drag_left=+300%@2.5"]) == 0
+    assert run_changed([str(path), "--set", "limits.skew_fault_mm=2", "--fault", "drag_left=+300%@2.5"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert [list(result[name]["faults"]) for name in ("recorded", "simulated", "instead")] == [["SKEW"], ["SKEW"], []]
     text = _instead(result)
@@ -217,15 +217,15 @@ def test_the_commands_of_tormagctl(path: Path, tmp_path: Path, capsys: pytest.Ca
 def test_what_cannot_be_run_again_is_refused_in_one_line(
     path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for arguments in (
-        [str(path), "--from", "-1"],
-        [str(path), "--set", "limits.skew=1"],
-        [str(path), "--fault", "nonsense"],
-        [str(path), "--fault", "no_sense", "--plant", "nowhere"],
-        [str(path), "--config", "/nowhere"],
-        [str(path.parent)],
+    for command, arguments in (
+        (run, [str(path), "--from", "-1"]),
+        (run_changed, [str(path), "--set", "limits.skew=1"]),
+        (run_changed, [str(path), "--fault", "nonsense"]),
+        (run_changed, [str(path), "--fault", "no_sense", "--plant", "nowhere"]),
+        (run, [str(path), "--config", "/nowhere"]),
+        (run, [str(path.parent)]),
     ):
-        assert run(arguments) == 2
+        assert command(arguments) == 2
         captured = capsys.readouterr()
         assert (captured.out, captured.err.count("\n")) == ("", 1)
 

@@ -18,16 +18,16 @@ from mcap.writer import Writer
 
 from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
-from tormagd.assembly.build import Core
-from tormagd.assembly.journal import ANSWER, CONFIRM, FORMAT, MISSING
 from tormagd.config import Config, Device
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
-from tormagd.keeping import Part
-from tormagd.recording.black_box import BlackBoxFile, Derived, read_black_box, write_black_box
-from tormagd.recording.reader import RecordingError, Seen, read_recording
-from tormagd.replay.rebuild import ReplayError, differences, rebuilt, recorded
-from tormagd.replay.rerun import rerun, ticks_of
-from tormagd.safety.codes import Fault
+from tormagd.control.safety.codes import Fault
+from tormagd.record.black_box import BlackBoxFile, Derived, read_black_box, write_black_box
+from tormagd.record.journal import ANSWER, CONFIRM, FORMAT, MISSING
+from tormagd.record.keeper_messages import Part
+from tormagd.record.reader import RecordingError, Seen, read_recording
+from tormagd.record.replay.rebuild import ReplayError, differences, rebuilt, recorded
+from tormagd.record.replay.rerun import rerun, ticks_of
 
 CHANGED_TICK = 3_210
 TICKS = 4_000
@@ -119,7 +119,7 @@ def test_the_other_build_replays_them_to_the_bit(fly: Any, path: Path, tmp_path:
     switch = "0" if settle().is_compiled else "1"
     stalled = fly(until_s=2.8, silent_s=0.083).write(tmp_path / "stalled.mcap")
     for box, from_s, ticks in ((path, 3.0, TICKS - 3_000), (stalled, 0.0, 3_000)):
-        command = [sys.executable, "-P", "-m", "tormagd.replay", str(box), "--from", str(from_s)]
+        command = [sys.executable, "-P", "-m", "tormagd.record.replay", str(box), "--from", str(from_s)]
         environment = os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}
         result = json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
         assert (result["rerun"]["difference"], result["rerun"]["ticks"]) == (None, ticks)

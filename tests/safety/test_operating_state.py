@@ -5,15 +5,14 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from firmware_protocol.codec import DeviceFault
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit, Position, device_faults
-from tormagd.safety.operating_state import (
+from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit, Position, device_faults
+from tormagd.control.safety.operating_state import (
     CLEARING_S,
     COMMANDS,
     LOST_POSITION,
     ROWS,
     TRANSITIONS,
     Conditions,
-    DeviceRequest,
     Event,
     OperatingState,
     Refusal,
@@ -26,6 +25,7 @@ from tormagd.safety.operating_state import (
     next_commands,
     reason,
 )
+from tormagd.hardware.measurement import DeviceRequest
 
 READY = Conditions(connected=True, fresh=True, homed=True, busy=False, device_latched=False)
 NEED_NO_DEVICE = ("stop", "use-scene")

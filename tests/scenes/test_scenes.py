@@ -7,14 +7,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from tormagd.assembly.build import Core, at_rates_of, build_core
 from tormagd.config import Config, Rates, load_config
+from tormagd.control.assembly.build import Core, at_rates_of, build_core
 from tormagd.control.records import TimedSetpoint
-from tormagd.model.displacement import MOBILISED_MM
-from tormagd.model.features import FEATURES
-from tormagd.model.model_file import load_model
-from tormagd.model.shipped import model_path
-from tormagd.physics.inserts import INSERTS, insert
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.element.model.features import FEATURES
+from tormagd.element.model.model_file import load_model, model_path
+from tormagd.element.physics.inserts import INSERTS, insert
 from tormagd.scenes.scene import EVERY_TERM, Scene, Terms, load_scene, scene_path, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tormagd.physics.errors import DomainError
-from tormagd.physics.inserts import insert
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.inserts import insert
 from tormagd.simulation.faults import KNOWN, SIZED, Fault, FaultError, parse_fault
 from tormagd.simulation.hand import HandError, PressingHand, ReversingHand, SteadyHand, parse_hand
 from tormagd.simulation.parameters import PlantError, load_plant, plant_names, with_insert

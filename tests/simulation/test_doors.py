@@ -33,12 +33,12 @@ from tormagd.hardware.backend import choose
 from tormagd.simulation.__main__ import main
 from tormagd.simulation.can_bus import SimulatorBus
 from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.can_door import MAX_HOSTS, CanDoor
 from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, from_socket, to_socket
+from tormagd.simulation.can_port import MAX_HOSTS, CanDoor
 from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
-from tormagd.simulation.slcan_door import LONGEST_COMMAND, SlcanAdapter
+from tormagd.simulation.slcan_port import LONGEST_COMMAND, SlcanAdapter
 
 LIMIT_S = 20.0
 HELLO = Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)

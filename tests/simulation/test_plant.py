@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import PressingHand, ReversingHand, SteadyHand

@@ -17,9 +17,9 @@ import pytest
 from benchmarks import inverse_report, inverse_workload, latency, loop, step, virtual_time
 from benchmarks.inverse_report import ROOT
 
-from tormagd.assembly.build import build_core
 from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG
 from tormagd.config import Config, RealTime, load_config
+from tormagd.control.assembly.build import build_core
 from tormagd.lab.told import lines
 from tormagd.scenes.scene import shipped_scenes
 from tormagd.simulation.element import TorqueElement

@@ -16,10 +16,10 @@ from rendering.following import Case, Followed, rehearse
 from rendering.pictures import touch_picture
 from rendering.touching import Case as Touching, Touch, ideal, reached_ms
 
-from tormagd.assembly.build import at_rates_of, build_core
 from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import at_rates_of, build_core
+from tormagd.control.safety.codes import FAULTS, Fault, Limit
 from tormagd.ctl.outcome import CommandError, Exit
-from tormagd.safety.codes import FAULTS, Fault, Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation import patient
 from tormagd.simulation.hand import FeltHand, parse_hand

@@ -12,8 +12,8 @@ from endurance import fuzz, replug, siege, soak, stalls
 from endurance.stand import Stand
 
 from firmware_protocol.c.build import BuildError
+from tormagd.control.safety.operating_state import COMMANDS
 from tormagd.daemon.inbox import SetpointInbox
-from tormagd.safety.operating_state import COMMANDS
 from tormagd_client.messages import MessageError, Request, decode
 
 

@@ -26,12 +26,11 @@ from rendering.signals import (
     recorded_signals,
 )
 
+from tormagd.element.model.model_file import load_model, model_path
+from tormagd.element.physics.inserts import INSERTS, insert
 from tormagd.lab.arrays import rms
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.training.dataset import not_rising_share
-from tormagd.model.model_file import load_model
-from tormagd.model.shipped import model_path
-from tormagd.physics.inserts import INSERTS, insert
 from tormagd.simulation.parameters import load_plant
 
 BEGINS_S, IDEAL_S = 4.0, 0.9

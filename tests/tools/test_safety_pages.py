@@ -12,8 +12,8 @@ from risk import rows as risk
 from risk.named_tests import named_tests
 from risk.page import page as risk_page, red_rows
 
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
-from tormagd.safety.operating_state import ROWS, OperatingState, Refusal
+from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.control.safety.operating_state import ROWS, OperatingState, Refusal
 from tormagd.scenes.scene import load_scene
 
 RECORD = json.loads(safety_pages.EVIDENCE.read_text(encoding="utf-8"))

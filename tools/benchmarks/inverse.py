@@ -30,14 +30,13 @@ from benchmarks.inverse_workload import (
     training_data,
 )
 from tormagd.daemon.realtime import freeze_garbage
-from tormagd.inverse import ordered
-from tormagd.inverse.choice import build, mean_error_N, named
-from tormagd.inverse.nearest import field_grid
-from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach, answer
+from tormagd.element.inverse import ordered
+from tormagd.element.inverse.choice import build, mean_error_N, named
+from tormagd.element.inverse.nearest import field_grid
+from tormagd.element.inverse.solution import FieldSolution, FieldSolver, Reach, answer
+from tormagd.element.model.force_curve import ForceCurve
+from tormagd.element.model.model_file import ForceModel, falling_at
 from tormagd.lab.arrays import Array
-from tormagd.model.force_curve import ForceCurve
-from tormagd.model.model_file import ForceModel
-from tormagd.model.rising import falling_at
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
 from tormagd.simulation.parameters import load_plant
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from tormagd.drawing import Axes
 from tormagd.lab.pages import figures_of, stamp, subplots, table
+from tormagd.view.drawing import Axes
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "inverse_trade.md"

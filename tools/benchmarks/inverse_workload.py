@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.control.nominal import FieldOfGap
+from tormagd.element.model.features import Element
+from tormagd.element.model.model_file import ForceModel
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.inserts import insert
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import fit_model
-from tormagd.model.features import Element
-from tormagd.model.model_file import ForceModel
-from tormagd.physics.field import PowerFieldLaw
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.physics.friction import Friction
-from tormagd.physics.inserts import insert
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
 

@@ -25,7 +25,7 @@ from tormagd.config import Config, RealTime
 from tormagd.daemon.endpoint import context
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.lab.arrays import Array
-from tormagd.recording.ticks import listening
+from tormagd.record.ticks import listening
 from tormagd_client.messages import VERSION, Setpoint, encode
 
 MIN_N, GRAIN_N = 1.0, 1e-4

@@ -43,7 +43,7 @@ from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.headroom.bare_timer import beat
 from tormagd.lab.arrays import Array
 from tormagd.lab.pages import subplots
-from tormagd.recording.ticks import listening
+from tormagd.record.ticks import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request

@@ -21,8 +21,8 @@ from rendering.device_draws import SAMPLES, SECOND
 from rendering.scene_runs import OF_A_HANDLE, ROOT, SITUATIONS, Case, run_all
 
 from benchmarks import loop
-from tormagd.assembly.build import choose_solver
 from tormagd.config import RealTime
+from tormagd.control.assembly.build import choose_solver
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.lab import executors
 from tormagd.lab.arrays import Json

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.commission.gains import corner_margins
 from tormagd.config import Config, Motor
 from tormagd.control.core import Stepper
@@ -21,6 +20,7 @@ from tormagd.control.move.motor import margins, zero_order_hold
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from endurance.stand import LOOK_S, Figures, Stand
 from tormagd.daemon.endpoint import SETPOINTS_PER_S
-from tormagd.safety.operating_state import DeviceRequest
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.keys import PUBLIC, SECRET, SERVER, load_pair, load_public
 from tormagd_client.messages import VERSION, Reply, Request, decode, encode

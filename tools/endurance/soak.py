@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from tqdm import tqdm
 
 from endurance.stand import PATIENCE_S, Figures, Stand, used
-from tormagd.recording.writer import TICKS_TOPIC
+from tormagd.record.writer import TICKS_TOPIC
 from tormagd_client import Client
 
 MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 0.2

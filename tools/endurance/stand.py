@@ -19,7 +19,7 @@ from machines.wire import carried
 
 from tormagd.config import load_config
 from tormagd.lab.arrays import Array
-from tormagd.recording.ticks import listening
+from tormagd.record.ticks import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.keys import SECRET, SERVER, generate
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import mpmath as mp
 import numpy as np
 
-from tormagd.physics.errors import FloatArray
-from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
+from tormagd.element.physics.errors import FloatArray
+from tormagd.element.physics.field import REFERENCE_PERMEABILITY, FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
 DIGITS = 65
 """50 are wanted, and differences over a step near the end of Eq. 7 lose the others."""

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple, get_type_hints
 import msgspec
 
 from extremes.stages import UNNAMED, leaves
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
-from tormagd.safety.operating_state import RefusedError
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant

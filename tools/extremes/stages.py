@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from firmware_protocol.codec import DecodeError, EncodeError
-from tormagd.exact import plain
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import RefusedError
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import RefusedError
+from tormagd.element.physics.errors import DomainError
+from tormagd.ground.plain_values import plain
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import MessageError
 

@@ -16,16 +16,14 @@ from firmware_protocol.codec import (
     Status,
     Switches,
 )
-from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Motor, Position
 from tormagd.control.aim.aim import Aim
-from tormagd.control.aim.floors import ceiling_mm, lawful_mT
-from tormagd.control.aim.portrait import Portrait, PortraitSearch
-from tormagd.control.ask.forecast import Forecast
+from tormagd.control.aim.portrait import Portrait, PortraitSearch, ceiling_mm, lawful_mT
+from tormagd.control.ask.forecast import Forecast, Skill
 from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.path import TIMES_S, Path
-from tormagd.control.ask.skill import Skill
 from tormagd.control.ask.way import Way
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.carriage_lag import CarriageLag
@@ -39,9 +37,7 @@ from tormagd.control.believe.slow_friction import SlowFriction
 from tormagd.control.believe.strength import UNSEEN, Strength, device_bounds
 from tormagd.control.contact import Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
-from tormagd.control.field_of_gap import FieldOfGap
-from tormagd.control.filter import low_pass
-from tormagd.control.interpolation import Rising, at_step, interpolated
+from tormagd.control.interpolation import Rising, at_step, interpolated, low_pass
 from tormagd.control.measure import Measure
 from tormagd.control.move.carriages import Carriages
 from tormagd.control.move.homing import Homing
@@ -50,20 +46,20 @@ from tormagd.control.move.opening import Opening
 from tormagd.control.move.pid import Pid
 from tormagd.control.move.reference import Reference, Speeds, follow, target_of
 from tormagd.control.move.watch import Watch
+from tormagd.control.nominal import FieldOfGap
 from tormagd.control.plausible import is_contradicted, is_outside, leap_between
 from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import Conditions, SafetyState, command
 from tormagd.control.sight import Sight
+from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, named
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.element.model.model_file import load_model, model_path
+from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.link_statistics import DeviceClock
-from tormagd.hardware.measurement import Measurement
-from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
-from tormagd.model.displacement import MOBILISED_MM, Turn
-from tormagd.model.model_file import load_model
-from tormagd.model.shipped import model_path
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, DeviceRequest, SafetyState, command
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
 "Periods of a tick and of a plan, and the longest tick of `Stepper`."
@@ -535,7 +531,7 @@ def stages() -> list[Stage]:
         Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT, PLAN_S),
         Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
         Stage("believe/anchor", partial(Anchor, UNSEEN), anchor, MEASUREMENT),
-        Stage("believe/ripple", partial(Ripple, 20.0), ripple, MEASUREMENT),
+        Stage("believe/ripple", Ripple, ripple, MEASUREMENT),
         Stage("believe/sensor", partial(SensorTrust, BOUNDS, 0.08), sensor, MEASUREMENT),
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT, PLAN_S),

@@ -9,14 +9,14 @@ import msgspec
 
 from fault_matrix.bad_lines import BadBus, BadSerialLine
 from fault_matrix.cases import NOTHING, SERIAL, Injection
-from tormagd.assembly.build import Core, build_core
-from tormagd.assembly.conditions import is_homed
-from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.assembly.conditions import is_homed
 from tormagd.control.records import TimedSetpoint
+from tormagd.control.safety.operating_state import SafetyState
 from tormagd.daemon.inbox import SetpointInbox
-from tormagd.safety.operating_state import SafetyState
 from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import FirmwareKind, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.firmware import Firmware

@@ -5,9 +5,9 @@ from typing import NamedTuple
 from fault_matrix.cases import FOLLOWED, HELD, HELD_OR_OPENS, LIMITED, OPENS, STAYS, Injection
 from fault_matrix.rig import OTHER_N, Rig
 from firmware_protocol.codec import DeviceMode
-from tormagd.closed_loop import Sample
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
-from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.control.safety.operating_state import OperatingState, RefusedError
+from tormagd.simulation.closed_loop import Sample
 
 SAFE_N = 1.0
 OPEN_MM = 94.0

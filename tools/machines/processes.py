@@ -10,7 +10,7 @@ from typing import Any
 
 import zmq
 
-from tormagd.recording.ticks import decode_ticks
+from tormagd.record.ticks import decode_ticks
 from tormagd_client import Client, ClientError
 
 PATIENCE_S, LOOK_S = 20.0, 0.05

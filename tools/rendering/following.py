@@ -9,14 +9,14 @@ import numpy as np
 
 from rendering.device_draws import device as device_of
 from rendering.hands import Legs, WaitingHand
-from tormagd.assembly.build import Core, build_core
-from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.ideal_actuator import ideal_stepper
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.closed_loop import ClosedLoop, stream
 from tormagd.simulation.device import FirmwareKind, VirtualDevice
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import Hand, parse_hand

@@ -5,16 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from rendering.device_draws import SAMPLES, device
-from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.control.nominal import FieldOfGap
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.element.model.model_file import ForceModel, load_model, model_path
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.inserts import Insert, insert
 from tormagd.lab.arrays import Array, Json
 from tormagd.lab.pages import table
 from tormagd.lab.training.dataset import force_metrics, not_rising_share
-from tormagd.model.displacement import MOBILISED_MM
-from tormagd.model.model_file import ForceModel, load_model
-from tormagd.model.shipped import model_path
-from tormagd.physics.field import PowerFieldLaw
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.physics.inserts import Insert, insert
 from tormagd.simulation.parameters import PlantParameters, with_insert
 from tormagd.simulation.static_laws import radial_moment_Tm
 

@@ -6,10 +6,10 @@ from rendering.following import Followed, Rehearsals, tracking
 from rendering.live_touch import FELT_N, HALF_S, PUSH_MM_S, ROUND_TRIP_MS, Wall, figures as touch_figures, lateness
 from rendering.show import PULSE_START_S, Shown
 from rendering.touching import Touch
-from tormagd.drawing import Axes
 from tormagd.lab.arrays import Array
 from tormagd.lab.pages import stamp, subplots
 from tormagd.scenes.scene import Scene
+from tormagd.view.drawing import Axes
 
 ASKED, RENDERED, OTHER, QUIET = "#222222", "#d1495b", "#2a6f97", "#8d99ae"
 CLOSE_UP_S = 4.0

@@ -17,8 +17,8 @@ from rendering import touching
 from rendering.device_draws import device
 from rendering.following import FILE_PREVIEW_S, armed, publisher, taught
 from rendering.hands import swinging
-from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.executors import finished
 from tormagd.scenes.scene import Bandwidth, Handle, Scene, Solver, load_scene, scene_path

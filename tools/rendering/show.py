@@ -25,10 +25,10 @@ from machines.wire import carried
 
 from rendering.following import RATE_HZ, Tracking, tracking
 from rendering.signals import with_approach
+from tormagd.control.safety.codes import FAULTS, Fault
 from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile
-from tormagd.recording.reader import RecordingError, Seen, read_recording
-from tormagd.safety.codes import FAULTS, Fault
+from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd_client import Client, ClientError, UnreachableError
 from tormagd_client.messages import MessageError, Telemetry
 

@@ -17,14 +17,14 @@ from msgspec import UNSET, UnsetType
 from rendering.device_draws import device as device_of
 from rendering.following import VALID_S, armed
 from rendering.hands import Legs, WaitingHand
-from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Rates
 from tormagd.control.ask.path import FLATTEST_N_MM, TIMES_S, nearest_path_mm
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint, Travel, Wall
+from tormagd.control.safety.codes import Limit
 from tormagd.lab.arrays import Array
 from tormagd.lab.ideal_actuator import put_gap
 from tormagd.lab.ideal_carriage import Brake, Drive, brake_of, drive_of
-from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import FeltHand, Impedance
 from tormagd.simulation.parameters import with_insert

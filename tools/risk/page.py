@@ -6,7 +6,7 @@ from html import escape
 
 from firmware_protocol.conformance.check import Hazard
 from risk.rows import Judged, Row
-from tormagd.safety.hazards import HARMLESS, HARMS
+from tormagd.control.safety.hazards import HARMLESS, HARMS
 
 COLUMNS = ("cause", "control", "code", "tests", "evidence")
 _HEAD = """<!doctype html>
@@ -32,9 +32,9 @@ tr.red td.gap { background: #d32222; color: #fff; font-weight: bold; }
 <p>Which hazardous situation may come of what, and what is done about it, in the terms of ISO 14971. It is written for
 a person who analyses the risk of a device. <strong>It certifies nothing</strong>: all evidence is of simulated
 devices.</p>
-<p>Written by <code>python tools/safety_pages.py</code> from the tables of <code>tormagd/safety</code>, the conformance
-kit, the test tree and the <a href="fault-matrix.html">fault matrix</a>. A row is red where a control, a code, a test or
-evidence is missing. Severity and probability are a person's, of <code>docs/risk.toml</code>.</p>
+<p>Written by <code>python tools/safety_pages.py</code> from the tables of <code>tormagd/control/safety</code>, the
+conformance kit, the test tree and the <a href="fault-matrix.html">fault matrix</a>. A row is red where a control, a
+code, a test or evidence is missing. Severity and probability are a person's, of <code>docs/risk.toml</code>.</p>
 """
 
 

@@ -11,9 +11,9 @@ from fault_matrix.cases import MATRIX
 from firmware_protocol.conformance.check import Hazard
 from firmware_protocol.conformance.examination import CHECKS
 from risk.named_tests import Named
-from tormagd.safety.codes import FAULTS, LIMITS, Explanation
-from tormagd.safety.hazards import CAUSES, FAULTS_OF, HARMLESS, LIMITS_OF
-from tormagd.toml_file import convert
+from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation
+from tormagd.control.safety.hazards import CAUSES, FAULTS_OF, HARMLESS, LIMITS_OF
+from tormagd.ground.toml_file import convert
 
 VERDICTS = ("named", "safe", "in_time", "recovered")
 KIT = "firmware_protocol/test_conformance.py"

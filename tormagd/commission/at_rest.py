@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from tormagd.commission.course import PLACES, Columns, Course, Known, Row, given, watch
+from tormagd.commission.carriage_findings import SIDES
 from tormagd.commission.finding import Finding, finding
-from tormagd.commission.of_carriages import SIDES
+from tormagd.commission.procedure import PLACES, Columns, Course, Known, Row, given, watch
 
 REST_S = 3.0
 BEGINS_S, HOMING_S = 2.0, 15.0

@@ -5,8 +5,8 @@ import math
 
 import msgspec
 
+from tormagd.commission.carriage_findings import BACK_EMF, FRICTION, INERTIA, RESISTANCE, nominals
 from tormagd.commission.gains import Corners, stiffest, tunings
-from tormagd.commission.of_carriages import BACK_EMF, FRICTION, INERTIA, RESISTANCE, nominals
 from tormagd.commission.sequence import Report
 from tormagd.config import Config
 

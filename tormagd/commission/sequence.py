@@ -11,10 +11,10 @@ import msgspec
 from msgspec import Meta
 
 from tormagd.commission.at_rest import homing, link, way_back, weight
-from tormagd.commission.course import Asked, Course, Known, StoppedError
+from tormagd.commission.carriage_findings import SIDES, carriages, nominals
 from tormagd.commission.finding import Finding
-from tormagd.commission.of_carriages import SIDES, carriages, nominals
-from tormagd.commission.of_force import force_over_gap, memory, sensor, steps
+from tormagd.commission.force_findings import force_over_gap, memory, sensor, steps
+from tormagd.commission.procedure import Asked, Course, Known, StoppedError
 from tormagd.config import Motor
 
 MAX_BYTES = 200_000

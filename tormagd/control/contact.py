@@ -8,7 +8,7 @@ friction makes the force.
 from typing import Final, TypeAlias, final
 
 from tormagd.control.records import Measured, TimedSetpoint
-from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
+from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S
 
 ROLLER_RATE_MM_S: Final = 42.0
 "The thesis turns at 20 rpm; the portrait is drawn for a handle in motion."

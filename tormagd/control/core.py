@@ -27,14 +27,16 @@ from tormagd.control.move.motor import full_speed_mm_s
 from tormagd.control.move.opening import Opening
 from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
+from tormagd.element.inverse.solution import Answer, Question
+from tormagd.element.model.features import require_number
+from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.measurement import Measurement
-from tormagd.inverse.solution import Answer, Question
-from tormagd.model.features import require_number
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
 from tormagd.scenes.scene import Scene
 
+PLAN_ERRORS: Final = (ValueError, ArithmeticError, RuntimeError)
+"What a plan may raise: DomainError and the errors of NumPy."
 _ENABLED: Final = OperatingState.ENABLED
 _PAUSED: Final = OperatingState.PAUSED
 

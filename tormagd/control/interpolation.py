@@ -1,10 +1,16 @@
-"""Linear interpolation between tabulated points, on floats."""
+"""Linear interpolation between tabulated points, and a low-pass filter of first order, on floats."""
 
 from itertools import accumulate
 from typing import Final, final
 
-from tormagd.model.features import require_number
-from tormagd.physics.errors import DomainError
+from tormagd.element.model.features import require_number
+from tormagd.element.physics.errors import DomainError
+
+
+def low_pass(value: float, towards: float, dt_s: float, time_s: float) -> float:
+    """Return `value` after `dt_s` on its way to `towards` with the time constant `time_s` (implicit Euler)."""
+    return value + dt_s / (time_s + dt_s) * (towards - value)
+
 
 STRETCHES: Final = 1024
 "A rising list is divided into this many stretches, so that few points share one and a search is short."

@@ -2,12 +2,12 @@
 
 from typing import Final, final
 
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 from tormagd.control.plausible import Leap, leap_between
 from tormagd.control.records import Handle, Measured
 from tormagd.control.sight import Sight
+from tormagd.element.model.displacement import MOVING_MM_S, Turn
 from tormagd.hardware.measurement import Measurement
-from tormagd.model.displacement import MOVING_MM_S, Turn
 
 RATE_FILTER_S: Final = 0.05
 QUICK_FILTER_S: Final = 0.01

@@ -9,9 +9,9 @@ from typing import Final, final
 from firmware_protocol.codec import DriveMode
 from firmware_protocol.value import Value
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.model.displacement import MOVING_MM_S, Turn
-from tormagd.safety.codes import Limit
-from tormagd.safety.operating_state import DeviceRequest
+from tormagd.control.safety.codes import Limit
+from tormagd.element.model.displacement import MOVING_MM_S, Turn
+from tormagd.hardware.measurement import DeviceRequest
 
 
 @final

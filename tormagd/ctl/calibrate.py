@@ -16,14 +16,14 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from tormagd.commission.course import Columns, handle_moved
+from tormagd.commission.procedure import Columns, handle_moved
 from tormagd.config import Config
 from tormagd.ctl.calibrate_device import calibrate_device
 from tormagd.ctl.calibrate_motors import calibrate_motors
 from tormagd.ctl.calibrate_run import SOURCE, Range, Run, armed, interrupted_run, known_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, by_legs
-from tormagd.interrupt import interrupted_by
+from tormagd.ground.terminal import interrupted_by
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints

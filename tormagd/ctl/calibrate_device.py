@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from tormagd.commission.of_force import RAMPS_S, STEP_S, STEP_SHARES, force_over_gap, steps
+from tormagd.commission.force_findings import RAMPS_S, STEP_S, STEP_SHARES, force_over_gap, steps
 from tormagd.config import Config
 from tormagd.ctl.calibrate_run import SOURCE, armed, known_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from tormagd.commission.course import Columns
+from tormagd.commission.procedure import Columns
 from tormagd.ctl.calibrate_run import SOURCE, Range, armed, reach
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Waveform, by_legs

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import zmq
 
-from tormagd.commission.course import (
+from tormagd.commission.force_findings import enabled
+from tormagd.commission.procedure import (
     COLUMNS,
     PREVIEW_STEP_S,
     Asked,
@@ -24,14 +25,13 @@ from tormagd.commission.course import (
     drive,
     watch,
 )
-from tormagd.commission.of_force import enabled
 from tormagd.config import Config
+from tormagd.control.safety.codes import FAULTS
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
-from tormagd.interrupt import interrupted_by
-from tormagd.recording.ticks import decode_ticks, listening
-from tormagd.safety.codes import FAULTS
+from tormagd.ground.terminal import interrupted_by
+from tormagd.record.ticks import decode_ticks, listening
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable

@@ -7,16 +7,16 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from tormagd.bounded_file import in_place_of, read_bounded
 from tormagd.commission.calibration import calibration
-from tormagd.commission.course import Known
-from tormagd.commission.page import page_of
+from tormagd.commission.procedure import Known
 from tormagd.commission.sequence import MAX_BYTES, STEPS, Findings, Report, Step, Stopped, begun, due, sequence
 from tormagd.config import Config, checked
 from tormagd.ctl.calibrate import agree
 from tormagd.ctl.calibrate_run import Run, connected, known_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
-from tormagd.output import write_line
+from tormagd.ground.files import in_place_of, read_bounded
+from tormagd.ground.terminal import write_line
+from tormagd.view.commission_page import page_of
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
 from tormagd.ctl.report import opened
-from tormagd.dashboard.live import Live
-from tormagd.dashboard.recorded import Recorded
-from tormagd.dashboard.server import LOOPBACK, serve
-from tormagd.output import write_line
+from tormagd.ground.terminal import write_line
+from tormagd.view.live import Live
+from tormagd.view.recorded import Recorded
+from tormagd.view.server import LOOPBACK, serve
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import Endpoints
 

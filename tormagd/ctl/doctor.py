@@ -21,7 +21,7 @@ from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rat
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd.ctl.status import RECOMMISSION, refused
-from tormagd.keys import require_own
+from tormagd.ground.access_keys import require_own
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, not_understood

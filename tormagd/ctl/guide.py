@@ -3,7 +3,7 @@
 from importlib.resources import files
 
 from tormagd.ctl.outcome import Outcome, usage_error
-from tormagd.named_file import did_you_mean, shipped
+from tormagd.ground.files import did_you_mean, shipped
 
 FOLDERS = ("guides", "reference", ".")
 "In the order of the list."

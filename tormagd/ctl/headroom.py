@@ -13,8 +13,7 @@ import msgspec
 from firmware_protocol.build import REMEDY
 from tormagd.config import MIN_INFERENCE_HZ, Config
 from tormagd.ctl.machine import Machine, Taken
-from tormagd.ctl.outcome import CommandError, Exit
-from tormagd.ctl.process import answer_of
+from tormagd.ctl.outcome import CommandError, Exit, answer_of
 from tormagd_client.messages import ExecReport
 
 LONGEST_S = 120.0

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
-from tormagd.keys import load_folder
+from tormagd.ground.access_keys import load_folder
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
 

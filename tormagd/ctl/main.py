@@ -15,7 +15,6 @@ from typing import Any
 import msgspec
 
 from tormagd import __version__
-from tormagd.command_line import Parser, UsageError
 from tormagd.config import Config, load_config
 from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL, Option
 from tormagd.ctl.outcome import (
@@ -26,7 +25,8 @@ from tormagd.ctl.outcome import (
     print_outcome,
     usage_error,
 )
-from tormagd.output import write_in_any_encoding, write_line
+from tormagd.ground.command_line import Parser, UsageError
+from tormagd.ground.terminal import write_in_any_encoding, write_line
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.errors import ClientError
 

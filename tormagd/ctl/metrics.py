@@ -18,8 +18,7 @@ from prometheus_client.registry import Collector
 
 from tormagd.ctl.outcome import Outcome, usage_error
 from tormagd.ctl.status import refused
-from tormagd.interrupt import interrupted_by
-from tormagd.output import write_line
+from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError

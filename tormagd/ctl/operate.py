@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
-from tormagd.output import write_line
+from tormagd.ground.terminal import write_line
 from tormagd_client.blocking import Client
 from tormagd_client.messages import Explained, Status
 

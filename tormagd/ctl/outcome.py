@@ -3,9 +3,10 @@
 import os
 import re
 import shutil
+import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
 from functools import partialmethod
@@ -13,7 +14,7 @@ from typing import Any, TextIO
 
 import msgspec
 
-from tormagd.output import write_answer, write_line
+from tormagd.ground.terminal import write_answer, write_line
 from tormagd_client.errors import ClientError, InFaultError, SettingError, UnreachableError
 from tormagd_client.printable import printable
 
@@ -120,3 +121,15 @@ class Colour:
     green = partialmethod(_paint, "32")
     yellow = partialmethod(_paint, "33")
     bold = partialmethod(_paint, "1")
+
+
+def answer_of(module: str, arguments: Iterable[str], longest_s: float) -> str:
+    """Run `python -m MODULE`, and return what it prints to stdout."""
+    command = [sys.executable, "-P", "-m", module, *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=longest_s, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise TimeoutError(f"not done after {longest_s:g} s") from error
+    if done.returncode:
+        raise ChildProcessError((done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1])
+    return done.stdout

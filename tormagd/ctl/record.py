@@ -12,11 +12,10 @@ import zmq
 
 from tormagd.config import Config, Recordings
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.interrupt import interrupted_by
-from tormagd.output import write_line
-from tormagd.recording.folder import Budget, RecordingFolder
-from tormagd.recording.ticks import decode_ticks, listening
-from tormagd.recording.writer import RecordingWriter
+from tormagd.ground.terminal import interrupted_by, write_line
+from tormagd.record.folder import Budget, RecordingFolder
+from tormagd.record.ticks import decode_ticks, listening
+from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable

@@ -9,8 +9,8 @@ from typing import Any
 from tormagd.config import Config
 from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.record import budget_of
-from tormagd.recording.folder import RecordingFolder, Segment, mark as mark_segment
-from tormagd.recording.reader import RecordingError, damage_in, summary_of
+from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
+from tormagd.record.reader import RecordingError, damage_in, summary_of
 from tormagd_client.blocking import Client
 
 

@@ -1,6 +1,6 @@
 """`tormagctl replay`: run a black box again, bit for bit, or with the simulator in place of the device.
 
-`python -m tormagd.replay` does it, in a process of its own.
+`tormagd.record.replay` does the one, `tormagd.simulation.rehearse` the other, in a process of its own.
 """
 
 from collections.abc import Sequence
@@ -9,8 +9,7 @@ from typing import Any
 
 import msgspec
 
-from tormagd.ctl.outcome import Exit, Outcome, usage_error
-from tormagd.ctl.process import answer_of
+from tormagd.ctl.outcome import Exit, Outcome, answer_of, usage_error
 
 LONGEST_S = 900.0
 "Half a minute takes some seconds, interpreted and simulated twice some minutes."
@@ -25,17 +24,13 @@ def replay(
     config_file: Path | None,
 ) -> Outcome:
     """Replay a black box; with `settings` or `faults`, on the simulated `plant`."""
-    arguments = [
-        f"--from={from_s!r}",
-        f"--plant={plant}",
-        *(f"--set={setting}" for setting in settings),
-        *(f"--fault={fault}" for fault in faults),
-        *([f"--config={config_file}"] if config_file else []),
-    ]
+    module, arguments = "tormagd.record.replay", [f"--from={from_s!r}"]
+    if changes := [*(f"--set={setting}" for setting in settings), *(f"--fault={fault}" for fault in faults)]:
+        module, arguments = "tormagd.simulation.rehearse", [f"--plant={plant}", *changes]
+    configured = [f"--config={config_file}"] if config_file else []
     try:
-        result: dict[str, Any] = msgspec.json.decode(
-            answer_of("tormagd.replay", [*arguments, "--", str(path)], LONGEST_S)
-        )
+        answer = answer_of(module, [*arguments, *configured, "--", str(path)], LONGEST_S)
+        result: dict[str, Any] = msgspec.json.decode(answer)
     except TimeoutError as error:
         raise usage_error(f"{path}: {error}", "is it a black box?") from error
     except ChildProcessError as error:

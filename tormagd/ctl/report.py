@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from tormagd.bounded_file import in_place_of
 from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
-from tormagd.dashboard.report import report as page_of
-from tormagd.recording.plot import figure, save_plot
-from tormagd.recording.reader import RecordingFile
+from tormagd.ground.files import in_place_of
+from tormagd.record.reader import RecordingFile
+from tormagd.view.plot import figure, save_plot
+from tormagd.view.report import report as page_of
 
 WRITABLE = "give a file in a directory you may write to"
 

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from tormagd.config import Config
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, folded, usage_error
-from tormagd.ctl.process import answer_of
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, answer_of, as_usage_error, folded, usage_error
 from tormagd.scenes.measured import MeasuredScene, Measurements, OperatingPoint, Share, Tried, measured
 from tormagd.scenes.scene import Force, Scene, load_scene, shipped_scenes
 from tormagd_client.endpoints import ConfigError, Endpoints

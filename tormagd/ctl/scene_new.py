@@ -12,7 +12,7 @@ import msgspec
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene import as_toml, check_scene
-from tormagd.force_file import ForceFileError, read_column
+from tormagd.ground.force_file import ForceFileError, read_column
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Scene
 from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError

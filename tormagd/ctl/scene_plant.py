@@ -7,8 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tormagd.ctl.outcome import CommandError, Exit, usage_error
-from tormagd.ctl.process import answer_of
+from tormagd.ctl.outcome import CommandError, Exit, answer_of, usage_error
 from tormagd.scenes.scene import Scene, scene_path
 from tormagd.scenes.signal import asked
 

@@ -12,8 +12,8 @@ import msgspec
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.watch import StatusWatch, require_range
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
-from tormagd.force_file import ForceFileError
-from tormagd.interrupt import interrupted_by
+from tormagd.ground.force_file import ForceFileError
+from tormagd.ground.terminal import interrupted_by
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import UnreachableError

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
-from tormagd.following import in_words
+from tormagd.record.force_following import in_words
 from tormagd_client.blocking import Client
 from tormagd_client.messages import (
     BeliefReport,

@@ -14,7 +14,7 @@ from rich.live import Live
 
 from tormagd.ctl.outcome import Outcome, is_terminal, usage_error
 from tormagd.ctl.top_screen import Seen, screen
-from tormagd.interrupt import interrupted_by
+from tormagd.ground.terminal import interrupted_by
 from tormagd_client.blocking import Client
 from tormagd_client.errors import not_understood
 from tormagd_client.messages import Explained, MessageError, Status, Telemetry

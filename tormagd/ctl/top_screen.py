@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tormagd.ctl.status import believed, played, refused, torque
-from tormagd.following import in_words
+from tormagd.record.force_following import in_words
 from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 

@@ -8,7 +8,7 @@ import msgspec
 
 from tormagd.ctl.operate import require_no_fault
 from tormagd.ctl.outcome import CommandError, Exit
-from tormagd.output import write_line
+from tormagd.ground.terminal import write_line
 from tormagd_client.blocking import Client
 from tormagd_client.messages import Description, Explained, Status
 from tormagd_client.wire import Pending, understood

@@ -8,8 +8,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
-from tormagd.force_file import OPTIONAL_COLUMNS, read_forces
-from tormagd.named_file import did_you_mean
+from tormagd.ground.files import did_you_mean
+from tormagd.ground.force_file import OPTIONAL_COLUMNS, read_forces
 from tormagd_client.messages import MAX_FORCE_N
 from tormagd_client.printable import in_short
 

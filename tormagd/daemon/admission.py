@@ -19,11 +19,10 @@ import zmq
 import zmq.utils.monitor
 from zmq.utils import z85
 
-from tormagd.daemon.allowance import Allowance
-from tormagd.daemon.arrivals import Arrivals
-from tormagd.daemon.door import door, let_in
-from tormagd.daemon.tally import Peer, Tally, shown
-from tormagd.keys import Allowed, KeyRing
+from tormagd.daemon.accept_gate import door, let_in
+from tormagd.daemon.peers import Allowance, Peer, Tally, shown
+from tormagd.daemon.requests import Arrivals
+from tormagd.ground.access_keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
 

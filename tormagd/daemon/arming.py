@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import (
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import (
     CONNECTED,
     NOT_BUSY,
     Conditions,

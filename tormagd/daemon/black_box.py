@@ -19,14 +19,14 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.assembly.build import Core, platform_name, sources_hash
-from tormagd.assembly.journal import FORMAT, Journal, Packer
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, platform_name, sources_hash
 from tormagd.control.core import Planner, Stepper
-from tormagd.daemon.beside import Beside
+from tormagd.control.safety.operating_state import RefusedError
+from tormagd.daemon.child_process import Beside
 from tormagd.hardware.connection import Connection
-from tormagd.keeping import KEEPER, REQUEST, Begin, End, Part, Said, Write, Written
-from tormagd.safety.operating_state import RefusedError
+from tormagd.record.journal import FORMAT, Journal, Packer
+from tormagd.record.keeper_messages import KEEPER, REQUEST, Begin, End, Part, Said, Write, Written
 from tormagd_client.messages import BlackBoxReport, TickRecord
 
 PART_TICKS = 20

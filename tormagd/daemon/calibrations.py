@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, load_calibration
+from tormagd.control.assembly.build import Core, build_core
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import CalibrationReport
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from tormagd.config import Device
 from tormagd.control.core import Stepper
+from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd.daemon.beat import Delay
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd_client.messages import Explained, StallReport
 
 WAITED_SHARE = 0.1

@@ -3,16 +3,16 @@
 import logging
 import time
 
-from tormagd.assembly.journal import Journal
 from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import Conditions, RefusedError, reason
 from tormagd.daemon.arming import Arming
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, RefusedError, reason
+from tormagd.record.journal import Journal
 
 REPEATED_S = 1.0
 

@@ -11,10 +11,12 @@ from functools import partial
 
 import msgspec
 
-from tormagd.assembly.build import Core, build_core
-from tormagd.assembly.profile import gains_of
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.assembly.profile import gains_of
 from tormagd.control.believe.strength import device_bounds
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox, header
 from tormagd.daemon.calibrations import Calibrations
@@ -31,11 +33,9 @@ from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.daemon.service import notify
 from tormagd.daemon.telemetry_loop import TelemetryLoop
+from tormagd.ground.access_keys import KeyRing
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
-from tormagd.keys import KeyRing
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd_client.endpoints import ConfigError
 
 NS = 1_000_000_000

@@ -15,16 +15,14 @@ from typing import Any
 import zmq
 
 from tormagd.config import Sources
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.admission import CONNECTIONS, MAY, Admission
-from tormagd.daemon.allowance import Allowance
-from tormagd.daemon.arrivals import Arrivals
 from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
 from tormagd.daemon.listeners import Listeners
-from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
+from tormagd.daemon.peers import Allowance, Peer, Tally
+from tormagd.daemon.requests import FIRST, Arrivals, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
-from tormagd.daemon.tally import Peer, Tally
-from tormagd.keys import KeyRing
-from tormagd.safety.operating_state import RefusedError
+from tormagd.ground.access_keys import KeyRing
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from tormagd.config import Sources
 from tormagd.control.records import TimedSetpoint, Wall
+from tormagd.control.safety.codes import Explanation, Limit
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.source import JITTER_SHARE, Needs, Order, Source, needs_of
-from tormagd.safety.codes import Explanation, Limit
-from tormagd.safety.operating_state import RefusedError
 from tormagd.scenes.scene import Scene
 from tormagd_client.messages import MessageError, PlayoutReport, Setpoint, SetpointReport, decode
 

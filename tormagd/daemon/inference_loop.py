@@ -5,18 +5,15 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from tormagd.assembly.journal import Journal
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
-from tormagd.control.core import Planner
+from tormagd.control.core import PLAN_ERRORS, Planner
 from tormagd.control.records import Measured
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.search_process import SearchProcess
-
-PLAN_ERRORS = (ValueError, ArithmeticError, RuntimeError)
-"DomainError and the errors of NumPy."
+from tormagd.record.journal import Journal
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ A peer that subscribes to everything gets a topic only while another asks for it
 
 from collections import Counter
 
-from tormagd.daemon.tally import Peer
+from tormagd.daemon.peers import Peer
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC
 
 TOPICS = MOTION_TOPIC, VERDICT_TOPIC

@@ -6,10 +6,9 @@ from pathlib import Path
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.command_line import Parser, UsageError
 from tormagd.config import load_config
-from tormagd.daemon.log import log_to_stderr
-from tormagd.output import write_in_any_encoding, write_line
+from tormagd.ground.command_line import Parser, UsageError
+from tormagd.ground.terminal import log_to_stderr, write_in_any_encoding, write_line
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import printable
 

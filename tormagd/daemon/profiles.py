@@ -13,10 +13,10 @@ from pathlib import Path
 
 import msgspec
 
-from tormagd.assembly.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
-from tormagd.bounded_file import in_place_of, read_bounded
+from tormagd.control.assembly.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.believe.strength import UNSEEN, DeviceBounds
+from tormagd.ground.files import in_place_of, read_bounded
 from tormagd_client.messages import ProfileReport
 
 log = logging.getLogger(__name__)

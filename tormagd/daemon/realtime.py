@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tormagd.config import RealTime
-from tormagd.slices import ask_for_slices
+from tormagd.ground.scheduling import ask_for_slices
 
 OPEN_FILES = 1_024
 "About 50 of the daemon's own, its endpoints' connections (`admission`), and a reserve."

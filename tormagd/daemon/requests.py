@@ -1,9 +1,12 @@
-"""Requests that wait for an answer. Clients take turns; `stop` and `disable` overtake all that wait."""
+"""Which sockets hold messages, and requests that wait. Clients take turns; `stop` and `disable` overtake all."""
 
+import select
 from collections import deque
 from typing import NamedTuple
 
-from tormagd.daemon.tally import Peer
+import zmq
+
+from tormagd.daemon.peers import Peer
 
 FIRST = ("stop", "disable")
 "These are carried out before anything that waits."
@@ -57,3 +60,32 @@ class Requests:
 def may_go_first(data: bytes) -> bool:
     """Tell whether an encoded request may be a `stop` or `disable`: whether either word is anywhere in its bytes."""
     return any(sign in data for sign in _SIGNS)
+
+
+_EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
+
+
+class Arrivals:
+    def __init__(self) -> None:
+        self._poll = select.poll()
+        self._sockets: dict[int, zmq.Socket[bytes]] = {}
+        self._ready: set[zmq.Socket[bytes]] = set()
+
+    def watch(self, socket: "zmq.Socket[bytes]") -> None:
+        self._ready.add(socket)
+        descriptor = int(socket.fileno())
+        self._sockets[descriptor] = socket
+        self._poll.register(descriptor, select.POLLIN)
+
+    def look(self) -> None:
+        for descriptor, _ in self._poll.poll(0):
+            self._ready.add(self._sockets[descriptor])
+
+    def touch(self, socket: "zmq.Socket[bytes]") -> None:
+        """Count `socket` as ready after a send through it: sending clears its signal."""
+        self._ready.add(socket)
+
+    def has(self, socket: "zmq.Socket[bytes]") -> bool:
+        if socket in self._ready and not int(socket.get(_EVENTS)) & _POLLIN:
+            self._ready.discard(socket)
+        return socket in self._ready

@@ -4,8 +4,8 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 
-from tormagd.assembly.build import Core
-from tormagd.safety.operating_state import RefusedError
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.operating_state import RefusedError
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import Explained, SceneReport
 

@@ -12,10 +12,10 @@ import socket
 import sys
 import time
 
-from tormagd.assembly.build import Core, build_core
-from tormagd.daemon.beside import MAX_PACKET, Beside
+from tormagd.control.assembly.build import Core, build_core
+from tormagd.daemon.child_process import MAX_PACKET, Beside
 from tormagd.daemon.rate_group import RateGroup
-from tormagd.inverse.solution import Answer, Question
+from tormagd.element.inverse.solution import Answer, Question
 from tormagd_client.endpoints import ConfigError
 
 STARTS_S = 60.0

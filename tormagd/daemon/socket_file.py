@@ -7,7 +7,7 @@ import socket
 import stat
 from pathlib import Path
 
-from tormagd.keys import require_own
+from tormagd.ground.access_keys import require_own
 
 
 class SocketFile:

@@ -16,10 +16,10 @@ from msgspec import UNSET
 
 from tormagd.config import MAX_PLAYOUT_MS
 from tormagd.control.ask.governor import AHEAD_S as SLOPE_S
+from tormagd.control.safety.codes import Explanation, Limit
 from tormagd.daemon.rate_group import Histogram
 from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S as LINE_S, DeviceClock
-from tormagd.safety.codes import Explanation, Limit
 from tormagd.scenes.scene import Scene
 from tormagd_client.messages import ClockReport, MessageError, Setpoint, SourceReport
 

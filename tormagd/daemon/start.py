@@ -8,18 +8,18 @@ from functools import partial
 import msgspec
 import uvloop
 
-from tormagd.assembly.build import Core, approaches_s, at_rates_of, build_core, least_resolution_N
 from tormagd.config import Config, load_config
+from tormagd.control.assembly.build import Core, approaches_s, at_rates_of, build_core, least_resolution_N
 from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.daemon import Daemon
 from tormagd.daemon.profiles import state_folder
 from tormagd.daemon.realtime import prepare, raise_open_files
 from tormagd.daemon.search_process import SearchProcess
+from tormagd.ground.access_keys import KeyRing
+from tormagd.ground.terminal import write_answer, write_line
+from tormagd.ground.toml_file import placed
 from tormagd.hardware.backend import Backend, choose, installed
-from tormagd.keys import KeyRing
-from tormagd.output import write_answer, write_line
 from tormagd.scenes.scene import load_scene
-from tormagd.toml_file import placed
 from tormagd_client.endpoints import ENDPOINTS, ConfigError
 from tormagd_client.printable import printable
 

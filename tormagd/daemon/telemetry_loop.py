@@ -12,30 +12,30 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.assembly.belief import beliefs
-from tormagd.assembly.build import Core
-from tormagd.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.config import Config
+from tormagd.control.assembly.belief import beliefs
+from tormagd.control.assembly.build import Core
+from tormagd.control.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.move.opening import is_open
+from tormagd.control.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.calibrations import Calibrations
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.force_delay import Way
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.service import READY, Service, notify, status_line
-from tormagd.daemon.telemetry import snapshot, tick_record
 from tormagd.daemon.topics import Topics
-from tormagd.daemon.way import Way
-from tormagd.following import Following
 from tormagd.hardware.connection import Connection
-from tormagd.keeping import REQUEST
-from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
+from tormagd.record.force_following import Following
+from tormagd.record.keeper_messages import REQUEST
+from tormagd.record.telemetry import snapshot, tick_record
 from tormagd_client.messages import (
     MAX_MARK_CHARACTERS,
     ArmReport,

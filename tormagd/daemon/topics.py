@@ -2,15 +2,15 @@
 
 import time
 
-from tormagd.assembly.build import Core
 from tormagd.config import Config
 from tormagd.control.ask.way import place_and_rate
+from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Limit
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.verdict import CANNOT, Judged, judged
-from tormagd.safety.codes import Limit
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, VERSION, Motion, Verdict
 
 NS = 1_000_000_000

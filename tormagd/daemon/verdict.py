@@ -5,8 +5,8 @@ from typing import NamedTuple
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Plan
-from tormagd.safety.codes import Limit
-from tormagd.safety.operating_state import OperatingState
+from tormagd.control.safety.codes import Limit
+from tormagd.control.safety.operating_state import OperatingState
 
 RENDERED, ARRIVES, CANNOT = "rendered", "arrives", "cannot"
 HOLDING = frozenset({Limit.RANGE, Limit.STANDBY, Limit.F_MIN, Limit.F_MAX})

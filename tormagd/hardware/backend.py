@@ -12,9 +12,9 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from firmware_protocol.codec import Message
 from tormagd.config import Device, Rates, checked
+from tormagd.ground.files import did_you_mean
 from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.named_file import did_you_mean
 from tormagd_client.endpoints import ConfigError, Strict
 
 ENTRY_POINTS = "tormagd.backends"

@@ -20,9 +20,9 @@ from msgspec import Meta
 
 from firmware_protocol.codec import Message
 from tormagd.config import Device, Rates
+from tormagd.ground.files import did_you_mean
 from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver, LinkStatistics
 from tormagd.hardware.can_stream import CanStream, SecondHostError
-from tormagd.named_file import did_you_mean
 from tormagd_client.endpoints import ConfigError, Strict
 
 FRAMES_AT_ONCE = 256

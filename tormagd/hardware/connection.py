@@ -12,13 +12,12 @@ from typing import Any, Protocol
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Message
 from tormagd.config import Device
-from tormagd.exact import Kinds, plain, restore
+from tormagd.ground.plain_values import Kinds, plain, restore
 from tormagd.hardware.backend import Backend, BackendError, Received, Sent, Stream
 from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
-from tormagd.hardware.measurement import Measurement
-from tormagd.safety.operating_state import DeviceRequest
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
 
 FIRST_BACK_OFF_S = 0.05

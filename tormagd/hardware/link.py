@@ -27,8 +27,7 @@ from firmware_protocol.codec import (
 )
 from tormagd.hardware.link_quality import UNKNOWN_QUALITY, Counts, LinkQuality, LinkWatch
 from tormagd.hardware.link_statistics import DeviceClock, RoundTrip
-from tormagd.hardware.measurement import Measurement
-from tormagd.safety.operating_state import DeviceRequest
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 REPEAT_S: Final = 0.05
 "After this time without an acknowledgement a Hello or a command is sent again."

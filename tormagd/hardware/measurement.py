@@ -1,5 +1,6 @@
-"""The device's newest state as one record, its wrapping counters unwrapped."""
+"""What is asked of the device, and its newest state as one record, its wrapping counters unwrapped."""
 
+from enum import StrEnum
 from typing import Final, final
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
@@ -18,6 +19,15 @@ _LARGEST: Final = 1e10
 
 def _is_set(bits: int, place: int) -> bool:
     return bits >> place & 1 != 0
+
+
+class DeviceRequest(StrEnum):
+    """A routine that the daemon asks the firmware for, once per request number."""
+
+    NONE = "none"
+    HOME = "home"
+    RETRACT = "retract"
+    CLEAR = "clear"
 
 
 @final

@@ -14,12 +14,12 @@ import numpy as np
 import uvloop
 
 from firmware_protocol.build import settle
-from tormagd.assembly.build import build_core
 from tormagd.config import Config, load_config
+from tormagd.control.assembly.build import build_core
+from tormagd.ground.terminal import write_line
 from tormagd.headroom.bare_timer import Lateness, lateness
 from tormagd.headroom.core_cost import Call, CoreCost, calls, core_cost
 from tormagd.headroom.machine_loop import machine_us
-from tormagd.output import write_line
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import printable
 

@@ -12,12 +12,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from tormagd.assembly.build import Core
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.headroom.bare_timer import NS, beat
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

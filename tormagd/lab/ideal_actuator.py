@@ -7,13 +7,13 @@ ones, so the error that remains is the plan's.
 import math
 from typing import Final, final
 
-from tormagd.assembly.build import Core
+from tormagd.control.assembly.build import Core
 from tormagd.control.core import Stepper
 from tormagd.control.move.actuator import Actuator, Drive
 from tormagd.control.move.reference import Reference, target_of
 from tormagd.control.records import Measured, Plan
+from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Limit
 from tormagd.simulation.plant import Plant
 
 

@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from tormagd.force_file import read_forces
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.relaxation import PronySeries
+from tormagd.ground.force_file import read_forces
 from tormagd.lab.arrays import Array, Json, rms
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
-from tormagd.physics.errors import DomainError
-from tormagd.physics.friction import Friction
-from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
 from tormagd.simulation.gap_field import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PLANTS_INSERT, PlantParameters, SecondParameters, load_plant, with_insert

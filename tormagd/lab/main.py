@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 from tormagd import __version__
 from tormagd.ctl.commands import Within
-from tormagd.force_file import ForceFileError
+from tormagd.element.physics.errors import DomainError
+from tormagd.ground.files import did_you_mean
+from tormagd.ground.force_file import ForceFileError
+from tormagd.ground.terminal import write_answer, write_in_any_encoding, write_line
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.told import lines
-from tormagd.named_file import did_you_mean
-from tormagd.output import write_answer, write_in_any_encoding, write_line
-from tormagd.physics.errors import DomainError
 from tormagd.simulation.parameters import PlantError
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import in_short, printable

@@ -10,7 +10,7 @@ import msgspec
 from tormagd.lab.arrays import Array
 
 if TYPE_CHECKING:
-    from tormagd.drawing import Figure
+    from tormagd.view.drawing import Figure
 
 KEY = "Figures"
 
@@ -27,7 +27,7 @@ def figures_of(page: str) -> list[str]:
 
 def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Figure", Any]:
     """Return a new matplotlib figure of `size`, inches, and its axes."""
-    from tormagd.drawing import Figure  # not every installation draws
+    from tormagd.view.drawing import Figure  # not every installation draws
 
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(*grid, **options)

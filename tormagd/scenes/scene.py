@@ -12,8 +12,8 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from tormagd.config import MIN_INFERENCE_HZ
-from tormagd.named_file import named, shipped
-from tormagd.toml_file import convert
+from tormagd.ground.files import named, shipped
+from tormagd.ground.toml_file import convert
 from tormagd_client.endpoints import Strict
 
 AUTO = "auto"

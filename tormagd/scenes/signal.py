@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET
 
-from tormagd.force_file import ForceFileError, read_forces
+from tormagd.ground.force_file import ForceFileError, read_forces
 from tormagd.scenes.scene import Signal
 from tormagd_client.endpoints import ConfigError
 

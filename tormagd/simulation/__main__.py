@@ -15,11 +15,11 @@ from functools import partial
 from pathlib import Path
 
 from firmware_protocol.c.build import BuildError
-from tormagd.interrupt import interrupted_by
-from tormagd.output import write_line
-from tormagd.physics.errors import DomainError
+from tormagd.element.physics.errors import DomainError
+from tormagd.ground.scheduling import ask_for_slices
+from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
-from tormagd.simulation.can_door import FOLDER_PREFIX, CanDoor
+from tormagd.simulation.can_port import FOLDER_PREFIX, CanDoor
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, MessageDevice, VirtualDevice
 from tormagd.simulation.emulated_firmware import EmulatedFirmware, EmulationError
@@ -27,10 +27,9 @@ from tormagd.simulation.faults import FORMS as KNOWN_FAULTS, FaultError, parse_f
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
 from tormagd.simulation.parameters import PlantError, load_plant, plant_names
-from tormagd.simulation.pty_door import PtyDoor
+from tormagd.simulation.pty_port import PtyDoor
 from tormagd.simulation.real_time import Door, PacedDevice, serve
-from tormagd.simulation.slcan_door import SlcanDoor
-from tormagd.slices import ask_for_slices
+from tormagd.simulation.slcan_port import SlcanDoor
 from tormagd_client.printable import printable
 
 # The C sources are what a microcontroller runs, in qemu or natively; the Python twin needs no compiler.

@@ -15,7 +15,6 @@ from typing import Any
 import can
 from can.typechecking import AutoDetectedConfig
 
-from tormagd.simulation.can_door import FOLDER_PREFIX
 from tormagd.simulation.can_frame import (
     ERROR_FLAG,
     MAX_DATA,
@@ -25,6 +24,7 @@ from tormagd.simulation.can_frame import (
     from_socket,
     to_socket,
 )
+from tormagd.simulation.can_port import FOLDER_PREFIX
 
 SEND_BUFFER_BYTES = 4_608
 """The kernel's least, a handful of frames: a host must soon notice that nobody takes its frames."""

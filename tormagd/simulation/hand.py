@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
-from tormagd.force_file import TIME, ForceFileError, read_table
+from tormagd.ground.force_file import TIME, ForceFileError, read_table
 
 ROLLER_RADIUS_MM: Final = 20.0
 DEFAULT_RPM: Final = 20.0

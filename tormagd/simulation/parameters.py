@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from tormagd.named_file import named, shipped
-from tormagd.physics.inserts import insert
-from tormagd.toml_file import convert, convert_as
+from tormagd.element.physics.inserts import insert
+from tormagd.ground.files import named, shipped
+from tormagd.ground.toml_file import convert, convert_as
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import require
 

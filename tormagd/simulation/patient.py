@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
-from tormagd.interrupt import interrupted_by
-from tormagd.physics.friction import Friction
+from tormagd.element.physics.friction import Friction
+from tormagd.ground.terminal import interrupted_by
 from tormagd_client import Client, ClientError
 
 T = TypeVar("T")

@@ -6,11 +6,11 @@ controller uses.
 
 from typing import Final, final
 
-from tormagd.physics.field import PAD_RADIUS_M
+from tormagd.element.physics.field import PAD_RADIUS_M
+from tormagd.simulation.element import Warmth
 from tormagd.simulation.gap_field import GapField
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.tactile_pad import DEEPEST_MM, FASTEST_MM_S, TactilePad, worked_pad
-from tormagd.simulation.warmth import Warmth
 
 MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
 

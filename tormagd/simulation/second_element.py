@@ -15,8 +15,8 @@ the order that the literature gives; they are in `plants/second.toml`, with thei
 import math
 from typing import Final, final
 
+from tormagd.simulation.element import Warmth
 from tormagd.simulation.parameters import PlantParameters, SecondParameters
-from tormagd.simulation.warmth import Warmth
 
 RESTED_S: Final = 1000.0
 "How long the handle has stood when the power comes."

@@ -8,10 +8,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from tormagd.physics.errors import FloatArray, Real
-from tormagd.physics.field import PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.physics.magnets import CuboidMagnet, attraction_N
+from tormagd.element.physics.errors import FloatArray, Real
+from tormagd.element.physics.field import PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.magnets import CuboidMagnet, attraction_N
 from tormagd.simulation.curve import Curve
 from tormagd.simulation.parameters import PlantParameters
 

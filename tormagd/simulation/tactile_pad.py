@@ -12,8 +12,8 @@ from typing import Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.physics.errors import require
-from tormagd.physics.relaxation import PronySeries, PronyState, PronyStep
+from tormagd.element.physics.errors import require
+from tormagd.element.physics.relaxation import PronySeries, PronyState, PronyStep
 from tormagd.simulation.parameters import PadParameters
 
 Array = NDArray[np.float64]

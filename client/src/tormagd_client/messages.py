@@ -587,7 +587,7 @@ def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -
 
 
 def encode_ticks(rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> bytes:
-    """Return the recording endpoint's message with these rows; `tormagd.recording.ticks` reads it."""
+    """Return the recording endpoint's message with these rows; `tormagd.record.ticks` reads it."""
     return _ENCODER.encode({"v": VERSION, "columns": columns, "rows": rows})
 
 

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.aim.floors import CEILING, LAW_SHARE, ceiling_mm
-from tormagd.control.aim.portrait import Portrait
+from tormagd.control.aim.portrait import CEILING, LAW_SHARE, Portrait, ceiling_mm
+from tormagd.control.assembly.build import build_core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
 from tormagd.control.believe.strength import DeviceFit, device_bounds
 from tormagd.control.records import Ask, Belief, Handle, Measured, Outside, Plan, TimedSetpoint
-from tormagd.inverse.solution import FieldSolution, Reach
-from tormagd.model.displacement import MOBILISED_MM, Turn
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.inverse.solution import FieldSolution, Reach
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.element.physics.errors import DomainError
 
 PERIOD_S = 0.004
 CONFIG = Config()

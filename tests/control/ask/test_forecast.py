@@ -8,10 +8,11 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.assembly.journal import KNOWN
 from tormagd.control.ask.forecast import (
     BEAT_DELAYS,
+    DOUBT_N,
     EVERY,
+    FORGIVEN_N,
     GRID_S,
     HISTORY,
     HORIZON,
@@ -26,9 +27,10 @@ from tormagd.control.ask.forecast import (
     STRIDE,
     TAPS,
     Forecast,
+    Skill,
 )
-from tormagd.control.ask.skill import DOUBT_N, FORGIVEN_N, Skill
-from tormagd.exact import plain, restore
+from tormagd.ground.plain_values import plain, restore
+from tormagd.record.journal import KNOWN
 
 Array = npt.NDArray[np.float64]
 

@@ -9,16 +9,16 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.assembly.journal import KNOWN
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, Forecast
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, _wanted_N
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Ask, TimedSetpoint, Travel
-from tormagd.exact import plain, restore
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.physics.errors import DomainError
+from tormagd.ground.plain_values import plain, restore
+from tormagd.record.journal import KNOWN
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
 PORTRAIT = Portrait(

@@ -11,8 +11,8 @@ from tormagd.control.ask.governor import EARLY_N, Governor
 from tormagd.control.ask.way import SLID_MM, Way
 from tormagd.control.believe.strength import UNSEEN, DeviceFit
 from tormagd.control.records import Ask, Handle, Measured, TimedSetpoint, Travel, Wall
-from tormagd.model.displacement import TURN_MM, Turn
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.model.displacement import TURN_MM, Turn
 from tormagd.scenes.scene import Force
 
 PORTRAIT = Portrait(

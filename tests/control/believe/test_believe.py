@@ -5,7 +5,6 @@ import math
 import msgspec
 import pytest
 
-from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
 from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
 from tormagd.control.believe.sensor_zero import MAX_SD_N, UNKNOWN_SD_N
@@ -13,10 +12,11 @@ from tormagd.control.believe.slow_friction import BRISTLES_N_MM
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle, TimedSetpoint
-from tormagd.exact import plain, restore
-from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
-from tormagd.physics.friction import Friction
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
+from tormagd.element.physics.friction import Friction
+from tormagd.ground.plain_values import plain, restore
+from tormagd.record.journal import KNOWN
 
 PERIOD_S = 0.004
 TURN = Turn(1.0, 0.0, 100.0)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from tormagd.control.believe.handle import FORGETS_S, MODEL_RISES_N, RISES_N, SETTLES_S, STANDS_MM, HandleWatch
-from tormagd.exact import plain
+from tormagd.ground.plain_values import plain
 
 PERIOD_S = 0.002
 STIFFEST_N_MM = 12.0

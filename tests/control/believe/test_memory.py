@@ -6,16 +6,16 @@ import msgspec
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.assembly.build import build_core
 from tormagd.config import Config
 from tormagd.control.aim.aim import Element
+from tormagd.control.assembly.build import build_core
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.records import Handle, Measured
-from tormagd.exact import plain
-from tormagd.model.displacement import Turn
-from tormagd.model.force_curve import within
-from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.physics.relaxation import PronySeries
+from tormagd.element.model.displacement import Turn
+from tormagd.element.model.force_curve import within
+from tormagd.element.model.memory import NO_MEMORY, Memory
+from tormagd.element.physics.relaxation import PronySeries
+from tormagd.ground.plain_values import plain
 
 MEMORY = Memory(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0), lag_mT=8.0, turn_mT=80.0)
 STEADY = msgspec.structs.replace(MEMORY, lag_mT=0.0)

@@ -19,8 +19,8 @@ from tormagd.control.believe.sensor import (
 )
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle
-from tormagd.model.displacement import MOBILISED_MM, Turn
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
 
 MODEL_N = 1.0871
 "What the model says at the gap of `moving`."

@@ -18,7 +18,7 @@ from tormagd.control.believe.slow_friction import (
     factor_bounds,
 )
 from tormagd.control.believe.strength import MAX_RELAXED, UNSEEN, DeviceFit, device_bounds
-from tormagd.exact import plain
+from tormagd.ground.plain_values import plain
 
 PERIOD_S = 0.003
 BOUNDS = device_bounds(Config().trim)

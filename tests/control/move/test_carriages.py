@@ -9,7 +9,7 @@ from tormagd.config import Config
 from tormagd.control.move.carriages import EXCHANGE_S, MAX_ACCELERATION_SCALE
 from tormagd.control.move.motor import electrical_time_s, pull_V
 from tormagd.control.move.reference import APPROACH_S, CARRY_S
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
 
 CONFIG = Config()
 

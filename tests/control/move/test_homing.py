@@ -4,8 +4,8 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.control.move.homing import BACKS_OFF_MM, LONGEST_S, Homing
-from tormagd.exact import plain
-from tormagd.safety.codes import Fault
+from tormagd.control.safety.codes import Fault
+from tormagd.ground.plain_values import plain
 
 CEILING_N = 3.0
 BOTH = Switches.LEFT_OPEN | Switches.RIGHT_OPEN

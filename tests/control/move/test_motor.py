@@ -10,8 +10,8 @@ from hypothesis import example, given, settings, strategies as st
 from scipy.optimize import brentq
 from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 
-from tormagd.assembly.build import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG, build_core
 from tormagd.config import Config, Motor, Position
+from tormagd.control.assembly.build import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG, build_core
 from tormagd.control.move.motor import (
     MAX_MARGIN_DB,
     delay_margin_s,
@@ -21,7 +21,7 @@ from tormagd.control.move.motor import (
     pull_V,
     zero_order_hold,
 )
-from tormagd.physics.magnets import CuboidMagnet, attraction_N
+from tormagd.element.physics.magnets import CuboidMagnet, attraction_N
 from tormagd_client.endpoints import ConfigError
 
 PERIOD_S = 1e-3

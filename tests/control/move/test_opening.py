@@ -5,8 +5,9 @@ import pytest
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Config
 from tormagd.control.move.opening import LATE_S, OPEN_MM, Opening, is_open
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import DeviceRequest, SafetyState, latch
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import SafetyState, latch
+from tormagd.hardware.measurement import DeviceRequest
 from tormagd.scenes.scene import load_scene
 
 CONFIG = Config()

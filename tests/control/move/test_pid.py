@@ -9,7 +9,7 @@ from simple_pid import PID
 
 from tormagd.config import Config, Position
 from tormagd.control.move.pid import ON_TARGET_MM, Pid
-from tormagd.physics.errors import DomainError
+from tormagd.element.physics.errors import DomainError
 
 DT_S = 1e-3
 SHIPPED = Config().position

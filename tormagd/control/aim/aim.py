@@ -12,20 +12,18 @@ from typing import Final, NamedTuple, final
 import numpy as np
 
 from tormagd.config import Config
-from tormagd.control.aim.floors import CEILING, lawful_mT, least_mm
-from tormagd.control.aim.portrait import LawOfField, Portrait
+from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, lawful_mT, least_mm
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.strength import DeviceFit, device_bounds
-from tormagd.control.field_of_gap import FieldOfGap
-from tormagd.control.nominal import Nominal
+from tormagd.control.nominal import FieldOfGap, Nominal
 from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
-from tormagd.inverse.solution import Answer, FieldSolution, FieldSolver, Question, Reach
-from tormagd.model.features import FEATURES
-from tormagd.model.force_curve import ForceCurve
-from tormagd.model.memory import Memory
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.inverse.solution import Answer, FieldSolution, FieldSolver, Question, Reach
+from tormagd.element.model.features import FEATURES
+from tormagd.element.model.force_curve import ForceCurve
+from tormagd.element.model.memory import Memory
+from tormagd.element.physics.errors import DomainError
 from tormagd.scenes.scene import Scene
 
 # looking a member up takes longer than comparing it

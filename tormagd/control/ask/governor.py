@@ -17,12 +17,12 @@ from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
 from tormagd.control.ask.path import PATH_S, SPEEDING_UP_S, TIMES_S, Path
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 from tormagd.control.records import AT_REST, Ask, TimedSetpoint, Travel, Wall
-from tormagd.model.features import LARGEST, require_number
-from tormagd.model.force_curve import within
-from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import Limit
+from tormagd.control.safety.codes import Limit
+from tormagd.element.model.features import LARGEST, require_number
+from tormagd.element.model.force_curve import within
+from tormagd.element.physics.errors import DomainError
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
 # compiled, a constant of this module is a plain float

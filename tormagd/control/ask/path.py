@@ -13,8 +13,8 @@ from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.model.features import require_number
-from tormagd.model.force_curve import within
+from tormagd.element.model.features import require_number
+from tormagd.element.model.force_curve import within
 
 PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
 "When, after the moment planned for, a plan looks at the force to come."

@@ -22,9 +22,9 @@ from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
 from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Belief, Measured
+from tormagd.control.safety.codes import Limit
 from tormagd.control.sight import unsensed_s
-from tormagd.model.displacement import MOVING_MM_S
-from tormagd.safety.codes import Limit
+from tormagd.element.model.displacement import MOVING_MM_S
 from tormagd.scenes.scene import Scene
 
 MIN_DT_S: Final = 0.003

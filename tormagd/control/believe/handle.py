@@ -8,7 +8,7 @@ feels.
 import math
 from typing import Final, final
 
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 
 STANDS_MM: Final = 0.01
 "A handle that keeps within this stands: just over a count of the encoder."

@@ -11,12 +11,11 @@ at all fields.
 import math
 from typing import Final, final
 
-from tormagd.control.field_of_gap import FieldOfGap
-from tormagd.control.nominal import Nominal
+from tormagd.control.nominal import FieldOfGap, Nominal
 from tormagd.control.records import Measured
-from tormagd.model.force_curve import ForceCurve, within
-from tormagd.model.memory import Memory
-from tormagd.physics.relaxation import PronyState
+from tormagd.element.model.force_curve import ForceCurve, within
+from tormagd.element.model.memory import Memory
+from tormagd.element.physics.relaxation import PronyState
 
 BEYOND_MM: Final = 2.0
 "The model is asked no further beyond the closed end, where a carriage may overrun."

@@ -16,7 +16,7 @@ from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.believe.strength import SURE, UNSEEN, DeviceBounds, DeviceFit
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 
 Disputed = Literal["device", "sensor"]
 "What an operator may say of readings outside: the device has changed, or the sensor is wrong."

@@ -12,7 +12,7 @@ import math
 from typing import Final, final
 
 from tormagd.control.believe.strength import MAX_RELAXED, DeviceBounds, DeviceFit
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 
 STRIBECK_MM_S: Final = 5.0
 "At this speed most of static friction is gone (plant card)."

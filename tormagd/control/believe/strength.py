@@ -12,7 +12,7 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.config import Trim
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 
 SCALE_SD: Final = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."

@@ -6,8 +6,8 @@ from typing import Final, final
 from firmware_protocol.value import Value
 from tormagd.control.move.reference import Reference
 from tormagd.control.records import Measured, Plan
+from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Limit
 
 
 @final

@@ -15,8 +15,8 @@ from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, mecha
 from tormagd.control.move.pid import Pid
 from tormagd.control.move.reference import Expected, Reference, Speeds, follow, target_of
 from tormagd.control.records import Measured, Plan
+from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene
 
 WEAK_MM: Final = 1.0

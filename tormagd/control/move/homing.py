@@ -6,8 +6,8 @@ Homing is the firmware's own routine, and a motor with wrong wiring presses shut
 from typing import Final, final
 
 from firmware_protocol.codec import DeviceMode, Switches
+from tormagd.control.safety.codes import Fault
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Fault
 
 LONGEST_S: Final = 12.0
 "The slowest homing from a closed gap takes under 10 s."

@@ -11,9 +11,9 @@ from typing import Final, final
 
 from firmware_protocol.codec import DeviceFault, DeviceMode
 from tormagd.config import Config
-from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import DeviceRequest, SafetyState
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import SafetyState
+from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.scenes.scene import Scene
 
 LATE_S: Final = 0.35

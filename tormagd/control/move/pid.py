@@ -10,7 +10,7 @@ position.
 from typing import Final, final
 
 from tormagd.config import Position
-from tormagd.model.features import LARGEST, require_number
+from tormagd.element.model.features import LARGEST, require_number
 
 # compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST

@@ -4,7 +4,7 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import low_pass
 from tormagd.control.records import Plan
 
 CARRY_S: Final = 0.012

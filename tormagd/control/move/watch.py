@@ -9,10 +9,10 @@ from tormagd.control.believe.strength import SCALE_SD
 from tormagd.control.move.motor import delay_margin_s
 from tormagd.control.plausible import Leap, is_contradicted, is_outside
 from tormagd.control.records import Measured
+from tormagd.control.safety.codes import Fault, Limit, device_faults
+from tormagd.control.safety.operating_state import Conditions, SafetyState
 from tormagd.control.sight import Sight, unsensed_s
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.codes import Fault, Limit, device_faults
-from tormagd.safety.operating_state import Conditions, SafetyState
 from tormagd.scenes.scene import Scene
 
 STARTING_S: Final = 0.15

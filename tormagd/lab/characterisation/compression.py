@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tormagd.element.physics.errors import require
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
-from tormagd.physics.errors import require
 
 CYCLES = 4
 "Three conditioning cycles and the evaluated one."

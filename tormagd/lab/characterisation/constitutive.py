@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tormagd.element.physics.force import MU0_H_M
 from tormagd.lab.arrays import Array
-from tormagd.physics.force import MU0_H_M
 
 
 class MooneyRivlin(NamedTuple):

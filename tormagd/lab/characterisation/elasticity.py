@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
+from tormagd.element.physics.errors import FloatArray, require
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
-from tormagd.physics.errors import FloatArray, require
 
 Shape = Callable[[FloatArray, float], FloatArray]
 "Stress of one term over its modulus, by stretch and exponent."

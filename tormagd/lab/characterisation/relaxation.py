@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
+from tormagd.element.physics.errors import require
+from tormagd.element.physics.relaxation import MAX_FORCE_N, PronySeries
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
-from tormagd.physics.errors import require
-from tormagd.physics.relaxation import MAX_FORCE_N, PronySeries
 
 MAX_BRANCHES = 6
 MIN_FRACTION = 1e-6

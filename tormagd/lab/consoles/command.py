@@ -16,12 +16,12 @@ import pyarrow
 import pyarrow.parquet
 
 from tormagd.commission.sequence import Report
+from tormagd.ground.terminal import write_line
 from tormagd.lab import executors
 from tormagd.lab.consoles.summary import SUFFIX, Console, Drift, Summary, consoles, files, read_all
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.told import table
-from tormagd.output import write_line
 from tormagd_client.printable import printable
 
 HEADINGS = (

@@ -17,8 +17,8 @@ import numpy as np
 from tormagd.commission.sequence import MAX_BYTES, Report
 from tormagd.lab.arrays import rms
 from tormagd.lab.executors import finished
-from tormagd.recording.overview import Floats, Glance, OverviewBuilder
-from tormagd.recording.reader import Seen, read_open
+from tormagd.record.overview import Floats, Glance, OverviewBuilder
+from tormagd.record.reader import Seen, read_open
 
 DAY_S = 86_400.0
 MIN_DAYS, MIN_RECORDINGS = 1.0, 3

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tormagd.element.physics.errors import Real, require, require_that
+from tormagd.element.physics.field import FieldLaw, PowerFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
 from tormagd.lab.design.force_law import d_force_d_gap, radial_moment_for_force_Tm
-from tormagd.physics.errors import Real, require, require_that
-from tormagd.physics.field import FieldLaw, PowerFieldLaw
-from tormagd.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
 
 CLOSED_MM, OPEN_MM = 45.0, 95.0
 "End positions of the thesis's device."

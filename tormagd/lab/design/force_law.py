@@ -4,10 +4,10 @@ import sys
 
 import numpy as np
 
-from tormagd.physics.brake_curve import MAX_COMPRESSION, BrakeCurve, functions
-from tormagd.physics.errors import Real, require
-from tormagd.physics.field import FieldLaw
-from tormagd.physics.force import Elastomer, Geometry, reduced
+from tormagd.element.physics.brake_curve import MAX_COMPRESSION, BrakeCurve, functions
+from tormagd.element.physics.errors import Real, require
+from tormagd.element.physics.field import FieldLaw
+from tormagd.element.physics.force import Elastomer, Geometry, reduced
 
 _NEWTON_STEPS = 100
 "Enough for bisection alone; Newton's method takes at most about 8."

@@ -20,13 +20,13 @@ import msgspec
 import numpy as np
 from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differential_evolution, minimize
 
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 from tormagd.lab.arrays import Array
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.phase_portrait import PhasePortrait, Region
 from tormagd.lab.executors import finished
-from tormagd.physics.errors import DomainError
-from tormagd.physics.field import PowerFieldLaw
-from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
 Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
 "Coverage by the trapezoid or the true boundary, or the thesis's cost."

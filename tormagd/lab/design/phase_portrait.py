@@ -14,9 +14,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from tormagd.element.physics.errors import FloatArray, require, require_that
 from tormagd.lab.arrays import Mask
 from tormagd.lab.design.brake import Brake
-from tormagd.physics.errors import FloatArray, require, require_that
 
 MAX_FORCE_N = 1e6
 MAX_RATE_N_S = 1e9

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tormagd.element.physics.field import REFERENCE_PERMEABILITY, FieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.inserts import Insert, relative_permeability
 from tormagd.lab.design.brake import CLOSED_MM, OPEN_MM
-from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.physics.inserts import Insert, relative_permeability
 
 MIN_EXPONENT, MAX_EXPONENT = 0.0, 3.0
 _GRID = 61

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.signal import butter, decimate, sosfiltfilt
 from scipy.stats import t as student
 
-from tormagd.commission.regression import solved
+from tormagd.commission.finding import solved
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd.lab.motor.log import Log

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.model.model_file import ForceModel, load_model, model_path
 from tormagd.lab.errors import LabError
 from tormagd.lab.training.dataset import not_rising_share
-from tormagd.model.model_file import ForceModel, load_model
-from tormagd.model.shipped import model_path
 from tormagd.scenes.scene import scene_path
 
 NEIGHBOURS = (1, 2, 4, 8, 16, 64)

@@ -17,16 +17,16 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
-from tormagd.assembly.build import build_core
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import build_core
 from tormagd.control.move.watch import SENSOR_FAULT_S
 from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
+from tormagd.control.safety.codes import Fault
+from tormagd.element.model.displacement import Turn
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import WORKERS, Found, within
-from tormagd.model.displacement import Turn
-from tormagd.safety.codes import Fault
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import PlantError, load_plant

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from tormagd.element.model.features import CIP
+from tormagd.element.model.model_file import ForceModel
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.tactile.pads import PADS, PadRecord, cyclic_records, holding_records
 from tormagd.lab.training.dataset import (
@@ -19,8 +21,6 @@ from tormagd.lab.training.dataset import (
 )
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
-from tormagd.model.features import CIP
-from tormagd.model.model_file import ForceModel
 from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, RATES_MM_S, TOUCHING_MM, worked_pad
 

@@ -5,15 +5,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tormagd.inverse.nearest import NearestFieldSearch, field_grid
-from tormagd.inverse.ordered import RowByRow
-from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
+from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.inverse.ordered import RowByRow
+from tormagd.element.inverse.solution import FieldSolution, FieldSolver, Reach
+from tormagd.element.model.model_file import ForceModel
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.human_pulse import pulse_profile, recorded, scaled
 from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
 from tormagd.lab.tactile.pads import PADS, Program, drawn_pad
 from tormagd.lab.training.grey_box import GreyBoxMemory
-from tormagd.model.model_file import ForceModel
 from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, worked_pad
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tormagd.drawing import Figure
+from tormagd.element.model.features import FIELD
 from tormagd.lab.arrays import Array, Json
 from tormagd.lab.pages import subplots, table, write_page
 from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT, Trained
 from tormagd.lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT
 from tormagd.lab.training.dataset import Dataset
-from tormagd.model.features import FIELD
+from tormagd.view.drawing import Figure
 
 WAYS = {
     "mlp": "network alone",

@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 import torch
 
+from tormagd.element.model.memory import Memory
+from tormagd.element.model.model_file import ForceModel, save_model
 from tormagd.lab.main import Found
 from tormagd.lab.tactile.models import FULL, Effort
 from tormagd.lab.tactile.pads import cyclic_records, holding_records
 from tormagd.lab.training.dataset import force_metrics, not_rising_share, random_split
 from tormagd.lab.training.grey_box import fit_grey_box
-from tormagd.model.memory import Memory
-from tormagd.model.model_file import ForceModel, save_model
 from tormagd.simulation.parameters import PlantError, load_plant
 
 INSERT = "MRE-C"

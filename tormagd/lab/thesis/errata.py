@@ -4,6 +4,9 @@ import math
 
 import numpy as np
 
+from tormagd.element.physics.field import PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import MU0_H_M, TORMAG, Elastomer
+from tormagd.element.physics.inserts import INSERTS
 from tormagd.lab.characterisation import constitutive
 from tormagd.lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormagd.lab.design.force_law import stretch_minus_one
@@ -15,9 +18,6 @@ from tormagd.lab.thesis.values import (
     TABLE_2_4_MEAN_PERCENT,
     USE_CASES,
 )
-from tormagd.physics.field import PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer
-from tormagd.physics.inserts import INSERTS
 
 SAMPLE = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
 APPENDIX_MU_R = 3.8

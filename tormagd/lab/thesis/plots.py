@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.drawing import Axes, Figure
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.optimisation import Design, Problem
 from tormagd.lab.design.phase_portrait import Region
@@ -12,6 +11,7 @@ from tormagd.lab.pages import subplots
 from tormagd.lab.thesis.page import best_start
 from tormagd.lab.thesis.step_test import StepTest
 from tormagd.lab.thesis.values import AS_BUILT, USE_CASES
+from tormagd.view.drawing import Axes, Figure
 
 MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e", "#e9ecf2"
 

@@ -11,6 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.element.physics.force import Elastomer
+from tormagd.element.physics.inserts import INSERTS, Insert, insert
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage, sweep
@@ -34,9 +37,6 @@ from tormagd.lab.thesis.values import (
     USE_CASES,
 )
 from tormagd.lab.told import table
-from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import Elastomer
-from tormagd.physics.inserts import INSERTS, Insert, insert
 
 CONTROLLER_SPEED_MM_S = 40.0
 "Two carriages at 150 rpm on 8 mm screws; a measured speed goes in with --gap-speed."

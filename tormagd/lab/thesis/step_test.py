@@ -9,13 +9,13 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
 from tormagd.control.core import Stepper
+from tormagd.element.physics.inserts import Insert
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.bench_sweep import BENCH_MOST_N, gap_plan
-from tormagd.physics.inserts import Insert
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

@@ -6,11 +6,11 @@ from its own least force on, and a passive brake does not reach 0 N.
 
 import math
 
+from tormagd.element.physics.inserts import INSERTS
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.brake import CLOSED_MM, Brake
 from tormagd.lab.design.selection import ForceTask, Verdict, rank
 from tormagd.lab.thesis.values import TABLE_2_5
-from tormagd.physics.inserts import INSERTS
 
 GAP_RESOLUTION_MM = 0.1
 "Reach of a plain position loop against the screws' backlash; the thesis's table implies a little less."

@@ -21,18 +21,18 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
 from tormagd.control.core import Stepper
-from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.control.nominal import FieldOfGap
 from tormagd.control.records import Plan
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.inserts import insert
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.main import SEED, Found
 from tormagd.lab.training.dataset import Dataset, write_csv
-from tormagd.model.displacement import MOBILISED_MM
-from tormagd.physics.field import PowerFieldLaw
-from tormagd.physics.inserts import insert
 from tormagd.scenes.scene import Scene, load_scene
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert

@@ -22,17 +22,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tormagd.bounded_file import in_place_of
+from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
+from tormagd.element.model.features import FEATURES, FIELD, Element
+from tormagd.element.model.model_file import ForceModel, save_model
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.field import PowerFieldLaw, flux_density_T
+from tormagd.element.physics.inserts import Insert, insert
+from tormagd.ground.files import in_place_of
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.tables import read_columns
 from tormagd.lab.training.dataset import ALLOWED, Dataset, fit_metrics, write_csv
-from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
-from tormagd.model.features import FEATURES, FIELD, Element
-from tormagd.model.model_file import ForceModel, save_model
-from tormagd.physics.errors import DomainError
-from tormagd.physics.field import PowerFieldLaw, flux_density_T
-from tormagd.physics.inserts import Insert, insert
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 "The handle's travel is at the roller; rate and force are positive in the direction of motion."

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tormagd.element.model.features import FEATURES, Scaling
+from tormagd.element.model.model_file import ForceModel
+from tormagd.element.physics.errors import DomainError
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
-from tormagd.model.features import FEATURES, Scaling
-from tormagd.model.model_file import ForceModel
-from tormagd.physics.errors import DomainError
 
 COLUMNS = (*FEATURES, "force_N")
 OPTIONAL_COLUMNS = ("cycle", "time_s")

@@ -7,15 +7,15 @@ import msgspec
 import numpy as np
 import torch
 
+from tormagd.element.model.features import CIP, Element, Scaling
+from tormagd.element.model.memory import NO_MEMORY, Memory
+from tormagd.element.model.model_file import ForceModel, ModelMetadata, Ranges
+from tormagd.element.model.network import ForceNetwork, to_model
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.inserts import insert
 from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset, random_split, trained_metrics
 from tormagd.lab.training.levenberg_marquardt import Training, train
-from tormagd.model.features import CIP, Element, Scaling
-from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.model.model_file import ForceModel, ModelMetadata, Ranges
-from tormagd.model.network import ForceNetwork, to_model
-from tormagd.physics.errors import DomainError
-from tormagd.physics.inserts import insert
 
 VALIDATION_SHARE = 0.1
 "Share of the training rows that decides when training stops; test rows have no part in that."

@@ -1,8 +1,9 @@
 """The relaxation-aware model: a network for the force without memory, and Prony series for the stress's relaxation.
 
 F0 = NN(displacement, rate, field, CIP) is the force without memory. Its part without field and what the field adds
-relax by fractions of their own, with the same times (see `tormagd.physics.relaxation`). For an inverse, the memory is a
-shift. `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now, and any search finds the field for it.
+relax by fractions of their own, with the same times (see `tormagd.element.physics.relaxation`). For an inverse, the
+memory is a shift. `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now, and any search finds the
+field for it.
 """
 
 import functools
@@ -11,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from tormagd.element.model.features import FIELD, RATE
+from tormagd.element.model.model_file import ForceModel
+from tormagd.element.physics.relaxation import PronySeries
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.training.dataset import Dataset, records, times_of
-from tormagd.model.features import FIELD, RATE
-from tormagd.model.model_file import ForceModel
-from tormagd.physics.relaxation import PronySeries
 
 START_TIMES_S = (1.0, 10.0, 100.0, 1000.0)
 START_FRACTION = 0.03

@@ -16,13 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tormagd.bounded_file import read_bounded
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.ground.files import read_bounded
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found, within
 from tormagd.lab.pages import subplots
 from tormagd.lab.training.dataset import ALLOWED, Dataset, records, write_csv
-from tormagd.model.displacement import MOBILISED_MM
 
 MAX_FILE_BYTES = 1 << 28
 LENGTH = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1e3}

@@ -20,16 +20,16 @@ from scipy.optimize import least_squares, minimize
 from scipy.special import expit
 from scipy.stats.qmc import Halton
 
+from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.element.model.features import FEATURES, FIELD, RATE, Element
+from tormagd.element.model.memory import NO_MEMORY, Memory
+from tormagd.element.model.model_file import ForceModel, ModelMetadata
+from tormagd.element.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
+from tormagd.element.physics.errors import require_that
+from tormagd.element.physics.force import MU0_H_M, TORMAG
+from tormagd.element.physics.inserts import Insert, insert
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset, trained_metrics
-from tormagd.model.displacement import MOBILISED_MM
-from tormagd.model.features import FEATURES, FIELD, RATE, Element
-from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.model.model_file import ForceModel, ModelMetadata
-from tormagd.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
-from tormagd.physics.errors import require_that
-from tormagd.physics.force import MU0_H_M, TORMAG
-from tormagd.physics.inserts import Insert, insert
 
 MIDDLE_MT = 450.0
 REFERENCE_MM_S, SLOW_MM_S = 42.0, 0.1

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from tormagd.element.model.features import FIELD
+from tormagd.element.model.network import ForceNetwork
+from tormagd.element.physics.errors import DomainError
 from tormagd.lab.training.dataset import Dataset
-from tormagd.model.features import FIELD
-from tormagd.model.network import ForceNetwork
-from tormagd.physics.errors import DomainError
 
 BATCH_ROWS = 4096
 "10 MB of the Jacobian at 50 hidden units."

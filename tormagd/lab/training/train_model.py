@@ -11,15 +11,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tormagd.element.model.features import Element
+from tormagd.element.model.memory import NO_MEMORY
+from tormagd.element.model.model_file import ForceModel, save_model
+from tormagd.ground.terminal import write_line
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import SEED, Found
 from tormagd.lab.training.dataset import Dataset, read_csv
 from tormagd.lab.training.law import fit_law_model
 from tormagd.lab.training.unremembered import identify
-from tormagd.model.features import Element
-from tormagd.model.memory import NO_MEMORY
-from tormagd.model.model_file import ForceModel, save_model
-from tormagd.output import write_line
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -14,11 +14,11 @@ field. Inserts of one matrix relax and lag alike, the lag scaled to the field.
 import numpy as np
 from scipy.optimize import least_squares
 
+from tormagd.element.model.features import CIP, FIELD
+from tormagd.element.model.memory import Memory
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset, records, times_of
 from tormagd.lab.training.law import mobilised_N
-from tormagd.model.features import CIP, FIELD
-from tormagd.model.memory import Memory
 
 START_TIMES_S = (10.0, 100.0, 1000.0)
 "Time constants of field-step tests."

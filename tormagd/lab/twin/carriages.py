@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tormagd.commission.of_carriages import SIDES
+from tormagd.commission.carriage_findings import SIDES
 from tormagd.lab.arrays import Array, rms
 from tormagd.lab.errors import LabError
 from tormagd.lab.twin.estimate import Estimate, Prior, Values, estimated, named, value_at, with_values

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from tormagd.commission.regression import sandwich
+from tormagd.commission.finding import sandwich
 from tormagd.lab.arrays import Array
 from tormagd.simulation.parameters import PlantParameters
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from tormagd.commission.of_carriages import SIDES, smooth, smoothed
+from tormagd.commission.carriage_findings import SIDES, smooth, smoothed
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
-from tormagd.recording.reader import RecordingError, Seen, read_recording
+from tormagd.record.reader import RecordingError, Seen, read_recording
 
 GRID_HZ = 100.0
 "Each row is a mean over its time."

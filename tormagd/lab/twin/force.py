@@ -12,13 +12,13 @@ import msgspec
 import numpy as np
 from scipy.signal import lfilter
 
+from tormagd.element.physics.force import TORMAG, Elastomer as Rubber, reduced
+from tormagd.element.physics.relaxation import PronySeries
 from tormagd.lab.arrays import Array, Mask, rms
 from tormagd.lab.errors import LabError
 from tormagd.lab.ideal_carriage import friction_of, lag_of
 from tormagd.lab.twin.estimate import Estimate, Prior, Values, estimated, named, value_at, with_values
 from tormagd.lab.twin.excerpt import GRID_HZ, Excerpt
-from tormagd.physics.force import TORMAG, Elastomer as Rubber, reduced
-from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.parameters import Elastomer, Field, PlantParameters, Thermal
 from tormagd.simulation.static_laws import radial_moment_Tm
 

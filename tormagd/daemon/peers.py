@@ -1,0 +1,76 @@
+"""Peers: how many of their messages are read, and counts of what was refused or not read."""
+
+import logging
+from collections.abc import Callable
+from typing import NamedTuple
+
+from tormagd_client.messages import PeerReport
+
+NEWS_S = 10.0
+
+log = logging.getLogger(__name__)
+
+
+class Peer(NamedTuple):
+    """A peer: its host or local process, as libzmq names it, and its key if it has one."""
+
+    address: str
+    key: str = ""
+
+
+class Tally:
+    """Counts refusals, and keeps the newest: endpoint, peer, reason, and how often it came in a row."""
+
+    def __init__(self, line: str, name: Callable[[str], str]) -> None:
+        self._line, self._name = line, name
+        self.total = self._told = self._in_a_row = 0
+        self._tell_s = 0.0
+        self._newest = "", Peer(""), ""
+
+    def add(self, endpoint: str, peer: Peer, reason: str) -> None:
+        newest = endpoint, peer, reason
+        self._in_a_row = self._in_a_row + 1 if newest == self._newest else 1
+        self._newest = newest
+        self.total += 1
+
+    def report(self) -> tuple[PeerReport, ...]:
+        endpoint, peer, reason = self._newest
+        key = peer.key and self._name(peer.key)
+        return (PeerReport(endpoint, shown(peer.address), key, reason, self._in_a_row),) if self.total else ()
+
+    def tell(self, now_s: float) -> None:
+        if self.total > self._told and now_s >= self._tell_s:
+            (it,) = self.report()
+            newest = f"{it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason}"
+            log.warning(self._line, self.total - self._told, newest)
+            self._told, self._tell_s = self.total, now_s + NEWS_S
+
+
+def shown(address: str) -> str:
+    """Return libzmq's address of a peer for people: the host, or `process N of user N`."""
+    if address.startswith("localhost:"):
+        _, user, _, process = address.split(":")
+        return f"process {process} of user {user}"
+    return address or "gone before it was seen"
+
+
+PEERS = 256
+"Peers that have a bucket; beyond, the one heard longest ago is forgotten."
+
+
+class Allowance:
+    """A token bucket for each peer: `per_s` messages a second, and a `burst` at once. No sockets, no clock."""
+
+    def __init__(self, per_s: float, burst: float) -> None:
+        self._per_s, self._burst = per_s, burst
+        self._buckets: dict[Peer, tuple[float, float]] = {}
+
+    def grants(self, peer: Peer, now_s: float) -> bool:
+        """Tell whether one more message of `peer` may be read at `now_s`; if so, it is taken from the peer's bucket."""
+        if peer not in self._buckets and len(self._buckets) >= PEERS:
+            del self._buckets[min(self._buckets, key=self._buckets.__getitem__)]
+        filled_s, left = self._buckets.get(peer, (now_s, self._burst))
+        left = min(self._burst, left + (now_s - filled_s) * self._per_s)
+        is_granted = left >= 1.0
+        self._buckets[peer] = now_s, left - is_granted
+        return is_granted

@@ -1,0 +1,1 @@
+"""What every room may take: files, terminal, plain values, scheduling, keys."""

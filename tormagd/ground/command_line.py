@@ -1,0 +1,43 @@
+"""A command line that refuses in one sentence with the next step, and suggests what may have been meant."""
+
+import argparse
+import sys
+from typing import Any, NoReturn
+
+from tormagd.ground.files import did_you_mean
+from tormagd.ground.terminal import write_answer
+from tormagd_client.printable import in_short, printable
+
+LONGEST = 300
+"Characters of a refusal that quotes what was given."
+UNKNOWN_OPTION = "unrecognized arguments: "
+
+
+class UsageError(Exception):
+    """The command line cannot be used: `message` says why, `hint` what to do next."""
+
+    def __init__(self, message: str, hint: str) -> None:
+        super().__init__(message, hint)
+        self.message, self.hint = message, hint
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises UsageError instead of ending the process."""
+
+    options: tuple[str, ...] = ()
+
+    def error(self, message: str) -> NoReturn:
+        """Raise UsageError with this message, cut to LONGEST characters."""
+        if message.startswith(UNKNOWN_OPTION):
+            known = self.options or tuple(self._option_string_actions)
+            message += did_you_mean(message.removeprefix(UNKNOWN_OPTION).split()[0], known)
+        raise UsageError(printable(message.removeprefix("argument ")[:LONGEST]), f"{self.prog} --help")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            near = did_you_mean(value, action.choices) or f": allowed are {', '.join(action.choices)}"
+            raise argparse.ArgumentError(action, f"{in_short(value)}{near}")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        if not write_answer(message.rstrip(), self.prog):
+            sys.exit(1)

@@ -1,0 +1,71 @@
+"""Files that anybody may have made, and files that a user names.
+
+Only a regular file is read, and never more than a given size. What is written replaces an earlier file in one step.
+"""
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterable, Iterator
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from tormagd_client.endpoints import ConfigError
+from tormagd_client.printable import in_short
+from tormagd_client.regular_file import require_regular
+
+
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """Return all bytes of a regular file of at most `most_bytes`, following links."""
+    require_regular(path, most_bytes)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:  # a file that grows, or one of the kernel's without a size
+        raise OSError(errno.EFBIG, f"allowed is a regular file of at most {most_bytes} bytes; this has more", str(path))
+    return data
+
+
+@contextlib.contextmanager
+def in_place_of(path: Path) -> Iterator[Path]:
+    """Give a path beside `path` to write to, which replaces `path` at the end."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))
+    beside = path.with_name(f"{path.name}.part")
+    beside.unlink(missing_ok=True)
+    try:
+        yield beside
+        with beside.open("rb") as file:
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        raise
+
+
+def shipped(folder: Traversable, ending: str) -> tuple[str, ...]:
+    """Return the names of a package folder's files with `ending`, without it."""
+    return tuple(sorted(each.name.removesuffix(ending) for each in folder.iterdir() if each.name.endswith(ending)))
+
+
+def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = Path()) -> Path:
+    """Return the path of a shipped file, or else of the existing file `name`, relative to `beside`."""
+    names, reason = shipped(folder, ending), ""
+    if name in names:
+        return Path(str(folder / f"{name}{ending}"))
+    try:
+        if name and (beside / name).exists():
+            return beside / name
+    except OSError as error:  # a name that no file can have, or a directory that may not be entered
+        reason = f"{error.strerror}; "
+    near = did_you_mean(name, names)
+    raise ConfigError(f"{key} = {in_short(name)}: {reason}allowed is a file or one of {', '.join(names)}{near}")
+
+
+def did_you_mean(word: str, allowed: Iterable[str]) -> str:
+    """Return `; did you mean ...?` with the allowed word nearest to `word`, or ""."""
+    import difflib  # takes a moment, and most configurations are right
+
+    near = difflib.get_close_matches(word, list(allowed), n=1)
+    return f"; did you mean `{near[0]}`?" if near else ""

@@ -1,0 +1,155 @@
+"""The journal: all inputs of the core, in their order. A replay runs the core again from them and a snapshot.
+
+`plan` and `step` are deterministic, and so is the conversation with the device, given what was read and when. Their
+results stand in the journal for comparison only.
+"""
+
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from firmware_protocol.codec import DeviceMode, Switches
+from tormagd.control.ask.forecast import Guess, Skill
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.sensor_zero import Level
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.core import Planner, Stepper
+from tormagd.control.move.reference import Reference
+from tormagd.control.plausible import Leap
+from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint, Travel, Wall
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState
+from tormagd.element.inverse.solution import Answer, FieldSolution, Question, Reach
+from tormagd.element.model.displacement import Turn
+from tormagd.ground.plain_values import kinds, plain
+from tormagd.hardware.backend import Received, Sent
+from tormagd.hardware.measurement import DeviceRequest
+from tormagd.record.keeper_messages import READ, WROTE
+from tormagd_client.messages import TickRecord
+
+FORMAT = 15
+"Version of the entries and their states: raised when one comes, goes or changes its meaning. No other is rerun."
+KNOWN = kinds(
+    *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
+    *(Measured, Handle, Travel, Turn, Wall, Leap, Reference, Plan, Outside),
+    *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
+)
+"All types that `exact` reads back."
+STEP = "step"
+PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
+COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
+CONNECTED = "connected"
+"A conversation began or ended. READ and WROTE are in `keeping`."
+STATE, MISSING = "state", "missing"
+MAX_ENTRIES = 4_096
+"When this many entries were not taken, MISSING takes their place."
+
+_LENGTH = struct.Struct(">I")
+_NONE = b"\xdd" + _LENGTH.pack(0)
+"An empty array whose length has four bytes."
+
+Entry = str | TickRecord | tuple[Any, ...]
+
+
+class Journal:
+    """The core's inputs since the last `take`. Every other method adds an entry."""
+
+    def __init__(self, *, is_kept: bool = True) -> None:
+        self.is_kept = is_kept
+        self._entries: list[Entry] = []
+
+    def stepped(self) -> None:
+        """Note that a step is about to run; its inputs follow with `ticked`."""
+        self._add(STEP)
+
+    def ticked(self, record: TickRecord) -> None:
+        self._add(record)
+
+    def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
+        self._add((PLAN, now_s, setpoint))
+
+    def foresaw(self) -> None:
+        self._add((FORESEE,))
+
+    def began_afresh(self, now_s: float) -> None:
+        """Note that a plan or forecast failed, and that planning began anew."""
+        self._add((AFRESH, now_s))
+
+    def taught(self, learned: Learned) -> None:
+        """Note that the estimators were set to what is known from another day."""
+        self._add((TEACH, learned))
+
+    def confirmed(self, what: str) -> None:
+        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong."""
+        self._add((CONFIRM, what))
+
+    def answered(self, answer: Answer) -> None:
+        self._add((ANSWER, answer))
+
+    def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
+        self._add((COMMAND, name, now_s, is_refused, conditions))
+
+    def latched(self, fault: Fault) -> None:
+        self._add((LATCH, str(fault)))
+
+    def lost_link(self) -> None:
+        self._add((LOSE_LINK,))
+
+    def read(self, now_s: float, raw: Received) -> None:
+        self._add((READ, now_s, raw))
+
+    def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
+        self._add((WROTE, now_s, raw, unsent))
+
+    def connected(self, memory: Any) -> None:
+        """Note that a conversation begins from the state `memory`, or with None that it is over."""
+        self._add((CONNECTED, memory))
+
+    def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
+        """Note the whole state of the core and of the conversation: a replay may begin here."""
+        if self.is_kept:
+            self._add((STATE, plain(stepper), plain(planner), connection))
+
+    def missed(self) -> None:
+        self._add((MISSING,))
+
+    def take(self) -> list[Entry]:
+        """Return and remove all entries."""
+        entries, self._entries = self._entries, []
+        return entries
+
+    def _add(self, entry: Entry) -> None:
+        if not self.is_kept:
+            return
+        if len(self._entries) >= MAX_ENTRIES:
+            self._entries = [(MISSING,)]
+        self._entries.append(entry)
+
+
+class Packer:
+    """Writes entries as one growing msgpack array."""
+
+    def __init__(self) -> None:
+        self._bytes, self._count = bytearray(_NONE), 0
+
+    def add(self, entries: Sequence[Entry]) -> None:
+        for entry in entries:
+            _ENCODER.encode_into(entry, self._bytes, -1)
+            self._count += 1
+
+    def take(self) -> bytes:
+        _LENGTH.pack_into(self._bytes, 1, self._count)
+        packed = bytes(self._bytes)
+        self._bytes, self._count = bytearray(_NONE), 0
+        return packed
+
+
+def _of_value(thing: Any) -> Any:
+    if type(thing) is TimedSetpoint:
+        return [getattr(thing, name) for name in thing.__match_args__]
+    return plain(thing)
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_of_value)

@@ -1,0 +1,368 @@
+"""A recording's overview: what pictures, pages and reports show of its whole length, in bounded memory.
+
+Time is cut into stretches of equal width. If there are too many, their width doubles. Each stretch holds the least and
+the greatest value of each quantity. The recorder writes the overview at the end of its file. For a file without one, a
+reader makes it from the messages in the same way.
+"""
+
+import math
+import re
+from array import array
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from typing import Annotated, Any, TypedDict
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from tormagd.record.force_following import PERIOD_S, Following
+from tormagd_client.messages import FollowingReport, Mark
+
+Floats = NDArray[np.float64]
+
+QUANTITIES = (
+    "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "gap_setpoint_mm", "left_duty", "right_duty", "field_mT",
+)  # fmt: skip
+KINDS = ("operating_state", "limits", "faults")
+BREAK_S = 0.1
+"Between messages further apart, nothing is known."
+BREAK_NS = round(BREAK_S * 1e9)
+FIRST_WIDTH_NS = 1_000_000
+MAX_STRETCHES = 1_500
+MAX_SPANS = 1_000
+"Beyond these, the nearest spans of one code are joined."
+MAX_CODES, MAX_MARKS = 66, 1_000
+MAX_BYTES = 2_000_000
+CODE = re.compile(r"[A-Za-z0-9_.:?-]{1,64}")
+ODD = re.compile(r"[^A-Za-z0-9_.:?-]")
+OTHER = "OTHER"
+"Stands for codes beyond MAX_CODES."
+_LOOK_NS = round(PERIOD_S * 1e9)
+LATE_US = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1_000.0, 2_000.0, 5_000.0)
+"Bounds of the bars of the lateness histogram."
+
+
+Word = Annotated[str, Meta(max_length=4_096)]
+Words = Annotated[tuple[Word, ...], Meta(max_length=256)]
+Code = Annotated[str, Meta(pattern=rf"\A{CODE.pattern}\Z")]
+
+
+class Glance(TypedDict, total=False):
+    setpoint_cf: float | None
+    governed_cf: float | None
+    measured_cf: float | None
+    field_mT: float | None
+    gap_mm: float | None
+    gap_setpoint_mm: float | None
+    left_mm: float | None
+    right_mm: float | None
+    reference_gap_mm: float | None
+    left_duty: float | None
+    right_duty: float | None
+    duty: tuple[float, float] | None
+    operating_state: Word | None
+    limits: Words | None
+    faults: Words | None
+    handle_mm: float | None
+    handle_rate_mm_s: float | None
+    handle_mm_s: float | None
+    lateness_us: float | None
+    mark: Mark | None
+
+
+class Curves(msgspec.Struct, frozen=True):
+    stretches: bytes
+    low: dict[str, bytes]
+    high: dict[str, bytes]
+
+
+class Series(msgspec.Struct, frozen=True):
+    """One quantity over time: middle of each stretch in seconds since the start, least and greatest value; all shape
+    (n,)."""
+
+    t_s: Floats
+    low: Floats
+    high: Floats
+
+
+class Codes(msgspec.Struct, frozen=True):
+    """When a code was present, ns since the start; spans may be joined, `held_ns` is the exact total."""
+
+    spans_ns: Annotated[list[tuple[int, int]], Meta(max_length=MAX_SPANS)]
+    held_ns: int
+
+
+class Overview(msgspec.Struct, frozen=True, kw_only=True):
+    """A whole recording in bounded size. Its start, end and marks are timed since 1970, the rest since `start_ns`."""
+
+    start_ns: int
+    end_ns: int
+    width_ns: Annotated[int, Meta(gt=0)]
+    ticks: int
+    snapshots: int
+    of_ticks: Curves
+    of_snapshots: Curves
+    codes: dict[str, Annotated[dict[Code, Codes], Meta(max_length=MAX_CODES)]]
+    "By kind, then by code in the order of their first appearance."
+    following: FollowingReport | None
+    followed_s: float
+    "`following` is None if this is too short."
+    late_counts: Annotated[list[int], Meta(min_length=len(LATE_US) + 1, max_length=len(LATE_US) + 1)]
+    marks: Annotated[list[Mark], Meta(max_length=MAX_MARKS)]
+
+    @property
+    def duration_s(self) -> float:
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    def require_messages(self) -> None:
+        if not self.ticks and not self.snapshots:
+            raise ValueError("the recording has no messages: was the daemon running?")
+
+    def series(self, name: str) -> Series | None:
+        """Return one of QUANTITIES, from the ticks or else from the snapshots."""
+        for curves in (self.of_ticks, self.of_snapshots):
+            if name in curves.low:
+                low, high = _numbers(curves.low[name]), _numbers(curves.high[name])
+                if np.isfinite(low).any():
+                    numbers = np.frombuffer(curves.stretches, np.int64)
+                    return Series(np.array((numbers + 0.5) * (self.width_ns * 1e-9), np.float64), low, high)
+        return None
+
+    def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
+        """Return the spans of each code of this kind, seconds since the start."""
+        known = self.codes.get(kind, {})
+        return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
+
+    def packed(self) -> bytes:
+        return msgspec.msgpack.encode(self)
+
+
+def unpacked(data: bytes) -> Overview:
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"an overview of {len(data)} bytes: allowed is {MAX_BYTES}")
+    try:
+        found = msgspec.msgpack.decode(data, type=Overview)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise ValueError(f"its overview: {error}") from error
+    for curves in (found.of_ticks, found.of_snapshots):
+        count = len(curves.stretches) // 8
+        sizes = {len(side) for sides in (curves.low, curves.high) for side in sides.values()}
+        if len(curves.stretches) % 8 or not sizes <= {4 * count} or set(curves.low) != set(curves.high):
+            raise ValueError("its overview: curves of unequal length")
+    if set(found.codes) != set(KINDS):
+        raise ValueError(f"its overview: allowed are codes of {', '.join(KINDS)}")
+    return found
+
+
+class OverviewBuilder:
+    def __init__(self) -> None:
+        self._start_ns: int | None = None
+        self._end_ns = 0
+        self._stretches = {True: _Stretches(), False: _Stretches()}
+        self._spans = {True: _Codes(), False: _Codes()}
+        self._following = {True: _Followed(), False: _Followed()}
+        self._counts = {True: 0, False: 0}
+        self._late = [0] * (len(LATE_US) + 1)
+        self._marks: list[Mark] = []
+
+    def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
+        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970."""
+        if self._start_ns is None:
+            self._start_ns = self._end_ns = t_ns
+        since_ns = t_ns - self._start_ns
+        self._end_ns = max(self._end_ns, t_ns)
+        self._counts[is_tick] += 1
+        values = quantities(message)
+        self._stretches[is_tick].add(since_ns, values)
+        self._spans[is_tick].add(since_ns, message)
+        self._following[is_tick].add(since_ns, values[0], values[2], message)
+        late_us = _number(message.get("lateness_us"))
+        if late_us is not None:
+            self._late[bisect_right(LATE_US, late_us)] += 1
+        mark = message.get("mark")
+        # every snapshot has the newest mark, even one from before
+        if mark and mark.t_ns >= self._start_ns and len(self._marks) < MAX_MARKS and self._marks[-1:] != [mark]:
+            self._marks.append(mark)
+
+    def made(self) -> Overview:
+        width_ns = max(each.width_ns for each in self._stretches.values())
+        for each in self._stretches.values():
+            each.widen(width_ns)
+        ticks, snapshots = self._spans[True].made(), self._spans[False].made()
+        followed = self._following[self._following[True].counted_s > 0.0]
+        return Overview(
+            start_ns=self._start_ns or 0,
+            end_ns=self._end_ns,
+            width_ns=width_ns,
+            ticks=self._counts[True],
+            snapshots=self._counts[False],
+            of_ticks=self._stretches[True].made(),
+            of_snapshots=self._stretches[False].made(),
+            codes={kind: ticks[kind] or snapshots[kind] for kind in KINDS},
+            following=followed.report(),
+            followed_s=followed.counted_s,
+            late_counts=self._late,
+            marks=self._marks,
+        )
+
+
+def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
+    """Return the QUANTITIES of a tick or a snapshot; None for what is missing or no number."""
+    get = message.get
+    gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
+    if gap_mm is None and left_mm is not None and right_mm is not None:
+        gap_mm = left_mm + right_mm
+    wanted_mm = _number(get("gap_setpoint_mm"))
+    left, right = get("duty") or (get("left_duty"), get("right_duty"))
+    return (
+        _number(get("setpoint_cf")),
+        _number(get("governed_cf")),
+        _number(get("measured_cf")),
+        gap_mm,
+        _number(get("reference_gap_mm")) if wanted_mm is None else wanted_mm,
+        _number(left),
+        _number(right),
+        _number(get("field_mT")),
+    )
+
+
+def _number(value: object) -> float | None:
+    return value if value.__class__ is float or value.__class__ is int else None
+
+
+def codes_in(told: object) -> tuple[str, ...]:
+    """Return the codes in a field's value, a text or several."""
+    words = (told,) if isinstance(told, str) else told if isinstance(told, tuple | list) else ()
+    return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
+
+
+def _numbers(data: bytes) -> Floats:
+    return np.array(np.frombuffer(data, np.float32), np.float64)
+
+
+class _Followed(Following):
+    _number = 0
+
+    def add(self, since_ns: int, asked_N: float | None, measured_N: float | None, message: Mapping[str, Any]) -> None:
+        number = since_ns // _LOOK_NS
+        if number == self._number:
+            return
+        if not 0 < number - self._number <= BREAK_NS // _LOOK_NS:
+            self.begin()
+        self._number, get = number, message.get
+        rate_mm_s = get("handle_rate_mm_s", get("handle_mm_s"))
+        limits = get("limits") or ()
+        self.look(get("operating_state"), limits, asked_N, measured_N, get("handle_mm"), rate_mm_s)
+
+
+class _Stretches:
+    """The least and greatest values of one kind of message, in stretches of `width_ns`."""
+
+    def __init__(self) -> None:
+        self.width_ns = FIRST_WIDTH_NS
+        self._numbers = array("q")
+        self._low = [array("f") for _ in QUANTITIES]
+        self._high = [array("f") for _ in QUANTITIES]
+
+    def add(self, since_ns: int, values: Iterable[float | None]) -> None:
+        number = since_ns // self.width_ns
+        # a clock that was set back must not set the curve back
+        if not self._numbers or number > self._numbers[-1]:
+            if len(self._numbers) >= MAX_STRETCHES:
+                self.widen(2 * self.width_ns)
+                self.add(since_ns, values)
+                return
+            self._numbers.append(number)
+            for low, high in zip(self._low, self._high, strict=True):
+                low.append(math.inf)
+                high.append(-math.inf)
+        for value, low, high in zip(values, self._low, self._high, strict=True):
+            if value is not None:
+                if value < low[-1]:
+                    low[-1] = value
+                if value > high[-1]:
+                    high[-1] = value
+
+    def widen(self, width_ns: int) -> None:
+        ratio, self.width_ns = width_ns // self.width_ns, width_ns
+        if ratio == 1 or not self._numbers:
+            return
+        numbers = [number // ratio for number in self._numbers]
+        firsts = [i for i, number in enumerate(numbers) if i == 0 or number != numbers[i - 1]]
+        ends = [*firsts[1:], len(numbers)]
+        self._numbers = array("q", [numbers[i] for i in firsts])
+        for sides, of in ((self._low, min), (self._high, max)):
+            for i, side in enumerate(sides):
+                sides[i] = array("f", [of(side[a:b]) for a, b in zip(firsts, ends, strict=True)])
+
+    def made(self) -> Curves:
+        """Return the curves as bytes; a stretch without a value has NaN."""
+        sides: tuple[dict[str, bytes], dict[str, bytes]] = ({}, {})
+        for known, arrays in zip(sides, (self._low, self._high), strict=True):
+            for name, side in zip(QUANTITIES, arrays, strict=True):
+                values = np.array(side, np.float32)
+                known[name] = np.where(np.isfinite(values), values, np.float32(np.nan)).tobytes()
+        return Curves(self._numbers.tobytes(), *sides)
+
+
+def _joined(spans: list[list[int]]) -> list[list[int]]:
+    """Join about half of the spans, across the smaller gaps."""
+    gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
+    near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
+    for span, gap_ns in zip(spans[1:-1], gaps, strict=True):
+        if gap_ns <= near_ns:
+            joined[-1][1] = span[1]
+        else:
+            joined.append(span)
+    return [*joined, spans[-1]]
+
+
+class _Held:
+    def __init__(self) -> None:
+        self.spans: list[list[int]] = []
+        self.ns = 0
+
+    def hold(self, from_ns: int, to_ns: int) -> None:
+        if self.spans and from_ns <= self.spans[-1][1] <= to_ns:
+            self.ns += to_ns - self.spans[-1][1]
+            self.spans[-1][1] = to_ns
+            return
+        self.ns += to_ns - from_ns
+        self.spans.append([from_ns, to_ns])
+        if len(self.spans) > MAX_SPANS:
+            self.spans = _joined(self.spans)
+
+
+class _Codes:
+    def __init__(self) -> None:
+        self._known: dict[str, dict[str, _Held]] = {kind: {} for kind in KINDS}
+        self._now: list[tuple[str, str]] = []
+        self._now_ns = self._step_ns = 0
+
+    def add(self, since_ns: int, message: Mapping[str, Any]) -> None:
+        """Hold the last message's codes up to this one, or over a break for one usual step; then take this one's."""
+        passed_ns = since_ns - self._now_ns
+        if 0 < passed_ns <= BREAK_NS:
+            self._step_ns = passed_ns
+        self._hold(min(max(passed_ns, 0), self._step_ns))
+        self._now = [(kind, code) for kind in KINDS if (told := message.get(kind)) for code in codes_in(told)]
+        self._now_ns = since_ns
+
+    def _hold(self, for_ns: int) -> None:
+        for kind, code in self._now:
+            known = self._known[kind]
+            is_kept = code in known or len(known) < MAX_CODES - 1
+            held = known.setdefault(code if is_kept else OTHER, _Held())
+            held.hold(self._now_ns, self._now_ns + for_ns)
+
+    def made(self) -> dict[str, dict[str, Codes]]:
+        """Hold the last codes for one usual step, and return all spans by kind and code."""
+        self._hold(self._step_ns)
+        self._now = []
+        return {
+            kind: {code: Codes([(a, b) for a, b in held.spans], held.ns) for code, held in known.items()}
+            for kind, known in self._known.items()
+        }

@@ -1,0 +1,297 @@
+"""Runs the core over its recorded inputs: it gives the same bits, or the first tick and field that differ."""
+
+from bisect import bisect_right
+from functools import reduce
+from operator import or_
+from typing import Any
+
+import msgspec
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from tormagd.control.assembly.build import Core
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.sensor import Disputed
+from tormagd.control.core import PLAN_ERRORS
+from tormagd.control.records import Duty, TimedSetpoint
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import RefusedError
+from tormagd.element.inverse.solution import Answer
+from tormagd.ground.plain_values import packed, plain, restore, restored
+from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.measurement import Measurement
+from tormagd.record import journal, keeper_messages as keeping
+from tormagd.record.black_box import frames_in, is_tick
+from tormagd.record.journal import KNOWN
+from tormagd.record.replay.conversation import Conversation, Found, differing
+from tormagd.record.replay.rebuild import ReplayError
+from tormagd.record.telemetry import tick_record
+from tormagd_client.messages import TickRecord
+
+UNTAKEN = (
+    TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
+)  # fmt: skip
+"The core may raise these for values that it never makes itself."
+SETPOINT = tuple[
+    float, float, float, float | None, float | None, tuple[float, ...], float, int, tuple[Limit, ...], float | None,
+    Any,
+]  # fmt: skip
+NOT_THE_CORES = 1
+"Leading columns that the core does not make: `t_ns`, from the clock."
+MEASURED = {
+    "received_s": "received_s",
+    "device_time_s": "device_time_s",
+    "left_mm": "device_left_mm",
+    "right_mm": "device_right_mm",
+    "left_current_A": "left_current_A",
+    "right_current_A": "right_current_A",
+    "force_N": "device_force_N",
+    "handle_mm": "device_handle_mm",
+    "temperature_C": "device_temperature_C",
+    "supply_V": "supply_V",
+    "sensed_s": "sensed_s",
+    "reported_s": "reported_s",
+    "delay_s": "delay_s",
+}
+"By field of a measurement, the column that holds it."
+QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s", "device_clock_drift")
+
+
+def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
+    """Return when a recorded plan began, and its setpoint."""
+    now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
+    return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """Where a replay first differs. `tick` counts from 1, `time_s` from the file's first tick."""
+
+    tick: int
+    time_s: float
+    field: str
+    recorded: str
+    replayed: str
+    frame: int | None
+
+
+class Rerun(msgspec.Struct, frozen=True):
+    """What a replay gave: `ticks` that agree to the bit, from `from_s` to `to_s`."""
+
+    ticks: int
+    from_s: float
+    to_s: float
+    snapshots: int
+    gaps: int
+    frames: int
+    difference: Difference | None
+
+
+def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
+    own = TickRecord.__struct_fields__
+    order = None if columns == own else [columns.index(name) for name in own]
+    records: dict[int, TickRecord] = {}
+    for place, entry in enumerate(entries):
+        if is_tick(entry):
+            if len(entry) != len(columns):
+                raise ReplayError(f"tick {len(records) + 1} has {len(entry)} values: allowed is {len(columns)}")
+            try:
+                row = entry if order is None else [entry[index] for index in order]
+                records[place] = msgspec.convert(row, TickRecord)
+            except msgspec.ValidationError as error:
+                raise ReplayError(f"tick {len(records) + 1}: {error}") from error
+    if not records:
+        raise ReplayError("there is no tick in it")
+    return records
+
+
+def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: float = 0.0) -> Rerun:
+    """Run `core` over the entries, up to the first difference or the last tick."""
+    records = ticks_of(columns, entries)
+    places = list(records)
+    first_s = records[places[0]].monotonic_s
+    lasts_s = records[places[-1]].monotonic_s - first_s
+    if not 0.0 <= from_s <= lasts_s:
+        raise ReplayError(f"--from = {from_s:g}: allowed is 0..{lasts_s:.3f} s")
+    start = _start(entries, records, first_s + from_s)
+    try:
+        running = _Running(core, sum(len(frames_in(entry)) for entry in entries[:start]))
+    except (ValueError, TypeError) as error:
+        raise ReplayError(f"before the start: no frames: {_short(error)}") from error
+    number = bisect_right(places, start)
+    from_s, ticks, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
+    difference: Difference | None = None
+    for place in range(start, places[-1] + 1):
+        # a step's inputs are in the record of its period, which comes after the period's other entries
+        record = records[places[number]]
+        time_s = record.monotonic_s - first_s
+        try:
+            differs = running.compare(record) if place in records else running.take(entries[place], record)
+        except UNTAKEN as error:
+            raise ReplayError(
+                f"tick {number + 1}: the core does not take what stands there: {_short(error)}"
+            ) from error
+        if differs is not None:
+            told = _short(differs.recorded), _short(differs.replayed)
+            difference = Difference(number + 1, round(time_s, 6), differs.field, *told, differs.frame)
+            break
+        if place in records:
+            number += 1
+            if running.is_known:
+                ticks, to_s = ticks + 1, time_s
+    return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, running.conversation.frames, difference)
+
+
+def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
+    """Return the index of the newest snapshot that a tick follows by `until_s`, else of the first."""
+    found: int | None = None
+    waiting: int | None = None
+    for place, entry in enumerate(entries):
+        if name_of(entry) == journal.STATE:
+            waiting = place
+        elif place in records and waiting is not None:
+            if found is not None and records[place].monotonic_s > until_s:
+                return found
+            found, waiting = waiting, None
+    if found is None:
+        raise ReplayError("there is no snapshot in it that is followed by a tick: under a second was kept")
+    return found
+
+
+class _Running:
+    def __init__(self, core: Core, frame: int) -> None:
+        self.conversation = Conversation(frame)
+        self._of_frames: Found | None = None
+        self._stepper, self._planner = core.stepper(), core.planner()
+        self._used = self._planner.planned
+        self._failure: Exception | None = None
+        self._output: Duty | None = None
+        self._measurement: Measurement | None = None
+        self.is_known = False
+        self.snapshots = self.gaps = 0
+
+    def take(self, entry: Any, record: TickRecord) -> Found | None:
+        """Take one entry that is no tick, and return the first difference."""
+        name = name_of(entry)
+        self.conversation.frame += len(frames_in(entry))
+        if name == journal.STATE:
+            return self._begin(entry)
+        if name == journal.MISSING:
+            self.gaps += self.is_known
+            self.is_known = False
+            self.conversation.begin(None)
+        elif name == keeping.READ:
+            self.conversation.read(entry)
+        elif name == journal.CONNECTED:
+            self.conversation.begin(entry[1])
+        elif self.is_known:
+            return self._run(name, entry, record)
+        return None
+
+    def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
+        """Do what one entry tells: step, plan, learning, command or fault."""
+        match name:
+            case journal.STEP:
+                self._measurement = measurement_of(record)
+                self._of_frames = self.conversation.compare(self._measurement)
+                self._used = self._planner.planned
+                self._output = self._stepper.step(record.monotonic_s, self._measurement, self._used)
+            case keeping.WROTE:
+                if self._output is None:
+                    raise ValueError("something written without a step")
+                self._of_frames = self._of_frames or self.conversation.wrote(entry, self._output)
+            case journal.PLAN:
+                now_s, timed = planned_for(entry)
+                try:
+                    self._planner.plan(now_s, timed, self._stepper.measured, self._stepper.is_followed)
+                except PLAN_ERRORS as error:
+                    self._failure = error
+            case journal.FORESEE:
+                self._planner.foresee()
+            case journal.AFRESH:
+                self._failure = None
+                self._planner.afresh(msgspec.convert(entry[1], float))
+            case journal.TEACH | journal.ANSWER:
+                match restored(entry[1], KNOWN):
+                    case Learned() as learned:
+                        self._planner.teach(learned)
+                    case Answer() as answer:
+                        self._planner.answered(answer)
+                    case other:
+                        raise ValueError(f"{other!r}: allowed is what is learned of a device, or what a search found")
+            case journal.CONFIRM:
+                self._planner.confirm(msgspec.convert(entry[1], Disputed))
+            case journal.COMMAND:
+                command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
+                try:
+                    self._stepper.command(command, now_s, restored(given, KNOWN))
+                except RefusedError as error:
+                    return None if was_refused else Found(command, "taken", f"refused: {error.message}")
+                if was_refused:
+                    return Found(command, "refused", "taken")
+            case journal.LATCH:
+                self._stepper.latch(Fault(entry[1]))
+            case journal.LOSE_LINK:
+                self._stepper.lose_link()
+            case _:
+                raise ValueError(f"{name[:40]!r}: no entry of a black box")
+        return None
+
+    def compare(self, record: TickRecord) -> Found | None:
+        """Return the first column that differs from the recorded tick, or else what its frames show."""
+        if not self.is_known:
+            return None
+        if self._output is None:
+            raise ValueError("a tick without a step")
+        timing = record.lateness_us, record.exec_us, record.tick
+        if self._failure is not None:
+            return Found("plan", "made", f"failed: {self._failure}")
+        given = tick_record(self._stepper, self._output, self._used, self._measurement, *timing)
+        left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
+        if packed(left) == packed(right):
+            return self._of_frames
+        rows = zip(TickRecord.__struct_fields__[NOT_THE_CORES:], left, right, strict=True)
+        return next(Found(*row) for row in rows if packed(row[1]) != packed(row[2]))
+
+    def _begin(self, entry: Any) -> Found | None:
+        """Compare the states with a snapshot's, if they are known, and then take them."""
+        differs, connection = None, entry[3]
+        if self.is_known:
+            self.snapshots += 1
+            for what, recorded, own in (("step", entry[1], self._stepper), ("plan", entry[2], self._planner)):
+                differs = differs or differing(f"state.{what}", recorded, plain(own))
+            differs = differs or self.conversation.compare_memory(connection)
+        self.conversation.begin(connection)
+        restore(self._stepper, entry[1], KNOWN)
+        restore(self._planner, entry[2], KNOWN)
+        self._failure, self.is_known = None, True
+        return differs
+
+
+def measurement_of(record: TickRecord) -> Measurement | None:
+    if record.measurement is None:
+        return None
+    numbers = {name: getattr(record, column) for name, column in MEASURED.items()}
+    quality = [getattr(record, column) for column in QUALITY]
+    if None in (*numbers.values(), *quality) or record.device_mode is None:
+        raise ValueError("a measurement in parts: allowed is a whole one, or none")
+    return Measurement(
+        number=record.measurement,
+        mode=DeviceMode[record.device_mode],
+        switches=reduce(or_, [Switches[name] for name in record.device_switches], Switches(0)),
+        faults=reduce(or_, [DeviceFault[name] for name in record.device_faults], DeviceFault(0)),
+        link=LinkQuality(*quality),
+        **numbers,
+    )
+
+
+def name_of(entry: Any) -> str:
+    """Return an entry's name, a word by itself or at the head of a list; empty for a tick."""
+    if isinstance(entry, str):
+        return entry
+    if isinstance(entry, list) and entry and isinstance(entry[0], str):
+        return entry[0]
+    return ""
+
+
+def _short(thing: object) -> str:
+    text = str(thing) if isinstance(thing, Exception | str) else repr(thing)
+    return text if len(text) <= 200 else f"{text[:197]}..."
