@@ -11,12 +11,12 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.config import Config
-from tormagd.control.believe.anchor import Anchor
+from tormagd.control.believe.anchor import MIDDLE_N, Anchor
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.ripple import Ripple
-from tormagd.control.believe.sensor import SLACK_N, Disputed, SensorTrust
+from tormagd.control.believe.sensor import NAMED_S, SLACK_N, Disputed, SensorTrust
 from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
 from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
@@ -81,8 +81,6 @@ class Believe:
     "Number of the newest measurement that taught; -1 before the first."
     read_s: float
     "When that measurement taught; -inf before the first."
-    heard_N: float = 0.0
-    "The model's force at the newest reading at speed."
     limits: tuple[Limit, ...] = ()
     "What is wrong with the sensor or with the fit, as the newest reading at speed shows."
     is_prior: bool = False
@@ -193,10 +191,8 @@ class Believe:
 
     def _ripple(self, measured: Measured) -> float:
         """Return the friction at the handle's place and way, over its mean."""
-        share = 0.0
-        if self._nominal.contact.slides:
-            share = self.ripple.share(measured.handle_mm / self._radius_mm)
-            share += self.zero.way * measured.handle.turn.direction
+        share = self.ripple.share(measured.handle_mm / self._radius_mm)
+        share += self.zero.way * measured.handle.turn.direction
         return 1.0 + min(max(share, -MOST_RIPPLE), MOST_RIPPLE)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
@@ -214,8 +210,8 @@ class Believe:
         reading_N = (measured.force_N - measured.handle.turn.direction * self.zero.zero_N) / self._ripple(measured)
         is_mobilised = self._nominal.contact.is_known(measured)
         # a hand that meets a wall stops within 10 ms
-        is_stuck = abs(measured.handle.quick_mm_s) < STOPPING_MM_S
-        is_stuck = is_stuck and reading_N < self.strength.fit.force_N(model_N) - STUCK_N
+        is_low = reading_N < self.strength.fit.force_N(model_N) - STUCK_N
+        is_stuck = is_low and abs(measured.handle.quick_mm_s) < STOPPING_MM_S
         if is_mobilised and not (
             slides and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
         ):
@@ -246,7 +242,6 @@ class Believe:
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
         angle, zero_sd_N = measured.handle_mm / self._radius_mm, zero.sd_N(now_s)
-        self.heard_N = model_N
         zero.begin(now_s)
         if self.learns:
             # an anchor that was learned one way only was misread
@@ -263,17 +258,17 @@ class Believe:
             )
         taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
         self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
-        if sensor.is_doubted or sensor.is_named:
+        if sensor.is_doubted or sensor.outside_s > NAMED_S:
             self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
         # of a zero that is not known only a force that it does not explain teaches
         unknown_N = 0.0 if zero_sd_N <= self._unknown_sd_N or sensor.is_disputed else SURE * zero_sd_N + SLACK_N
         if unknown_N > 0.0:
             self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
-        is_explained = unknown_N > 0.0 and (not sensor.has_slid or reading_N - unknown_N < fit.force_N(model_N))
-        if taught_N is None or is_explained:
+        least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
+        if taught_N is None or (unknown_N > 0.0 and reading_N < least_N):
             self.strength.settle()
             return
-        if not self.strength.is_held:
+        if self._nominal.contact.slides and not self.strength.is_held:
             self.ripple.update(angle, model_N, sensor.measured_N, sensor.anchor)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
@@ -301,6 +296,6 @@ class Believe:
         if wrong == "device":
             self.sensor = SensorTrust(self._bounds, self._leash)
         else:
-            fit = fit.shifted(self.sensor.anchor.force_N(self.heard_N) - fit.force_N(self.heard_N))
+            fit = fit.shifted(self.sensor.anchor.force_N(MIDDLE_N) - fit.force_N(MIDDLE_N))
             self.sensor.is_doubted = True
         self.strength.forget(fit.unsure())

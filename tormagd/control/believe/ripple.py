@@ -18,9 +18,7 @@ LEARNS: Final = 0.2
 QUIET: Final = 0.01
 "So much of a wave is not believed: steps and relaxing leave as much."
 STEP_RAD: Final = 0.1
-"Changes are taken over this angle."
-LONGEST_RAD: Final = 0.3
-"Without a reading for a greater angle, none is."
+"Changes are taken over this angle; none over three times as much without a reading."
 STEEPEST: Final = 0.045
 "No ripple changes by a greater share over STEP_RAD, nor moves the gap by as much."
 LEAST_N: Final = 0.1
@@ -60,7 +58,7 @@ class Ripple:
         force_N, before_N = max(anchor.force_N(model_N), LEAST_N), max(anchor.force_N(self.model_N), LEAST_N)
         changed = math.copysign(1.0, step_rad) * (reading_N / force_N - self.reading_N / before_N)
         self.at_rad, self.model_N, self.reading_N = angle, model_N, reading_N
-        if abs(step_rad) > LONGEST_RAD or max(abs(changed), abs(before_N / force_N - 1.0)) > STEEPEST:
+        if abs(step_rad) > 3.0 * STEP_RAD or max(abs(changed), abs(before_N / force_N - 1.0)) > STEEPEST:
             return
         for k in HARMONICS:
             self.shares[2 * k - 2] -= LEARNS * changed / k * math.sin(k * (angle - 0.5 * step_rad))

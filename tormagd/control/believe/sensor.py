@@ -84,10 +84,6 @@ class SensorTrust:
     def is_disputed(self) -> bool:
         return self.is_doubted or self.outside_s > 0.0
 
-    @property
-    def is_named(self) -> bool:
-        return self.outside_s > NAMED_S
-
     def update(
         self,
         fit: DeviceFit,
@@ -113,11 +109,10 @@ class SensorTrust:
         self.doubted_s = self.doubted_s + dt_s if self.is_doubted else 0.0
         if not is_strange and not self.is_doubted:
             self.known_s = min(self.known_s + dt_s, LEARNS_S)
-        anchor = self.anchor
-        force_N, deviation_N = max(anchor.force_N(model_N), 0.0), anchor.deviation_N(model_N)
+        force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
         unsure_N += VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
-        anchored_N = KNOWN_N + SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
-        is_inside = abs(self.measured_N - force_N) <= self._leash * force_N + unsure_N + anchored_N
+        beyond_N = abs(self.measured_N - force_N) - self._leash * force_N - unsure_N - KNOWN_N
+        is_inside = beyond_N <= SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
         self._judge(is_strange, is_inside or not self.has_slid, dt_s)
         is_taken = self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
         if not (is_taken and weakest_N <= reading_N <= strongest_N):
@@ -129,7 +124,7 @@ class SensorTrust:
             surely_N = SURE * deviation_N if self.has_slid else math.inf
             # what has fallen at the forces that are known has fallen here, too
             shown_N = reading_N / self.fallen
-            anchor.learn(model_N, min(max(shown_N, force_N - surely_N), force_N + surely_N), dt_s)
+            self.anchor.learn(model_N, min(max(shown_N, force_N - surely_N), force_N + surely_N), dt_s)
         if not self.has_slid:
             return reading_N
         self._give_way(fit.force_N(model_N) / max(force_N, SLACK_N), self.share * force_N - unsure_N, dt_s)
