@@ -696,7 +696,7 @@ def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(arm
 def test_a_dispute_of_device_and_sensor_is_the_operators_to_settle(alone: Running) -> None:
     assert [alone.refused("confirm", what=what) for what in ("both", "device")] == ["bad_confirmation", "not_disputed"]
     sensor = alone.daemon._inference.planner.believe.sensor
-    sensor.is_disputed = True
+    sensor.outside_s = 1.0
     assert alone.command("confirm", what="sensor") == {"confirmed": "sensor"}
     assert sensor.is_doubted
 

@@ -117,18 +117,19 @@ class SensorTrust:
         is_taken = self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
         if not (is_taken and weakest_N <= reading_N <= strongest_N):
             return None
+        low_N = self.share * force_N - unsure_N if self.has_slid else -math.inf
+        taught_N = max(reading_N, low_N)
+        believed = fit.force_N(model_N) / max(force_N, SLACK_N)
         if deviation_N <= KNOWN_N:
-            self.fallen = min(max(fit.force_N(model_N) / max(force_N, SLACK_N), 1.0 - self._leash), 1.0)
+            self.fallen = min(max(believed, self._bounds.min_scale), 1.0)
         elif learns and zero_sd_N <= UNKNOWN_SD_N:
             self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
-            surely_N = SURE * deviation_N if self.has_slid else math.inf
             # what has fallen at the forces that are known has fallen here, too
-            shown_N = reading_N / self.fallen
+            surely_N, shown_N = SURE * deviation_N if self.has_slid else math.inf, taught_N / self.fallen
             self.anchor.learn(model_N, min(max(shown_N, force_N - surely_N), force_N + surely_N), dt_s)
-        if not self.has_slid:
-            return reading_N
-        self._give_way(fit.force_N(model_N) / max(force_N, SLACK_N), self.share * force_N - unsure_N, dt_s)
-        return max(reading_N, self.share * force_N - unsure_N)
+        if self.has_slid:
+            self._give_way(believed, low_N, dt_s)
+        return taught_N
 
     def _give_way(self, believed: float, low_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share that is `believed`."""
