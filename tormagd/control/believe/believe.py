@@ -16,7 +16,7 @@ from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.ripple import Ripple
-from tormagd.control.believe.sensor import NAMED_S, SLACK_N, Disputed, SensorTrust
+from tormagd.control.believe.sensor import KNOWN_N, NAMED_S, SLACK_N, Disputed, SensorTrust
 from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
 from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
@@ -181,8 +181,9 @@ class Believe:
         ripple = self._ripple(measured) if measured is not None else 1.0
         anchor_N: float | None = None
         if self.sensor.has_slid:
-            most_N = self._surely_N / (slow * max(ripple, 1.0))
-            anchor_N = self.sensor.anchor.model_N(most_N) + self.memory.relaxed_N
+            anchor, most_N = self.sensor.anchor, self._surely_N
+            most_N += SURE * max(anchor.deviation_N(most_N) - 2.0 * KNOWN_N, 0.0)
+            anchor_N = anchor.model_N(most_N / (slow * max(ripple, 1.0))) + self.memory.relaxed_N
         device = at_speed.times(slow * ripple)
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
@@ -269,7 +270,7 @@ class Believe:
             self.strength.settle()
             return
         if self._nominal.contact.slides and not self.strength.is_held:
-            self.ripple.update(angle, model_N, sensor.measured_N, sensor.anchor)
+            self.ripple.update(angle, measured.handle.rate_mm_s, model_N, sensor.measured_N, sensor.anchor)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:

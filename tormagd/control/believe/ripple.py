@@ -21,6 +21,10 @@ STEP_RAD: Final = 0.1
 "Changes are taken over this angle; none over three times as much without a reading."
 STEEPEST: Final = 0.045
 "No ripple changes by a greater share over STEP_RAD, nor moves the gap by as much."
+STEADY_MM_S: Final = 5.0
+"Over STEP_RAD the handle's rate may change by so much: friction differs with the rate."
+SETTLES_RAD: Final = 1.5
+"After a change of rate or gap nothing is learned for this angle."
 LEAST_N: Final = 0.1
 "Least force that a share is of."
 
@@ -37,6 +41,10 @@ class Ripple:
     "The reading there."
     model_N: float = 0.0
     "The model's force there."
+    rate_mm_s: float = 0.0
+    "The handle's rate there."
+    steady_rad: float = 0.0
+    "Over which angle gap and rate have been steady."
 
     def __init__(self) -> None:
         self.shares = [0.0] * 6
@@ -50,15 +58,18 @@ class Ripple:
             share += believed * (a * math.cos(k * angle) + b * math.sin(k * angle))
         return share
 
-    def update(self, angle: float, model_N: float, reading_N: float, anchor: Anchor) -> None:
+    def update(self, angle: float, rate_mm_s: float, model_N: float, reading_N: float, anchor: Anchor) -> None:
         """Take a mean of readings at the handle's `angle`, the known ripple taken off."""
         step_rad = angle - self.at_rad
         if abs(step_rad) < STEP_RAD:
             return
         force_N, before_N = max(anchor.force_N(model_N), LEAST_N), max(anchor.force_N(self.model_N), LEAST_N)
         changed = math.copysign(1.0, step_rad) * (reading_N / force_N - self.reading_N / before_N)
-        self.at_rad, self.model_N, self.reading_N = angle, model_N, reading_N
-        if abs(step_rad) > 3.0 * STEP_RAD or max(abs(changed), abs(before_N / force_N - 1.0)) > STEEPEST:
+        is_steady = abs(step_rad) <= 3.0 * STEP_RAD and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S
+        is_steady = is_steady and max(abs(changed), abs(before_N / force_N - 1.0)) <= STEEPEST
+        self.steady_rad = self.steady_rad + abs(step_rad) if is_steady else 0.0
+        self.at_rad, self.rate_mm_s, self.model_N, self.reading_N = angle, rate_mm_s, model_N, reading_N
+        if self.steady_rad < SETTLES_RAD:
             return
         for k in HARMONICS:
             self.shares[2 * k - 2] -= LEARNS * changed / k * math.sin(k * (angle - 0.5 * step_rad))
