@@ -16,8 +16,8 @@ MATRICES ?= 10 30 50
 DESTDIR ?=
 PREFIX ?= /usr/local
 LIBRARY := $(PREFIX)/lib/tormagd
-# what the service's users have besides: recordings, their pictures, calibration, and what they look at it with
-SERVICE_EXTRAS ?= record,plot,identify,top,dashboard,metrics
+# what the service's users have besides: recordings, their pictures, and what they look at it with
+SERVICE_EXTRAS ?= record,plot,top,dashboard,metrics
 
 export OMP_NUM_THREADS ?= 1
 # each of the many processes that a test starts would compile all that it imports
@@ -36,7 +36,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb wheels run test compiled live yielding interpreted fuzz coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb wheels parts run test compiled live yielding interpreted fuzz coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py --plant '$(PLANT)'
@@ -63,9 +63,9 @@ interpreted: $(VENV)/.dev
 
 # the firmware's sources under libFuzzer and sanitizers for so many seconds; where clang is not there, that is said
 fuzz: $(VENV)/.dev
-	$(BIN)/python tools/endure.py fuzz --count $(SECONDS) --seed $(SEED)
+	$(BIN)/python tools/judge.py endure fuzz --count $(SECONDS) --seed $(SEED)
 
-# which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
+# which lines of the packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
 # part are asked again, interpreted. pyproject.toml has the least share
 coverage: $(VENV)/.dev
 	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
@@ -127,7 +127,7 @@ reproduction: $(VENV)/.dev
 	$(BIN)/tormag-lab reproduce-thesis --out docs
 	$(BIN)/tormag-lab tactile-experiment --out docs
 
-# docs/evidence: the fault matrix and the cases of tools/endure.py in full (well over an hour); `make test` samples them
+# docs/evidence: the judges and the benchmarks in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev
 	$(BIN)/python tools/evidence.py
 
@@ -135,7 +135,7 @@ evidence: $(VENV)/.dev
 # commands find it there. It is built for, and run by, the interpreter that PYTHON names.
 install: $(VENV)/.man
 	rm -rf '$(DESTDIR)$(LIBRARY)'
-	$(PIP_TO) '$(DESTDIR)$(LIBRARY)' ./client '.[$(SERVICE_EXTRAS)]'
+	$(PIP_TO) '$(DESTDIR)$(LIBRARY)' ./client '.[$(SERVICE_EXTRAS)]' ./lab
 	rm -rf '$(DESTDIR)$(LIBRARY)/bin'
 	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(DESTDIR)$(LIBRARY)' \
 	    systemd/install.sh '$(DESTDIR)' '$(PREFIX)' "$$(command -v $(PYTHON))" '$(LIBRARY)'
@@ -148,19 +148,31 @@ uninstall:
 	    '$(DESTDIR)$(PREFIX)'/share/bash-completion/completions/tormagctl \
 	    '$(DESTDIR)$(PREFIX)'/share/zsh/site-functions/_tormagctl
 
-# both distributions in build/wheels, to be installed together: pip install build/wheels/*.whl
+# the three distributions in build/wheels, to be installed together: pip install build/wheels/*.whl
 wheels: | $(BIN)/python
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheels ./client .
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheels ./client . ./lab
 
-# a Debian package in build/, for the Python of this Debian: without torch, which only networks' training and two searches need
+# each distribution's tests where nothing but it, what it needs and what its tests need is installed
+parts: $(addprefix part-,client tormagd lab)
+part-client: WHEELS = $$(echo build/wheels/tormagd_client-*.whl)
+part-client: TESTS = client/tests
+part-tormagd: WHEELS = $$(echo build/wheels/tormagd_client-*.whl build/wheels/tormagd-*.whl)[test]
+part-tormagd: TESTS = tests --ignore tests/tools --ignore tests/docs
+part-lab: WHEELS = $$(echo build/wheels/tormagd*.whl build/wheels/tormag_lab-*.whl)[all]
+part-lab: TESTS = lab/tests
+part-%: wheels
+	@echo "$*: a new environment in build/parts/$*"
+	$(PYTHON) -m venv --clear build/parts/$*
+	build/parts/$*/bin/python -m pip install --quiet --no-compile $(WHEELS) hypothesis mpmath pytest pytest-timeout
+	build/parts/$*/bin/python -P -m pytest -m 'not live' $(TESTS)
+
+# a Debian package in build/, for the Python of this Debian, with this Debian's packages and, inside, what systemd/bundled.txt locks
 deb: $(VENV)/.man
-	$(BIN)/python -c 'import sys, subprocess as s; v = "%d.%d" % sys.version_info[:2]; a = s.check_output(["/usr/bin/python3", \
-	    "-c", "import sys; print(\"%d.%d\" % sys.version_info[:2], end=\"\")"], text=True); \
-	    sys.exit(None if a == v else f"the package runs with Python {a}, but .venv has {v}: make clean, make deb PYTHON=/usr/bin/python3")'
+	@$(BIN)/python -c 'import sys; sys.exit(None if sys.base_prefix == "/usr" else \
+	    "the package is for Debian\x27s own Python: make clean, make deb PYTHON=/usr/bin/python3")'
 	rm -rf build/library
-	$(PIP_TO) build/library --no-deps ./client .
-	$(BIN)/python tools/dependencies.py record plot identify top dashboard metrics | grep -v '^torch=' > build/requirements.txt
-	$(PIP_TO) build/library --requirement build/requirements.txt
+	$(PIP_TO) build/library --no-compile --no-deps ./client . ./lab
+	$(PIP_TO) build/library --no-compile --no-deps --only-binary :all: --require-hashes --requirement systemd/bundled.txt
 	rm -rf build/library/bin
 	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library' systemd/deb.sh build/library build
 
@@ -170,25 +182,25 @@ clean:
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.demo: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
+$(VENV)/.demo: pyproject.toml client/pyproject.toml lab/pyproject.toml setup.py | $(BIN)/python
 	$(MAKE) --no-print-directory --jobs=2 core fetched EXTRAS=demo
 	@$(SAY_BUILD)
 	touch $@
 
-$(VENV)/.man: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
-	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6'
+$(VENV)/.man: pyproject.toml client/pyproject.toml lab/pyproject.toml setup.py | $(BIN)/python
+	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6' 'shtab>=1.7'
 	touch $@
 
-$(VENV)/.dev: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
-	$(MAKE) --no-print-directory --jobs=2 core fetched EXTRAS=dev
+$(VENV)/.dev: pyproject.toml client/pyproject.toml lab/pyproject.toml setup.py | $(BIN)/python
+	$(MAKE) --no-print-directory --jobs=2 core fetched EXTRAS='dev all'
 	@$(SAY_BUILD)
 	touch $@ $(VENV)/.demo
 
 # the core is compiled while what it needs is fetched, which waits for the network and the disk
 core: | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --no-deps --editable client --editable .
+	$(BIN)/python -m pip install --quiet --no-deps --editable client --editable . --editable lab
 
 # --no-compile: pip would compile every module of torch, SciPy and PyArrow, where few are imported
 fetched: | $(BIN)/python
-	$(BIN)/python tools/dependencies.py $(EXTRAS) > $(VENV)/$(EXTRAS).txt
-	$(BIN)/python -m pip install --quiet --no-compile --requirement $(VENV)/$(EXTRAS).txt
+	$(BIN)/python tools/dependencies.py $(EXTRAS) > $(VENV)/requirements.txt
+	$(BIN)/python -m pip install --quiet --no-compile --requirement $(VENV)/requirements.txt

@@ -51,13 +51,12 @@ COMPILED = {
     "tormagd/record": ("journal", "telemetry"),
     "tormagd/simulation": (
         *("curve", "gap_field", "axis", "element", "second_element", "tactile_pad"),
-        *("pressed_pad", "hand", "plant", "motion", "firmware", "device", "closed_loop"),
+        *("pressed_pad", "hand", "plant", "motion", "firmware", "device", "closed_loop", "ideal_actuator"),
     ),
     "tormagd/daemon": (
         *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay", "topics"),
-        *("control_loop", "inference_loop", "black_box", "telemetry_loop"),
+        *("control_loop", "inference_loop", "black_box", "commands", "telemetry_loop", "answers"),
     ),
-    "tormagd/lab": ("ideal_actuator",),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]
 GROUP = "firmware_protocol.core"

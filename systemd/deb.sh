@@ -1,7 +1,8 @@
 #!/bin/sh
 # Packs a Debian package:  deb.sh LIBRARY OUT
-# LIBRARY is a folder with both distributions and all that they import, for PYTHON (/usr/bin/python3), which the package runs with. All
-# of it is in the package, but for torch, which only networks' training and two searches need: a console need not reach a registry.
+# LIBRARY is a folder with the three distributions and what bundled.txt lists, for PYTHON (/usr/bin/python3), which the package runs
+# with. What else they import is Debian's: Depends is for the service, Recommends for what is drawn, served and fitted. torch is
+# nobody's here: it is for networks' training and two searches only. DEBFULLNAME and DEBEMAIL name who builds.
 set -eu
 library=$1 out=$2
 python=${PYTHON:-/usr/bin/python3}
@@ -14,18 +15,38 @@ root=$(mktemp -d)
 trap 'rm -rf "$root"' EXIT
 chmod 755 "$root"
 
-BUILD_PYTHON=${BUILD_PYTHON:-$python} BUILD_LIBRARY=${BUILD_LIBRARY:-$checkout:$checkout/client/src} \
+build_python=${BUILD_PYTHON:-$python}
+BUILD_PYTHON=$build_python BUILD_LIBRARY=${BUILD_LIBRARY:-$checkout:$checkout/client/src} \
     "$here/install.sh" "$root" /usr "${RUN_PYTHON:-$python}" /usr/lib/tormagd
-cp -a "$library/." "$root/usr/lib/tormagd"
+inside=$root/usr/lib/tormagd doc=$root/usr/share/doc/tormagd
+cp -a "$library/." "$inside"
+find "$inside" \( -name __pycache__ -o -name tests -o -name INSTALLER -o -name REQUESTED -o -name RECORD \) -prune -exec rm -rf {} +
+find "$inside" -path '*.dist-info/licenses' -prune -exec rm -rf {} +    # they are in copyright
+find "$inside" -type f -name '*.so' -exec strip --strip-unneeded {} + -exec chmod 644 {} +
+"$build_python" -P "$here/sbom.py" "$inside" "$inside/tormagd/view/page" > "$doc/sbom.cdx.json"
+cp "$here/copyright" "$doc/copyright"
+install -D -m 644 "$here/lintian-overrides" "$root/usr/share/lintian/overrides/tormagd"
+maintainer="${DEBFULLNAME:-The tormagd developers} <${DEBEMAIL:-maintainers@tormagd.invalid}>"
+# packages of one state of the sources are equal
+export SOURCE_DATE_EPOCH="${SOURCE_DATE_EPOCH:-$(git -C "$checkout" log -1 --format=%ct 2>/dev/null || date -r "$checkout/CHANGELOG.md" +%s)}"
+gzip -9n > "$doc/changelog.gz" <<END
+tormagd ($version) unstable; urgency=medium
+
+  * CHANGELOG.md beside this file says what users notice.
+
+ -- $maintainer  $(date -uR -d "@$SOURCE_DATE_EPOCH")
+END
+packages() { printf 'python3-%s, ' "$@" | sed 's/, $//'; }
 mkdir "$root/DEBIAN"
 echo /etc/tormag/tormagd.toml > "$root/DEBIAN/conffiles"
 cat > "$root/DEBIAN/control" <<END
 Package: tormagd
 Version: $version
 Architecture: $(dpkg --print-architecture)
-Maintainer: The tormagd developers <tormagd@localhost>
+Maintainer: $maintainer
 Installed-Size: $(du -sk "$root" | cut -f1)
-Depends: python3 (>= $abi), python3 (<< $next), systemd, passwd
+Depends: libc6, libgcc-s1, python3 (>= $abi), python3 (<< $next), systemd, passwd, procps, $(packages lz4 msgpack numpy packaging serial typing-extensions uvloop wrapt zmq zstandard)
+Recommends: $(packages aiohttp matplotlib prometheus-client rich scipy tqdm)
 Section: science
 Priority: optional
 Description: Real-time haptic controller daemon
@@ -36,6 +57,7 @@ cat > "$root/DEBIAN/postinst" <<'END'
 #!/bin/sh
 set -e
 [ "$1" = configure ] || exit 0
+py3compile -p tormagd /usr/lib/tormagd
 systemd-sysusers tormag.conf
 systemd-tmpfiles --create tormag.conf
 if [ -d /run/systemd/system ]; then
@@ -55,7 +77,7 @@ if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
     systemctl disable --quiet tormag.target tormagd.service tormagd@.service tormag-record.service tormag-record@.service \
         2>/dev/null || true
 fi
-find /usr/lib/tormagd -name __pycache__ -prune -exec rm -rf {} +
+py3clean -p tormagd
 END
 cat > "$root/DEBIAN/postrm" <<'END'
 #!/bin/sh

@@ -14,12 +14,12 @@ lib=$root$prefix/lib share=$root$prefix/share
 
 put() { install -D -m 644 "$1" "$2"; }
 
-for program in daemon:tormagd ctl:tormagctl lab:tormag-lab; do
+for program in tormagd.daemon:tormagd tormagd.ctl:tormagctl tormag_lab:tormag-lab; do
     install -d "$root$prefix/bin"
-    # children, such as the fitting of a calibration, find the library by the same variable
+    # children, such as a replay, find the library by the same variable
     cat > "$root$prefix/bin/${program#*:}" <<END
 #!/bin/sh
-PYTHONPATH='$library' exec $python -P -s -c 'import sys; from tormagd.ground.entry import ${program%:*}; sys.exit(${program%:*}())' "\$@"
+PYTHONPATH='$library' exec $python -P -s -m ${program%:*} "\$@"
 END
     chmod 755 "$root$prefix/bin/${program#*:}"
 done

@@ -2,7 +2,7 @@
 
 import gzip
 import sys
-from argparse import ArgumentParser
+from argparse import SUPPRESS, ArgumentParser
 from pathlib import Path
 
 from argparse_manpage.manpage import Manpage
@@ -17,6 +17,15 @@ from tormagd.daemon.main import parser as daemon
 def page(parser: ArgumentParser) -> bytes:
     """Return the man page in section 1, compressed; the same bytes for the same parser."""
     known = {"project_name": "tormagd", "version": __version__, "manual_title": "Haptic controller"}
+    known["description"] = (parser.description or "").rstrip(".")
+    parser._positionals.title = "commands"
+    for commands in (action.choices.values() for action in parser._actions if isinstance(action.choices, dict)):
+        for command in commands:
+            # its heading and the common options are the program's; its own usage line would repeat both
+            command.description, command.epilog, command.usage = None, None, SUPPRESS
+            for action in command._actions:
+                if not parser._option_string_actions.keys().isdisjoint(action.option_strings):
+                    action.help = SUPPRESS
     made = Manpage(parser, known, format="single-commands-section")
     made.date = ""  # the date of the build means nothing
     return gzip.compress(str(made).encode(), mtime=0)

@@ -1,7 +1,7 @@
-"""What every test shares: a live test that the host spoiled is started again, twice at most.
+"""What the tests of tormagd share: a live test that the host spoiled is started again, twice at most.
 
 If the host takes the processor for longer than the device may be silent, device and daemon protect themselves, and the
-scenario is over. Only the kernel's counters and bare timers on every processor (`tools/machines/host.py`) may blame the
+scenario is over. Only the kernel's counters and bare timers on every processor (`rigs/machines/host.py`) may blame the
 host; otherwise it is a failure.
 """
 
@@ -10,40 +10,20 @@ import contextlib
 import ctypes
 import inspect
 import os
-import signal
 import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, settings
 from machines.host import HostWatch
 
 from firmware_protocol.c.build import BuildError, compiler, load_library
 from tormagd.ground.scheduling import ask_for_slices
 
-# No test asserts a wall-clock duration. One commit has one verdict: a property's cases are drawn from its source, and
-# `make search` draws others, whose finds become an `@example`
-UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("tormagd", UNHURRIED, derandomize=True, max_examples=40)
-settings.register_profile("search", UNHURRIED, print_blob=True, max_examples=200)
-settings.load_profile("tormagd")
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # pytest-xdist's workers ignore Ctrl-C, and what a test starts would inherit that
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
 ATTEMPTS = 3
 WATCHED_ABOVE = 51
 WATCHED = pytest.StashKey[HostWatch]()
-
-
-@pytest.fixture
-def recordings() -> Path:
-    folder = Path(os.environ.get("TORMAG_DATA", Path(__file__).parents[2] / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip("no measured data: set TORMAG_DATA to its folder")
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -1,27 +1,30 @@
-"""Prints this project's requirements for `pip install -r`, so that they are fetched while the core is compiled."""
+"""Prints what tormagd and its laboratory require for `pip install -r`; it is fetched while the core is compiled."""
 
 import re
 import sys
 import tomllib
 from pathlib import Path
 
-PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
+ROOT = Path(__file__).parents[1]
+OURS = re.compile(r"tormag(?:d|d-client|-lab)(?:\[(.*)\])?(?:==.*)?")
 
 
 def requirements(extras: list[str]) -> list[str]:
-    """Return what `pip install ./client '.[extras]'` would fetch, without this project and its client."""
-    project = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
-    ours = re.compile(rf"{project['name']}\[(.*)\]")
-    found = [requirement for requirement in project["dependencies"] if not requirement.startswith("tormagd-client==")]
-    waiting = list(extras)
+    """Return what `pip install ./client '.[extras]' './lab[extras]'` would fetch besides these three."""
+    texts = (path.read_text(encoding="utf-8") for path in (ROOT / "pyproject.toml", ROOT / "lab/pyproject.toml"))
+    projects = [tomllib.loads(text)["project"] for text in texts]
+    known = {name: needed for each in projects for name, needed in each["optional-dependencies"].items()}
+    waiting = [requirement for each in projects for requirement in each["dependencies"]]
+    waiting += [requirement for name in extras for requirement in known[name]]
+    found = set()
     while waiting:
-        for requirement in project["optional-dependencies"][waiting.pop(0)]:
-            own = ours.fullmatch(requirement)
-            if own is None:
-                found.append(requirement)
-            else:
-                waiting += own[1].split(",")
-    return sorted(set(found))
+        requirement = waiting.pop()
+        own = OURS.fullmatch(requirement)
+        if own is None:
+            found.add(requirement)
+        elif own[1]:
+            waiting += [each for name in own[1].split(",") for each in known[name]]
+    return sorted(found)
 
 
 if __name__ == "__main__":

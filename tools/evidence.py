@@ -45,22 +45,26 @@ class Part(NamedTuple):
 
 PARTS = {
     "fuzz": Part(
-        "tools/endure.py fuzz --json",
+        "tools/judge.py endure fuzz --json",
         "{executions[codec]:,} payloads, {executions[framing]:,} streams and {executions[device]:,} lives "
         "under sanitizers: {lines} of the lines that bytes can reach. C and Python differ {languages_differ} times",
     ),
     "replug-serial": Part(
-        "tools/endure.py replug-serial --json", "{cycles} cycles. Lost after {lost_after_ms} ms at most"
+        "tools/judge.py endure replug-serial --json", "{cycles} cycles. Lost after {lost_after_ms} ms at most"
     ),
-    "replug-can": Part("tools/endure.py replug-can --json", "{cycles} cycles; lost after {lost_after_ms} ms at most"),
+    "replug-can": Part(
+        "tools/judge.py endure replug-can --json", "{cycles} cycles; lost after {lost_after_ms} ms at most"
+    ),
     "stalls": Part(
-        "tools/endure.py stalls --json", "{stops} stops, {faulted} latched, force off by {worst_N} N at most"
+        "tools/judge.py endure stalls --json", "{stops} stops, {faulted} latched, force off by {worst_N} N at most"
     ),
-    "soak": Part("tools/endure.py soak --json", "{minutes} min, growth in kB {growth_kB}, {ticks:,} ticks recorded"),
-    "siege": Part("tools/endure.py siege --json", "{count} stops beside each attack"),
-    "faults": Part("tools/faults.py --json", "all cells: [the matrix](../fault-matrix.md)", is_kept=True),
+    "soak": Part(
+        "tools/judge.py endure soak --json", "{minutes} min, growth in kB {growth_kB}, {ticks:,} ticks recorded"
+    ),
+    "siege": Part("tools/judge.py endure siege --json", "{count} stops beside each attack"),
+    "faults": Part("tools/judge.py faults --json", "all cells: [the matrix](../fault-matrix.md)", is_kept=True),
     "numerics": Part(
-        "tools/numerics.py --json",
+        "tools/judge.py numerics --json",
         "{cases:,} cases, {stage_cases:,} hostile steps of the core's stages: [errors](../measurements.md)",
     ),
     "inverse": Part(
@@ -71,11 +75,11 @@ PARTS = {
         is_kept=True,
     ),
     "envelope": Part(
-        "tools/envelope.py --json --picture docs/images/envelope.png",
+        "tools/judge.py envelope --json --picture docs/images/envelope.png",
         "{cases} runs on samples and {draws} draws: [bounds and worst](../control.md#the-envelope)",
     ),
     "models": Part(
-        "tools/envelope.py --models --json",
+        "tools/judge.py models --json",
         "[every insert's model on devices](../guides/insert.md#the-shipped-models)",
         is_kept=True,
     ),
@@ -86,7 +90,7 @@ PARTS = {
         judges=False,
     ),
     "tracking": Part(
-        "tools/force_tracking.py pulse --json",
+        "tools/judge.py tracking pulse --json",
         "the pulse on samples 1 to 3, live, RMS: {pulse[sample_1][live]:.4f}, {pulse[sample_2][live]:.4f}, "
         "{pulse[sample_3][live]:.4f} N",
         judges=False,

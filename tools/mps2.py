@@ -12,16 +12,16 @@ from statistics import mean
 from typing import final
 
 import numpy as np
-from rendering.following import RATE_HZ, Case, rehearse
-from rendering.signals import pulse_signal
+from judge.following import RATE_HZ, Case, rehearse
+from judge.signals import pulse_signal
 
 from firmware_protocol.c.build import BuildError, Target, build, debian_tool
 from firmware_protocol.conformance.check import run
 from firmware_protocol.conformance.examination import checks_on
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import SerialLine
+from tormag_lab.told import table
 from tormagd.config import Config
-from tormagd.lab.told import table
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import FirmwareKind, VirtualDevice
 from tormagd.simulation.emulated_firmware import EmulatedFirmware

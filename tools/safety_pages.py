@@ -11,14 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from risk.named_tests import named_tests
-from risk.page import page, red_rows
-from risk.rows import Row, judgement, rows
+from judge.risk import Row, judgement, named_tests, page, red_rows, rows
 
+from tormag_lab.pages import table
 from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd.control.safety.operating_state import ROWS, Event, OperatingState, Refusal, Transition
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.lab.pages import table
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -37,7 +35,7 @@ _STATES_HEAD = """# Operating states, faults and limits
 _MATRIX_HEAD = """# Fault matrix
 
 The effect of each fault, in virtual time on simulated devices. Written by `python tools/safety_pages.py` from
-[evidence/faults.json](evidence/faults.json), a run of `tools/faults.py --json`.
+[evidence/faults.json](evidence/faults.json), a run of `tools/judge.py faults --json`.
 
 Faults are injected while 1.8 ± 0.1 N are rendered at a turning handle, those of homing and of the start from the
 beginning. A row is for both buses if they agree. *Safe after* is when the gap was open or at rest, or the limit was

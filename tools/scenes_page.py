@@ -4,11 +4,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from rendering.scene_runs import ROOT
+from benchmarks.scene_runs import ROOT
 
+from tormag_lab.pages import stamp, subplots, table
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.lab.pages import stamp, subplots, table
 from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, Measurements, OperatingPoint, measured
 from tormagd.scenes.scene import load_scene, scene_path, shipped_scenes
 from tormagd.scenes.signal import asked

@@ -19,6 +19,8 @@ BESIDE = (
     "CONTRIBUTING.md",
     "CHANGELOG.md",
     "RELEASING.md",
+    "client/README.md",
+    "lab/README.md",
     "systemd/README.md",
     "firmware_protocol/README.md",
     "firmware_protocol/c/README.md",

@@ -8,8 +8,7 @@ import pytest
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
-from tormagd.lab.training.bench_sweep import gap_plan
-from tormagd.simulation.closed_loop import ClosedLoop, Sample
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, SteadyHand

@@ -16,7 +16,6 @@ from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
-from tormagd.lab.tactile.held import Case, hold
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
@@ -225,21 +224,6 @@ def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
     assert not loop.stepper.safety.faults
     assert float(np.sqrt(np.mean(np.square(errors_N)))) < 0.8 * SCENE.force.tolerance_rms_N
     assert loop.planner.believe.memory.relaxed_N > 0.1
-
-
-def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
-    within, without = (hold(Case("pad_1", remembers, False, 200.0, coarse=True)) for remembers in (True, False))
-    assert within["force_error"] < 0.01
-    assert not within["fault"]
-    assert without["last_force_error"] < -0.05
-
-
-def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
-    whole, coarse = (hold(Case("pad_1", False, False, 10.0, is_coarse)) for is_coarse in (False, True))
-    # friction lets the gap rest in different places; how the force falls from there is the same
-    fell, fell_coarse = (run["last_force_error"] - run["shares"][0] for run in (whole, coarse))
-    assert fell == pytest.approx(fell_coarse, abs=1e-4)
-    assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=2e-3)
 
 
 def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_core: Core) -> None:

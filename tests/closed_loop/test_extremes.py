@@ -16,9 +16,8 @@ from tormagd.control.core import Stepper
 from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
 from tormagd.control.move.reference import Reference
 from tormagd.control.safety.operating_state import OperatingState
-from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.closed_loop import Array, ClosedLoop, Sample
+from tormagd.simulation.closed_loop import Array, ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import RecordedHand, SteadyHand

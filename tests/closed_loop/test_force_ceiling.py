@@ -5,7 +5,7 @@ import random
 import msgspec
 import numpy as np
 import pytest
-from fault_matrix.rig import Lie, LyingSensor
+from lying import Lie, LyingSensor
 
 from tormagd.config import Config
 from tormagd.control.aim.portrait import Portrait

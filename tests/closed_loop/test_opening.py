@@ -6,16 +6,14 @@ from functools import partial
 
 import msgspec
 import pytest
-from benchmarks.step import drive as held
-from fault_matrix.bad_lines import BadSerialLine, losing
+from bad_lines import BadSerialLine, losing
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
-from tormagd.lab.training.bench_sweep import gap_plan
 from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.closed_loop import ClosedLoop, VirtualBus
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, VirtualBus, gap_plan
 from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.firmware import Firmware
@@ -30,6 +28,10 @@ MM_S = 20.0
 "More than the weakest device closes the gap by."
 Spoils = Callable[[MessageDevice, float], None]
 Opens = Callable[..., ClosedLoop]
+
+
+def held(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
+    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(duration_s * 1e3))]
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 from tormagd.config import Sources
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Limit
-from tormagd.daemon.force_delay import Way
+from tormagd.daemon.force_delay import ForceDelay
 from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
 from tormagd.daemon.source import SETTLED_S
 from tormagd.scenes.scene import Budget
@@ -60,7 +60,7 @@ class Publisher(NamedTuple):
 class Run(NamedTuple):
     samples: list[Sample]
     inbox: SetpointInbox
-    way: Way
+    way: ForceDelay
     start_s: float
 
     def of(self, source: str) -> SourceReport:
@@ -89,7 +89,7 @@ def run(
     at: Callable[[SetpointInbox, float], None] = lambda inbox, now_s: None,
 ) -> Run:
     """Run the loop with these publishers; `at` is called in every tick."""
-    inbox, way, samples, start_s = SetpointInbox(sources), Way(), [], loop.now_s
+    inbox, way, samples, start_s = SetpointInbox(sources), ForceDelay(), [], loop.now_s
     coming = heapq.merge(*(each.messages(start_s, lasts_s) for each in publishers))
     following = next(coming, None)
     for _ in range(round(lasts_s * 1e3)):

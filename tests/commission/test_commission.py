@@ -5,7 +5,7 @@ import random
 
 import msgspec
 import pytest
-from rendering.device_draws import drawn_device
+from devices import drawn_device
 
 from firmware_protocol.codec import Sense, State
 from tormagd.commission.calibration import calibration

@@ -1,6 +1,8 @@
 """`tormagctl dashboard`: what it serves, and the page in a headless Chromium if there is one."""
 
 import asyncio
+import contextlib
+import importlib.resources
 import itertools
 import json
 import math
@@ -9,7 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from typing import Any
 import msgspec
 import pytest
 import zmq
-from aiohttp import ClientResponse, ClientSession, ClientWebSocketResponse
+from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType, WSServerHandshakeError, web
 from aiohttp.test_utils import TestClient, TestServer
 from hypothesis import given, settings, strategies as st
 
@@ -29,9 +31,11 @@ from tormagd.record.writer import RecordingWriter
 from tormagd.view.frame import SHOWN_S, Frame, late_counts
 from tormagd.view.live import WAITING, Live
 from tormagd.view.recorded import Recorded
-from tormagd.view.server import application
+from tormagd.view.report import report
+from tormagd.view.server import Operating, application
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import in_folder
+from tormagd_client.errors import RefusedError
 from tormagd_client.messages import BeliefReport, Description, ProfileReport, Status, encode
 
 START_NS = 1_790_000_000_000_000_000
@@ -61,8 +65,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 
 @asynccontextmanager
-async def served(shown: Live | Recorded) -> AsyncIterator[Browser]:
-    async with TestClient(TestServer(application(shown))) as asks:
+async def served(
+    shown: Live | Recorded, operating: Operating | None = None, origin: str | None = None
+) -> AsyncIterator[Browser]:
+    async with TestClient(TestServer(application(shown, operating, origin))) as asks:
         yield asks
 
 
@@ -75,13 +81,11 @@ async def live(folder: Path) -> AsyncIterator[Live]:
         listening.cancel()
 
 
-async def event(stream: ClientResponse, wanted: str) -> Any:
+async def event(stream: ClientWebSocketResponse, wanted: str) -> Any:
     while True:
-        name = (await stream.content.readline()).decode().removeprefix("event: ").strip()
-        data = (await stream.content.readline()).decode().removeprefix("data: ")
-        assert await stream.content.readline() == b"\n"
+        ((name, value),) = (await stream.receive_json()).items()
         if name == wanted:
-            return json.loads(data)
+            return value
 
 
 async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
@@ -92,23 +96,19 @@ async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
     async with live(fake_daemon.directory) as shown, served(shown) as asks:
         about = await (await asks.get("/about")).json()
         assert (about["kind"], about["shown_s"], tuple(about["late_us"])) == ("live", SHOWN_S, LATE_US)
-        stream = await asks.get("/live")
-        assert stream.content_type == "text/event-stream"
-        told = await event(stream, "status")
-        assert (told["status"]["link"]["state"], told["explained"]) == (
-            "RUNNING",
-            {
-                "limits": {"RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}},
-                "faults": {},
-            },
-        )
-        assert await event(stream, "portrait") == {"portrait": PORTRAIT}
+        stream = await asks.ws_connect("/live")
+        assert (await event(stream, "status"))["link"]["state"] == "RUNNING"
+        assert await event(stream, "explained") == {
+            "limits": {"RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}},
+            "faults": {},
+        }
+        assert await event(stream, "portrait") == PORTRAIT
         first = msgspec.convert(await event(stream, "frame"), Frame)
         then = msgspec.convert(await event(stream, "frame"), Frame)
         assert (first.asked_N[-1], first.gap_mm[-1], first.operating_state) == (1.5, 70.0, "ENABLED")
         assert then.t_s[0] > first.t_s[-1]
         # a late one begins with the past seconds
-        assert msgspec.convert(await event(await asks.get("/live"), "frame"), Frame).t_s[0] <= first.t_s[0]
+        assert msgspec.convert(await event(await asks.ws_connect("/live"), "frame"), Frame).t_s[0] <= first.t_s[0]
         assert sum(then.late_counts) >= len(first.t_s)
         fake_daemon.is_silent = True
         assert (await event(stream, "silence"))["seconds"] >= 0.5
@@ -127,7 +127,7 @@ async def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telem
         shown = Live(client, msgspec.convert(status_with(), Status), described)
         listening = asyncio.create_task(shown.run())
         async with served(shown) as asks:
-            streams = [await asks.get("/live") for _ in range(10)]
+            streams = [await asks.ws_connect("/live") for _ in range(10)]
             publishes.send(encode(telemetry_with(1, START_NS)))
             while not publishes.poll(0):
                 await asyncio.sleep(0.01)
@@ -149,7 +149,7 @@ async def test_a_browser_that_does_not_read_misses_the_oldest_and_holds_nobody_u
             for number in range(3 * WAITING):
                 shown._publish("status", number)
             assert events.qsize() == WAITING
-            assert events.get_nowait() == b"event: status\ndata: %d\n\n" % (2 * WAITING)
+            assert json.loads(events.get_nowait()) == {"status": 2 * WAITING}
         assert not shown.browsers
 
 
@@ -157,7 +157,8 @@ async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Rec
     async with served(recorded) as asks:
         hosts = ("evil.example", "localhost", "127.0.0.1:8733")
         assert [(await asks.get("/about", headers={"Host": host})).status for host in hosts] == [403, 200, 200]
-        assert [(await asks.post(path)).status for path in ("/", "/about", "/frame")] == [405] * 3
+        ours = {"Origin": str(asks.make_url("/")).rstrip("/")}
+        assert [(await asks.post(path, headers=ours)).status for path in ("/", "/about", "/frame")] == [405] * 3
         page = await asks.get("/")
         assert page.headers["Content-Security-Policy"].startswith("default-src 'self'")
         text = await page.text()
@@ -201,22 +202,23 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     fault = recorded.frame(29.5)
     # in FAULT no field is planned
     assert (fault.faults, fault.field_mT[-1], fault.field_mT[0]) == (["SKEW"], None, 120.0)
-    assert frame.belief == {}  # ticks do not say
+    assert frame.believed == {}  # ticks do not say
     assert [held.is_now for held in recorded.frame(6.0).held] == [True]
 
 
 def test_a_recording_shows_what_was_believed_then(tmp_path: Path, telemetry_with) -> None:
-    lag = BeliefReport(value=0.013, sd=None, unit="s", acts=False)
+    idle = BeliefReport(value=0.013, sd=None, unit="s", acts=False)
+    lag = BeliefReport(value=-3.53, sd=None, unit="mT", acts=True)
     with RecordingWriter(tmp_path / "b.mcap") as writer:
         for seq, at_s in enumerate((0.0, 0.02, 0.04, 1.0)):
             scale = BeliefReport(value=1.0 + at_s, sd=0.17, unit="", acts=True)
-            belief = {"scale": scale, "carriage_lag": lag} if at_s else {}
+            belief = {"scale": scale, "carriage_lag": idle, "field_lag": lag} if at_s else {}
             writer.telemetry(telemetry_with(seq, START_NS + round(at_s * 1e9), belief=belief))
     shown = Recorded(RecordingFile(tmp_path / "b.mcap"))
-    assert [shown.frame(at_s).belief for at_s in (0.01, 0.5)] == [{}, {}]
-    for at_s, value in ((0.03, 1.02), (0.1, 1.04), (1.0, 2.0)):
-        known = BeliefReport(value=value, sd=0.17, unit="", acts=True)
-        assert shown.frame(at_s).belief == {"scale": known, "carriage_lag": lag}
+    assert [shown.frame(at_s).believed for at_s in (0.01, 0.5)] == [{}, {}]
+    for at_s, value in ((0.03, "1.02"), (0.1, "1.04"), (1.0, "2")):
+        known = {"force over the model's": f"{value} ± 0.17", "element's field less the gap's": "3.53 mT"}
+        assert shown.frame(at_s).believed == known
 
 
 @settings(max_examples=25)
@@ -239,17 +241,169 @@ def test_lateness_falls_into_the_bar_that_names_it() -> None:
     assert (counts[0], counts[1], counts[-2], counts[-1], sum(counts)) == (2, 1, 1, 2, 6)
 
 
-def test_the_command_says_where_it_serves_and_ends_in_order(fake_daemon: Any) -> None:
-    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "5", "--json"]
-    command += ["dashboard", "--port", "0"]
+@pytest.mark.parametrize(("options", "sent"), [((), []), (("--operate",), ["operate", "stop", "pause"])])
+def test_the_command_says_where_it_serves_and_ends_in_order(
+    fake_daemon: Any, options: tuple[str, ...], sent: list[str]
+) -> None:
+    fake_daemon.answers["stop"] = lambda: {"ok": True, "result": {"operating_state": "FAULT", "is_connected": True}}
+    fake_daemon.refuse("pause", "not_enabled")
+    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "20", "--json"]
+    command += ["dashboard", "--port", "0", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert any(line.startswith("tormagctl dashboard: http://127.0.0.1:") for line in process.stderr)
+            link = next(found for line in process.stderr if (found := re.search(r"(http://127\S+)/#?(\S*)", line)))
+            answers = asyncio.run(given_by(link[1], link[2], sent[1:]))
             process.send_signal(signal.SIGINT)
-            said, _ = process.communicate(timeout=60.0)
+            said, more = process.communicate(timeout=60.0)
         finally:
             process.kill()
-    assert (process.returncode, json.loads(said)["ok"]) == (0, True)
+    assert (process.returncode, json.loads(said)["ok"], len(link[2])) == (0, True, 43 if options else 0)
+    assert answers == [(200, "stopped and latched"), (409, "pause: cannot pause")][: len(answers)]
+    assert not options or link[2] not in said + more
+    assert [each for each in fake_daemon.commands if each not in ("status", "describe")] == sent
+
+
+async def given_by(address: str, secret: str, commands: Sequence[str]) -> list[tuple[int, str]]:
+    found = []
+    async with ClientSession(headers={"Origin": address, "Tormag-Secret": secret}) as session:
+        for command in commands:
+            async with session.post(f"{address}/command", json={"command": command}) as answer:
+                found.append((answer.status, (await answer.text()).split(";")[0]))
+    return found
+
+
+def test_a_key_that_may_only_look_starts_no_page_that_operates(fake_daemon: Any, ctl: Any, tmp_path: Path) -> None:
+    fake_daemon.refuse("operate", "forbidden")
+    assert ctl(*fake_daemon.at, "--json", "dashboard", "--operate", "--port", "0").ended(1).error["code"] == "forbidden"
+    assert "cannot be operated" in ctl(*fake_daemon.at, "dashboard", str(tmp_path), "--operate").ended(2).err
+
+
+@pytest.mark.parametrize("origin", ["*", "null", "http://elsewhere.example", "https://a/b", "https://", "ftp://a"])
+def test_an_origin_that_is_none_is_refused(ctl: Any, origin: str) -> None:
+    assert "allowed are https://HOST" in ctl("dashboard", "--origin", origin).ended(2).err
+
+
+LONGEST_S = 60.0
+SECRET = 21 * "aB"
+OURS, OTHERS, PROXY = "OURS", "http://evil.example", "https://console.example"
+"OURS stands for the server's own address."
+
+
+class Given(list[str]):
+    async def __call__(self, command: str) -> str:
+        if command == "pause":
+            raise RefusedError(command, "busy", "homing", "wait for it")
+        self.append(command)
+        return "done"
+
+
+def asked(asks: Browser, changes: dict[str, Any]) -> dict[str, Any]:
+    """Return a request that stops the brake, with these headers instead; None leaves one out."""
+    headers = {
+        "Origin": OURS,
+        "Tormag-Secret": SECRET,
+        "Content-Type": "application/json",
+        **changes.get("headers", {}),
+    }
+    kept = [
+        (name, value.replace(OURS, f"http://{asks.host}:{asks.port}"))
+        for name, values in headers.items()
+        for value in (values if isinstance(values, tuple) else (values,))
+        if value is not None
+    ]
+    return {"method": "POST", "path": "/command", "data": b'{"command": "stop"}', **changes, "headers": kept}
+
+
+MISUSES: dict[str, tuple[int, dict[str, Any]]] = {
+    "no secret": (401, {"headers": {"Tormag-Secret": None}}),
+    "an empty secret": (401, {"headers": {"Tormag-Secret": ""}}),
+    "another secret": (401, {"headers": {"Tormag-Secret": 43 * "b"}}),
+    "a part of it": (401, {"headers": {"Tormag-Secret": SECRET[:-1]}}),
+    "more than it": (401, {"headers": {"Tormag-Secret": f"{SECRET}a"}}),
+    "in other letters": (401, {"headers": {"Tormag-Secret": SECRET.upper()}}),
+    "not ASCII": (401, {"headers": {"Tormag-Secret": "ä" * 42}}),
+    "in the address": (401, {"headers": {"Tormag-Secret": None}, "path": f"/command?secret={SECRET}"}),
+    "in a cookie": (401, {"headers": {"Tormag-Secret": None, "Cookie": f"Tormag-Secret={SECRET}"}}),
+    "no origin": (403, {"headers": {"Origin": None}}),
+    "an empty origin": (403, {"headers": {"Origin": ""}}),
+    "a foreign page": (403, {"headers": {"Origin": OTHERS}}),
+    "a page of nowhere": (403, {"headers": {"Origin": "null"}}),
+    "a page of another port": (403, {"headers": {"Origin": "http://127.0.0.1:1"}}),
+    "a page of another scheme": (403, {"headers": {"Origin": "https://127.0.0.1"}}),
+    "a name that begins like ours": (403, {"headers": {"Origin": f"{OURS}.evil.example"}}),
+    "two origins": (403, {"headers": {"Origin": (OURS, OTHERS)}}),
+    "a foreign name for our address": (403, {"headers": {"Host": "evil.example", "Origin": OTHERS}}),
+    "GET": (405, {"method": "GET"}),
+    "PUT": (405, {"method": "PUT"}),
+    "leave for a foreign page": (403, {"method": "OPTIONS", "headers": {"Origin": OTHERS}}),
+    "a form": (415, {"headers": {"Content-Type": "application/x-www-form-urlencoded"}, "data": b"command=stop"}),
+    "plain text": (415, {"headers": {"Content-Type": "text/plain"}}),
+    "a long body": (413, {"data": b'{"command": "stop"' + 1_000 * b" " + b"}"}),
+    "no JSON": (400, {"data": b"stop"}),
+    "no body": (400, {"data": b""}),
+    "no object": (400, {"data": b'["stop"]'}),
+    "an unknown command": (400, {"data": b'{"command": "explode"}'}),
+    "a command that is none of the page's": (400, {"data": b'{"command": "use-scene"}'}),
+    "a field more": (400, {"data": b'{"command": "stop", "scene": "x"}'}),
+    "looking without the secret": (401, {"method": "GET", "path": "/about", "headers": {"Tormag-Secret": None}}),
+    "the stream to a foreign page": (403, {"method": "GET", "path": "/live", "headers": {"Origin": OTHERS}}),
+}
+
+
+@pytest.mark.parametrize(("status", "changes"), MISUSES.values(), ids=MISUSES)
+async def test_a_misuse_is_refused(recorded: Recorded, status: int, changes: dict[str, Any]) -> None:
+    given = Given()
+    async with served(recorded, Operating(SECRET, given)) as asks:
+        answer = await asks.request(**asked(asks, changes))
+        assert (answer.status, given) == (status, [])
+        assert (SECRET in await answer.text(), "Access-Control-Allow-Origin" in answer.headers) == (False, False)
+        # nor may a page frame it, or tell another where it was
+        names = ("X-Frame-Options", "Referrer-Policy", "Cache-Control")
+        assert [answer.headers[name] for name in names] == ["DENY", "no-referrer", "no-store"]
+        assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+
+
+async def test_a_secret_commands_a_server_of_its_start(recorded: Recorded) -> None:
+    given = Given()
+    for operating, expected in (
+        (Operating(SECRET, given), {"stop": 200, "arm": 200, "pause": 409}),
+        (Operating(f"b{SECRET[1:]}", given), {"stop": 401}),
+        (None, {"stop": 404}),
+    ):
+        async with served(recorded, operating) as asks:
+            for command, status in expected.items():
+                answer = await asks.request(**asked(asks, {"data": json.dumps({"command": command})}))
+                assert answer.status == status
+    assert given == ["stop", "arm"]
+
+
+@pytest.mark.parametrize(
+    ("protocols", "origin", "status"),
+    [
+        ((), OURS, 401),
+        (("tormag",), OURS, 401),
+        (("tormag", SECRET[:-1]), OURS, 401),
+        (("tormag", SECRET), OTHERS, 403),
+        (("tormag", SECRET), "null", 403),
+        (("tormag", SECRET), PROXY, 101),
+    ],
+)
+async def test_the_stream_is_for_who_has_the_secret_and_only_tells(
+    fake_daemon: Any, protocols: tuple[str, ...], origin: str, status: int
+) -> None:
+    given = Given()
+    async with (
+        live(fake_daemon.directory) as shown,
+        served(shown, Operating(SECRET, given), PROXY) as asks,
+        asyncio.timeout(LONGEST_S),
+    ):
+        headers = {"Origin": origin.replace(OURS, f"http://{asks.host}:{asks.port}")}
+        with contextlib.nullcontext() if status == 101 else pytest.raises(WSServerHandshakeError, match=str(status)):
+            stream = await asks.ws_connect("/live", protocols=protocols, headers=headers)
+            assert stream.protocol == "tormag"
+            await stream.send_json({"command": "stop"})
+            assert [each async for each in stream if each.type is not WSMsgType.TEXT] == []
+    assert given == []
 
 
 CHROMIUM = next(
@@ -258,7 +412,6 @@ CHROMIUM = next(
 OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars")
 PHONE = 600
 "A narrower window is a phone's."
-LONGEST_S = 60.0
 
 
 class Page:
@@ -327,12 +480,14 @@ async def browser(profile: Path) -> AsyncIterator[Page]:
 
 
 @asynccontextmanager
-async def page_of(shown: Live | Recorded, tmp_path: Path, width: int, height: int) -> AsyncIterator[Page]:
-    async with served(shown) as asks, browser(tmp_path) as page:
+async def page_of(
+    shown: Live | Recorded, tmp_path: Path, width: int, height: int, operating: Operating | None = None
+) -> AsyncIterator[Page]:
+    async with served(shown, operating) as asks, browser(tmp_path) as page:
         await page.resize(width, height)
         for domain in ("Runtime", "Log", "Page"):
             await page.tell(f"{domain}.enable")
-        await page.tell("Page.navigate", url=str(asks.make_url("/")))
+        await page.tell("Page.navigate", url=f"{asks.make_url('/')}{(operating and f'#{operating.secret}') or ''}")
         yield page
         assert page.complaints == []
 
@@ -392,3 +547,83 @@ async def test_the_page_scrubs_through_a_recording(recorded: Recorded, tmp_path:
         assert await page.ask("at('play').textContent") == "Pause"
         await page.until(DRAWN)
         await page.until(FITS)
+
+
+IS_STOP = """[at("stop").getBoundingClientRect()].every(({left, right, top, bottom}) =>
+    left >= 0 && right <= innerWidth && top >= 0 && bottom <= innerHeight &&
+    document.elementFromPoint((left + right) / 2, (top + bottom) / 2) === at("stop"))"""
+STATES = ("at('operate').hidden", "at('question').open", "location.href.includes('#')")
+
+
+def press(command: str) -> str:
+    return f"document.querySelector('[data-command={command}]').click()"
+
+
+@needs_chromium
+async def test_stop_is_within_reach_and_everything_else_asks_first(fake_daemon: Any, tmp_path: Path) -> None:
+    given = Given()
+    how = Operating(SECRET, given)
+    async with live(fake_daemon.directory) as shown, page_of(shown, tmp_path, 1440, 900, how) as page:
+        await page.until("document.querySelector('#state')?.textContent === 'ENABLED'")
+        for width, height in ((1440, 900), (1024, 768), (390, 844), (320, 480)):
+            await page.resize(width, height)
+            await page.until(f"{IS_STOP} && {FITS}")
+            await page.ask(press("arm"))
+            assert [await page.ask(each) for each in (*STATES, IS_STOP)] == [False, True, False, True]
+            await page.ask("at('no').click()")
+        assert given == []
+        for command in ("resume", "disable", "arm"):
+            await page.ask(press(command))
+            await page.ask("at('yes').click()")
+            await page.until(f"at('answer').textContent === '{command}: done'")
+        await page.ask(press("arm"))
+        await page.ask(press("stop"))
+        await page.until("at('answer').textContent === 'stop: done'")
+        assert given == ["resume", "disable", "arm", "stop"]
+        await page.tell("Page.reload")
+        await page.until("document.querySelector('#state')?.textContent === 'ENABLED'")
+        assert [await page.ask(each) for each in STATES] == [False, False, False]
+
+
+@needs_chromium
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+async def test_axe_finds_nothing(fake_daemon: Any, recorded: Recorded, tmp_path: Path, scheme: str) -> None:
+    axe = (importlib.resources.files(pytest.importorskip("axe_core_python")) / "axe.min.js").read_text(encoding="utf-8")
+    (tmp_path / "a.html").write_text(report([recorded._file]), encoding="utf-8")
+    (tmp_path / "browser").mkdir()
+    async with (
+        live(fake_daemon.directory) as shown,
+        served(shown, Operating(SECRET, Given())) as now,
+        served(recorded) as then,
+        browser(tmp_path / "browser") as page,
+    ):
+        await page.tell("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        for url, is_ready in (
+            (f"{now.make_url('/')}#{SECRET}", "document.querySelector('#state')?.textContent === 'ENABLED'"),
+            (str(then.make_url("/")), "document.querySelector('#state')?.textContent === 'FAULT'"),
+            ((tmp_path / "a.html").as_uri(), "document.querySelector('h2') !== null"),
+        ):
+            await page.tell("Page.navigate", url=url)
+            await page.until(is_ready)
+            await page.ask("document.querySelector('[data-command=arm]')?.click()")
+            await page.ask(f"{axe}; 0")
+            await page.resize(390, 844)
+            await page.until(FITS)
+            found = "axe.run().then((it) => it.violations.map((each) => each.id + each.nodes[0].html))"
+            assert await page.ask(found) == [], url
+
+
+@needs_chromium
+async def test_the_example_shows_the_stream(fake_daemon: Any, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "examples/live.html").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 15
+    made = web.Application()
+    async with live(fake_daemon.directory) as shown, TestServer(made) as own, browser(tmp_path) as page:
+        for origin, shows in ((str(own.make_url("/")).rstrip("/"), "1.50 N asked"), (None, "– N asked")):
+            async with served(shown, origin=origin) as asks:
+                here = text.replace("127.0.0.1:8733", f"127.0.0.1:{asks.port}")
+                await page.tell("Page.navigate", url=str(own.make_url("/")))
+                await page.ask(f"document.write({json.dumps(here)})")
+                await page.until("stream.readyState === WebSocket.OPEN || stream.readyState === WebSocket.CLOSED")
+                await page.until(f"document.body.textContent.includes({json.dumps(shows)})")
+                await page.ask("stream.close()")

@@ -131,7 +131,8 @@ def test_a_recording_with_seals_of_before_is_shown_listed_and_exported(tmp_path,
     Path(sealed).write_bytes(data)
     damaged = ctl("--json", "recordings", "export", sealed, "--to", str(tmp_path / "b.mcap")).ended(1).result
     assert "crc validation failed in Chunk" in damaged["damage"]
-    assert "crc validation failed in Chunk" in ctl("plot", sealed, "-o", str(tmp_path / "a.png")).ended(2).err
+    drawn = ctl("--json", "plot", sealed, "-o", str(tmp_path / "a.png")).ended(1).result  # without that chunk
+    assert drawn["ticks"] < 80
 
 
 def test_rubbish_is_counted_and_left_out(fake_daemon, ctl, file):

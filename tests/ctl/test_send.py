@@ -10,8 +10,8 @@ from hypothesis import given, strategies as st
 from tormagd.ctl.outcome import CommandError
 from tormagd.ctl.watch import held_back
 from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
-from tormagd.ground.force_file import ForceFileError
-from tormagd_client.messages import Setpoint, Status
+from tormagd.ground.table import TableError
+from tormagd_client.messages import MAX_PREVIEW_SAMPLES, Setpoint, Status
 
 
 @pytest.fixture
@@ -36,6 +36,7 @@ def file(tmp_path):
 def test_every_setpoint_arrives_from_the_first_on(published):
     result, arrived = published("ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
     assert result["sent"] + result["skipped"] == 61
+    assert 0.0 <= result["worst_late_ms"] <= 1e3 * result["seconds"]
     assert (len(arrived), arrived[0].servo_cf, arrived[-1].servo_cf) == (result["sent"], 1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
     # the force belongs to the setpoint's own deadline
@@ -55,13 +56,15 @@ def test_a_second_run_of_the_same_source_is_newer(published):
     assert {(s.source, s.valid_for_ms) for s in arrived} == {("me", 70.0)}
 
 
-def test_a_preview_is_what_will_be_sent(published):
-    _, arrived = published("sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")
-    forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
+@pytest.mark.parametrize(("rate_hz", "preview_ms", "count"), [(100, 50, 5), (320, 800, MAX_PREVIEW_SAMPLES)])
+def test_a_preview_is_what_will_be_sent(published, rate_hz, preview_ms, count):
+    options = ("--duration", "0.2", "--rate", str(rate_hz), "--preview-ms", str(preview_ms))
+    _, arrived = published("sine", *options)
+    forces = {round(rate_hz * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
     for setpoint in arrived:
-        assert (len(setpoint.preview_N), setpoint.preview_dt_ms) == (5, 10.0)
+        assert (len(setpoint.preview_N), setpoint.preview_dt_ms) == (count, 1e3 / rate_hz)
         for after, force in enumerate(setpoint.preview_N, start=1):
-            later = min(round(100.0 * after_s(setpoint, arrived[0])) + after, 20)
+            later = min(round(rate_hz * after_s(setpoint, arrived[0])) + after, 0.2 * rate_hz)
             assert force == pytest.approx(forces.get(later, force), abs=1e-9)
 
 
@@ -83,29 +86,36 @@ def test_a_file_is_sent(published, file, content, options, count, last):
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        ("", "no column t_s"),
-        ("t_s,force_N\n", "0 rows"),
+        ("", "no numbers stand right below a row of names"),
+        ("t_s,force_N\n", "no numbers stand right below a row of names"),
+        ("0,1\n1,2\n", "no numbers stand right below a row of names"),
         ("t_s,force_N\n0,1\n", "1 rows"),
-        ("time,force_N\n0,1\n1,1\n", "no column t_s (it is 'time,force_N')"),
-        ("t_s,force_N,mood\n0,1,2\n1,1,2\n", "column 'mood'"),
-        ("t_s,force_N,t_s\n0,1,0\n1,1,1\n", "t_s is there twice"),
-        ("t_s,force_N\n0,1\n1,nan\n", "row 3, force_N = 'nan'"),
+        ("time,force_N\n0,1\n1,1\n", "'time' states no unit: time_s is in s, ms, us, min, h:m:s"),
+        ("time,force_N\n0,1\n1,1\n", "state --time-column time:UNIT"),
+        ("t [s],force [lb]\n0,1\n1,1\n", "'force [lb]' has the unit 'lb': force_N is in N, mN"),
+        ("t_s,pressure\n0,1\n1,1\n", "no column is force_N (force, load, kraft, F)"),
+        ("t_s,force_N,t_s\n0,1,0\n1,1,1\n", "'t_s' and 't_s' may both be time_s"),
+        ("t_s,force_N\n0,1\n1,nan\n2,1\n", "row 3 lacks a value"),
+        ("t_s;force_N\n1;1,500\n2;2,500\n", "'1,500' may be a thousand or a fraction"),
+        ("t_s;force_N\n1;1,5\n2;2.5\n", "two decimal marks"),
+        ("t_s,force_N\n0,00,1,5\n0,01,1,6\n", "decimal commas need ; or tab"),
+        ("Zeit,force_N\n10:05,1\n10:06,1\n", "states no unit: time_s is in s"),
         ("t_s,force_N\n0,1\ninf,1\n", "row 3, t_s = 'inf'"),
-        ("t_s,force_N\n0,1\n1,-0.5\n", "row 3, force_N = -0.5: allowed is 0..1000 N"),
-        ("t_s,force_N\n0,1\n1,1e9\n", "row 3, force_N = 1e9"),
-        ("t_s,force_N\n-1e308,1\n1e308,1\n", "row 2, t_s = -1e308: allowed is -1e+10..1e+10 s"),
-        ("t_s,force_N,displacement_mm\n0,1,0\n1,1,1e10\n", "row 3, displacement_mm = 1e10: allowed is 0..2 mm"),
-        ("t_s,force_N,rate_mm_s\n0,1,0\n1,1,-1e5\n", "row 3, rate_mm_s = -1e5: allowed is -300..300 mm/s"),
-        ("t_s,force_N\n0,1\n0,2\n", "row 3, t_s = 0: allowed is above"),
-        ("t_s,force_N\n1,1\n0,2\n", "row 3, t_s = 0: allowed is above"),
+        ("t_s,force_N\n0,1\n1,-0.5\n", "row 3, force_N = -0.5: allowed is 0..1000 N; a brake cannot push"),
+        ("t_s,force_N\n0,1\n1,1e9\n", "row 3, force_N = 1e+09"),
+        ("t_s,force_N\n-1e308,1\n1e308,1\n", "row 2, time_s = -1e+308: allowed is -1e+10..1e+10 s"),
+        ("t_s,force_N,displacement_mm\n0,1,0\n1,1,1e10\n", "row 3, displacement_mm = 1e+10: allowed is 0..2 mm"),
+        ("t_s,force_N,rate_mm_s\n0,1,0\n1,1,-1e5\n", "row 3, rate_mm_s = -100000: allowed is -300..300 mm/s"),
+        ("t_s,force_N\n0,1\n0,2\n", "row 3, time_s = 0: allowed is above"),
+        ("t_s,force_N\n1,1\n0,2\n", "row 3, time_s = 0: allowed is above"),
         ("t_s,force_N\n0,1\n1\n", "row 3 has 1 values: allowed is 2"),
         ("t_s,force_N\n0,1\n1,1,5\n", "row 3 has 3 values"),
         ("t_s,force_N\n0,1\n1,1_5\n", "row 3, force_N = '1_5'"),
-        ("t_s,force_N\n0,1\n1,\n", "row 3, force_N = ''"),
+        ("t_s,force_N\n0,1\n1,\n", "row 3 lacks one"),
         ('t_s,force_N\n0,"1\n', "not CSV"),
-        ("t_s;force_N\n0;1\n", "no column t_s"),
+        ("t_s;force_N\n0;1\n", "1 rows"),
         ("t_s,force_N\n0," + "9" * 200_000 + "\n", "not CSV"),
-        (b"t_s,force_N\n0,\xff\n", "not UTF-8"),
+        (b"t_s,force_N\n0,\x81\n", "neither UTF-8 text"),
         (b"\x00\x01\x02", "task.csv"),
     ],
 )
@@ -120,7 +130,7 @@ def test_any_bytes_are_a_waveform_or_refused(tmp_path_factory, data):
     file.write_bytes(b"t_s,force_N\n" + data)
     try:
         waveform = read_csv(file)
-    except ForceFileError:
+    except TableError:
         return
     assert 0.0 <= waveform.at(waveform.duration_s / 2).force_N <= 1_000.0
 

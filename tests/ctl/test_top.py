@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
 from hypothesis import given, strategies as st
 from rich.console import Console
 
+from tormagd.ctl.top import Watcher
 from tormagd.ctl.top_screen import CURVES, EIGHTHS, Seen, columns, screen, span, sparkline
 from tormagd_client.messages import ExecReport, Explained, FollowingReport, PlayoutReport, Status
 
@@ -116,6 +118,15 @@ def test_what_was_not_granted_and_how_the_force_is_followed_is_said(seen: Seen) 
 
 def test_before_the_first_snapshot_it_says_so(seen: Seen) -> None:
     assert "nothing, and there is no fault" in "\n".join(drawn(seen._replace(telemetry=[]), 80, 24))
+
+
+def test_what_comes_with_the_newest_snapshot_is_explained(seen: Seen) -> None:
+    known = msgspec.structs.replace(seen.status, limit_details=(RATE,))
+    client = Mock(**{"status.return_value": seen.status, "answer.return_value": msgspec.to_builtins(known)})
+    client.telemetry.side_effect = [seen.telemetry[-1:], seen.telemetry[:1], seen.telemetry[-1:]]
+    watcher = Watcher(client)
+    looks = [watcher.look() for _ in range(3)]
+    assert (len(looks[-1].telemetry), looks[-1].explained) == (3, {"RATE": RATE})
 
 
 def test_nothing_that_telemetry_says_is_obeyed_by_the_terminal(seen: Seen) -> None:

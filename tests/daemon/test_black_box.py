@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ class Rig:
         self.process = Mock()
         self.stepper, self.planner = core.stepper(), core.planner()
         self.output = self.stepper.step(1.0, None, self.planner.planned)
-        with patch("tormagd.daemon.child_process.start_beside", self.start):
+        with patch("tormagd.daemon.child_process.start_child", self.start):
             self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000)
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
         self.box.begin(self.stepper, self.planner, connection)
@@ -162,6 +163,26 @@ def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: Ca
     rig.box.close()
 
 
+def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tormagd.daemon.child_process.start_child", rig.start)
+    waits: list[float] = []
+    for _ in range(4):
+        rig.its.close()
+        ended_s = time.monotonic()
+        rig.box.look()
+        waits.append(round(rig.box._due_s - ended_s))
+        monkeypatch.setattr(rig.box, "_due_s", ended_s)
+        rig.box.look()
+    assert (waits, rig.box.report().refusal) == ([1, 2, 4, 8], "")  # none lived for long
+    rig.tick(PART_TICKS + 1)
+    begun, part = rig.heard()
+    assert begun == Begin("/boxes", {"format": "1"}, is_again=True)
+    assert isinstance(part, Part)
+    assert names(part)[:4] == ["missing", "state", "step", "tick"]
+    rig.box.write("SKEW", 0.0, {})
+    assert len(rig.heard()) == 1
+
+
 def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) -> None:
     rig.box.journal._entries.append((TEACH, object()))
     rig.tick()
@@ -193,7 +214,7 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     ("name", "fails", "says"),
     [
         (
-            "tormagd.daemon.child_process.start_beside",
+            "tormagd.daemon.child_process.start_child",
             Mock(side_effect=OSError(11, "Try again")),
             "did not start: Try again",
         ),

@@ -7,6 +7,7 @@ import pytest
 from tormagd.config import Config
 from tormagd.daemon.calibrations import Calibrations
 from tormagd_client.endpoints import ConfigError
+from tormagd_client.messages import CalibrationReport
 
 WEAK = "serial_number = 7\n[motor]\nresistance_ohm = 2.5\n[trim]\nleast = 0.5\n"
 
@@ -38,12 +39,12 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
     return made
 
 
-def test_another_device_runs_by_its_own_calibration_or_by_none(rig: Rig) -> None:
+def test_another_device_runs_by_its_own_calibration_or_by_none(rig: Rig, tmp_path: Path) -> None:
     asyncio.run(rig.look(None, 7))
     assert (rig.running.motor.resistance_ohm, rig.running.trim.least) == (2.5, 0.5)
     assert [rig.calibrations.is_awaited(it) for it in (None, 7, 8)] == [False, False, True]
     asyncio.run(rig.look(None, 8))
-    assert (rig.running, rig.calibrations.report().file) == (Config(), "")
+    assert (rig.running, rig.calibrations.report()) == (Config(), CalibrationReport(folder=str(tmp_path)))
 
 
 def test_a_device_in_use_keeps_what_it_runs_by_until_it_is_idle(rig: Rig) -> None:

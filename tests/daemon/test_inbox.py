@@ -382,8 +382,20 @@ def test_a_refused_setpoint_changes_nothing_but_the_counter(publishing: Publishi
     assert publishing.send(2, 1.1)
 
 
+def test_a_force_around_zero_is_taken_as_zero_and_counted(publishing: Publishing) -> None:
+    assert publishing.send(1, 1.0)
+    assert publishing.send(2, -1e-17, preview_N=[1.0, -0.005, -0.0], preview_dt_ms=1.0, withdraw_cf=-0.004)
+    assert publishing.inbox.in_force is not None
+    taken = publishing.inbox.in_force.setpoint
+    asked_N = [taken.force_N, *taken.preview_N, taken.withdraw_N]
+    assert [str(force_N) for force_N in asked_N] == ["0.0", "1.0", "0.0", "0.0", "0.0"]
+    assert publishing.inbox.in_force.is_raised
+    assert [source.raised for source in publishing.inbox.report(publishing.now_s).by_source.values()] == [1]
+    assert not publishing.send(3, -0.0051)
+
+
 def test_the_report_fits_into_an_answer_whatever_the_sources_call_themselves(publishing: Publishing) -> None:
-    assert not publishing.send(1, preview_N=[-1.2345678901234567e-100] * 256, preview_dt_ms=1.0)
+    assert not publishing.send(1, preview_N=[-1.2345678901234567e100] * 256, preview_dt_ms=1.0)
     for tick in range(30):
         publishing.now_s += 0.01
         for number in range(SOURCES):

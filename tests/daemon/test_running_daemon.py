@@ -22,7 +22,7 @@ from firmware_protocol.codec import Message
 from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, load_calibration
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
-from tormagd.daemon import daemon as daemon_module, telemetry_loop
+from tormagd.daemon import daemon as daemon_module, service
 from tormagd.daemon.beat import KERNEL, Beat, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.element.physics.errors import DomainError
@@ -226,11 +226,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
 
 
 @pytest.fixture
-def running(clock: Clock, core: Core, tmp_path: Path) -> Iterator[Running]:
+def running(clock: Clock, core: Core, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    told: list[str] = []
+    monkeypatch.setattr(daemon_module, "notify", told.append)
     with asyncio.Runner() as runner:
         made = Running(runner, clock, core, tmp_path)
         yield made
         made.end()
+    assert told == ["STOPPING=1"]
 
 
 @pytest.fixture
@@ -310,7 +313,7 @@ def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(alone: Running, error
 
 def test_the_watchdog_is_fed_while_plans_are_fresh(alone: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     notified: list[str] = []
-    monkeypatch.setattr(telemetry_loop, "notify", notified.append)
+    monkeypatch.setattr(service, "notify", notified.append)
     alone.tick(100)
     assert "WATCHDOG=1" in notified
     alone.search.error = TypeError("nobody expects this")
@@ -440,11 +443,10 @@ def test_a_homing_that_is_over_shows_as_one_that_succeeded(running: Running) -> 
     running.start()
     running.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
     running.command("home")
-    telemetry = running.daemon._telemetry
     for _ in range(PATIENCE_TICKS):
         running.port.advance(time.monotonic() + 0.5e-3)  # between two ticks
         running.daemon._connection.receive(time.monotonic())
-        look = telemetry._build_status(telemetry._newest)
+        look = running.daemon._answers.status()
         if not look.is_busy:
             break
         running.tick()

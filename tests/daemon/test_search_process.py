@@ -114,14 +114,18 @@ def answered(process: SearchProcess, until: int = -1) -> Answer | None:
     return answer
 
 
-def test_a_search_that_is_gone_answers_no_more_and_one_that_cannot_start_is_refused(
+def test_a_search_that_is_gone_is_replaced_and_one_that_cannot_start_is_refused(
     core: Core, process: SearchProcess, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     elsewhere = msgspec.structs.replace(core.scene.insert, model="none.safetensors")
     with pytest.raises(ConfigError, match=r"solver\.name = 'thesis': its process did not start"):
         SearchProcess(core._replace(models=tmp_path, scene=msgspec.structs.replace(core.scene, insert=elsewhere)))
-    process.close()
-    for _ in range(3):
-        process.ask(Question(7.0, 2.0, 42.0, 1.5, 300.0))
-        assert process.answer() is None
-    assert caplog.messages == ["the search beside the plans has ended; next: start the daemon again"]
+    process._beside.process.kill()
+    process._beside.process.wait()
+    question = Question(7.0, 2.0, 42.0, 1.5, 300.0)
+    until_s = time.monotonic() + PATIENCE_S
+    while (answer := process.answer()) is None and time.monotonic() < until_s:
+        process.ask(question)
+        time.sleep(0.001)
+    assert answer == core.planner().aim.answer_to(question)
+    assert caplog.messages == ["the search beside the plans has ended; another one starts"]

@@ -148,6 +148,13 @@ def test_two_publishers_of_one_name_do_not_alternate(
     assert not sequence.is_doubled(2.0 + STRAYS_S)
 
 
+@pytest.mark.parametrize(("apart_s", "is_doubled"), [(0.5 * STRAYS_S, True), (0.6, False)])
+def test_strays_that_are_far_apart_are_of_no_second_publisher(apart_s: float, is_doubled: bool) -> None:
+    sequence = Sequence(None, 100)
+    assert [sequence.order(k * apart_s, None, 50 - k, is_over=False) for k in range(RUN)] == [STRAY] * RUN
+    assert sequence.is_doubled((RUN - 1) * apart_s) == is_doubled
+
+
 @given(st.lists(st.tuples(st.sampled_from([None, 0, 1, 2**63 - 1]), st.integers(0, 2**63 - 1)), max_size=20))
 def test_whatever_came_before_a_stream_is_heard_within_a_few_messages(before: list[tuple[int | None, int]]) -> None:
     sequence = Sequence(None, 0)
@@ -270,6 +277,16 @@ def test_until_it_is_settled_a_message_is_as_old_as_it_says() -> None:
         clock = SourceClock()
         heard = [(clock.hear(at_s, lateness_s), clock.is_settled) for at_s in (0.0, SETTLED_S - 0.01, SETTLED_S)]
         assert heard == [(lateness_s, False), (lateness_s, False), (0.0, True)]
+
+
+@pytest.mark.parametrize(
+    ("lateness_s", "is_settled"),
+    [(-AHEAD_S, True), (MAX_WAY_S, True), (-1.01 * AHEAD_S, False), (1.01 * MAX_WAY_S, False)],
+)
+def test_a_first_message_that_may_be_right_is_believed_at_once(lateness_s: float, is_settled: bool) -> None:
+    clock = SourceClock()
+    clock.hear(0.0, lateness_s)
+    assert clock.is_settled == is_settled
 
 
 def test_a_reader_that_is_held_up_blames_no_clock() -> None:

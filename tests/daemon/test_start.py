@@ -15,8 +15,8 @@ from tormagd.ground import entry
 
 
 COMMANDS = {
-    "tormagd": "import tormagd.ground.entry; sys.exit(tormagd.ground.entry.daemon())",
-    "tormagctl": "import tormagd.ground.entry; sys.argv[1:] = ['status']; sys.exit(tormagd.ground.entry.ctl())",
+    "tormagd": "from tormagd.daemon.__main__ import command; sys.exit(command())",
+    "tormagctl": "from tormagd.ctl.__main__ import command; sys.argv[1:] = ['status']; sys.exit(command())",
     "simulation": "import runpy; sys.argv[1:] = ['--pty']; runpy.run_module('tormagd.simulation', run_name='__main__')",
 }
 SIGNALLED_AT = """
@@ -69,7 +69,7 @@ def test_a_signal_in_the_middle_of_loading_ends_a_command_without_a_word(
 def test_ctrl_c_between_loading_and_running_is_quiet_too(monkeypatch: pytest.MonkeyPatch):
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(daemon_main, "main", Mock(side_effect=KeyboardInterrupt))
-    assert entry.daemon() == entry.INTERRUPTED
+    assert entry.run("tormagd.daemon.main") == entry.INTERRUPTED
     assert signal.getsignal(signal.SIGINT) == before
 
 

@@ -12,7 +12,7 @@ from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, Outside, Plan
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, SafetyState
-from tormagd.daemon.force_delay import Way
+from tormagd.daemon.force_delay import ForceDelay
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.record.telemetry import limits_held, snapshot, tick_record
@@ -225,7 +225,7 @@ def planned(stamp_s: float) -> Plan:
 
 
 def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -> None:
-    way = Way()
+    way = ForceDelay()
     way.ticked(0.5, planned(-math.inf), 0.0)
     way.to_duty.refresh()
     found = way.report(400.0, 0.013, Budget())
@@ -252,4 +252,7 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
 
 
 def test_the_ways_budget_is_the_scenes_where_it_states_one() -> None:
-    assert [Way().report(None, 0.0, each).budget_ms for each in (Budget(delay_ms=150.0), Budget())] == [150.0, 400.0]
+    assert [ForceDelay().report(None, 0.0, each).budget_ms for each in (Budget(delay_ms=150.0), Budget())] == [
+        150.0,
+        400.0,
+    ]

@@ -13,13 +13,13 @@ from PIL import Image
 from reference_pages import commands_page, configuration_page, keys, subparsers, tables
 
 from firmware_protocol.conformance import __main__ as conformance
+from tormag_lab.pages import KEY, figures_of, stamp
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
 from tormagd.ctl.commands import COMMANDS
 from tormagd.daemon import main as daemon
 from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
-from tormagd.lab.pages import KEY, figures_of, stamp
 from tormagd.scenes.measured import measured
 from tormagd.simulation import __main__ as simulation
 
@@ -38,8 +38,8 @@ COMMAND = re.compile(
 )
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^(?: {4}| {8})(\S.*)$", re.MULTILINE)
-IMPORTED = re.compile(r"^from (\w+) import (\w+)$", re.MULTILINE)
-LAB = importlib.import_module("tormagd.lab.main") if importlib.util.find_spec("tormagd.lab") else None
+IMPORTED = re.compile(r"^from (\w+)(?:\.| import )(\w+)", re.MULTILINE)
+LAB = importlib.import_module("tormag_lab.main") if importlib.util.find_spec("tormag_lab") else None
 DECISION = ["Question", "Decision", "Why", "Given up"]
 
 
@@ -145,7 +145,9 @@ def test_every_decision_has_the_same_four_parts(page):
     assert re.findall(r"^## (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE) == DECISION
 
 
-SOURCES = sorted(file for room in ("tormagd", "firmware_protocol", "client") for file in (ROOT / room).rglob("*.py"))
+SOURCES = sorted(
+    file for room in ("tormagd", "firmware_protocol", "client/src") for file in (ROOT / room).rglob("*.py")
+)
 NAMED = re.compile(r"\b(tormagctl(?: --?[\w-]+)*|tormag-lab|python -m|python|make) ([a-z][\w./-]*)|\b(tools/\w+\.py)")
 TARGETS = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 PROSE = ("of", "are")

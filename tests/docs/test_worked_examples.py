@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from tormag_lab.main import main as lab
+from tormag_lab.training.dataset import Dataset, write_csv
+from tormag_lab.training.law import START
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
 from tormagd.ctl.main import main as ctl
 from tormagd.element.physics.inserts import insert
-from tormagd.lab.main import main as lab
-from tormagd.lab.training.dataset import Dataset, write_csv
-from tormagd.lab.training.law import START
 from tormagd.scenes.scene import load_scene
 
 GUIDES = Path(__file__).parents[2] / "docs" / "guides"

@@ -200,6 +200,7 @@ def bench() -> Bench:
     [
         (False, {"is_there": False}, 1, LinkState.BACK_OFF, "no such port", "plug"),
         (False, {"is_held": True}, 1, LinkState.BACK_OFF, "another process", "tormagctl ports"),
+        (False, {"has_status": False}, 100, LinkState.RUNNING, "no Status yet", "wait a moment"),
         (False, {"identity": Identity(0xBAD, 3, 1, 7)}, 60, LinkState.REFUSED, "00000bad", "same protocol schema"),
         (False, {"is_mute": True}, 1_010, LinkState.UNANSWERED, "it is silent", "rate"),
         (False, {"is_mute": True, "is_babbling": True}, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
@@ -233,7 +234,7 @@ def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
 
 
 def heal(bench: Bench) -> None:
-    bench.is_there = True
+    bench.is_there = bench.has_status = True
     bench.is_held = bench.is_mute = bench.is_bus_off = bench.is_babbling = False
     bench.identity = US
 

@@ -21,8 +21,7 @@ import can
 import msgspec
 import numpy as np
 import pytest
-from extremes.stages import leaves
-from fault_matrix.bad_lines import (
+from bad_lines import (
     MakeTransfer,
     Transfer,
     damaging,
@@ -34,6 +33,7 @@ from fault_matrix.bad_lines import (
     unit_of,
     whole,
 )
+from leaves import leaves
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from tormagd.config import Config, Device
@@ -52,8 +52,8 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import parse_hand
 from tormagd.simulation.parameters import load_plant
 from tormagd.simulation.plant import Truth
-from tormagd.simulation.pty_port import Pty, PtyDoor
-from tormagd.simulation.slcan_port import SlcanDoor
+from tormagd.simulation.pty_port import Pty, PtyPort
+from tormagd.simulation.slcan_port import SlcanPort
 
 CONFIG = Config()
 PATIENCE_S = 10.0
@@ -156,7 +156,7 @@ class PtyEnd(Pty):
             assert select.select([descriptor(backend)], [], [], PATIENCE_S)[0], "the backend gets nothing"
 
 
-class SerialEnd(PtyEnd, PtyDoor):
+class SerialEnd(PtyEnd, PtyPort):
     end = b"\x00"
 
     @property
@@ -164,7 +164,7 @@ class SerialEnd(PtyEnd, PtyDoor):
         return Device(port=self.address)
 
 
-class SlcanEnd(PtyEnd, SlcanDoor):
+class SlcanEnd(PtyEnd, SlcanPort):
     end = b"\r"
 
     @property

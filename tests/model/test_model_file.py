@@ -17,12 +17,7 @@ import torch
 from hypothesis import given, strategies as st
 from safetensors import safe_open
 
-from tormagd.config import Config, Rates
-from tormagd.control.assembly.build import build_core
-from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.records import Handle, Measured
 from tormagd.element.model import model_file
-from tormagd.element.model.displacement import Turn
 from tormagd.element.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
 from tormagd.element.model.force_curve import LARGEST_EXPONENT, Known, Network
 from tormagd.element.model.memory import NO_MEMORY, Memory
@@ -36,8 +31,6 @@ from tormagd.element.model.model_file import (
 )
 from tormagd.element.model.network import to_network
 from tormagd.element.physics.errors import DomainError
-from tormagd.lab.training.dataset import Dataset, fit_metrics, not_rising_share
-from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
 
 
 @pytest.fixture(scope="session")
@@ -319,25 +312,6 @@ def test_features_of_another_shape_are_refused(model: ForceModel, shape: tuple[i
         model.predict(np.zeros(shape))
 
 
-def test_metrics_of_a_known_error(model: ForceModel) -> None:
-    rows = np.random.default_rng(3).uniform((0, 0, 100, 40), (1, 60, 800, 40.0001), (300, 4))
-    data = Dataset(rows, model.predict(rows) + np.where(np.arange(300) % 2, 0.5, -0.5))
-    r2 = 1 - 0.25 / np.var(data.force_N)
-    expected = {"mae_N": 0.5, "rmse_N": 0.5, "max_N": 0.5, "mae_percent": 50 / 5.6, "r2": r2}
-    assert fit_metrics(model, data) == pytest.approx(expected)
-
-
-def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelMetadata) -> None:
-    def share(field_weights: list[float], bias: list[float], **options: int) -> float:
-        weight = np.zeros((6, 4))
-        weight[:, 2] = field_weights
-        return not_rising_share(ForceModel(metadata, weight, np.array(bias), np.ones(6), 0.0), **options)
-
-    assert (share([1.0] * 6, [0.0] * 6), share([-1.0] * 6, [0.0] * 6)) == (0, 1)
-    # a hill: rises at -0.5, falls at +0.5 in scaled units
-    assert share([8.0, -8.0, 0, 0, 0, 0], [4.0, 4, 0, 0, 0, 0], points=17) == pytest.approx(9 / 17)
-
-
 @pytest.fixture
 def of_two(model: ForceModel) -> ForceModel:
     whole = model.metadata.ranges | {"cip_percent": (20.0, 40.0)}
@@ -370,15 +344,6 @@ def test_a_model_of_several_inserts_is_loaded_in_the_box_of_the_one_that_is_aske
         < of_two.curve(0.3, 12.0, 20.0).confidence(700.0, 0.0)
     )
     refused(path, "trained on insert MRE-50, but MRE-50-30 is in use", insert="MRE-50-30")
-
-
-def test_not_rising_counts_in_the_boxes_alone(of_two: ForceModel) -> None:
-    weight = np.zeros((6, 4))
-    weight[:, 2] = 0.5, -0.5, 0.0, 0.0, 0.0, 0.0
-    # it rises where either insert's fields are, and falls with more iron, in corners that neither insert has
-    whole = replace(of_two, hidden_weight=weight, output_weight=np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]))
-    assert not_rising_share(whole) == 0.0
-    assert not_rising_share(replace(of_two, hidden_weight=-np.abs(weight), output_weight=np.ones(6))) == 1.0
 
 
 def test_a_box_that_is_none_is_refused(of_two: ForceModel) -> None:
@@ -528,21 +493,3 @@ def test_confidence_follows_its_formula(
         expected,
         curve.confidence(field, error_N),
     )
-
-
-def test_the_daemon_remembers_what_the_grey_box_does() -> None:
-    model = load_model(model_path("tactile_mre_c", Path()), element="tactile")
-    grey = GreyBox(model, model.metadata.memory.free, model.metadata.memory.added)
-    element = build_core(Config(scene="radial_pulse", rates=Rates(control_hz=500, inference_hz=83))).element
-    gap_range_mm = element.portrait.gap_mm[-1], element.portrait.gap_mm[0]
-    lab, memory = GreyBoxMemory(grey, 0.01), ElementMemory(element.memory, element.nominal, element.field, gap_range_mm)
-    memory.free, memory.added = element.memory.free.relaxed(0.0), element.memory.added.relaxed(0.0)
-    memory.field_mT, memory.time_s = 140.0, 0.0
-    draw = np.random.default_rng(4)
-    for step in range(1, 300):
-        place = min(0.01 * step, 2.0), 0.3, float(draw.uniform(140.0, 360.0))
-        expected_N = lab.advance(*place, 45.0)
-        at_mm, handle = element.field.gap_mm(place[2]) / 2.0, Handle(*place[:2], Turn(1.0, 0.0, 0.0))
-        seen = Measured(step, True, 0.0, at_mm, at_mm, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
-        memory.update(0.01 * step, seen)
-        assert memory.force_N(element.nominal.now(seen)) == pytest.approx(expected_N, abs=1e-6)

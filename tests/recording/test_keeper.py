@@ -1,6 +1,7 @@
 """The process that keeps the black box: bounded, and it outlives the daemon."""
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -11,9 +12,11 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from tormagd.daemon.black_box import KEEPER
+from tormagd.record import keeper
 from tormagd.record.black_box import is_tick, read_black_box
-from tormagd.record.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring
-from tormagd.record.keeper_messages import KEEPER, Begin, End, Part, Said, Write, Written
+from tormagd.record.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring, ring_paths
+from tormagd.record.keeper_messages import Begin, End, Part, Said, Write, Written
 
 PATIENCE_S = 60.0
 HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}
@@ -23,33 +26,37 @@ def part(time_s: float, size: int = 100) -> Part:
     return Part(time_s, round(time_s * 1e9), bytes(size))
 
 
+def kept(ring: Ring) -> int:
+    return sum(len(each.entries) for each in ring.parts())
+
+
 def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
     ring = Ring()
-    for number in range(100_000):
+    for number in range(10_000):
         ring.put(part(0.02 * number))
     parts = ring.parts()
     assert parts[-1].time_s - parts[0].time_s == pytest.approx(KEPT_S, abs=0.021)
-    assert ring.bytes == sum(len(each.entries) for each in parts)
 
 
 def test_the_ring_holds_no_more_bytes_than_it_may() -> None:
     ring = Ring()
     for number in range(300):
         ring.put(part(0.001 * number, 1_000_000))
-    assert MAX_BYTES - 1_000_000 < ring.bytes <= MAX_BYTES
+        if number % 40 == 39:
+            assert MAX_BYTES // 2 - 1_000_000 <= kept(ring) <= MAX_BYTES or number < 60
     ring.put(part(1.0, MAX_BYTES + 1))
-    assert [each.time_s for each in ring.parts()] == [1.0]  # the newest is always there
+    assert ring.parts()[-1].time_s == 1.0  # the newest is always there
 
 
 @settings(max_examples=30)
 @given(st.lists(st.tuples(st.floats(0.0, 2.0), st.integers(0, 60)), max_size=60))
 def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
-    ring, now_s = Ring(5.0, 200), 0.0
+    ring, now_s = Ring(None, 5.0, 200), 0.0
     for step_s, size in steps:
         now_s += step_s
         ring.put(part(now_s, size))
         parts = ring.parts()
-        assert ring.bytes == sum(len(each.entries) for each in parts) <= 200
+        assert kept(ring) <= 200
         assert parts[-1].time_s - parts[0].time_s <= 5.0
         assert parts[-1].time_s == now_s
 
@@ -141,6 +148,39 @@ def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Proc
     assert process.child.wait(PATIENCE_S) == 0
     assert [process.heard().name for _ in range(3)] == ["1Z-X.mcap", "3Z-X.mcap", "5Z-X.mcap"]
     assert len(list(tmp_path.iterdir())) == MAX_DUE
+
+
+@pytest.mark.parametrize("is_again", [False, True], ids=["both were killed", "the keeper was killed"])
+def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: Path, is_again: bool) -> None:
+    process.say(Begin(str(tmp_path), HEADER), ticks(1, 20), Write("1Z-X.mcap", "X", 0.0, {}))
+    process.heard()  # so it has taken all that
+    process.child.kill()
+    process.child.wait()
+    after = Process()
+    after.say(Begin(str(tmp_path), HEADER, is_again), ticks(21, 20), Write("2Z-Y.mcap", "Y", 0.0, {}))
+    while after.heard().name != "2Z-Y.mcap":
+        pass
+    after.say(End())
+    assert after.child.wait(PATIENCE_S) == 0
+    after.ours.close()
+    after.child.communicate()
+    boxes = {path.name.partition("Z-")[2]: read_black_box(path).entries for path in tmp_path.iterdir()}
+    firsts = {name: (entries[1][0], entries[-1][0]) for name, entries in boxes.items()}
+    assert firsts.pop("X.mcap") == (1, 20)
+    assert firsts == ({"Y.mcap": (1, 40)} if is_again else {"Y.mcap": (21, 40), f"{DIED}.mcap": (1, 20)})
+    assert not any(path.exists() for path in ring_paths(str(tmp_path)))
+
+
+def test_another_s_files_are_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeper, "SHARED_MEMORY", str(tmp_path))
+    ours, first = os.getuid(), keeper.in_shared_memory("/boxes")
+    assert (len(first), keeper.in_shared_memory("/boxes")) == (2, [])  # another keeper has them
+    for file in first:
+        os.close(file)
+    monkeypatch.setattr("os.getuid", lambda: 12_345)
+    for path in tmp_path.iterdir():
+        path.rename(tmp_path / path.name.replace(f"tormagd-{ours}", "tormagd-12345"))
+    assert keeper.in_shared_memory("/boxes") == []
 
 
 @pytest.mark.parametrize("words", [(), (ticks(1, 20), End())], ids=["gone before it kept anything", "ended in order"])

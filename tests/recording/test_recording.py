@@ -312,6 +312,65 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("overview") / "a.mcap")
 
 
+@pytest.mark.parametrize("hole_at", [0.2, 0.45, 0.7, 0.9])
+def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path: Path, hole_at: float) -> None:
+    data, summary = bytearray(path.read_bytes()), summary_of(path)
+    assert summary is not None
+    places = summary[0].places
+    first = int(hole_at * places[-1].at)
+    data[first : first + 4096] = bytes(4096)
+    spoilt = tmp_path / "spoilt.mcap"
+    spoilt.write_bytes(data)
+    ends = [each.at for each in places[1:]] + [len(data)]
+    hit = [each for each, end in zip(places, ends, strict=True) if each.at < first + 4096 and end > first]
+    lost = sum(len(RecordingFile(path).between(each.from_ns, each.to_ns - 1, Glance)) for each in hit)
+    known = RecordingFile(spoilt)
+    assert known.overview.ticks + known.overview.snapshots >= 31_500 - lost - 2 * len(hit)
+    assert known.overview.duration_s == pytest.approx(30.0, abs=0.1)
+    assert ("damaged" in known.notes[0], f"left out: {len(hit)}" in known.notes[1]) == (True, True)
+    everything = known.between(places[0].from_ns, places[-1].to_ns, Glance)
+    assert len(everything) == known.overview.ticks + known.overview.snapshots
+
+
+def test_a_damaged_chunk_of_a_file_that_was_not_ended_costs_no_other(path: Path, tmp_path: Path) -> None:
+    summary = summary_of(path)
+    assert summary is not None
+    places = summary[0].places
+    data = bytearray(path.read_bytes()[: places[20].at])  # its recorder was killed there
+    data[places[10].at + 200] ^= 1
+    spoilt = tmp_path / "killed.mcap"
+    spoilt.write_bytes(data)
+    known = RecordingFile(spoilt)
+    assert (known.is_complete, "left out: 1" in known.notes[0]) == (False, True)
+    assert known.overview.duration_s == pytest.approx((places[19].to_ns - places[0].from_ns) * 1e-9)
+
+
+def test_zeros_where_a_tail_was_are_a_cut(path: Path, tmp_path: Path) -> None:
+    data, spoilt = path.read_bytes(), tmp_path / "zeros.mcap"
+    spoilt.write_bytes(data[: len(data) // 2] + bytes(len(data) // 2))
+    known = RecordingFile(spoilt)
+    assert (known.is_complete, known.overview.ticks > 10_000) == (False, True)
+
+
+@pytest.mark.parametrize("step_s", [-5.0, 3_600.0, START_NS * 1e-9])
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_a_step_of_the_clock_is_shown_and_stretches_nothing(tmp_path: Path, step_s: float, is_closed: bool) -> None:
+    path, early_ms = tmp_path / "step.mcap", -step_s * 1e3 if step_s > 1e6 else 0.0
+    with RecordingWriter(path) as writer:
+        for k in range(900):
+            ms = 10.0 * k + early_ms + (1e3 * step_s if k >= 500 else 0.0)
+            writer.telemetry(telemetry(ms, k))  # it knows of the step before the ticks do
+            writer.ticks(batch((ms, 40.0 + 0.01 * k, 1.5), columns=("t_ns", "monotonic_s", "measured_cf")))
+        writer.telemetry(telemetry(ms, 900, mark=Mark(t_ns=START_NS + int(ms * 1e6), text="here")))
+    if not is_closed:
+        path.write_bytes(path.read_bytes()[:-1])
+    overview = RecordingFile(path).overview
+    assert overview.duration_s == pytest.approx(8.99)
+    step, mark = ((each.text, (each.t_ns - overview.start_ns) * 1e-9) for each in overview.marks)
+    assert step == (f"the clock stepped by {step_s:+.6g} s", pytest.approx(5.0))
+    assert mark == ("here", pytest.approx(8.99, abs=1e-3))
+
+
 def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path: Path) -> None:
     known = RecordingFile(path)
     killed = tmp_path / "killed.mcap"

@@ -224,8 +224,8 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
     head = box.entries[: list(ticks_of(COLUMNS, box.entries))[600]]
     derived = Derived.of
 
-    def other(self: Derived, entries: Any, offset_ns: int | None) -> Any:
-        for shown in derived(self, entries, offset_ns):
+    def other(self: Derived, entries: Any) -> Any:
+        for shown in derived(self, entries):
             is_it = shown.topic == "/ticks" and shown.sequence == 300
             if not is_it:
                 yield shown

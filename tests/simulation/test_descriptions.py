@@ -172,8 +172,8 @@ def test_a_recording_is_interpolated_and_held_at_its_ends(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("t_s,x\n1,2\n", "position_mm"),
-        ("t_s,position_mm\n", "0 rows"),
+        ("t_s,x\n1,2\n", "displacement_mm"),
+        ("t_s,position_mm\n", "no numbers stand"),
         ("t_s,position_mm\n0,0\n0,1\n", "row 3"),
         ("t_s,position_mm\n0,nan\n", "row 2"),
         ("t_s,position_mm\n0,abc\n", "row 2"),

@@ -3,7 +3,6 @@
 import msgspec
 import pytest
 
-from tormagd.lab.ideal_carriage import brake_of
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.second_element import SecondElement
 
@@ -86,11 +85,3 @@ def test_warmth_weakens_it() -> None:
     element.advance(1e7, 60.0, SPEED_MM_S)
     assert element.temperature_C == pytest.approx(40.0)
     assert element.kinetic_N < 0.96 * cool_N
-
-
-@pytest.mark.parametrize("gap_mm", [94.0, 70.0, 50.0])
-def test_the_ideal_carriages_know_its_force_but_for_play_and_creep(gap_mm: float) -> None:
-    brake = brake_of(SECOND)
-    moment_T = float(brake.moment_Tm[abs(brake.gap_mm - gap_mm).argmin()])
-    known_N = 0.85 * brake.sliding_N(brake.fresh_at_N(moment_T), SPEED_MM_S)
-    assert slid(gap_mm).force_N == pytest.approx(known_N, rel=0.02)

@@ -91,7 +91,9 @@ def test_the_service_from_its_installation_to_its_removal(package, machine, impo
 
 
 def unpack(machine, package) -> None:
-    machine.run("dpkg", "--no-triggers", "--force-unsafe-io", "--install", f"/opt/shared/package/{package.name}")
+    # the package's dependencies are this interpreter's, in /opt/packages
+    options = "--no-triggers", "--force-unsafe-io", "--force-depends"
+    machine.run("dpkg", *options, "--install", f"/opt/shared/package/{package.name}")
 
 
 def installed(machine, package, imports) -> None:

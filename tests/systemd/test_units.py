@@ -143,6 +143,7 @@ def test_man_pages_name_every_command_and_option(root):
     actions = [action for command in commands().values() for action in command._actions]
     options = {option for action in actions for option in action.option_strings} - {"--help"}
     assert [said for said in (*(f"tormagctl {name}" for name in commands()), *options) if said not in plain] == []
+    assert plain.count("\n--endpoint ") == 1
     assert "SIGHUP" in pages["tormagd.1.gz"]
 
 

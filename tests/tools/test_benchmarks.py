@@ -14,13 +14,13 @@ import benchmark
 import msgspec
 import numpy as np
 import pytest
-from benchmarks import inverse_report, inverse_workload, latency, loop, step, virtual_time
-from benchmarks.inverse_report import ROOT
+from benchmarks import inverse, latency, loop, step, virtual_time
+from benchmarks.inverse import ROOT
 
+from tormag_lab.told import lines
 from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG
 from tormagd.config import Config, RealTime, load_config
 from tormagd.control.assembly.build import build_core
-from tormagd.lab.told import lines
 from tormagd.scenes.scene import shipped_scenes
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.parameters import load_plant
@@ -78,15 +78,11 @@ def test_a_scene_gets_a_search_that_is_measured_and_exact_enough(result):
 
 def test_the_roots_that_judge_are_roots():
     plant = load_plant("sample_1")
-    model = inverse_workload.trained(inverse_workload.training_data(plant, 600, seed=1), hidden=8, epochs=5)
-    along = inverse_workload.course(plant, 50)
-    for (displacement, rate, force), roots in zip(
-        along.rows(), inverse_workload.network_roots_mT(model, along), strict=True
-    ):
+    model = inverse.trained(inverse.training_data(plant, 600, seed=1), hidden=8, epochs=5)
+    along = inverse.course(plant, 50)
+    for (displacement, rate, force), roots in zip(along.rows(), inverse.network_roots_mT(model, along), strict=True):
         for root in roots.tolist():
-            assert model.predict_one(displacement, rate, root, inverse_workload.CIP_PERCENT) == pytest.approx(
-                force, abs=1e-9
-            )
+            assert model.predict_one(displacement, rate, root, inverse.CIP_PERCENT) == pytest.approx(force, abs=1e-9)
 
 
 def test_the_plant_of_the_workload_is_the_plant():
@@ -102,14 +98,14 @@ def test_the_plant_of_the_workload_is_the_plant():
     for ticks, rate in ((20_000, -speed), (round(travel / speed / dt), speed)):
         for tick in range(ticks):
             element.advance(tick * dt, gap, rate)
-    field = inverse_workload.NOMINAL.field_mT(gap)
-    (expected,) = inverse_workload.plant_force_N(plant, np.array([travel]), np.array([speed]), np.array([field]))
+    field = inverse.NOMINAL.field_mT(gap)
+    (expected,) = inverse.plant_force_N(plant, np.array([travel]), np.array([speed]), np.array([field]))
     assert element.force_N == pytest.approx(expected, abs=2e-3)
 
 
 def test_the_committed_page_is_of_the_committed_figures() -> None:
     figures = json.loads((ROOT / "docs/evidence/inverse.json").read_text(encoding="utf-8"))["figures"]
-    assert inverse_report.PAGE.read_text(encoding="utf-8") == inverse_report.page(figures), (
+    assert inverse.PAGE.read_text(encoding="utf-8") == inverse.page(figures), (
         "python tools/evidence.py inverse writes both anew"
     )
 
@@ -249,3 +245,9 @@ def test_a_result_is_told_by_lines_and_tables() -> None:
         "rate_hz 999.3", "lateness_us p50 44, p99 900", "against ratio p50 1.5",
         "variants", "name p50_us more RATE", "a 1.25", "long 10 0.5", "cpus 0, 1",
     ]  # fmt: skip
+
+
+def test_only_a_checkout_can_be_measured_against(tmp_path: Path):
+    assert loop.checkout(str(ROOT)) == ROOT
+    with pytest.raises(argparse.ArgumentTypeError, match="allowed is the root of a checkout"):
+        loop.checkout(str(tmp_path))

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from contact import LATER_MS, WORSE, WORSE_N, held_ms, judged, kept
-from rendering.device_draws import device
-from rendering.following import VALID_S, armed
-from rendering.touching import Case, Touch, core_of
+from devices import device
+from judge.contact import LATER_MS, WORSE, WORSE_N, held_ms, judged, kept
+from judge.following import VALID_S, armed
+from judge.touching import Case, Touch, core_of
 
 from tormagd.control.records import TimedSetpoint
 from tormagd.simulation.hand import FeltHand, Impedance

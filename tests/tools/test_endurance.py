@@ -1,4 +1,4 @@
-"""Every case of `tools/endure.py` for a moment, and that each can fail."""
+"""Every case of `judge.py endure` for a moment, and that each can fail."""
 
 import contextlib
 import math
@@ -6,10 +6,10 @@ import random
 from contextlib import ExitStack
 from pathlib import Path
 
-import endure
 import pytest
-from endurance import fuzz, replug, siege, soak, stalls
-from endurance.stand import Stand
+from judge import endure, fuzz, siege
+from judge.frame import parsed
+from judge.stand import Stand
 
 from firmware_protocol.c.build import BuildError
 from tormagd.control.safety.operating_state import COMMANDS
@@ -19,7 +19,7 @@ from tormagd_client.messages import MessageError, Request, decode
 
 @pytest.mark.live
 def test_a_device_is_unplugged_in_motion_and_plugged_in_again() -> None:
-    result = replug.run("can", 1, seed=3)
+    result = endure.unplugged("can", 1, seed=3)
     assert result["failures"] == []
     assert result["lost_after_ms"] > 0.0
 
@@ -28,15 +28,23 @@ def test_a_device_is_unplugged_in_motion_and_plugged_in_again() -> None:
 def test_cases_in_real_time_hold_on_one_stand_one_after_the_other() -> None:
     with ExitStack() as stack:
         stand = Stand(stack)
-        for case, count in ((soak, 8), (siege, 1), (stalls, 3)):
-            assert case.run(stand, count, 1)["failures"] == []
+        for case, count in ((endure.soaked, 8), (siege.run, 1), (endure.stalled, 3)):
+            assert case(stand, count, 1)["failures"] == []
         assert (stand.latched, stand.unhandled()) == ([], [])
 
 
-@pytest.mark.parametrize("wrong", [["nobody"], ["fuzz", "--count", "0"]])
-def test_a_wrong_command_line_is_refused(wrong: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (["nobody"], "invalid choice: 'nobody'"),
+        (["endure", "nobody"], "invalid choice: 'nobody'"),
+        (["endure", "fuzz", "--count", "0"], "0: allowed is at least 1"),
+    ],
+)
+def test_a_wrong_command_line_is_refused(wrong: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match=r"^2$"):
-        endure.main(wrong)
+        parsed("judge", {"endure": ""}, wrong)
+    assert says in capsys.readouterr().err
 
 
 def test_both_languages_hear_the_vectors_and_a_difference_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +72,7 @@ def test_without_clang_the_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> No
     assert (result["passed"], "clang is not on the path" in result["skipped"]) == (True, True)
 
 
-KIND = stalls.Stop("daemon", 40.0, (), 0, 0)
+KIND = endure.Stop("daemon", 40.0, (), 0, 0)
 LONG = KIND._replace(took_ms=83.0, faults=("HOST_STALL",))
 
 
@@ -81,7 +89,7 @@ LONG = KIND._replace(took_ms=83.0, faults=("HOST_STALL",))
         (LONG._replace(took_ms=50.0), 1.0, 70.0, "gap 70.0 mm, not open"),
     ],
 )
-def test_a_stop_is_judged_by_what_it_really_was(stop: stalls.Stop, worst_N: float, gap_mm: float, says: str) -> None:
+def test_a_stop_is_judged_by_what_it_really_was(stop: endure.Stop, worst_N: float, gap_mm: float, says: str) -> None:
     assert says in stop.failure(worst_N, gap_mm)
     assert bool(says) == bool(stop.failure(worst_N, gap_mm))
 
@@ -89,10 +97,10 @@ def test_a_stop_is_judged_by_what_it_really_was(stop: stalls.Stop, worst_N: floa
 def test_what_grows_or_is_missing_is_named() -> None:
     # the first two minutes of a long run do not count
     runs = ([1, 90, 100, 101, 102, 110, 104, 103], [*range(240), *(2_000 * [240]), 245])
-    assert [soak.growth(run) for run in runs] == [10, 5]
-    assert [soak.staying([3, 9, 5, 7, 6, 5, *last]) for last in ([9, 5], [7, 6])] == [0, 1]
-    assert soak.failures({"daemon": 9}, {"daemon": 0}, [4, 5, 6]) == []
-    said = soak.failures({"daemon": 5_000}, {"daemon": 1}, [4, 6])
+    assert [endure.growth(run) for run in runs] == [10, 5]
+    assert [endure.staying([3, 9, 5, 7, 6, 5, *last]) for last in ([9, 5], [7, 6])] == [0, 1]
+    assert endure.failures({"daemon": 9}, {"daemon": 0}, [4, 5, 6]) == []
+    said = endure.failures({"daemon": 5_000}, {"daemon": 1}, [4, 6])
     assert [what.split(":")[0] for what in said] == ["daemon", "daemon", "recording"]
 
 

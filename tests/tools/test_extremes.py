@@ -1,4 +1,4 @@
-"""The table of stages and runs at the ends, `tools/numerics.py` on a sample, and that each can fail."""
+"""The table of stages and runs at the ends, `judge.py numerics` on a sample, and that each can fail."""
 
 import json
 import math
@@ -8,15 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numerics
 import numpy as np
 import pytest
-from extremes.runs import Became, End, became, drawn_ends, ends, summed
-from extremes.stages import HOSTILE_STEPS, Draw, Row, Stage, leaves, tried
-from extremes.table import stages
 from hypothesis import given, strategies as st
+from judge import numerics
+from judge.ends import Became, End, became, drawn_ends, ends, summed
+from judge.stage_table import stages
+from judge.stages import HOSTILE_STEPS, Draw, Row, Stage, tried
+from leaves import leaves
 
 import tormagd.control
+from tormag_lab.design.force_law import radial_moment_for_force_Tm
 from tormagd.config import Position
 from tormagd.control.move.pid import Pid
 from tormagd.control.safety.codes import Limit
@@ -28,7 +30,6 @@ from tormagd.element.physics.force import (
     brake_force_N,
     max_radial_moment_Tm,
 )
-from tormagd.lab.design.force_law import radial_moment_for_force_Tm
 
 EPISODES = 12
 
@@ -148,12 +149,23 @@ def test_configurations_are_summed() -> None:
     }
 
 
-TOOL = Path(__file__).parents[2] / "tools" / "numerics.py"
+TOOL = Path(__file__).parents[2] / "tools" / "judge.py"
 
 
 def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
-    command = [sys.executable, str(TOOL), "--json", "--cases", "4000", "--reference", "80", "--episodes", "1"]
-    command += ["--configurations", "1", "--seconds", "0.1", "--workers", "1"]
+    command = [
+        sys.executable,
+        str(TOOL),
+        "numerics",
+        "--json",
+        "--cases",
+        "4000",
+        "--reference",
+        "80",
+        "--episodes",
+        "1",
+    ]
+    command += ["--episodes", "1", "--configurations", "1", "--seconds", "0.1", "--workers", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)

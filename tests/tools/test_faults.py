@@ -1,10 +1,10 @@
 """The fault matrix: on either bus each fault has the name and the end that it should have."""
 
-import faults
 import msgspec
 import pytest
-from fault_matrix.cases import CAN, MATRIX, OPENS, SERIAL, Injection
-from fault_matrix.watch import OPEN_MM
+from judge import faults
+from judge.faults import OPEN_MM
+from judge.injections import CAN, MATRIX, OPENS, SERIAL, Injection
 
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.parameters import PlantParameters, load_plant
@@ -72,7 +72,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
         near = msgspec.structs.replace(plant.assumed, start_left_mm=47.0, start_right_mm=46.5)
         return msgspec.structs.replace(plant, assumed=near)
 
-    monkeypatch.setattr("fault_matrix.rig.load_plant", left_open)
+    monkeypatch.setattr("judge.rig.load_plant", left_open)
     monkeypatch.setattr(faults, "INJECTED_S", 3.3)
     monkeypatch.setattr(faults, "USUAL_S", 0.6)
 

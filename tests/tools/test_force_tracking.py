@@ -4,11 +4,17 @@ import json
 import math
 from pathlib import Path
 
-import envelope
-import force_tracking
 import numpy as np
 import pytest
-from force_tracking import (
+from judge import envelope, models, tracking
+from judge.following import Followed, publisher, tracking as scored
+from judge.frame import parsed, told
+from judge.signals import (
+    Signal,
+    pulse_signal,
+    recorded_signals,
+)
+from judge.tracking import (
     ARRIVES_S,
     LATER_S,
     STEP_S,
@@ -17,31 +23,25 @@ from force_tracking import (
     step_figures,
     track,
 )
-from rendering import models
-from rendering.following import Followed, publisher, tracking
-from rendering.models import models_table
-from rendering.signals import (
-    Signal,
-    pulse_signal,
-    recorded_signals,
-)
 
+from tormag_lab.arrays import rms
+from tormag_lab.human_pulse import pulse_profile
+from tormag_lab.training.dataset import not_rising_share
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
-from tormagd.lab.arrays import rms
-from tormagd.lab.human_pulse import pulse_profile
-from tormagd.lab.training.dataset import not_rising_share
 from tormagd.simulation.parameters import load_plant
 
 BEGINS_S, IDEAL_S = 4.0, 0.9
 
 
-@pytest.mark.parametrize(("named", "measured"), [([], force_tracking.CASES), (["pulse", "steps"], ("steps", "pulse"))])
+@pytest.mark.parametrize(("named", "measured"), [([], tracking.CASES), (["pulse", "steps"], ("steps", "pulse"))])
 def test_without_a_name_every_case_is_measured(monkeypatch: pytest.MonkeyPatch, capsys, named, measured) -> None:
-    monkeypatch.setattr(force_tracking, "measure", lambda case, pool: {"of": [case]})
-    monkeypatch.setattr("sys.argv", ["force_tracking.py", "--json", *named])
-    assert force_tracking.main() == 0
+    monkeypatch.setattr(tracking, "of_case", lambda case: {"of": [case]})
+    module, options = parsed("judge", {"tracking": ""}, ["tracking", "--json", *named])
+    assert told(module, options, module.measure(options)) == 0
     assert tuple(json.loads(capsys.readouterr().out)) == measured
+    assert told(module, options, {"passed": False, "missed": ["a bound"]}) == 1
+    assert capsys.readouterr().err == "missed: a bound\n"
 
 
 def course(*errors: tuple[float, float, float]) -> Followed:
@@ -95,7 +95,7 @@ def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:
 
 def test_nothing_is_removed_from_the_error() -> None:
     reference = np.sin(np.linspace(0.0, 20.0, 1_000))
-    result = tracking(reference, reference + 0.5)
+    result = scored(reference, reference + 0.5)
     assert (result.rms_N, result.variance_accounted_for) == pytest.approx((0.5, 1.0 - 0.25 / reference.var()))
 
 
@@ -234,7 +234,7 @@ def test_the_shipped_model_is_good_where_it_is_asked() -> None:
 def test_the_page_has_the_figures_of_every_model_and_none_falls_with_the_field() -> None:
     found = json.loads((ROOT / "docs/evidence/models.json").read_text(encoding="utf-8"))["figures"]
     assert {row["insert"] for row in found["rows"]} == set(INSERTS)
-    assert models_table(found) in (ROOT / "docs/guides/insert.md").read_text(encoding="utf-8")
+    assert "\n".join(models.shown(found)) in (ROOT / "docs/guides/insert.md").read_text(encoding="utf-8")
     assert all(row["not_rising_share"] == 0.0 for row in found["rows"])
     of_now = models.of_file(model_path("torque_mre_30", Path()))
     kept = {row["insert"]: row for row in found["rows"]}

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 import safety_pages
-from fault_matrix.cases import MATRIX
-from risk import rows as risk
-from risk.named_tests import named_tests
-from risk.page import page as risk_page, red_rows
+from judge import risk
+from judge.injections import MATRIX
+from judge.risk import named_tests, page as risk_page, red_rows
 
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.control.safety.operating_state import ROWS, OperatingState, Refusal

@@ -8,9 +8,9 @@ from unittest.mock import Mock
 import msgspec
 import numpy as np
 import pytest
+from benchmarks import scene_runs
+from benchmarks.scene_runs import Case, Play, run, run_all
 from benchmarks.scenes import RATES_HZ, case_of, measured_scene
-from rendering import scene_runs
-from rendering.scene_runs import Case, Play, run, run_all
 
 from tormagd.scenes.measured import TOLERATED, WORSE, MeasuredScene, OperatingPoint, allowed_N, measured
 from tormagd.scenes.scene import MIN_CONTROL_HZ, load_scene, shipped_scenes

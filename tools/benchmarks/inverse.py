@@ -1,9 +1,12 @@
-"""`benchmark inverse`: every search for the field on one workload: time, memory, errors.
+"""`benchmark inverse`: every search for the field on one workload: time, memory, errors; `--write`: its page and plot.
 
-It runs in one thread with the garbage collector frozen, as in the daemon, on synthetic data (`inverse_workload.py`).
+It runs in one thread with the garbage collector frozen, as in the daemon. The plant is the simulator's torque element
+without memory: its force law, field law, pre-sliding and Stribeck friction. Hysteresis and relaxation are left out,
+because no search could undo them and they would hide the searches.
 """
 
 import argparse
+import datetime
 import gc
 import itertools
 import os
@@ -11,34 +14,226 @@ import platform
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks import inverse_report as report
-from benchmarks.inverse_report import USUAL_HIDDEN
-from benchmarks.inverse_workload import (
-    CIP_PERCENT,
-    FIELDS_MT,
-    Course,
-    course,
-    network_roots_mT,
-    plant_force_N,
-    trained,
-    training_data,
-)
+from tormag_lab.arrays import Array
+from tormag_lab.pages import figures_of, stamp, subplots, table
+from tormag_lab.training.dataset import Dataset
+from tormag_lab.training.fitting import fit_model
+from tormagd.control.nominal import FieldOfGap
 from tormagd.daemon.realtime import freeze_garbage
 from tormagd.element.inverse import ordered
 from tormagd.element.inverse.choice import build, mean_error_N, named
 from tormagd.element.inverse.nearest import field_grid
 from tormagd.element.inverse.solution import FieldSolution, FieldSolver, Reach, answer
+from tormagd.element.model.features import Element
 from tormagd.element.model.force_curve import ForceCurve
 from tormagd.element.model.model_file import ForceModel, falling_at
-from tormagd.lab.arrays import Array
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.inserts import insert
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
-from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.static_laws import radial_moment_Tm
+from tormagd.view.drawing import Axes
+
+INSERT = insert("MRE-50-40")
+CIP_PERCENT = 100.0 * INSERT.cip_fraction
+GAPS_MM = (45.0, 95.0)
+NOMINAL = FieldOfGap(PowerFieldLaw(), INSERT.elastomer.relative_permeability, TORMAG.inner_radius_m)
+FIELDS_MT = (NOMINAL.field_mT(GAPS_MM[1]), NOMINAL.field_mT(GAPS_MM[0]))
+"What the controller calls field: the nominal law's, over the device's stroke."
+
+DISPLACEMENTS_MM = (1.4, 2.1)
+RATES_MM_S = (2.0, 55.0)
+"Near full mobilisation and in motion: before break-away the hand chooses the force, and the inverse is ill-posed."
+
+COVERED = (0.04, 0.96)
+ROOT_STEP_MT = 0.5
+
+
+class Course(NamedTuple):
+    displacement_mm: Array
+    rate_mm_s: Array
+    field_mT: Array
+    force_N: Array
+
+    def rows(self) -> list[tuple[float, float, float]]:
+        return list(zip(self.displacement_mm.tolist(), self.rate_mm_s.tolist(), self.force_N.tolist(), strict=True))
+
+
+def plant_force_N(plant: PlantParameters, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
+    """Return the plant's force so far after a reversal at a steady rate, at the gap with nominal field `field_mT`."""
+    gaps = np.array([min(max(NOMINAL.gap_mm(field), GAPS_MM[0]), GAPS_MM[1]) for field in field_mT.tolist()])
+    elastomer = Elastomer(
+        shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
+        relative_permeability=plant.elastomer.relative_permeability,
+        friction_coefficient=plant.elastomer.kinetic_friction,
+    )
+    kinetic_N = brake_force_N(radial_moment_Tm(gaps, plant), elastomer, TORMAG)
+    friction = Friction(
+        presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
+        viscous_N_s_mm=plant.friction.viscous_N_s_mm,
+        static_ratio=plant.friction.static_to_kinetic,
+        stribeck_speed_mm_s=plant.friction.stribeck_speed_mm_s,
+    )
+    # a reversal leaves the bristles bent the other way, which is the largest deflection there is
+    columns = zip(displacement_mm.tolist(), rate_mm_s.tolist(), kinetic_N.tolist(), strict=True)
+    return np.array([friction.advance(-1e3, rate, level, travel / rate)[0] for travel, rate, level in columns])
+
+
+def course(plant: PlantParameters, solves: int) -> Course:
+    """Return a smooth course through the plant's range: slow and fast swings of field, speed and travel."""
+    phase = 2 * np.pi * np.arange(solves) / solves
+    middle, swing = sum(COVERED) / 2, (COVERED[1] - COVERED[0]) / 2
+    share = middle + swing * (0.8 * np.sin(3 * phase) + 0.2 * np.sin(17 * phase))
+    field = FIELDS_MT[0] + share * (FIELDS_MT[1] - FIELDS_MT[0])
+    rate = 25.0 + 20.0 * np.sin(5 * phase)
+    displacement = 1.75 + 0.25 * np.sin(7 * phase)
+    return Course(displacement, rate, field, plant_force_N(plant, displacement, rate, field))
+
+
+def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
+    draw = np.random.default_rng(seed)
+    displacement, rate = draw.uniform(*DISPLACEMENTS_MM, rows), draw.uniform(*RATES_MM_S, rows)
+    field = draw.uniform(*FIELDS_MT, rows)
+    force = plant_force_N(plant, displacement, rate, field)
+    force = force + draw.normal(0.0, 1e-3 * plant.force_sensor.noise_mN, rows)
+    return Dataset(np.column_stack((displacement, rate, field, np.full(rows, CIP_PERCENT))), force)
+
+
+def trained(data: Dataset, hidden: int, epochs: int) -> ForceModel:
+    model, _ = fit_model(
+        *data.split(0.3, 0),
+        element=Element.TORQUE,
+        inserts=(INSERT.name,),
+        data_sha256=data.sha256(),
+        created=datetime.date(2024, 1, 1),
+        hidden=hidden,
+        epochs=epochs,
+    )
+    return model
+
+
+def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
+    """Return for each solve every field in range at which the network gives the force."""
+    grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
+    found: list[Array] = []
+    for displacement, rate, force in along.rows():
+        excess = _network(model, displacement, rate, grid) - force
+        left = np.flatnonzero((excess[1:] < 0) != (excess[:-1] < 0))
+        low, high, rises = grid[left], grid[left + 1], excess[left] < 0
+        for _ in range(40 if left.size else 0):
+            middle = (low + high) / 2
+            under = (_network(model, displacement, rate, middle) < force) == rises
+            low, high = np.where(under, middle, low), np.where(under, high, middle)
+        found.append((low + high) / 2)
+    return found
+
+
+def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields_mT: Array) -> Array:
+    of_all = [np.full(len(fields_mT), value) for value in (displacement_mm, rate_mm_s, CIP_PERCENT)]
+    return model.predict(np.column_stack((*of_all[:2], fields_mT, of_all[2])))
+
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "inverse_trade.md"
+PLOT = ROOT / "docs" / "images" / "inverse_trade.png"
+
+USUAL_HIDDEN = 50
+COLUMNS = {
+    "search": "{name}",
+    "p50 us": "{p50_us:.1f}",
+    "p99 us": "{p99_us:.1f}",
+    "solver MAE mT": "{solver_mae_mT:.2g}",
+    "plant MAE mT": "{plant_mae_mT:.3f}",
+    "force MAE N": "{force_mae_N:.4f}",
+    "Pareto": "{pareto}",
+}
+MIN_SHOWN_MT = 1e-6
+"Newton comes to 1e-11 mT, which would squeeze what matters; the page says so."
+MARKERS = {
+    "thesis-linear": "v",
+    "linear-argmin": "^",
+    "vectorised-argmin": "s",
+    "nearest": "o",
+    "torch": "D",
+    "newton": "*",
+}
+TEXT = """# Speed against accuracy of the inverse
+
+Written by `python tools/evidence.py inverse` with [all its figures](evidence/inverse.json); do not edit. All data are
+synthetic: {workload}. One process, one thread, garbage collector frozen ({environment}).
+
+The *solver error* is the distance to the network's own nearest root, the *plant error* to the field at which the
+simulated element gives the force. *Force* is the plant's force at the answer minus the force asked.
+
+![p50 against the solver error and against the plant error](images/inverse_trade.png)
+
+- `thesis-linear`, the daemon's `thesis`, goes row by row in torch at 1 mT by the thesis's rule. `linear-argmin`
+  looks at every row, `vectorised-argmin` at the whole grid at once.
+- `torch` is the network over the grid in torch, the k nearest, then interpolation. `nearest` is the same in NumPy.
+- `newton` is Newton's method from the last field, on the same network {speedup_vs_thesis_linear:.0f} times as fast
+  as the thesis's search.
+
+*Pareto* marks variants that no faster one equals in plant error, to an encoder count of the gap (about 0.02 mT).
+[The shipped networks](guides/insert.md#the-shipped-models) are others.
+
+## All searches on {usual} units, and the Pareto variants of every size
+
+{table}"""
+
+
+def write(result: dict[str, Any]) -> None:
+    text = page(result)
+    plot(result, figures_of(text))
+    PAGE.write_text(text, encoding="utf-8")
+
+
+def page(result: dict[str, Any]) -> str:
+    shown = [row for row in result["variants"] if row["pareto"] or row["hidden"] == USUAL_HIDDEN]
+    stars = [
+        row
+        | {"pareto": "*" if row["pareto"] else ""}
+        | {"name": row["name"] + (f", {row['hidden']} units" if row["hidden"] != USUAL_HIDDEN else "")}
+        for row in shown
+    ]
+    texts = {
+        "environment": ", ".join(f"{name} {value}" for name, value in result["environment"].items()),
+        "usual": USUAL_HIDDEN,
+        "table": table(COLUMNS, [[form.format(**row) for form in COLUMNS.values()] for row in stars]),
+    }
+    return TEXT.format(**(result | texts))
+
+
+def plot(result: dict[str, Any], figures: list[str]) -> None:
+    """Draw two panels over p50: the solver's error at one network, and the plant's for every network."""
+    figure, (left, right) = subplots((11, 5), 1, 2)
+    rows = result["variants"]
+    _scatter(left, [row for row in rows if row["hidden"] == USUAL_HIDDEN], "solver_mae_mT")
+    _scatter(right, rows, "plant_mae_mT")
+    front = sorted((row["p50_us"], row["plant_mae_mT"]) for row in rows if row["pareto"])
+    right.step(*zip(*front, strict=True), where="post", color="0.5", linewidth=1, zorder=0)
+    left.set(title=f"against the network's own root, {USUAL_HIDDEN} units", ylabel="mean field error, mT")
+    right.set(title="against the plant, all sizes")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    figure.savefig(PLOT, dpi=130, metadata=stamp(figures))
+
+
+def _scatter(axes: Axes, rows: list[dict[str, Any]], error: str) -> None:
+    for solver, marker in MARKERS.items():
+        found = [row for row in rows if row["solver"] == solver]
+        errors_mT = [max(row[error], MIN_SHOWN_MT) for row in found]
+        axes.scatter([row["p50_us"] for row in found], errors_mT, marker=marker, s=40, alpha=0.8, label=solver)
+    axes.set(xscale="log", yscale="log", xlabel="time of a solve, us (p50)")
+    axes.grid(alpha=0.3)
+
 
 PLANT = "sample_1"
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9}
@@ -264,5 +459,5 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         "speedup_vs_thesis_linear": usual["thesis-linear"]["p50_us"] / p50_us,
     }
     if options.write:
-        report.write(result)
+        write(result)
     return result

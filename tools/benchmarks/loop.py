@@ -35,14 +35,14 @@ from machines.own import own_machine
 from machines.processes import begun, first_line, is_linked, received
 
 from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compiler
+from tormag_lab.arrays import Array
+from tormag_lab.pages import subplots
 from tormagd.config import Config, RealTime, load_config
-from tormagd.ctl.scene import as_toml
+from tormagd.ctl.scene_check import as_toml
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.headroom.bare_timer import beat
-from tormagd.lab.arrays import Array
-from tormagd.lab.pages import subplots
 from tormagd.record.ticks import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
@@ -329,7 +329,7 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
 
 def checkout(text: str) -> Path:
     root = Path(text).resolve()
-    if not (root / "tormagd" / "closed_loop.py").is_file() or not (root / "tools" / "benchmark.py").is_file():
+    if not (root / "tormagd").is_dir() or not (root / "tools" / "benchmark.py").is_file():
         raise argparse.ArgumentTypeError(f"{text}: allowed is the root of a checkout, with tormagd/ and tools/ in it")
     return root
 

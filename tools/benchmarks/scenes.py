@@ -17,15 +17,15 @@ from functools import partial
 from pathlib import Path
 
 import msgspec
-from rendering.device_draws import SAMPLES, SECOND
-from rendering.scene_runs import OF_A_HANDLE, ROOT, SITUATIONS, Case, run_all
+from devices import SAMPLES, SECOND
 
 from benchmarks import loop
+from benchmarks.scene_runs import OF_A_HANDLE, ROOT, SITUATIONS, Case, run_all
+from tormag_lab import executors
+from tormag_lab.arrays import Json
 from tormagd.config import RealTime
 from tormagd.control.assembly.build import choose_solver
 from tormagd.headroom.machine_loop import machine_us
-from tormagd.lab import executors
-from tormagd.lab.arrays import Json
 from tormagd.scenes.measured import (
     FILE,
     MeasuredScene,

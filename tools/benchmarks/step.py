@@ -17,10 +17,9 @@ from tormagd.commission.gains import corner_margins
 from tormagd.config import Config, Motor
 from tormagd.control.core import Stepper
 from tormagd.control.move.motor import margins, zero_order_hold
-from tormagd.lab.arrays import Array
-from tormagd.lab.training.bench_sweep import gap_plan
+from tormagd.element.physics.errors import FloatArray as Array
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.closed_loop import ClosedLoop, Sample
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant

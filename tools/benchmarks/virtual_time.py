@@ -24,8 +24,7 @@ from benchmarks.step import START_MM, STEP_MM
 from firmware_protocol.build import SWITCH, settle
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
-from tormagd.lab.training.bench_sweep import gap_plan
-from tormagd.simulation.closed_loop import ClosedLoop, stream
+from tormagd.simulation.closed_loop import ClosedLoop, gap_plan, stream
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

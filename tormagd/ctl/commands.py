@@ -2,12 +2,15 @@
 
 import argparse
 import math
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tormagd.ground.command_line import Within, number
 from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
+ORIGIN = re.compile(r"(https://[a-z0-9.-]+|http://(localhost|127\.0\.0\.1))(:[0-9]{1,5})?")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 
 
@@ -29,31 +32,6 @@ def option(*names: str, **settings: Any) -> Option:
     return names, settings
 
 
-def number(text: str) -> float:
-    """Parse a finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed is a finite number")
-    return value
-
-
-class Within(NamedTuple):
-    """Parses a number from `least` to `most`."""
-
-    least: float
-    most: float
-    unit: str = ""
-
-    def __call__(self, text: str) -> float:
-        value = number(text)
-        if not self.least <= value <= self.most:
-            raise argparse.ArgumentTypeError(f"{text}: allowed is {self.least:g}..{self.most:g}{self.unit}")
-        return value
-
-
 def port(text: str) -> int:
     """Parse a TCP port; 0 takes one that is free."""
     value = Within(0, 65_535)(text)
@@ -73,6 +51,13 @@ def rates(text: str) -> tuple[float, ...]:
 def source(text: str) -> str:
     if not 0 < len(text) <= 64 or not text.isprintable():
         raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
+    return text
+
+
+def origin(text: str) -> str:
+    """Parse where a page comes from, as a browser names it: https, or http of this machine."""
+    if not ORIGIN.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are https://HOST[:PORT] and http://localhost[:PORT]")
     return text
 
 
@@ -153,11 +138,13 @@ COMMANDS = {
         _waiting(30.0),
     ),
     "send": Command(
-        "publish setpoints: a synthetic shape or a CSV file t_s,force_N",
+        "publish setpoints: a synthetic shape, or times and forces of a file",
         "send.send",
         ("endpoints", "wait_s"),
         (
             option("what", metavar="{step|sine|ramp|pulse|FILE.csv}"),
+            option("--column", metavar="NAME[:UNIT]", help="the file's forces (force_N)"),
+            option("--time-column", metavar="NAME[:UNIT]", help="its times (t_s)"),
             option(
                 "--rate",
                 dest="rate_hz",
@@ -274,15 +261,14 @@ COMMANDS = {
         ),
     ),
     "calibrate": Command(
-        "guided: learn the device, sweep an insert into a model file, or log the motors",
+        "guided: learn the device, sweep an insert for tormag-lab calibrate, or log the motors",
         "calibrate.calibrate",
         ("config", "endpoints", "wait_s"),
         (
             option("--device", action="store_true", help="learn the device into its profile"),
             option("--insert", metavar="NAME", help="the fitted insert, such as MRE-50-40"),
             option("--motors", action="store_true", help="record a motor log instead"),
-            option("--out", type=Path, metavar="FILE", help="MODEL.safetensors, or LOG.csv"),
-            option("--csv", type=Path, metavar="FILE", help="also write the training data"),
+            option("--out", type=Path, metavar="FILE.csv", help="the sweeps, or the log"),
             option(
                 "--rates",
                 dest="rates_N_s",
@@ -291,7 +277,6 @@ COMMANDS = {
                 metavar="N/s,...",
                 help="at least three (0.1,0.2,0.4,0.2,0.1,0.4)",
             ),
-            option("--law", dest="by_law", action="store_true", help="fit the brake's law, without torch"),
             option("--side", choices=("left", "right"), default="left", help="motor to log (left)"),
             option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),
         ),
@@ -339,7 +324,25 @@ COMMANDS = {
         (
             option("path", type=Path, nargs="?", metavar="FILE.mcap", help="recording; default: live"),
             option("--port", type=port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: a free one"),
+            option(
+                "--operate",
+                dest="is_operated",
+                action="store_true",
+                help="also STOP, disable, pause, resume and arm, for who has the link that is printed",
+            ),
+            option(
+                "--origin",
+                type=origin,
+                metavar="URL",
+                help="pages from there may use it too: https://HOST of a proxy, or http://localhost:PORT of your page",
+            ),
         ),
+    ),
+    "foxglove": Command(
+        "telemetry and control ticks live for Foxglove on this machine",
+        "foxglove.foxglove",
+        ("endpoints", "wait_s"),
+        (option("--port", type=port, default=8765, metavar="N", help="of 127.0.0.1 (8765); 0: a free one"),),
     ),
     "metrics": Command(
         "status for Prometheus, printed once or served with --port",
@@ -360,7 +363,8 @@ COMMANDS = {
             ),
             option("name", nargs="?", metavar="NAME|FILE"),
             option("--force", type=Path, metavar="FORCE.csv", help="new: from this recorded force"),
-            option("--column", metavar="NAME", help="new: its column (force_N)"),
+            option("--column", metavar="NAME[:UNIT]", help="new: its column (force_N)"),
+            option("--time-column", metavar="NAME[:UNIT]", help="new: its times (t_s)"),
             option("--scale", type=Within(-1e6, 1e6), metavar="K", help="new: newtons per unit (1)"),
             option("--offset", type=Within(-1e6, 1e6), dest="offset_N", metavar="N", help="new: newtons at 0 (0)"),
             option("--insert", metavar="NAME", help="new: insert (the softest that renders it all)"),
@@ -380,7 +384,6 @@ COMMANDS = {
             option(
                 "--out", "-o", type=Path, metavar="FILE.toml", help="check: write the scene served so to a new file"
             ),
-            option("--plant", metavar="P", help="check, new: simulated device, such as tormag-lab twin's"),
         ),
     ),
     "keys": Command(

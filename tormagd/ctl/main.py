@@ -36,6 +36,7 @@ EXTRAS = {
     "matplotlib": "plot",
     "rich": "top",
     "aiohttp": "dashboard",
+    "foxglove": "foxglove",
     "prometheus_client": "metrics",
     "tqdm": "lab",
 }

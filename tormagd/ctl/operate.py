@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
 from tormagd.ground.terminal import write_line
@@ -39,31 +40,43 @@ COMES_BACK_S = 0.6
 def arm(client: Client, timeout_s: float) -> Outcome:
     """Have the daemon clear faults, home and enable as needed, and report each step on stderr."""
     begun_s = time.monotonic()
-    given = client.arm(timeout_s, lambda step: write_line(f"tormagctl arm: {step}", sys.stderr))
-    known = client.status()
+    given = client.arm(timeout_s, report_step)
+    return armed(given, client.status(), time.monotonic() - begun_s)
+
+
+def report_step(step: str) -> None:
+    write_line(f"tormagctl arm: {step}", sys.stderr)
+
+
+def armed(given: Sequence[str], known: Status, seconds: float) -> Outcome:
+    """Return the outcome of an `arm`. Raises CommandError if the device is not enabled after it."""
     if known.operating_state != "ENABLED":
         raise _not_done(f"it was armed, and is {known.operating_state}")
-    seconds = round(time.monotonic() - begun_s, 2)
     to = "what is published next" if known.setpoint_cf is None else f"{known.setpoint_cf:.2f} N"
     text = f"armed in {seconds:.1f} s; the force goes to {to} along the scene's ramp"
-    result = {"operating_state": known.operating_state, "given": list(given), "seconds": seconds}
+    result = {"operating_state": known.operating_state, "given": list(given), "seconds": round(seconds, 2)}
     return Outcome(result, text if given else "it was armed already")
 
 
 def operate(client: Client, command: str) -> Outcome:
     is_needless = command == "clear-fault" and not client.status().faults
-    result = client.request(command)
+    outcome = done(command, client.request(command))
+    if is_needless:
+        return Outcome(outcome.result, f"no fault is latched; it is {outcome.result['operating_state']}")
+    if command == "clear-fault":
+        for _, after in statuses(client, COMES_BACK_S):
+            require_no_fault(after, "the fault came back")
+    return outcome
+
+
+def done(command: str, result: dict[str, Any]) -> Outcome:
+    """Return the outcome of a command that the daemon has answered. Raises CommandError if it was not done."""
     state = result.get("operating_state")
     text, states = DONE[command]
     if state not in states:
         raise _not_done(f"the daemon answers {command} with operating_state = {state!r}: it was not done")
     if command == "stop" and result.get("is_connected") is False:
         return Outcome(result, STOPPED_WITHOUT_DEVICE, Exit.REFUSED)
-    if is_needless:
-        return Outcome(result, f"no fault is latched; it is {state}")
-    if command == "clear-fault":
-        for _, after in statuses(client, COMES_BACK_S):
-            require_no_fault(after, "the fault came back")
     return Outcome(result, text)
 
 

@@ -45,7 +45,8 @@ def _list(folder: RecordingFolder) -> Outcome:
         f"{'marked' if row['is_marked'] else '':<7}{row['said']}"
         for row in rows
     ]
-    total = f"{len(rows)} recordings, {size_MB:.1f} of {folder.budget.most_bytes / 1e6:.1f} MB in {folder.path}"
+    count = f"{len(rows)} recording{'s' * (len(rows) != 1)}"
+    total = f"{count}, {size_MB:.1f} of {folder.budget.most_bytes / 1e6:.1f} MB in {folder.path}"
     return Outcome({"folder": str(folder.path), "recordings": rows, "MB": size_MB}, "\n".join([*lines, total]))
 
 
@@ -80,7 +81,7 @@ def _prune(folder: RecordingFolder) -> Outcome:
     gone = folder.prune()
     over = folder.make_room(0)
     names = [each.path.name for each in gone]
-    text = f"{len(gone)} recordings taken away, {sum(each.bytes for each in gone) / 1e6:.1f} MB"
+    text = f"{len(gone)} recording{'s' * (len(gone) != 1)} taken away, {sum(each.bytes for each in gone) / 1e6:.1f} MB"
     return Outcome({"removed": names, "over": over}, f"{text}\n{over}".strip(), Exit.REFUSED if over else Exit.DONE)
 
 

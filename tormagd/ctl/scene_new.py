@@ -3,6 +3,7 @@
 import math
 import os
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,8 +12,9 @@ import msgspec
 
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ctl.scene import as_toml, check_scene
-from tormagd.ground.force_file import ForceFileError, read_column
+from tormagd.ctl.scene_check import as_toml, check_scene
+from tormagd.ground.force_file import read_column, read_forces, stated_columns
+from tormagd.ground.table import TableError
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Scene
 from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError
@@ -35,8 +37,9 @@ class Recorded(NamedTuple):
     """A recorded quantity that becomes the scene's force, and what a person states of the scene."""
 
     force: Path | None = None
-    "A CSV with the column `t_s` and one of the quantity; without it, a person is asked."
+    "A file with times and one column of the quantity; without it, a person is asked."
     column: str | None = None
+    time_column: str | None = None
     scale: float | None = None
     "Newtons for each unit of the column."
     offset_N: float | None = None
@@ -45,21 +48,23 @@ class Recorded(NamedTuple):
     tolerance_N: float | None = None
 
 
-def new_scene(out: Path, recorded: Recorded, config: Path | None, plant: str | None = None) -> Outcome:
+def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
-    force_file = _forces_of(out, recorded)
+    force_file, told = _forces_of(out, recorded)
     try:
-        return _proposed(out, force_file, recorded, config, plant)
+        made = _proposed(out, force_file, recorded, config)
     except CommandError:
         if force_file is not None and force_file != recorded.force:
             force_file.unlink()
         raise
+    if not told:
+        return made
+    text = f"{recorded.force}: {'; '.join(told)}\n{made.text}"
+    return msgspec.structs.replace(made, result=made.result | {"read": told}, text=text)
 
 
-def _proposed(
-    out: Path, force_file: Path | None, recorded: Recorded, config: Path | None, plant: str | None
-) -> Outcome:
+def _proposed(out: Path, force_file: Path | None, recorded: Recorded, config: Path | None) -> Outcome:
     """Write the scene file `out` for the forces in `force_file`, or from a person's answers."""
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
     if recorded.tolerance_N is not None:
@@ -71,7 +76,7 @@ def _proposed(
         raise usage_error(
             f"no scene can be made of this: {error}", "tormagctl guide scenes says what each key asks"
         ) from error
-    insert, checked, unmet = _softest(out, tables, inserts, config, plant)
+    insert, checked, unmet = _softest(out, tables, inserts, config)
     found = {"file": str(out), "insert": insert, "unmet": unmet, "unmet_if_weak": []}
     if checked is None:
         said = f"{out} is written, with insert {insert}, and is NOT MET:\n" + "\n".join(unmet)
@@ -95,31 +100,34 @@ def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
     return weak
 
 
-def _forces_of(out: Path, recorded: Recorded) -> Path | None:
-    """Return the file of the scene's forces, if need be a converted one."""
-    is_converted = (recorded.column, recorded.scale, recorded.offset_N) != (None, None, None)
+def _forces_of(out: Path, recorded: Recorded) -> tuple[Path | None, list[str]]:
+    """Return the file of the scene's forces, if need be a converted one, and what was converted."""
+    stated = stated_columns(recorded.column, recorded.time_column)
+    is_converted = bool(stated) or (recorded.scale, recorded.offset_N) != (None, None)
     if recorded.force is None:
         if is_converted:
-            raise usage_error("--column, --scale and --offset convert a recorded force", "add --force FORCE.csv")
-        return None
-    if not is_converted:
-        return recorded.force
-    column = "force_N" if recorded.column is None else recorded.column
-    scale, offset_N = (1.0 if recorded.scale is None else recorded.scale), recorded.offset_N or 0.0
+            raise usage_error(
+                "--column, --time-column, --scale and --offset convert a recorded force", "add --force FORCE.csv"
+            )
+        return None, []
+    with as_usage_error(TableError, hint="--column, --time-column, --scale and --offset say what the file has"):
+        if not is_converted:
+            return recorded.force, read_forces(recorded.force, stated).told
+        table = read_column(recorded.force, stated, has_unit=recorded.scale is None)
     converted = out.with_suffix(".csv")
-    if converted.exists():
-        raise usage_error(f"{converted} exists, where the scene's forces go", "give another FILE.toml")
-    with as_usage_error(ForceFileError, OSError, hint="a CSV with the columns t_s and --column"):
-        times_s, values = read_column(recorded.force, column)
-        rows = (f"{time_s:.6f},{offset_N + scale * value:.6g}\n" for time_s, value in zip(times_s, values, strict=True))
+    scale, offset_N = (1.0 if recorded.scale is None else recorded.scale), recorded.offset_N or 0.0
+    rows = zip(table.values["time_s"], table.values["force_N"], strict=True)
+    try:
         with converted.open("x", encoding="utf-8") as file:
             file.write("t_s,force_N\n")
-            file.writelines(rows)
-    return converted
+            file.writelines(f"{time_s:.6f},{offset_N + scale * value:.6g}\n" for time_s, value in rows)
+    except FileExistsError as error:
+        raise usage_error(f"{converted} exists, where the scene's forces go", "give another FILE.toml") from error
+    return converted, table.told
 
 
 def _softest(
-    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None, plant: str | None
+    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None
 ) -> tuple[str, Outcome | None, list[str]]:
     """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all."""
     taken: dict[str, Outcome] = {}
@@ -127,7 +135,7 @@ def _softest(
     for insert in inserts:
         _write(out, tables, insert)
         try:
-            taken[insert] = check_scene(str(out), config, plant)
+            taken[insert] = check_scene(str(out), config)
         except CommandError as error:
             reason = error.message.removeprefix(f"scene {tables['name']}: ")
             # a machine too busy to say, or an unknown insert or model
@@ -154,7 +162,7 @@ def _with(tables: Tables, insert: str) -> Tables:
 
 
 def _write(out: Path, tables: Tables, insert: str, unmet: Sequence[str] = (), begin: str = UNMET) -> None:
-    lines = [f"{begin}{reason}" for reason in unmet]
+    lines = [line for reason in unmet for line in textwrap.wrap(f"{begin}{reason}", 100, subsequent_indent="#   ")]
     out.write_text("\n".join([*lines, as_toml(_with(tables, insert))]) + "\n", encoding="utf-8")
 
 
@@ -164,7 +172,7 @@ def _has_reserve(tables: Tables, checked: Outcome) -> bool:
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
     """Propose a scene's tables for a recorded force, at a steady handle of 42 mm/s."""
-    hint = "a CSV with the columns t_s,force_N, no force below 0; else --column, --scale, --offset"
+    hint = "no force below 0; else --scale or --offset"
     with as_usage_error(ConfigError, hint=hint):
         time_s, force_N = recorded(force_file)
     least_N, most_N = _rounded(float(force_N.min()), math.floor), _rounded(float(force_N.max()), math.ceil)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.ctl.scene import as_toml, loaded, measured_as
+from tormagd.ctl.scene_check import as_toml, loaded, measured_as
 from tormagd.scenes.measured import OperatingPoint, measured
 from tormagd.scenes.scene import load_scene, scene_path
 

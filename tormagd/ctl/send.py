@@ -12,7 +12,8 @@ import msgspec
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.watch import StatusWatch, require_range
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
-from tormagd.ground.force_file import ForceFileError
+from tormagd.ground.force_file import stated_columns
+from tormagd.ground.table import TableError
 from tormagd.ground.terminal import interrupted_by
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
@@ -24,6 +25,8 @@ def send(
     endpoints: Endpoints,
     wait_s: float,
     what: str,
+    column: str | None,
+    time_column: str | None,
     rate_hz: float,
     duration_s: float | None,
     from_N: float,
@@ -37,11 +40,11 @@ def send(
     """Publish a shape or a CSV file at `rate_hz`, and report what became of it."""
     with as_usage_error(
         WaveformError,
-        ForceFileError,
+        TableError,
         hint="correct it and send again; tormagctl send --help shows the choices",
     ):
-        if what.lower().endswith(".csv"):
-            waveform = read_csv(Path(what))
+        if Path(what).suffix:
+            waveform = read_csv(Path(what), stated_columns(column, time_column))
             lasts_s = min(waveform.duration_s, duration_s or math.inf)
         else:
             lasts_s = duration_s or 10.0
@@ -74,11 +77,12 @@ def send(
             )
             became = None if watch is None else watch.finish(done["sent"])
     left_out = f", {done['skipped']} left out because this machine was late" if done["skipped"] else ""
-    text = f"sent {done['sent']} setpoints as {source!r} in {done['seconds']:.1f} s{left_out}; "
+    read = f"{what}: {'; '.join(waveform.told)}\n" if waveform.told else ""
+    text = f"{read}sent {done['sent']} setpoints as {source!r} in {done['seconds']:.1f} s{left_out}; "
     if became is None:
-        return Outcome({"source": source, **done}, f"{text}whether they were taken is not known")
+        return Outcome({"source": source, "read": waveform.told, **done}, f"{text}whether they were taken is not known")
     held = f", held by {', '.join(became.limits)} at times" if became.limits else ""
-    result = {"source": source, **done, **msgspec.structs.asdict(became)}
+    result = {"source": source, "read": waveform.told, **done, **msgspec.structs.asdict(became)}
     return Outcome(result, f"{text}{became.accepted} taken and rendered{held}")
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd.record.force_following import in_words
+from tormagd.view.believed import as_said
 from tormagd_client.blocking import Client
 from tormagd_client.messages import (
     BeliefReport,
@@ -142,11 +143,8 @@ def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
     """Return the beliefs that act in one line."""
-    return ", ".join(
-        f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
-        for name, it in belief.items()
-        if it.acts and name not in but
-    )
+    told = as_said({name: it for name, it in belief.items() if name not in but})
+    return ", ".join(f"{name} {value}" for name, value in told.items())
 
 
 def _core(build: str, colour: Colour) -> list[str]:
@@ -182,6 +180,8 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
         parts[-1] += f", {source.clock.drift_ppm:+.0f} ppm"
     if source.restarts:
         parts.append(f"{source.restarts} restarts")
+    if source.raised:
+        parts.append(f"{source.raised} around zero taken as 0")
     return [f"source    {name!r}: {', '.join(parts)}", *_explained(source.cause, source.remedy, colour.yellow)]
 
 

@@ -80,11 +80,12 @@ def _head(seen: Seen, width: int) -> Text:
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state, is_silent = printable(newest.operating_state), seen.silent_s > SILENT_S
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
+    shaft = torque(newest.measured_cf, status.roller_radius_mm).strip(" ()")
     head = Text.assemble(
         (f" {state} ", "reverse" if is_silent else STATE_STYLES.get(state, "reverse")),
         *([(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")] if is_silent else []),
         (f"  {', '.join(flags)}", "" if newest.is_homed else "yellow"),
-        torque(newest.measured_cf, status.roller_radius_mm),
+        f"  {shaft} at the handle" if shaft else "",
         no_wrap=True,
         overflow="ellipsis",
     )

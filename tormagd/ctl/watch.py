@@ -93,7 +93,9 @@ class StatusWatch:
     def __init__(self, client: Client, source: str) -> None:
         self._client, self._source = client, source
         before = client.status()
-        held_back(before, source)  # it may be enabled later, unless it is in FAULT
+        held = held_back(before, source)  # it may be enabled later, unless it is in FAULT
+        if held is not None and before.operating_state != "ENABLED":
+            write_line(f"{held.message}: nothing is felt until it is ENABLED; next: {held.hint}", sys.stderr)
         self._before = _accepted(before, source)
         self._asked: Pending | None = None
         self._look_s: float | None = None

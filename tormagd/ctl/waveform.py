@@ -3,7 +3,7 @@
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +33,8 @@ class Waveform(NamedTuple):
     at: Callable[[float], Sample]
     least_N: float
     most_N: float
+    told: tuple[str, ...] = ()
+    "What was converted to read a file."
 
 
 def by_legs(start_N: float, legs: Sequence[tuple[float, float]]) -> Waveform:
@@ -90,8 +92,10 @@ def beat(phase: float) -> float:
     return min(1.0, bells)
 
 
-def read_csv(path: Path) -> Waveform:
-    table = read_forces(path)
-    start_s = table["t_s"][0]
-    times_s = array("d", (time_s - start_s for time_s in table["t_s"]))
-    return _lines(times_s, table["force_N"], *(table.get(name) for name in OPTIONAL_COLUMNS))
+def read_csv(path: Path, stated: Mapping[str, str] | None = None) -> Waveform:
+    table = read_forces(path, stated or {})
+    values = table.values
+    start_s = values["time_s"][0]
+    times_s = array("d", (time_s - start_s for time_s in values["time_s"]))
+    others = (values.get(name) for name in OPTIONAL_COLUMNS)
+    return _lines(times_s, values["force_N"], *others)._replace(told=tuple(table.told))

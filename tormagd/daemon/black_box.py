@@ -9,6 +9,7 @@ import hashlib
 import importlib.util
 import json
 import logging
+import math
 import socket
 import subprocess
 import time
@@ -23,12 +24,14 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import Core, platform_name, sources_hash
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
-from tormagd.daemon.child_process import Beside
+from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
 from tormagd.record.journal import FORMAT, Journal, Packer
-from tormagd.record.keeper_messages import KEEPER, REQUEST, Begin, End, Part, Said, Write, Written
+from tormagd.record.keeper_messages import REQUEST, Begin, End, Part, Said, Write, Written
 from tormagd_client.messages import BlackBoxReport, TickRecord
 
+KEEPER = "tormagd.record.keeper"
+"The keeper's main module, with its socket's descriptor as the argument."
 PART_TICKS = 20
 "Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
 SNAPSHOT_S = 1.0
@@ -38,6 +41,8 @@ AFTER_FAULT_S = 2.0
 BUFFER_BYTES = 4_000_000
 "Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
 LEAVING_S = 2.0
+AGAIN_S = 1.0, 60.0
+"How soon a keeper that has ended is replaced: after a long life, and at most."
 MAX_REQUESTED, MAX_ASKED = 8, 28
 "Boxes that somebody asked for and that are still to be written, at most; and all that wait for the keeper."
 
@@ -67,25 +72,19 @@ class BlackBox:
     """Hands the core's journal to the keeper, a process that writes black boxes into `folder`."""
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
-        self._folder = folder
+        self._folder, self._begun = folder, Begin(str(folder), header)
         self._refusal, self._newest, self._dropped = "", "", 0
-        self._beside: Beside | None = None
+        self._beside: ChildProcess | None = None
+        self._started_s, self._due_s, self._wait_s = -math.inf, math.inf, 0.5 * AGAIN_S[0]
+        self.journal, self._packer = Journal(is_kept=False), Packer()
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
             self._refusal = "mcap is not installed: pip install 'tormagd[record]'"
-        else:
-            try:
-                self._beside = Beside(KEEPER)
-            except OSError as error:
-                self._refusal = f"the process that keeps it did not start: {error.strerror}"
-            else:
-                self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-                self._beside.send(msgspec.msgpack.encode(Begin(str(folder), header)))
-        if folder is not None and self._refusal:
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
-        self.journal = Journal(is_kept=self._beside is not None)
-        self._packer = Packer()
+        else:
+            self._start(self._begun)
+        self.journal.is_kept = not self._refusal
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._connection: Connection | None = None
@@ -94,7 +93,7 @@ class BlackBox:
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with a snapshot of both states, which are those before the first tick."""
-        if self._beside is not None:
+        if self._started_s > -math.inf:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
@@ -102,12 +101,18 @@ class BlackBox:
         """Begin anew with the core of another scene, from a snapshot of these states."""
         self.journal.take()
         self._packer.take()
-        self._send(Begin(str(self._folder), header))
+        self._begun = Begin(str(self._folder), header)
+        self._send(self._begun)
         self._snapshot(stepper, planner)
 
     def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
         """Add the record of a control period to the journal, and encode all entries since the last call."""
         if self._beside is None:
+            return
+        if not self.journal.is_kept:  # another keeper has begun: from the end of this period
+            self.journal.is_kept, self._ticks = True, 0
+            self.journal.missed()
+            self._snapshot(stepper, planner)
             return
         self.journal.ticked(record)
         try:
@@ -165,6 +170,8 @@ class BlackBox:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
         self._stop_if_gone()
+        if self._beside is None and time.monotonic() >= self._due_s:
+            self._start(msgspec.structs.replace(self._begun, is_again=True))
 
     def report(self) -> BlackBoxReport:
         """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since
@@ -182,7 +189,7 @@ class BlackBox:
         beside = self._beside
         if beside is not None:
             self._send(End())
-            self._beside = None
+            self._beside, self._due_s = None, math.inf
             beside.close()
             try:
                 beside.process.wait(LEAVING_S)
@@ -206,12 +213,28 @@ class BlackBox:
         if self._beside is not None and self._beside.is_gone:
             self._stop("the process that keeps it has ended")
 
+    def _start(self, begun: Begin) -> None:
+        """Start the keeper; where that fails, it is tried again."""
+        self._started_s, self._due_s = time.monotonic(), math.inf
+        try:
+            self._beside = ChildProcess(KEEPER)
+        except OSError as error:
+            self._stop(f"the process that keeps it did not start: {error.strerror}")
+            return
+        self._refusal = ""
+        self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        self._send(begun)
+
     def _stop(self, reason: str) -> None:
-        """End the black box: close the socket, stop the journal and drop its entries."""
-        self._refusal = reason
-        log.error("no black box is kept any more: %s; next: start the daemon again", reason)
+        """Close the socket, stop the journal, drop its entries, and start another keeper soon: the sooner, the longer
+        this one has kept."""
+        now_s = time.monotonic()
+        self._wait_s = AGAIN_S[0] if now_s - self._started_s > AGAIN_S[1] else min(2.0 * self._wait_s, AGAIN_S[1])
+        self._refusal, self._due_s = reason, now_s + self._wait_s
+        log.error("no black box is kept: %s; another one starts in %.0f s", reason, self._wait_s)
         if self._beside is not None:
             self._beside.close()
         self._beside = None
         self.journal.is_kept = False
         self.journal.take()
+        self._packer.take()

@@ -8,7 +8,7 @@ import sys
 MAX_PACKET = 65_536
 
 
-def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
+def start_child(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
     """Start `python -m module DESCRIPTOR` with `its_end` as that descriptor."""
     number = its_end.fileno()
     command = [sys.executable, "-P", "-m", module, str(number)]
@@ -16,14 +16,14 @@ def start_beside(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes
     return subprocess.Popen(command, pass_fds=(number,), stdin=subprocess.DEVNULL, start_new_session=True)
 
 
-class Beside:
+class ChildProcess:
     """Our end of a process that runs `module`, and of the packet socket to it."""
 
     def __init__(self, module: str) -> None:
         self.socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.socket.setblocking(False)
         with its:
-            self.process = start_beside(module, its)
+            self.process = start_child(module, its)
         self.is_gone = False
 
     def send(self, data: bytes) -> bool:

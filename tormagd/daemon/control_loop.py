@@ -3,7 +3,9 @@
 import logging
 import time
 
+from tormagd.control.assembly.conditions import is_busy, is_homed
 from tormagd.control.core import Stepper
+from tormagd.control.move.opening import is_open
 from tormagd.control.records import Duty, Plan
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import Conditions, RefusedError, reason
@@ -86,6 +88,18 @@ class ControlLoop:
     def lose_link(self) -> None:
         self._journal.lost_link()
         self.stepper.lose_link()
+
+    def is_busy(self) -> bool:
+        """Tell whether the device homes or opens, or has been asked to."""
+        connection = self._connection
+        return is_busy(connection.measurement, connection.pending, self.stepper, self.output)
+
+    def is_homed(self) -> bool:
+        return is_homed(self._connection.measurement, self.stepper.measured)
+
+    def is_open(self) -> bool | None:
+        measurement = self._connection.measurement
+        return None if measurement is None else is_open(measurement, self.is_homed())
 
     def new_faults(self) -> tuple[Fault, ...]:
         faults, known = self.stepper.safety.faults, self._known_faults

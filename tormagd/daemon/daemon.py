@@ -6,7 +6,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import msgspec
@@ -17,21 +17,23 @@ from tormagd.control.assembly.profile import gains_of
 from tormagd.control.believe.strength import device_bounds
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
+from tormagd.daemon.answers import Answers
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox, header
 from tormagd.daemon.calibrations import Calibrations
 from tormagd.daemon.causes import Causes
+from tormagd.daemon.commands import Commands
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, state_folder
-from tormagd.daemon.rate_group import ERROR_PERIODS
+from tormagd.daemon.rate_group import ERROR_PERIODS, Histogram
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
 from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.search_process import SearchProcess
-from tormagd.daemon.service import notify
+from tormagd.daemon.service import Service, notify
 from tormagd.daemon.telemetry_loop import TelemetryLoop
 from tormagd.ground.access_keys import KeyRing
 from tormagd.hardware.backend import Backend
@@ -44,6 +46,8 @@ SWITCH_S = 1e-4
 "How long another thread may keep the interpreter's lock from this one; Python's own value is 5 ms."
 LONGEST_RETRACT_S = 10.0
 "The firmware needs 3 s for a full stroke; if it cannot retract, it reports that itself."
+TELL_S = 0.1
+REFRESHED = 2
 NAMED_S = 0.5
 "By then a gap that does not open is a fault, and in the log."
 
@@ -89,38 +93,47 @@ class Daemon:
         self._calibrations = Calibrations(
             state_folder(config.device.calibrations, "calibrations"), config, self._run_core
         )
-        self._telemetry = TelemetryLoop(
+        control, inference, endpoint = self._control, self._inference, self._endpoint
+        self._commands = Commands(
             config,
-            core,
-            self._control,
-            self._inference,
+            control,
+            inference,
+            self._connection,
+            endpoint.inbox,
+            self._box,
             self._profiles,
             self._calibrations,
-            self._connection,
-            self._endpoint,
+            SceneChange(self._build, self._require_disabled, self._run_scene),
+        )
+        self._telemetry = TelemetryLoop(config, core, control, inference, endpoint, self._box, self._commands)
+        self._answers = Answers(
+            control,
+            inference,
+            endpoint,
+            self._telemetry,
+            self._commands,
             self._phases,
             self._causes,
-            self._box,
-            SceneChange(self._build, self._require_disabled, self._run_scene),
             refused,
             config_file,
         )
+        self._service, self._told_s, self._histograms = Service(), 0.0, self._in_turn()
         self._box.begin(self._control.stepper, self._inference.planner, self._connection)
         telemetry = self._telemetry
         self._phases.begin(
             [
                 ("receive", self._receive),
-                ("requests", lambda _beat: self._endpoint.take_requests(telemetry.command)),
+                ("requests", lambda _beat: self._endpoint.take_requests(self._answers.command)),
                 ("plan", self._plan),
                 ("drive", self._drive),
                 ("record", telemetry.record),
                 ("topics", telemetry.topics.publish),
-                ("telemetry", telemetry.publish),
+                ("telemetry", self._publish),
             ],
             [
                 ("forecast", self._inference.foresee),
-                ("tell", telemetry.tell),
-                ("answers", telemetry.serve),
+                ("tell", self._tell),
+                ("answers", self._answers.serve),
                 ("admission", lambda _beat: self._endpoint.admission.update()),
             ],
         )
@@ -195,7 +208,36 @@ class Daemon:
         if faults := control.new_faults():
             self._causes.tell(faults, control.stepper, control.measurement)
             with contextlib.suppress(RefusedError):
-                self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
+                self._commands.keep(str(faults[0]), AFTER_FAULT_S)
+
+    def _publish(self, beat: Beat) -> bool:
+        if not self._telemetry.publish(beat):
+            return False
+        # before the next plan learns from a new device
+        self._commands.look_at_device()
+        return True
+
+    def _tell(self, _beat: Beat) -> bool:
+        """Feed log, systemd and black box, and continue an arming; return False if it is not time."""
+        now_s = time.monotonic()
+        if now_s - self._told_s < TELL_S:
+            return False
+        self._told_s = now_s
+        for _ in range(REFRESHED):
+            next(self._histograms).refresh()
+        self._endpoint.inbox.refresh(now_s)
+        self._endpoint.inbox.tell(now_s)
+        self._box.look()
+        limit_s, plan = self._config.realtime.watchdog_ms * 1e-3, self._inference.planner.planned
+        self._service.tell(now_s, limit_s, self._control, plan, self._connection, self._core.scene.name)
+        self._control.go_on_arming(self._commands.conditions())
+        self._endpoint.tell(now_s)
+        self._phases.tell()
+        return True
+
+    def _in_turn(self) -> Iterator[Histogram]:
+        while True:
+            yield from (*self._telemetry.histograms(), *self._phases.spent.values())
 
     async def _build(self, scene: str) -> Core:
         """Build the core of another scene at the running rates."""
@@ -207,7 +249,7 @@ class Daemon:
         return core
 
     def _require_disabled(self) -> None:
-        self._control.command("use-scene", self._telemetry.conditions())
+        self._control.command("use-scene", self._commands.conditions())
 
     def _run_scene(self, scene: str, core: Core) -> None:
         """Run `core`, made for `scene`; if model and insert are the same, keep what was learned."""
@@ -227,7 +269,9 @@ class Daemon:
         self._endpoint.inbox.begin_scene(core.scene)
         self._profiles.close()
         self._profiles = self._profiles_of(core)
-        self._telemetry.run_scene(self._config, core, self._profiles)
+        self._commands.config, self._commands.profiles = config, self._profiles
+        self._telemetry.run_scene(core)
+        self._answers.reset()
         self._box.begin_scene(header(self._config, core), stepper, planner)
 
     def _begin_reload(self) -> None:
@@ -252,7 +296,7 @@ class Daemon:
             return
         self._calibrations.configured, self._config = again.config, config
         self._calibrations.read_again()
-        self._telemetry.config = self._config
+        self._commands.config = self._config
         self._endpoint.inbox.sources = again.config.sources
         log.info(
             "configuration read again: %s", f"now in force: {', '.join(again.taken)}" if again.taken else "no news"
@@ -263,9 +307,9 @@ class Daemon:
     async def _open_gap(self) -> None:
         """Open the gap, and wait for it up to LONGEST_RETRACT_S while the beat goes on."""
         if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
-            self._control.command("disable", self._telemetry.conditions())
+            self._control.command("disable", self._commands.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S
-        while self._telemetry.is_busy() and time.monotonic() < until_s:
+        while self._control.is_busy() and time.monotonic() < until_s:
             await asyncio.sleep(OPENING_LOOK_S)
-        if self._telemetry.is_open() is False:
+        if self._control.is_open() is False:
             await asyncio.sleep(NAMED_S)

@@ -18,7 +18,7 @@ BUDGET_MS = 400.0
 "A longer delay slows a task down and hardens its contacts."
 
 
-class Way:
+class ForceDelay:
     def __init__(self) -> None:
         self.to_duty = Histogram()
         self._stamp_s = -math.inf

@@ -42,6 +42,8 @@ class Taken(NamedTuple):
     source: str
     seq: int
     stamp_s: float
+    is_raised: bool = False
+    "A force around zero was taken as 0."
 
 
 class SetpointInbox:
@@ -198,17 +200,19 @@ class SetpointInbox:
         is_contested = now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s)
         others = (Limit.OTHER_SOURCE,) if is_contested else ()
         due_s = source.stamp_s + playout_s
+        servo_cf, withdraw_cf, preview_N, is_raised = _from_zero(setpoint)
+        source.raised += is_raised
         timed = TimedSetpoint(
-            setpoint.servo_cf,
+            servo_cf,
             due_s,
             setpoint.valid_for_ms * 1e-3 - playout_s,
             setpoint.displacement_mm,
             setpoint.rate_mm_s,
-            setpoint.preview_N or (),
+            preview_N,
             (setpoint.preview_dt_ms or 0.0) * 1e-3,
             self._number,
             (*others, *source.found),
-            setpoint.withdraw_cf,
+            withdraw_cf,
             None if wall is None else Wall(wall.handle_mm, wall.stiffness_N_mm, wall.friction_N),
         )
         if playout_s > 0.0:
@@ -221,7 +225,7 @@ class SetpointInbox:
             self._late += due_s < now_s
         while self._waiting and self._waiting[-1].setpoint.stamp_s >= due_s:
             self._waiting.pop()
-        self._waiting.append(Taken(timed, setpoint.source, setpoint.seq, source.stamp_s))
+        self._waiting.append(Taken(timed, setpoint.source, setpoint.seq, source.stamp_s, is_raised))
         return self.hand_on(now_s)
 
     def _hand_over(self, name: str, why: str) -> None:
@@ -264,8 +268,9 @@ class SetpointInbox:
         name, silent_ms = self.holder, (now_s - holder.heard_s) * 1e3
         valid_ms = holder.setpoint.valid_for_ms
         if silent_ms > valid_ms:
+            silent = f"{silent_ms:.0f} ms" if silent_ms < 1e4 else f"{silent_ms * 1e-3:.0f} s"
             return Explanation(
-                f"{name!r} has sent nothing for {silent_ms:.0f} ms, and its setpoints are valid for {valid_ms:g} ms; "
+                f"{name!r} has sent nothing for {silent}, and its setpoints are valid for {valid_ms:g} ms; "
                 "the force decays to F_min",
                 "check the publisher and the network",
             )
@@ -299,3 +304,12 @@ def _refuse_way(setpoint: Setpoint) -> None:
     for name in ("withdraw_cf", "contact"):
         if getattr(setpoint, name) is not None:
             raise MessageError(f"{name}: allowed is servo_cf alone, as the scene's element is a pad")
+
+
+def _from_zero(setpoint: Setpoint) -> tuple[float, float | None, tuple[float, ...], bool]:
+    """Return the forces of a setpoint, 0 for those around zero, and whether one was below it."""
+    withdraw, preview_N = setpoint.withdraw_cf, setpoint.preview_N or ()
+    is_raised = min((setpoint.servo_cf, withdraw or 0.0, *preview_N)) < 0.0
+    # 0.0 stands first: of 0.0 and -0.0, max takes the first
+    servo_cf, withdraw_cf = max(0.0, setpoint.servo_cf), None if withdraw is None else max(0.0, withdraw)
+    return servo_cf, withdraw_cf, tuple(max(0.0, force_N) for force_N in preview_N), is_raised

@@ -6,6 +6,7 @@ installation and one parent, so packets are pickled.
 """
 
 import logging
+import math
 import pickle
 import signal
 import socket
@@ -13,11 +14,12 @@ import sys
 import time
 
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.daemon.child_process import MAX_PACKET, Beside
+from tormagd.daemon.child_process import MAX_PACKET, ChildProcess
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd_client.endpoints import ConfigError
 
+READY = b"ready"
 STARTS_S = 60.0
 "Loading torch takes seconds, on a cold disk more."
 
@@ -30,9 +32,9 @@ class SearchProcess:
     def __init__(self, core: Core) -> None:
         self.timing = RateGroup("search", 1_000_000_000 // core.config.rates.inference_hz)
         self._asked_ns = self._due_ns = 0
-        self._is_idle, self._is_told = True, False
-        self._beside = Beside(__name__)
-        self._beside.send(pickle.dumps((core.config, core.scene, core.models)))
+        self._is_idle, self._again_s = True, -math.inf
+        self._searched = pickle.dumps((core.config, core.scene, core.models))
+        self._begin()
         if self._beside.receive(STARTS_S) is None:
             self.close()
             raise ConfigError(
@@ -40,11 +42,17 @@ class SearchProcess:
                 "daemon again, or name another"
             )
 
+    def _begin(self) -> None:
+        self._beside = ChildProcess(__name__)
+        self._beside.send(self._searched)
+
     def answer(self) -> Answer | None:
         data = None if self._is_idle else self._beside.receive()
         if data is None:
             return None
         self._is_idle = True
+        if data == READY:
+            return None
         self.timing.record(self._due_ns, self._asked_ns, time.monotonic_ns())
         found: Answer | ValueError = pickle.loads(data)
         if isinstance(found, Answer):
@@ -53,10 +61,13 @@ class SearchProcess:
         return None
 
     def ask(self, question: Question | None) -> None:
-        """Send `question` to the search if it is idle and the next question is due."""
-        if self._beside.is_gone and not self._is_told:
-            self._is_told = True
-            log.error("the search beside the plans has ended; next: start the daemon again")
+        """Send `question` to the search if it is idle and the next question is due; start one that has ended again."""
+        now_s = time.monotonic()
+        if self._beside.is_gone and now_s >= self._again_s:
+            log.error("the search beside the plans has ended; another one starts")
+            self.close()
+            self._again_s, self._is_idle = now_s + STARTS_S, False
+            self._begin()
         now_ns, period_ns = time.monotonic_ns(), self.timing.period_ns
         if question is None or not self._is_idle or now_ns < self._due_ns + period_ns:
             return
@@ -77,7 +88,7 @@ def main() -> None:
     with socket.socket(fileno=int(sys.argv[1])) as asked:
         config, scene, models = pickle.loads(asked.recv(MAX_PACKET))
         aim = build_core(config, scene, models).planner().aim
-        asked.send(b"ready")
+        asked.send(READY)
         while data := asked.recv(MAX_PACKET):
             try:
                 found: Answer | ValueError = aim.answer_to(pickle.loads(data))

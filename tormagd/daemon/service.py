@@ -1,9 +1,13 @@
 """What systemd is told: that the device is identified (ready), a status line, and that the daemon lives."""
 
+import logging
 import os
 import socket
 from collections.abc import Sequence
 
+from tormagd.control.records import Plan
+from tormagd.daemon.control_loop import ControlLoop
+from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
 
 READY = "READY=1"
@@ -12,6 +16,8 @@ EXTENSION_S = 30.0
 _NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
 "Nothing answers behind a port that is not open, and a restart of the daemon would not help."
 
+log = logging.getLogger(__name__)
+
 
 class Service:
     def __init__(self) -> None:
@@ -19,6 +25,32 @@ class Service:
         "Whether a device has been identified; from then on systemd's watchdog runs."
         self._heard_s = 0.0
         self._status = ""
+
+    def tell(
+        self, now_s: float, limit_s: float, control: ControlLoop, plan: Plan, connection: Connection, scene: str
+    ) -> None:
+        """Tell systemd what is new."""
+        safety, measurement, link = control.stepper.safety, connection.measurement, connection.state
+        is_alive = self.is_alive(
+            now_s,
+            limit_s,
+            plan.time_s if plan.number else None,
+            link,
+            None if measurement is None else measurement.received_s,
+        )
+        status = status_line(
+            link,
+            connection.cause,
+            connection.remedy,
+            str(safety.operating_state),
+            control.is_homed(),
+            [str(fault) for fault in safety.faults],
+            scene,
+        )
+        for message in self.news(is_alive, link, status):
+            if message == READY:
+                log.info("ready: the device is identified; next: tormagctl arm")
+            notify(message)
 
     def is_alive(
         self, now_s: float, limit_s: float, planned_s: float | None, link: LinkState, received_s: float | None

@@ -264,7 +264,7 @@ class Source:
         self.heard_s = self.stamp_s = -math.inf
         self.sequence, self.clock = Sequence(setpoint.session, setpoint.seq), SourceClock()
         self.delays = Histogram()
-        self.accepted = self.refused = 0
+        self.accepted = self.refused = self.raised = 0
         self.found: dict[Limit, Explanation] = {}
         self.cause = self.remedy = ""
         self._fit: ClockReport | None = None
@@ -340,6 +340,7 @@ class Source:
             clock=clock_report(self._fit),
             cause=self.cause,
             remedy=self.remedy,
+            raised=self.raised,
         )
 
     def _require_ns(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:

@@ -1,6 +1,7 @@
 """Starting the daemon, or printing what would run."""
 
 import argparse
+import asyncio
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -35,7 +36,8 @@ def start(options: argparse.Namespace) -> int:
     if options.check:
         return 0 if write_answer(_resolved(config, core, backend.options), "tormagd") else 1
     try:
-        uvloop.run(_run(config, core, backend.open, keys, options))
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(_run(config, core, backend.open, keys, options))
     except (ConfigError, OSError) as error:
         write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return 1

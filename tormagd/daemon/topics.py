@@ -40,7 +40,7 @@ class Topics:
 
     def verdict(self) -> Verdict | None:
         in_force = self._endpoint.inbox.in_force
-        return None if in_force is None else self._verdict(in_force.source, in_force.seq, self._judge())
+        return None if in_force is None else self._verdict(*in_force[1:3], self._judge(), in_force.is_raised)
 
     def _publish_motion(self, beat: Beat) -> bool:
         measured = self._control.stepper.measured
@@ -63,7 +63,7 @@ class Topics:
         # by identity: a source may begin its numbers anew
         if in_force is not None and in_force is not self._judged:
             self._judged, is_said = in_force, True
-            verdict = self._verdict(in_force.source, in_force.seq, self._judge())
+            verdict = self._verdict(in_force.source, in_force.seq, self._judge(), in_force.is_raised)
             self._endpoint.publish(verdict, VERDICT_TOPIC)
         other = self._endpoint.inbox.passed_over()
         if other is not None and other != self._passed_over:
@@ -88,7 +88,7 @@ class Topics:
         )
 
     @staticmethod
-    def _verdict(source: str, seq: int, found: Judged) -> Verdict:
+    def _verdict(source: str, seq: int, found: Judged, is_raised: bool = False) -> Verdict:
         return Verdict(
             v=VERSION,
             t_ns=time.time_ns(),
@@ -97,4 +97,5 @@ class Topics:
             outcome=found.outcome,
             arrives_ms=found.arrives_ms,
             why=found.why,
+            is_raised=is_raised,
         )

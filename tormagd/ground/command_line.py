@@ -1,8 +1,9 @@
 """A command line that refuses in one sentence with the next step, and suggests what may have been meant."""
 
 import argparse
+import math
 import sys
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from tormagd.ground.files import did_you_mean
 from tormagd.ground.terminal import write_answer
@@ -41,3 +42,28 @@ class Parser(argparse.ArgumentParser):
     def _print_message(self, message: str, file: Any = None) -> None:
         if not write_answer(message.rstrip(), self.prog):
             sys.exit(1)
+
+
+def number(text: str) -> float:
+    """Parse a finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r}: allowed is a finite number")
+    return value
+
+
+class Within(NamedTuple):
+    """Parses a number from `least` to `most`."""
+
+    least: float
+    most: float
+    unit: str = ""
+
+    def __call__(self, text: str) -> float:
+        value = number(text)
+        if not self.least <= value <= self.most:
+            raise argparse.ArgumentTypeError(f"{text}: allowed is {self.least:g}..{self.most:g}{self.unit}")
+        return value

@@ -1,15 +1,14 @@
-"""Entry points of the installed commands: Ctrl-C while one is loading ends the process without a traceback."""
+"""Entry of the installed commands: Ctrl-C while one is loading ends the process without a traceback."""
 
 import signal
 from collections.abc import Callable
-from functools import partial
 from importlib import import_module
 
 INTERRUPTED = 130
 """The shell's exit code for a process that SIGINT ended."""
 
 
-def _run(module: str) -> int:
+def run(module: str) -> int:
     """Import `module`, run its `main` and return the exit code."""
     interrupt = signal.getsignal(signal.SIGINT)
     if interrupt is signal.default_int_handler:  # a shell's background job ignores it, and keeps doing so
@@ -20,8 +19,3 @@ def _run(module: str) -> int:
         return main()
     except KeyboardInterrupt:
         return INTERRUPTED
-
-
-daemon = partial(_run, "tormagd.daemon.main")
-ctl = partial(_run, "tormagd.ctl.main")
-lab = partial(_run, "tormagd.lab.main")

@@ -1,112 +1,81 @@
-"""Quantities over time in a CSV file: a force that is sent, asked for or designed for, or a hand's motion."""
+"""Quantities over time in a file: a force that is sent, asked for or designed for, or a hand's motion."""
 
-import csv
-import io
-import math
 from array import array
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
-from tormagd.ground.files import read_bounded
-from tormagd_client.messages import MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S
+from tormagd.ground.table import FORCE, QUANTITIES, Quantity, Table, TableError, Wanted, read_table
+from tormagd_client.messages import AROUND_ZERO_N, MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S, NO_PUSH
 
 OPTIONAL_COLUMNS = ("displacement_mm", "rate_mm_s")
-TIME = (-1e10, 1e10, "s")  # seconds since 1970 are allowed
 ALLOWED = {
-    "t_s": TIME,
+    "time_s": (-1e10, 1e10, "s"),  # seconds since 1970 are allowed
     "force_N": (0.0, MAX_FORCE_N, "N"),
     "displacement_mm": (0.0, MAX_DISPLACEMENT_MM, "mm"),
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
 }
-"Least, most and unit of each column."
-MIN_ROWS = 2
-MAX_FILE_BYTES = 16_000_000
+"Least, most and unit of each quantity."
+MAX_FILE_BYTES: Final = 16_000_000
 "Over a quarter of an hour at 1 kHz."
-
+OPTIONS: Final = {"time_s": "--time-column ", "force_N": "--column "}
 
 Allowed = Mapping[str, tuple[float, float, str]]
 
 
-class ForceFileError(ValueError):
-    """A CSV file that is not as allowed: the message names file, row, column and value."""
+def stated_columns(force: str | None, time: str | None) -> dict[str, str]:
+    """Return the columns that a person states, by quantity."""
+    return {name: text for name, text in (("force_N", force), ("time_s", time)) if text is not None}
 
 
-def read_forces(path: Path) -> dict[str, "array[float]"]:
-    """Read the columns `t_s` and `force_N`, and those of OPTIONAL_COLUMNS that the file has, by name."""
-    return read_table(path, ALLOWED, OPTIONAL_COLUMNS)
-
-
-def read_column(path: Path, column: str) -> tuple["array[float]", "array[float]"]:
-    """Read `t_s` and one `column` more, and ignore the rest."""
-    table = read_table(path, {"t_s": TIME, column: (-1e9, 1e9, "")}, has_others=True)
-    return table["t_s"], table[column]
-
-
-def read_table(
-    path: Path, allowed: Allowed, optional: tuple[str, ...] = (), *, has_others: bool = False
-) -> dict[str, "array[float]"]:
-    """Read a CSV file's columns into arrays of equal length, by name."""
-    try:
-        data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
-        with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, strict=True)
-            header = [name.strip() for name in next(reader, [])]
-            others = [name for name in header if name not in allowed] if has_others else []
-            _check_header(path, header, [*allowed, *others], (*optional, *others))
-            table = {name: array("d") for name in header if name in allowed}
-            for cells in reader:
-                if cells:
-                    row = _check_row(path, reader.line_num, header, cells, table["t_s"][-1:], allowed)
-                    for name, value in zip(table, row, strict=True):
-                        table[name].append(value)
-    except OSError as error:
-        raise ForceFileError(f"{path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ForceFileError(f"{path}: not UTF-8 text (byte {error.start})") from error
-    except csv.Error as error:
-        raise ForceFileError(f"{path}: not CSV: {error}") from error
-    if len(table["t_s"]) < MIN_ROWS:
-        raise ForceFileError(f"{path}: {len(table['t_s'])} rows: allowed is at least {MIN_ROWS}")
+def read_forces(path: Path, stated: Mapping[str, str] | None = None) -> Table:
+    """Read times and forces, and the OPTIONAL_COLUMNS that the file has by these names; None: nobody can state any."""
+    table = _read(path, FORCE, stated)
+    forces_N = table.values["force_N"]
+    under = [place for place, force_N in enumerate(forces_N) if -AROUND_ZERO_N <= force_N < 0.0]
+    for place in under:
+        forces_N[place] = 0.0
+    if under:
+        table.told.append(f"{len(under)} forces within {AROUND_ZERO_N * 1e3:g} mN under 0 are taken as 0")
+    _require(path, table, ALLOWED)
     return table
 
 
-def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> None:
-    required = [name for name in known if name not in optional]
-    also = f" and optionally {','.join(optional)}" if optional else ""
-    allowed = f"allowed is {','.join(required)}{also}"
-    missing = [name for name in required if name not in columns]
-    if missing:
-        raise ForceFileError(f"{path}: row 1 has no column {missing[0]} (it is {','.join(columns)[:80]!r}): {allowed}")
-    for index, name in enumerate(columns):
-        if name not in known:
-            raise ForceFileError(f"{path}: row 1: column {name[:40]!r} is not known: {allowed}")
-        if name in columns[:index]:
-            raise ForceFileError(f"{path}: row 1: column {name} is there twice")
+def read_column(path: Path, stated: Mapping[str, str], *, has_unit: bool) -> Table:
+    """Read times and one column, in newtons if it `has_unit`, else as it is."""
+    table = _read(path, FORCE if has_unit else {}, stated)
+    _require(path, table, {"time_s": ALLOWED["time_s"], "force_N": (-1e9, 1e9, "")})
+    return table
 
 
-def _check_row(
-    path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]", allowed: Allowed
-) -> list[float]:
-    """Return the numbers of the columns that `allowed` names."""
-    if len(cells) != len(columns):
-        raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
-    known = [(name, text) for name, text in zip(columns, cells, strict=True) if name in allowed]
-    row = [_number(path, line, name, text, *allowed[name]) for name, text in known]
-    time = [name for name, _ in known].index("t_s")
-    if before_s and not row[time] > before_s[0]:
-        raise ForceFileError(
-            f"{path}: row {line}, t_s = {known[time][1]}: allowed is above the row before, {before_s[0]:g}"
-        )
-    return row
+def _read(path: Path, units: Mapping[str, float], stated: Mapping[str, str] | None) -> Table:
+    needed = {"time_s": QUANTITIES["time_s"], "force_N": QUANTITIES["force_N"]._replace(units=units)}
+    optional = {name: Quantity((name,)) for name in OPTIONAL_COLUMNS}
+    wanted = Wanted(needed, optional, stated or {}, {} if stated is None else OPTIONS)
+    return read_table(path, wanted, MAX_FILE_BYTES)
 
 
-def _number(path: Path, line: int, name: str, text: str, least: float, most: float, unit: str) -> float:
-    try:
-        value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ForceFileError(f"{path}: row {line}, {name} = {text[:40]!r}: allowed is a finite number")
-    if not least <= value <= most:
-        raise ForceFileError(f"{path}: row {line}, {name} = {text[:40]}: allowed is {least:g}..{most:g} {unit}")
-    return value
+def read_motion(path: Path) -> tuple["array[float]", "array[float]"]:
+    """Read times, s, and positions, mm."""
+    table = read_table(path, Wanted({name: QUANTITIES[name] for name in ("time_s", "displacement_mm")}), MAX_FILE_BYTES)
+    _require(path, table, {"time_s": ALLOWED["time_s"], "displacement_mm": (-1e6, 1e6, "mm")})
+    return table.values["time_s"], table.values["displacement_mm"]
+
+
+def _require(path: Path, table: Table, allowed: Allowed) -> None:
+    """Refuse a row that lacks a value, is out of range or does not follow the row before."""
+    if table.missing:
+        raise TableError(f"{path}: row {table.missing[0]} lacks a value: fill it in, or delete the row")
+    for name, values in table.values.items():
+        least, most, unit = allowed.get(name, ALLOWED[name])
+        for row, value in zip(table.rows, values, strict=True):
+            if not least <= value <= most:
+                why = f"; {NO_PUSH}" if unit == "N" and value < least else ""
+                raise TableError(f"{path}: row {row}, {name} = {value:g}: allowed is {least:g}..{most:g} {unit}{why}")
+    times_s, rows = table.values["time_s"], table.rows
+    for place in range(1, len(rows)):
+        if not times_s[place] > times_s[place - 1]:
+            raise TableError(
+                f"{path}: row {rows[place]}, time_s = {times_s[place]:g}: allowed is above the row before, "
+                f"{times_s[place - 1]:g}"
+            )

@@ -98,7 +98,7 @@ class Connection:
     @property
     def remedy(self) -> str:
         if self.state is LinkState.RUNNING:
-            return "look at what the firmware sends, and at its CRC-8" if self.cause else ""
+            return self.cause and "wait a moment; if it stays, look at what the firmware sends, and at its CRC-8"
         return self._remedy or _REMEDIES.get(self.state, "")
 
     @property

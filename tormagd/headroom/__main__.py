@@ -5,6 +5,7 @@ interpreter with the one who asks.
 """
 
 import argparse
+import asyncio
 import json
 import sys
 from pathlib import Path
@@ -44,7 +45,8 @@ def main(arguments: list[str] | None = None) -> int:
 def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority
-    late, cost = uvloop.run(_in_real_time(config, timer_s, steps, plans))
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        late, cost = runner.run(_in_real_time(config, timer_s, steps, plans))
     return {
         "machine_us": round(machine, 1),
         "build": build(),

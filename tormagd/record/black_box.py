@@ -16,8 +16,9 @@ from mcap.records import Channel, McapRecord, Message, Metadata
 
 from tormagd import __version__
 from tormagd.ground.files import in_place_of
-from tormagd.record.keeper_messages import READ, WROTE, Part
+from tormagd.record.keeper_messages import MISSING, READ, WROTE, Part
 from tormagd.record.reader import RecordingError, damage_in, opened, scan
+from tormagd.record.ticks import Axis
 from tormagd.record.writer import TICK_SCHEMA, TICKS_TOPIC, begun, known_values, plain_schema, registered
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
@@ -76,24 +77,24 @@ class Shown(NamedTuple):
 class Derived:
     """Derives the messages of `/ticks` and `/frames` from the parts of `/core`."""
 
-    def __init__(self, columns: str) -> None:
-        """Begin; `columns` names the values of a tick, a list in JSON."""
+    def __init__(self, columns: str, offset_ns: int = 0) -> None:
+        """Begin; `columns` names the values of a tick, a list in JSON, `offset_ns` is from monotonic time to 1970's."""
         self._columns = msgspec.json.decode(columns, type=tuple[str, ...])
         self._ticks = self._frames = 0
-        self._offset_ns: int | None = None
+        self._offset_ns = offset_ns
+        self._axis = Axis()
+        self._monotonic_at = self._columns.index("monotonic_s") if "monotonic_s" in self._columns else 0
 
-    def of(self, entries: Sequence[Any], offset_ns: int | None) -> Iterator[Shown]:
+    def of(self, entries: Sequence[Any]) -> Iterator[Shown]:
         """Yield the messages derived from one part's entries, in their order: one a tick, one a frame."""
-        if self._offset_ns is None:
-            self._offset_ns = offset_ns
         for entry in entries:
             if is_tick(entry):
                 data = msgspec.json.encode(known_values(self._columns, entry))
-                yield Shown(TICKS_TOPIC, entry[0], self._ticks, data)
+                yield Shown(TICKS_TOPIC, self._axis.of_tick(entry[0], entry[self._monotonic_at]), self._ticks, data)
                 self._ticks += 1
             for frame in frames_in(entry):
                 self._frames += 1
-                t_ns = round(frame.monotonic_s * 1e9) + (self._offset_ns or 0)
+                t_ns = round(frame.monotonic_s * 1e9) + self._offset_ns
                 yield Shown(FRAMES_TOPIC, t_ns, self._frames, msgspec.json.encode(frame))
 
 
@@ -101,7 +102,8 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -
     """Write a new black box of these parts, whole or not at all."""
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
-    derived = Derived(header["columns"])
+    offset_ns = parts[0].t_ns - round(parts[0].time_s * 1e9)
+    derived = Derived(header["columns"], offset_ns)
     with in_place_of(path) as beside, beside.open("wb") as file:
         mcap = begun(file, {"version": __version__, "kind": HEADER})
         mcap.add_metadata(HEADER, header)
@@ -109,9 +111,9 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -
         schemas = {TICKS_TOPIC: TICK_SCHEMA, FRAMES_TOPIC: plain_schema(Frame)}
         channels = {topic: registered(mcap, topic, schema) for topic, schema in schemas.items()}
         for number, part in enumerate(parts):
-            mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
-            offset_ns = part.t_ns - round(part.time_s * 1e9)
-            for shown in derived.of(msgspec.msgpack.decode(part.entries), offset_ns):
+            at_ns = round(part.time_s * 1e9) + offset_ns
+            mcap.add_message(core, log_time=at_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
+            for shown in derived.of(msgspec.msgpack.decode(part.entries)):
                 t_ns, channel = shown.t_ns, channels[shown.topic]
                 mcap.add_message(channel, t_ns, shown.data, publish_time=t_ns, sequence=shown.sequence)
         mcap.finish()  # type: ignore[no-untyped-call]
@@ -126,7 +128,7 @@ def read_black_box(path: Path) -> BlackBoxFile:
     """Read the black box in `path`; one that was cut short is returned as far as it reads, with `is_complete` False."""
     found = _Reading(path)
     with opened(path) as file:
-        is_complete = scan(file, str(path), found.take, found.message)
+        is_complete = scan(file, str(path), found.take, found.message, found.lose)
         damage = damage_in(file)
     if not found.header or not found.entries:
         raise RecordingError(f"{path}: {NO_BLACK_BOX}")
@@ -172,6 +174,11 @@ class _Reading:
         elif topic in self._expected and not self.odd:
             self._compare(topic, sent)
 
+    def lose(self, _what: str) -> None:
+        """Note that entries are missing; what is derived from them is compared no more."""
+        self.entries.append([MISSING])
+        self._expected.clear()
+
     def _part(self, sent: Message) -> None:
         """Add a part's entries to `entries`, and expect the messages derived from them in the file."""
         self._size, self._parts = self._size + len(sent.data), self._parts + 1
@@ -184,9 +191,9 @@ class _Reading:
         if self._derived is None:
             self._derived = Derived(self.header.get("columns", "[]"))
         try:
-            for shown in self._derived.of(entries, None):
+            for shown in self._derived.of(entries) if self._expected else ():
                 self._expected[shown.topic].append(shown)
-        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+        except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
 
     def _compare(self, topic: str, sent: Message) -> None:

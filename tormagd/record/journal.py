@@ -26,23 +26,23 @@ from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.keeper_messages import READ, WROTE
+from tormagd.record.keeper_messages import MISSING as MISSING, READ, WROTE
 from tormagd_client.messages import TickRecord
 
-FORMAT = 15
-"Version of the entries and their states: raised when one comes, goes or changes its meaning. No other is rerun."
+FORMAT = 16
+"Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
     *(Measured, Handle, Travel, Turn, Wall, Leap, Reference, Plan, Outside),
     *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
 )
-"All types that `exact` reads back."
+"All types that `plain_values` reads back."
 STEP = "step"
 PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
-"A conversation began or ended. READ and WROTE are in `keeping`."
-STATE, MISSING = "state", "missing"
+"A conversation began or ended. READ and WROTE are in `keeper_messages`."
+STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."
 

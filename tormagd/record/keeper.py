@@ -1,14 +1,18 @@
 """The process that keeps a daemon's black box: `python -m tormagd.record.keeper DESCRIPTOR`.
 
-It holds the newest half minute in memory and writes it to a file when the daemon says so. It also writes it when the
-daemon is gone without having said that it ends.
+It holds the newest half minute in shared memory and writes it to a file when the daemon says so. It also writes it when
+the daemon is gone without having said that it ends; where both were killed, the next keeper does.
 """
 
 import contextlib
+import fcntl
+import hashlib
+import math
 import os
 import select
 import signal
 import socket
+import struct
 import sys
 import threading
 import time
@@ -31,29 +35,86 @@ MAX_DUE = 28
 LOOK_S = 0.05
 "Period of looking whether a file is due."
 DIED = "DAEMON-DIED"
+SHARED_MEMORY = "/dev/shm"
+LENGTH = struct.Struct("<I")
+"Of what follows it in a file of the ring."
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Ring:
-    """The newest parts of a black box: none over `kept_s` older than the last, at most `most_bytes`, and always the
-    last."""
+def in_shared_memory(folder: str) -> list[int]:
+    """Open the two files of the ring for `folder`; none where another keeps them, or they are not ours."""
+    files: list[int] = []
+    try:
+        for path in ring_paths(folder):
+            files.append(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
+            if os.fstat(files[-1]).st_uid != os.getuid():
+                raise PermissionError(path)
+            fcntl.flock(files[-1], fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        for file in files:
+            os.close(file)
+        return []
+    return files
 
-    def __init__(self, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
-        self._kept_s, self._most_bytes = kept_s, most_bytes
-        self._parts: deque[Part] = deque()
-        self.bytes = 0
+
+def ring_paths(folder: str) -> list[Path]:
+    name = hashlib.sha256(folder.encode()).hexdigest()[:16]
+    return [Path(SHARED_MEMORY, f"tormagd-{os.getuid()}-{name}-{number}") for number in range(2)]
+
+
+class Ring:
+    """The newest parts of a black box, after their Begin, in two files of which the older is written over.
+
+    The files outlive their writer; `parts` gives none over `kept_s` older than the last, and always the last.
+    """
+
+    def __init__(self, files: list[int] | None = None, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
+        self._files = files or [os.memfd_create("tormagd", os.MFD_CLOEXEC) for _ in range(2)]
+        self._kept_s, self._most_bytes = kept_s, most_bytes // 2
+        self._begun = Begin("", {})
+        self._first_s, self._bytes = -math.inf, 0
+
+    def begin(self, begun: Begin) -> None:
+        """Forget what is kept."""
+        self._begun = begun
+        for file in self._files:
+            os.ftruncate(file, 0)
+        self._turn(-math.inf)
 
     def put(self, part: Part) -> None:
-        """Add a part, which comes later than those before, and drop the oldest while they are too old or too large."""
-        self._parts.append(part)
-        self.bytes += len(part.entries)
-        parts = self._parts
-        while len(parts) > 1 and (self.bytes > self._most_bytes or part.time_s - parts[0].time_s > self._kept_s):
-            self.bytes -= len(parts.popleft().entries)
+        """Add a part, which comes later than those before."""
+        if part.time_s - self._first_s > self._kept_s or self._bytes + len(part.entries) > self._most_bytes:
+            self._turn(part.time_s)
+        self._append(part)
+        self._bytes += len(part.entries)
+
+    def said(self) -> list[Begin | Part]:
+        """List what both files hold, as far as they were written."""
+        found: list[Begin | Part] = []
+        for file in self._files:
+            data, at = os.pread(file, os.fstat(file).st_size, 0), LENGTH.size
+            with contextlib.suppress(msgspec.MsgspecError, struct.error):
+                while at <= len(data):
+                    end = at + LENGTH.unpack_from(data, at - LENGTH.size)[0]
+                    found.append(msgspec.msgpack.decode(data[at:end], type=Begin | Part))
+                    at = end + LENGTH.size
+        return found
 
     def parts(self) -> list[Part]:
         """List what is kept, the oldest first."""
-        return list(self._parts)
+        parts = sorted((each for each in self.said() if isinstance(each, Part)), key=lambda part: part.time_s)
+        return [each for each in parts if parts[-1].time_s - each.time_s <= self._kept_s]
+
+    def _turn(self, first_s: float) -> None:
+        """Write over the older file."""
+        self._files.reverse()
+        os.ftruncate(self._files[0], 0)
+        self._first_s, self._bytes = first_s, 0
+        self._append(self._begun)
+
+    def _append(self, what: Begin | Part) -> None:
+        data = msgspec.msgpack.encode(what)
+        os.pwrite(self._files[0], LENGTH.pack(len(data)) + data, os.fstat(self._files[0]).st_size)
 
 
 class Keeper:
@@ -61,8 +122,7 @@ class Keeper:
 
     def __init__(self, its: socket.socket) -> None:
         self._socket = its
-        self._ring = Ring()
-        self._begun = Begin("", {})
+        self._ring, self._begun, self._is_named = Ring(), Begin("", {}), False
         self._due: list[tuple[float, Write]] = []
         self._writing: threading.Thread | None = None
         self._written: deque[str] = deque(maxlen=2 * MAX_FILES)
@@ -79,6 +139,9 @@ class Keeper:
                 self._writing = threading.Thread(target=self._write, args=(due[1], self._begun, self._ring.parts()))
                 self._writing.start()
         self._write_due()
+        if self._is_named:
+            for path in ring_paths(self._begun.folder):
+                path.unlink(missing_ok=True)
 
     def _write_due(self) -> None:
         """Write all black boxes that are still due, without waiting for what should have come into them."""
@@ -99,8 +162,7 @@ class Keeper:
             data = b""
         if not data:
             if self._ring.parts():
-                stamp = time.strftime("%Y%m%dT%H%M%S.000Z", time.gmtime())
-                self._due.append((0.0, Write(f"{stamp}-{DIED}.mcap", DIED, 0.0, {})))
+                self._due.append((0.0, died()))
             return False
         said: Said = msgspec.msgpack.decode(data, type=Said)
         self._take(said)
@@ -113,12 +175,28 @@ class Keeper:
                 self._ring.put(said)
             case Begin():
                 self._write_due()  # they are of the scene that ends
-                self._begun, self._ring = said, Ring()
+                self._begin(said)
             case Write() if len(self._due) < MAX_DUE:
                 self._due.append((time.monotonic() + said.after_s, said))
                 self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
             case Write():
                 self._answer(Written(said.name, f"{said.name}: {MAX_DUE} others are still to be written"))
+
+    def _begin(self, begun: Begin) -> None:
+        """Begin the ring anew; write what a keeper that was killed has left, or go on with it for the same daemon."""
+        parts: list[Part] = []
+        if not self._begun.folder:
+            files = in_shared_memory(begun.folder)
+            self._ring, self._is_named = Ring(files), bool(files)
+            parts = self._ring.parts()
+            left = next((each for each in self._ring.said() if isinstance(each, Begin)), None)
+            if left is not None and parts and not begun.is_again:
+                self._write(died(), left, parts)
+                parts = []
+        self._begun = begun
+        self._ring.begin(begun)
+        for part in parts:
+            self._ring.put(part)
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
         """Write one black box of `parts`, delete the oldest of its kind beyond MAX_FILES, and answer the daemon."""
@@ -147,6 +225,10 @@ class Keeper:
     def _answer(self, answer: Written) -> None:
         with contextlib.suppress(OSError):  # there may be nobody any more
             self._socket.send(msgspec.msgpack.encode(answer), socket.MSG_DONTWAIT)
+
+
+def died() -> Write:
+    return Write(time.strftime(f"%Y%m%dT%H%M%S.000Z-{DIED}.mcap", time.gmtime()), DIED, 0.0, {})
 
 
 def main() -> None:

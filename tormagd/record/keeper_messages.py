@@ -2,23 +2,24 @@
 
 import msgspec
 
-KEEPER = "tormagd.record.keeper"
-"The keeper's main module, with its socket's descriptor as the argument."
 REQUEST = "REQUEST"
 "Reason of a black box that somebody asked for; any other is a fault's."
 READ, WROTE = "read", "wrote"
 "Entries of what passed between daemon and device: `[READ, time_s, raw, ...]`."
+MISSING = "missing"
+"An entry where others were lost."
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
-    """First message: the folder for black boxes, and the header of each."""
+    """First message: the folder for black boxes, and the header of each; `is_again` where a keeper has ended before."""
 
     folder: str
     header: dict[str, str]
+    is_again: bool = False
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
-    """Some control periods, as entries of `assembly/journal.py`. Both times are the last period's."""
+    """Some control periods, as entries of `journal.py`. Both times are the last period's."""
 
     time_s: float
     t_ns: int

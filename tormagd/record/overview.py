@@ -34,6 +34,8 @@ FIRST_WIDTH_NS = 1_000_000
 MAX_STRETCHES = 1_500
 MAX_SPANS = 1_000
 "Beyond these, the nearest spans of one code are joined."
+STEP_NS = 100_000_000
+"A wall clock that is set further is said."
 MAX_CODES, MAX_MARKS = 66, 1_000
 MAX_BYTES = 2_000_000
 CODE = re.compile(r"[A-Za-z0-9_.:?-]{1,64}")
@@ -51,6 +53,7 @@ Code = Annotated[str, Meta(pattern=rf"\A{CODE.pattern}\Z")]
 
 
 class Glance(TypedDict, total=False):
+    t_ns: float | None
     setpoint_cf: float | None
     governed_cf: float | None
     measured_cf: float | None
@@ -167,9 +170,11 @@ class OverviewBuilder:
         self._counts = {True: 0, False: 0}
         self._late = [0] * (len(LATE_US) + 1)
         self._marks: list[Mark] = []
+        self._mark: Mark | None = None
+        self._ahead_ns = 0
 
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
-        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970."""
+        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970, by an `Axis`."""
         if self._start_ns is None:
             self._start_ns = self._end_ns = t_ns
         since_ns = t_ns - self._start_ns
@@ -182,9 +187,19 @@ class OverviewBuilder:
         late_us = _number(message.get("lateness_us"))
         if late_us is not None:
             self._late[bisect_right(LATE_US, late_us)] += 1
+        wall_ns = _number(message.get("t_ns")) if is_tick else None
+        if wall_ns is not None:
+            step_ns = round(wall_ns) - t_ns - self._ahead_ns
+            if abs(step_ns) > STEP_NS:
+                self._ahead_ns += step_ns
+                self._add_mark(Mark(t_ns=t_ns, text=f"the clock stepped by {step_ns * 1e-9:+.6g} s"))
         mark = message.get("mark")
-        # every snapshot has the newest mark, even one from before
-        if mark and mark.t_ns >= self._start_ns and len(self._marks) < MAX_MARKS and self._marks[-1:] != [mark]:
+        if mark and mark != self._mark:  # every snapshot has the newest
+            self._mark = mark
+            self._add_mark(Mark(t_ns=mark.t_ns - self._ahead_ns, text=mark.text))
+
+    def _add_mark(self, mark: Mark) -> None:
+        if mark.t_ns >= (self._start_ns or 0) and len(self._marks) < MAX_MARKS:
             self._marks.append(mark)
 
     def made(self) -> Overview:

@@ -7,6 +7,7 @@ at most MAX_RECORD_BYTES, and all chunks together MAX_RATIO times the file's byt
 import contextlib
 import struct
 import zlib
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -107,7 +108,8 @@ class _Bounded:
 def _records(file: BinaryIO, *, has_magic: bool = False) -> Iterator[McapRecord]:
     """Yield the records to the end, chunks packed."""
     stream = _Bounded(file)
-    reader = StreamReader(stream, skip_magic=not has_magic, emit_chunks=True)  # type: ignore[arg-type]
+    limits: dict[str, Any] = {"emit_chunks": True, "record_size_limit": MAX_RECORD_BYTES}
+    reader = StreamReader(stream, skip_magic=not has_magic, **limits)  # type: ignore[arg-type]
     for record in reader.records:
         yield record
         stream.left = MAX_RECORD_BYTES
@@ -125,31 +127,92 @@ def _within(chunk: Chunk) -> list[McapRecord]:
 
 
 def scan(
-    file: BinaryIO, name: str, take: Callable[[McapRecord, int], None], message: Callable[[Message], None]
+    file: BinaryIO,
+    name: str,
+    take: Callable[[McapRecord, int], None],
+    message: Callable[[Message], None],
+    lost: Callable[[str], None],
 ) -> bool:
-    """Read an MCAP file: each message goes to `message`, other records and where they begin to `take`."""
-    at, size = MAGIC_SIZE, 0
+    """Read an MCAP file: each message goes to `message`, other records and where they begin to `take`.
+
+    Damage goes to `lost`, and reading goes on with the next chunk. Returns False for a file that was cut short.
+    """
+    size, damage, is_whole = 0, "", True
+
+    def note(text: str) -> None:
+        nonlocal damage
+        damage = damage or text
+        lost(text)
+
     with readable(name):
         try:
-            for record in _records(file, has_magic=True):
-                within = [record]
+            for at, record, within in _intact(file, note):
                 if isinstance(record, Chunk):
                     take(record, at)
                     size += record.uncompressed_size
                     if size > MAX_RATIO * file.tell() + FREE_BYTES:
                         raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
-                    within = _within(record)
                 for each in within:
                     if isinstance(each, Message):
                         message(each)
                     else:
                         take(each, at)
-                at = file.tell()
         except EOFError:
-            return False
-        if file.read(1):
+            is_whole = False
+        if damage and not size:
+            raise ValueError(damage)
+        if is_whole and file.read(1):
             raise ValueError("it does not end as MCAP does")
-    return True
+    return is_whole
+
+
+def _intact(file: BinaryIO, lost: Callable[[str], None]) -> Iterator[tuple[int, McapRecord, list[McapRecord]]]:
+    """Yield where each record begins, the record, and what is in a chunk; EOFError where no more can be read.
+
+    After damage the summary says where the next chunk is; without one, reading goes on after a chunk.
+    """
+    at, records = MAGIC_SIZE, _records(file, has_magic=True)
+    chunks: list[int] | None = None
+    while True:
+        record: McapRecord | None = None
+        try:
+            record = next(records, None)
+            if record is None:
+                return
+            within = _within(record) if isinstance(record, Chunk) else [record]
+        except UNREADABLE as error:
+            if record is None and isinstance(error, EOFError):
+                raise
+            lost(f"byte {at}: {str(error)[:80] or repr(error)}")
+            end = file.tell()
+            if chunks is None:
+                chunks = sorted(each.chunk_start_offset for each in _indexed(file))
+            following = bisect_right(chunks, at)
+            if following == len(chunks) and record is None:
+                raise EOFError from error
+            at = file.seek(chunks[following] if following < len(chunks) else end)
+            records = _records(file)
+        else:
+            yield at, record, within
+            at = file.tell()
+
+
+def _indexed(file: BinaryIO) -> list[ChunkIndex]:
+    """List the chunks that the file's summary names; none where it is not there."""
+    found: list[ChunkIndex] = []
+    with contextlib.suppress(*UNREADABLE):
+        for record in _summary(file):
+            if isinstance(record, ChunkIndex) and len(found) < MAX_INDEX:
+                found.append(record)
+    return found
+
+
+def _summary(file: BinaryIO) -> Iterator[McapRecord]:
+    """Yield the records of a file's summary; none of one that was cut short."""
+    footer, _ = _end(file)
+    if footer is not None:
+        file.seek(footer.summary_start)
+        yield from _records(file)
 
 
 def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
@@ -177,7 +240,10 @@ def damage_in(file: BinaryIO) -> str:
         data_crc = _at(file, data_end_at, DataEnd).data_section_crc
         if not data_crc:
             file.seek(0)
-            scan(file, file.name, lambda record, at: None, lambda message: None)
+            lost: list[str] = []
+            scan(file, file.name, lambda record, at: None, lambda message: None, lost.append)
+            if lost:
+                return lost[0]
         elif data_crc != _crc(file, 0, data_end_at):
             return "the CRC of its data is wrong"
         if footer.summary_crc not in (0, _crc(file, footer.summary_start, at + FOOTER_SIZE - 4)):
@@ -210,6 +276,7 @@ class Contents:
         self._topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
+        self.lost: list[str] = []
         self.is_complete = True
         "False if the recorder was killed or the disk was full: earlier messages are there."
 
@@ -248,7 +315,7 @@ class Contents:
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
     """Read an open recording: each tick and snapshot goes to `each`."""
     found = Contents()
-    is_whole = scan(file, name, found.take, found.reading(wanted, each))
+    is_whole = scan(file, name, found.take, found.reading(wanted, each), found.lost.append)
     found.require(name)
     found.is_complete = is_whole and CUT not in found.metadata
     return found
@@ -277,6 +344,11 @@ class RecordingFile:
         known = self.metadata
         self.notes = [
             *([f"damaged: {self.damage}"] if self.damage else []),
+            *(
+                [f"left out: {len(self._contents.lost)} damaged, {self._contents.lost[0]}"]
+                if self._contents.lost
+                else []
+            ),
             *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
             *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
         ]
@@ -306,11 +378,7 @@ def summary_of(path: Path) -> tuple[Contents, Overview] | None:
     """Read contents and overview from the end of the file, if they are there."""
     found, told, overview_at = Contents(), [], 0
     with opened(path) as file, readable(str(path)):
-        footer, _ = _end(file)
-        if footer is None:
-            return None
-        file.seek(footer.summary_start)
-        for record in _records(file):
+        for record in _summary(file):
             if isinstance(record, ChunkIndex) and len(found.places) < MAX_INDEX:
                 place = Place(record.message_start_time, record.message_end_time, record.chunk_start_offset)
                 found.places.append(place)

@@ -9,6 +9,7 @@ import contextlib
 import errno
 import fcntl
 import math
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from itertools import repeat
@@ -23,7 +24,7 @@ from tormagd import __version__
 from tormagd.record.folder import RecordingFolder
 from tormagd.record.overview import OverviewBuilder
 from tormagd.record.thinning import AROUND_S, Thinning
-from tormagd.record.ticks import TickBatch, Value
+from tormagd.record.ticks import Axis, TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry, TickRecord
 
 ABOUT = "tormagd"
@@ -79,7 +80,7 @@ class RecordingWriter:
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        self._overview = OverviewBuilder()
+        self._overview, self._axis = OverviewBuilder(), Axis()
         self._mcap = begun(self._file, self._about)
         self._file.flush()
         self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
@@ -112,22 +113,29 @@ class RecordingWriter:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
         mark, before, self._mark = message.mark, self._mark, message.mark or self._mark
+        at_ns = self._axis.of_snapshot(message.t_ns)
         if mark is not None and mark != before:
-            self._thinning.happened(message.t_ns)
-        known = _known(msgspec.to_builtins(message))
-        self._add(self._telemetry_channel, message.t_ns, msgspec.json.encode(known), self.telemetry_count)
-        self._overview.add(message.t_ns, False, known | {"mark": mark})
+            self._thinning.happened(at_ns)
+        known = only_known(msgspec.to_builtins(message))
+        self._add(self._telemetry_channel, at_ns, msgspec.json.encode(known), self.telemetry_count)
+        self._overview.add(at_ns, False, known | {"mark": mark})
         self.telemetry_count += 1
         # every snapshot has the newest mark, even one from before
-        if mark is not None and mark != before and mark.t_ns >= self._begin_ns and self._folder is not None:
+        if (
+            mark is not None
+            and mark != before
+            and mark.t_ns - self._axis.ahead_ns >= self._begin_ns
+            and self._folder is not None
+        ):
             self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
         """Write each row as one message, thinned, and count missing ticks."""
         number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
+        monotonic_at = batch.columns.index("monotonic_s") if "monotonic_s" in batch.columns else 0
         for row in batch.rows:
-            t_ns = row[0]
-            assert isinstance(t_ns, int)
+            assert isinstance(row[0], int)
+            t_ns = self._axis.of_tick(row[0], row[monotonic_at])
             if number_at is not None and isinstance(number := row[number_at], int):
                 if self._last_tick is not None and number > self._last_tick + 1:
                     self.ticks_lost += number - self._last_tick - 1
@@ -149,6 +157,8 @@ class RecordingWriter:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", self._overview.made().packed())
             self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            os.fsync(self._file.fileno())
 
     def __enter__(self) -> Self:
         return self
@@ -221,7 +231,7 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
 
 def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Value]:
     """Return a tick's row as a message, without values that are None, NaN or infinite."""
-    # inlines _known: some sixty values a thousand times a second
+    # inlines only_known: some sixty values a thousand times a second
     return {
         name: value
         for name, value in zip(columns, row, strict=True)
@@ -243,9 +253,9 @@ TICK_KINDS = {name: kind["type"] for name, kind in TICK_SCHEMA["properties"].ite
 OTHER_SCHEMA = {"title": "tormagd.OtherTick", "type": "object"}
 
 
-def _known(value: Any) -> Any:
+def only_known(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: known for name, inner in value.items() if (known := _known(inner)) is not None}
+        return {name: known for name, inner in value.items() if (known := only_known(inner)) is not None}
     if isinstance(value, list | tuple):
-        return None if None in map(_known, value) else value
+        return None if None in map(only_known, value) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value

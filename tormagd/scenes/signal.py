@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET
 
-from tormagd.ground.force_file import ForceFileError, read_forces
+from tormagd.ground.force_file import read_forces
+from tormagd.ground.table import TableError
 from tormagd.scenes.scene import Signal
 from tormagd_client.endpoints import ConfigError
 
@@ -17,10 +18,10 @@ Array = npt.NDArray[np.float64]
 def recorded(path: Path) -> tuple[Array, Array]:
     """Read a file of forces, and return times from the first row on, s, and forces, N. Raises ConfigError."""
     try:
-        table = read_forces(path)
-    except ForceFileError as error:
+        table = read_forces(path).values
+    except TableError as error:
         raise ConfigError(f"signal.file = {error}") from error
-    time_s = np.array(table["t_s"])
+    time_s = np.array(table["time_s"])
     return time_s - time_s[0], np.array(table["force_N"])
 
 

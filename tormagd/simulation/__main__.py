@@ -19,7 +19,7 @@ from tormagd.element.physics.errors import DomainError
 from tormagd.ground.scheduling import ask_for_slices
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
-from tormagd.simulation.can_port import FOLDER_PREFIX, CanDoor
+from tormagd.simulation.can_port import FOLDER_PREFIX, CanPort
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, MessageDevice, VirtualDevice
 from tormagd.simulation.emulated_firmware import EmulatedFirmware, EmulationError
@@ -27,9 +27,9 @@ from tormagd.simulation.faults import FORMS as KNOWN_FAULTS, FaultError, parse_f
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
 from tormagd.simulation.parameters import PlantError, load_plant, plant_names
-from tormagd.simulation.pty_port import PtyDoor
+from tormagd.simulation.pty_port import PtyPort
 from tormagd.simulation.real_time import Door, PacedDevice, serve
-from tormagd.simulation.slcan_port import SlcanDoor
+from tormagd.simulation.slcan_port import SlcanPort
 from tormagd_client.printable import printable
 
 # The C sources are what a microcontroller runs, in qemu or natively; the Python twin needs no compiler.
@@ -75,14 +75,14 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
     door: Door
     if options.pty:
         line = VirtualDevice(plant, hand, faults, options.seed, options.baud, boot)
-        door = resources.enter_context(contextlib.closing(PtyDoor(line)))
+        door = resources.enter_context(contextlib.closing(PtyPort(line)))
         return line, door
     device = CanDevice(MessageDevice(plant, hand, faults, options.seed, boot), options.bitrate, options.node)
     if options.slcan:
-        door = SlcanDoor(device)
+        door = SlcanPort(device)
     else:
         folder = resources.enter_context(tempfile.TemporaryDirectory(prefix=FOLDER_PREFIX))
-        door = CanDoor(device, Path(options.can or f"{folder}/can"))
+        door = CanPort(device, Path(options.can or f"{folder}/can"))
     resources.callback(door.close)
     return device, door
 

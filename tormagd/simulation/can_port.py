@@ -15,7 +15,7 @@ FOLDER_PREFIX = "tormagsim-"
 "Names the folder of a channel without a given path."
 
 
-class CanDoor:
+class CanPort:
     """A simulated CAN bus with a device and up to MAX_HOSTS hosts, which come and go."""
 
     def __init__(self, device: CanDevice, path: Path) -> None:

@@ -1,7 +1,7 @@
 """The closed loop in virtual time: the daemon's core against the simulated device, as fast as the processor goes.
 
 `plan` and `step`, the connection and the protocol bytes are the daemon's own; only time, sockets and the port are
-replaced. The module stands beside the rooms because it joins control with simulation, which no room may.
+replaced.
 """
 
 from collections.abc import Callable, Iterable
@@ -265,3 +265,7 @@ def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callabl
         return TimedSetpoint(sent_N[sent - 1], sent_s[sent - 1], valid_for_s) if sent else None
 
     return newest
+
+
+def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())

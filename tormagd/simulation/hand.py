@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
-from tormagd.ground.force_file import TIME, ForceFileError, read_table
+from tormagd.ground.force_file import read_motion
+from tormagd.ground.table import TableError
 
 ROLLER_RADIUS_MM: Final = 20.0
 DEFAULT_RPM: Final = 20.0
@@ -19,7 +20,6 @@ PRESSING_MM_S: Final = 1.0
 EXACT_N: Final = 1e-9
 ROUNDS: Final = 100
 "How exactly, and in how many rounds at most, a felt step is solved."
-RECORDED = {"t_s": TIME, "position_mm": (-1e6, 1e6, "mm")}
 KNOWN = (
     "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], felt[=KEY=VALUE,...], "
     "or a FILE.csv with the columns t_s,position_mm"
@@ -241,7 +241,7 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
 def read_recording(path: Path) -> RecordedHand:
     """Read a hand's motion from a CSV file. Raises HandError."""
     try:
-        table = read_table(path, RECORDED)
-    except ForceFileError as error:
+        times_s, positions_mm = read_motion(path)
+    except TableError as error:
         raise HandError(str(error)) from error
-    return RecordedHand(tuple(table["t_s"]), tuple(table["position_mm"]))
+    return RecordedHand(tuple(times_s), tuple(positions_mm))

@@ -45,7 +45,7 @@ class Pty:
             termios.tcflush(self._theirs, termios.TCIFLUSH)
 
 
-class PtyDoor(Pty):
+class PtyPort(Pty):
     def __init__(self, device: VirtualDevice) -> None:
         super().__init__()
         self._device = device

@@ -63,7 +63,7 @@ class SlcanAdapter:
         return TOLD.get(command[:1], REFUSED)
 
 
-class SlcanDoor(Pty):
+class SlcanPort(Pty):
     """The device on a CAN bus, behind an slcan adapter on a pseudo-terminal."""
 
     def __init__(self, device: CanDevice) -> None:

@@ -8,7 +8,7 @@ from tormagd.commission.sequence import STEPS, Report
 from tormagd.view.html import page, table
 
 FAIL = "FAIL"
-HEADS = ("step", "", "measured", "allowed", "", "what to do", "last time", "difference")
+HEADS = ("step", "finding", "measured", "allowed", "verdict", "what to do", "last time", "difference")
 KIT = "python -m firmware_protocol.conformance PORT --json > FILE, then --conformance FILE"
 
 

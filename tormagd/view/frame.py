@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 
 from tormagd.record.overview import LATE_US
-from tormagd_client.messages import BeliefReport
 
 SHOWN_S = 20.0
 DRIVEN = ("ENABLED", "PAUSED")
@@ -23,7 +22,7 @@ class Held(msgspec.Struct, frozen=True):
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True):
-    """One update of the page: curves of equal length, the oldest first. `t_s` is since 1970; None is not known."""
+    """One update: curves of equal length, the oldest first. `t_s` is since 1970; None is not known."""
 
     t_s: Sequence[float]
     asked_N: Sequence[float | None]
@@ -35,7 +34,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     operating_state: str
     held: Sequence[Held]
     faults: Sequence[str]
-    belief: Mapping[str, BeliefReport]
+    believed: Mapping[str, str]
     late_counts: Sequence[int]
 
 

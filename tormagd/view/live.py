@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
+from tormagd.view.believed import as_said
 from tormagd.view.frame import DRIVEN, Frame, Held, late_counts
 from tormagd_client.aio import AsyncClient
 from tormagd_client.errors import ClientError
@@ -36,11 +37,11 @@ class Live:
         self._client, self._status = client, status
         self._kept: deque[Telemetry] = deque(maxlen=KEPT)
         self._new: list[Telemetry] = []
-        self.browsers: set[asyncio.Queue[bytes]] = set()
+        self.browsers: set[asyncio.Queue[str]] = set()
         self._explained: dict[str, dict[str, Explained]] = {"limits": {}, "faults": {}}
         self._heard_s = time.monotonic()
         self._why_silent = ""
-        self._portrait = {"portrait": description.portrait}
+        self._portrait = description.portrait
         self._learn(status)
 
     async def run(self) -> None:
@@ -50,12 +51,13 @@ class Live:
                 tasks.create_task(each)
 
     @contextlib.contextmanager
-    def browser(self) -> Iterator[asyncio.Queue[bytes]]:
+    def browser(self) -> Iterator[asyncio.Queue[str]]:
         """Add a browser for this context, and give the queue of its events."""
-        events: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
+        events: asyncio.Queue[str] = asyncio.Queue(WAITING)
         if self._kept:
             events.put_nowait(event("frame", self._frame(self._kept)))
-        events.put_nowait(event("status", self._shown_status()))
+        events.put_nowait(event("status", self._status))
+        events.put_nowait(event("explained", self._explained))
         events.put_nowait(event("portrait", self._portrait))
         self.browsers.add(events)
         try:
@@ -91,9 +93,10 @@ class Live:
                 with contextlib.suppress(ClientError):  # the page says that nothing is heard
                     self._status = await self._client.status()
                     self._learn(self._status)
-                    self._publish("status", self._shown_status())
+                    self._publish("status", self._status)
+                    self._publish("explained", self._explained)
                     if number % PORTRAIT_EVERY == 0:
-                        self._portrait = {"portrait": (await self._client.describe()).portrait}
+                        self._portrait = (await self._client.describe()).portrait
                         self._publish("portrait", self._portrait)
 
     def _publish(self, name: str, value: object) -> None:
@@ -106,9 +109,6 @@ class Live:
     def _learn(self, status: Status) -> None:
         self._explained["limits"] |= {each.code: each for each in status.limit_details}
         self._explained["faults"] |= {each.code: each for each in status.fault_details}
-
-    def _shown_status(self) -> dict[str, object]:
-        return {"status": self._status, "explained": self._explained}
 
     def _frame(self, snapshots: Sequence[Telemetry]) -> Frame:
         newest, kept = snapshots[-1], self._kept
@@ -124,11 +124,11 @@ class Live:
             operating_state=newest.operating_state,
             held=[Held(code, count / len(kept), code in newest.limits) for code, count in times.most_common()],
             faults=newest.faults,
-            belief=newest.belief,
+            believed=as_said(newest.belief),
             late_counts=late_counts(each.tick.lateness_us for each in kept),
         )
 
 
-def event(name: str, value: object) -> bytes:
-    """Return a server-sent event with `value` as JSON; NaN becomes null."""
-    return b"event: %s\ndata: %s\n\n" % (name.encode(), msgspec.json.encode(value))
+def event(name: str, value: object) -> str:
+    """Return an event as JSON, by its name; NaN becomes null."""
+    return msgspec.json.encode({name: value}).decode()

@@ -12,6 +12,7 @@ from tormagd.control.safety.codes import FAULTS, LIMITS
 from tormagd.record.force_following import in_words
 from tormagd.record.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, Glance, codes_in, quantities
 from tormagd.record.reader import RecordingFile, Seen
+from tormagd.view.believed import as_said
 from tormagd.view.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
 
@@ -132,7 +133,7 @@ class Recorded:
             operating_state=now.get("operating_state") or "",
             held=_held(shown, from_s, at_s, codes_in(now.get("limits"))),
             faults=list(codes_in(now.get("faults"))),
-            belief=believed(snapshots, at_s),
+            believed=as_said(believed(snapshots, at_s)),
             late_counts=late_counts(each for each in late_us if each is not None),
         )
 

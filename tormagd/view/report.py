@@ -13,6 +13,7 @@ from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation
 from tormagd.record.force_following import in_words
 from tormagd.record.overview import BREAK_NS, LATE_US, Codes
 from tormagd.record.reader import RecordingFile
+from tormagd.view.believed import as_said
 from tormagd.view.html import page, table
 from tormagd.view.plot import figure, picture
 from tormagd.view.recorded import believed, moments
@@ -27,16 +28,16 @@ def report(of: Sequence[RecordingFile]) -> str:
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
         *(_notes(each) for each in of if each.notes),
-        table(["", *names], _figures(of)),
+        table(["figure", *names], _figures(of)),
         *(_picture(each) for each in of),
         "<h2>What held the force back</h2>",
         _codes(of, "limits", LIMITS, _held),
         "<h2>Faults</h2>",
         _codes(of, "faults", FAULTS, _moments),
         "<h2>Marks</h2>",
-        table(["", *names], _marks(of)),
+        table(["at", *names], _marks(of)),
         "<h2>What was believed of the device at the end</h2>",
-        table(["", *names], _belief(of)),
+        table(["quantity", *names], _belief(of)),
         "<h2>The machine: how late control ticks began</h2>",
         table(["µs", *names], _lateness(of)),
     ]
@@ -83,7 +84,8 @@ def _range(of: RecordingFile, name: str) -> str:
 def _picture(of: RecordingFile) -> str:
     name = of.path.stem
     png = base64.b64encode(picture(figure(of.overview, name, of.notes), "png")).decode()
-    return f'<p><img alt="force, gap, duty, limits and faults of {escape(name)}" src="data:image/png;base64,{png}"></p>'
+    alt = f"force, gap, duty, limits and faults of {escape(name)}"
+    return f'<p class="wide" tabindex="0"><img alt="{alt}" src="data:image/png;base64,{png}"></p>'
 
 
 def _codes(
@@ -98,7 +100,7 @@ def _codes(
         why = texts.get(code)
         when = ["" if codes is None else told(codes, lasts_s) for codes, lasts_s in known]
         rows.append([code, *when, why.cause if why else "", why.remedy if why else ""])
-    return table(["", *(each.path.name for each in of), "why", "what to do"], rows)
+    return table(["code", *(each.path.name for each in of), "why", "what to do"], rows)
 
 
 def _held(codes: Codes, lasts_s: float) -> str:
@@ -124,14 +126,7 @@ def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
     for each in of:
         end_ns = each.overview.end_ns
         _, snapshots = moments(each, end_ns - BREAK_NS, end_ns)
-        told = believed(snapshots, each.overview.duration_s)
-        found.append(
-            {
-                name: f"{it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'} {it.unit}"
-                for name, it in told.items()
-                if it.acts
-            }
-        )
+        found.append(as_said(believed(snapshots, each.overview.duration_s)))
     return _rows(found)
 
 

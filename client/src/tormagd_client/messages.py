@@ -6,13 +6,14 @@ values. Unknown fields are ignored, so that a newer client can talk to an older 
 docs/messages.md lists the fields of all messages, and says when `v` rises.
 """
 
+import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import msgpack
 import msgspec
 
-from tormagd_client.printable import require
+from tormagd_client.printable import in_short, require
 
 VERSION = 1
 TELEMETRY_TOPIC, MOTION_TOPIC, VERDICT_TOPIC = b"\xde", b"motion", b"verdict"
@@ -22,6 +23,8 @@ MAX_SOURCE_CHARACTERS = 64
 MAX_MARK_CHARACTERS = 200
 MAX_PREVIEW_SAMPLES = 256
 MIN_PREVIEW_DT_MS, MAX_PREVIEW_DT_MS = 0.1, 1_000.0  # no loop runs faster, and a closer one has a slope without measure
+AROUND_ZERO_N = 0.005  # a signal around zero goes so far below it, and is taken as 0
+NO_PUSH = "a brake cannot push"
 MAX_FORCE_N = 1_000.0  # no brake of this size can mean more; `ask` keeps to the scene's own range
 MAX_VALIDITY_MS = 60_000.0
 MAX_DISPLACEMENT_MM = 2.0  # since the handle last turned: friction is mobilised there, and more means nothing
@@ -39,6 +42,12 @@ def _require_within(key: str, value: float | None, least: float, most: float) ->
         require(False, key, value, f"{least:g}..{most:g}")
 
 
+def _require_force(key: str, force_N: float | None) -> None:
+    if not (force_N is None or -AROUND_ZERO_N <= force_N <= MAX_FORCE_N):
+        why = f"; {NO_PUSH}" if force_N < 0.0 else ""
+        require(False, key, force_N, f"0..{MAX_FORCE_N:g} N{why}")
+
+
 class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """An elastic wall on the handle's way, placed as telemetry's `handle_mm`, positive pushing on."""
 
@@ -53,8 +62,9 @@ class Contact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A force to render, from one publisher. `stamp_ns` is the publisher's CLOCK_REALTIME. Raises ValueError out of
-    range.
+    """A force to render, from one publisher. `stamp_ns` is the publisher's CLOCK_REALTIME.
+
+    A force down to -AROUND_ZERO_N means 0. Raises ValueError out of range.
     """
 
     v: int
@@ -78,11 +88,11 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         require(0 <= self.seq < 2**63, "seq", self.seq, "0..2^63-1")
         require(self.session is None or 0 <= self.session < 2**63, "session", self.session, "0..2^63-1")
         require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
-        require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
+        _require_force("servo_cf", self.servo_cf)
         require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
         _require_within("displacement_mm", self.displacement_mm, 0.0, MAX_DISPLACEMENT_MM)
         _require_within("rate_mm_s", self.rate_mm_s, -MAX_RATE_MM_S, MAX_RATE_MM_S)
-        _require_within("withdraw_cf", self.withdraw_cf, 0.0, MAX_FORCE_N)
+        _require_force("withdraw_cf", self.withdraw_cf)
         spacing = self.preview_dt_ms
         if self.preview_N is not None or spacing is not None:
             is_spacing = spacing is not None and MIN_PREVIEW_DT_MS <= spacing <= MAX_PREVIEW_DT_MS
@@ -91,8 +101,7 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
             require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)
             for index, force_N in enumerate(self.preview_N):
-                if not 0.0 <= force_N <= MAX_FORCE_N:
-                    raise ValueError(f"preview_N[{index}] = {force_N!r}: allowed is 0..{MAX_FORCE_N:g} N")
+                _require_force(f"preview_N[{index}]", force_N)
 
 
 class Tick(msgspec.Struct, frozen=True):
@@ -120,7 +129,9 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """What becomes of one setpoint: it is `rendered`, `arrives` in `arrives_ms`, or `cannot`, and `why`."""
+    """What becomes of one setpoint: it is `rendered`, `arrives` in `arrives_ms`, or `cannot`, and `why`; `is_raised` if
+    a force around zero is taken as 0.
+    """
 
     v: int
     t_ns: int
@@ -129,6 +140,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     outcome: str
     arrives_ms: float | None
     why: tuple[str, ...]
+    is_raised: bool = False
 
 
 class Mark(msgspec.Struct, frozen=True, kw_only=True):
@@ -233,7 +245,9 @@ class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's."""
+    """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's; `raised`
+    counts its setpoints around zero that were taken as 0.
+    """
 
     state: str
     silent_ms: float
@@ -250,6 +264,7 @@ class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
     clock: ClockReport | None
     cause: str
     remedy: str
+    raised: int = 0
 
 
 class PlayoutReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -565,21 +580,64 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Request, Reply)
 
+_EXPECTED = re.compile(r"Expected `(.+?)`, got `(.+?)`(?: - at `\$\.?(.*)`)?")
+_REMEDIES = {
+    ("int", "float"): "; pack a whole number (JavaScript: BigInt)",
+    ("int", "Timestamp"): "; pack ns since 1970",
+    ("object", "array"): "; pack the names with the values (rmp-serde: to_vec_named)",
+    ("str", "bin"): "; pack text as str",
+}
+_KINDS = {"object": "map", "bytes": "bin"}
+
 
 def decode(data: bytes, message_type: type[M]) -> M:
     """Return the message in `data`. Raises MessageError for anything but a valid map of this type."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise MessageError(f"message of {len(data)} bytes: allowed is {MAX_MESSAGE_BYTES}")
+    if not data:
+        raise MessageError("message is empty, or has several parts: allowed is one part, the map, without a topic")
     try:
         unpacked = msgpack.unpackb(
-            data, max_str_len=4096, max_bin_len=0, max_array_len=1024, max_map_len=256, max_ext_len=0
+            data,
+            object_pairs_hook=_map,
+            max_str_len=4096,
+            max_bin_len=4096,
+            max_array_len=1024,
+            max_map_len=256,
+            max_ext_len=256,
         )
+    except msgpack.ExtraData as error:
+        where = "after" if isinstance(error.unpacked, dict) else "before"
+        kind = "is JSON" if data[:1] in b"[{" else f"has bytes {where} the map"
+        raise MessageError(f"message {kind}: allowed is one msgpack map and nothing else") from error
+    except MessageError:
+        raise
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
         raise MessageError(f"not a msgpack map: {type(error).__name__} {error}".strip()) from error
     try:
         return msgspec.convert(unpacked, message_type)
     except msgspec.ValidationError as error:
-        raise MessageError(str(error)) from error
+        raise MessageError(_in_words(str(error))) from error
+
+
+def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    names = [name for name, _ in pairs]
+    for name in names:
+        if not isinstance(name, str):
+            raise MessageError(f"key {in_short(name)} is bin: allowed is str; pack names as str, numbers as numbers")
+        if names.count(name) > 1:
+            raise MessageError(f"{in_short(name)} stands twice: allowed is once")
+    return dict(pairs)
+
+
+def _in_words(text: str) -> str:
+    """Return what msgspec found wrong as `field is a type: allowed is another`."""
+    match = _EXPECTED.fullmatch(text)
+    if match is None:
+        return text
+    expected, got = (_KINDS.get(kind, kind) for kind in match.groups()[:2])
+    remedy = _REMEDIES.get((match[1], got), "")
+    return f"{match[3] or 'message'} is {got}: allowed is {expected.replace(' | null', '')}{remedy}"
 
 
 def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -> bytes:

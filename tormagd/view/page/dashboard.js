@@ -1,10 +1,24 @@
 "use strict";
-// The page of tormagctl dashboard: it shows frames (tormagd/view/frame.py), live or of a recording, and asks for no more.
+// The page of tormagctl dashboard: it shows frames (tormagd/view/frame.py), live or of a recording. Where the link that
+// is printed has a secret, it also operates. Colours here are those of light and paper; dashboard.css turns them in the dark.
 
 const CURVES = ["asked_N", "governed_N", "measured_N", "gap_mm", "gap_wanted_mm", "field_mT"];
 const DIGITS = {asked_N: 3, governed_N: 3, measured_N: 3, gap_mm: 2, field_mT: 1};
-const COLOURS = {black: "#222", blue: "#0072b2", orange: "#e69f00", sky: "#56b4e9", green: "#009e73", red: "#d32f2f"};
+const COLOURS = {black: "#222", blue: "#0072b2", orange: "#e69f00", sky: "#56b4e9", green: "#007a59", red: "#d32f2f"};
 const PATH_S = 2;
+const QUESTIONS = {
+  pause: "Pause? The gap is held where it is.",
+  resume: "Resume? The force changes at once: warn whoever holds the handle.",
+  disable: "Disable? The gap opens, and the drives are turned off.",
+  arm: "Arm? It homes if needed, and the force ramps up: warn whoever holds the handle.",
+};
+// the address bar shows no secret, and a bookmark keeps none; a reload of this tab finds it here
+if (location.hash) {
+  sessionStorage.secret = location.hash.slice(1);
+  history.replaceState(null, "", location.pathname);
+}
+addEventListener("hashchange", () => location.reload());
+const secret = sessionStorage.secret ?? "";
 
 const at = (id) => document.getElementById(id);
 const kept = {t_s: [], ...Object.fromEntries(CURVES.map((name) => [name, []]))};
@@ -185,11 +199,9 @@ function showLate(counts) {
 }
 
 // an older daemon and a recording of ticks alone say nothing of it
-function showBelief(belief) {
-  const acting = Object.entries(belief).filter(([, it]) => it.acts)
-    .map(([name, it]) => `${name} ${it.value.toPrecision(3)}${it.sd === null ? "" : ` ± ${it.sd.toPrecision(2)}`} ${it.unit}`.trim());
-  at("believed").textContent = Object.keys(belief).length
-    ? `Believed of the device: ${acting.join(", ") || "nothing that acts"}.` : "";
+function showBelief(believed) {
+  const told = Object.entries(believed).map((each) => each.join(" "));
+  at("believed").textContent = told.length ? `Believed of the device: ${told.join(", ")}.` : "";
 }
 
 // ---- frames
@@ -201,7 +213,7 @@ function show(frame) {
   showState(frame);
   showCodes(frame);
   showLate(frame.late_counts);
-  showBelief(frame.belief);
+  showBelief(frame.believed);
   charts.force.setData([x, kept.measured_N, kept.governed_N, kept.asked_N]);
   charts.gap.setData([x, kept.gap_mm, kept.gap_wanted_mm, kept.field_mT]);
   showPortrait();
@@ -214,8 +226,14 @@ function showSilence(why) {
 }
 
 function live() {
-  const events = new EventSource("live");
-  const on = (name, act) => events.addEventListener(name, (event) => act(JSON.parse(event.data)));
+  const acts = {}, on = (name, act) => { acts[name] = act; };
+  const stream = new WebSocket(new URL("live", location).href.replace("http", "ws"), ["tormag", ...(secret ? [secret] : [])]);
+  stream.onopen = () => { for (const name of Object.keys(kept)) kept[name] = []; };
+  stream.onmessage = ({data}) => Object.entries(JSON.parse(data)).forEach(([name, value]) => acts[name](value));
+  stream.onclose = () => {
+    showSilence("tormagctl dashboard has ended, or restarts: open the link that it prints");
+    setTimeout(live, 1000);
+  };
   on("frame", (frame) => {
     at("silence").textContent = "";
     for (const name of Object.keys(kept)) kept[name].push(...frame[name]);
@@ -223,8 +241,8 @@ function live() {
     for (const values of Object.values(kept)) values.splice(0, old);
     show(frame);
   });
-  on("status", ({status, explained: newest}) => {
-    explained = newest;
+  on("explained", (newest) => { explained = newest; });
+  on("status", (status) => {
     notGranted = status.not_granted;
     const lever = status.roller_radius_mm === null ? "" : `, 1 N is ${status.roller_radius_mm} mNm of the handle`;
     at("scene").textContent = `scene ${status.scene}${lever}${status.is_homed ? "" : ", not homed"}`;
@@ -243,11 +261,45 @@ function live() {
     at("rates").textContent = "Of every twentieth tick of 20 s, bars as logarithms. " + (control ? `Of all: ${control.hz.toFixed(0)} Hz, `
       + `p50 ${late.p50.toFixed(0)}, p99 ${late.p99.toFixed(0)}, longest ${late.max.toFixed(0)} µs; ${control.stalls} stalls.` : "");
   });
-  on("portrait", (told) => { portrait = told.portrait; });
+  on("portrait", (told) => { portrait = told; });
   on("silence", ({seconds: silent_s, why}) => {
     showSilence(`nothing heard for ${silent_s.toFixed(0)} s ${why}`);
   });
-  events.onerror = () => showSilence("tormagctl dashboard has ended, or restarts");
+}
+
+// ---- operating
+
+async function give(command) {
+  const say = (text, isBad) => { at("answer").textContent = text; at("answer").className = isBad ? "bad" : ""; };
+  say(`${command} …`);
+  try {
+    const answer = await fetch("command", {
+      method: "POST",
+      headers: {"Content-Type": "application/json", "Tormag-Secret": secret},
+      body: JSON.stringify({command}),
+    });
+    say(`${command}: ${await answer.text()}`, !answer.ok);
+  } catch (error) {
+    say(`${command} was not sent: tormagctl dashboard does not answer. Next: tormagctl ${command}`, true);
+  }
+}
+
+// the question is not modal: STOP stays within reach
+function operate() {
+  let asked = null;
+  at("operate").hidden = false;
+  document.body.classList.add("operates");
+  for (const button of document.querySelectorAll("[data-command]")) {
+    button.addEventListener("click", () => {
+      asked = button.dataset.command;
+      at("question").close();
+      if (asked === "stop") { give(asked); return; }
+      at("asked").textContent = QUESTIONS[asked];
+      at("question").show();
+    });
+  }
+  at("yes").addEventListener("click", () => { at("question").close(); give(asked); });
+  at("no").addEventListener("click", () => at("question").close());
 }
 
 // ---- a recording
@@ -320,7 +372,10 @@ function recording() {
 }
 
 async function start() {
-  about = await (await fetch("about")).json();
+  const answer = await fetch("about", {headers: {"Tormag-Secret": secret}});
+  if (!answer.ok) { showSilence(await answer.text()); return; }
+  about = await answer.json();
+  if (about.operates) operate();
   makeCharts();
   if (about.kind === "live") live(); else recording();
 }

@@ -1,0 +1,190 @@
+"""Fit a plant file to recordings of one device: the simulator's laws, by regression, without simulating.
+
+tormag-lab twin FILE.mcap ... --out mine.toml
+
+Ordinary use will do: ten minutes with steps, pulses and holds, the handle going both ways. A number is told where its
+interval (95 %) is at most half as wide as what is believed of any device. The others keep the prior's values, and the
+motion that would tell them is named. Magnets, insert and the sensor's gain share the strength: only a weight parts them
+(tormagctl commission --weight-N). A sensor that stands still is cut out, one that drifts is refused. What the laws do
+not explain is the model error. Exit code 1 means that it is too large for the plant to stand for this device.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tormag_lab.errors import LabError
+from tormag_lab.main import Found
+from tormag_lab.pages import draw_beside
+from tormag_lab.twin.estimate import keys_of, value_at
+from tormag_lab.twin.excerpt import Excerpt, excerpt_of
+from tormag_lab.twin.fit import EXPLAINED_N, STANDS_FOR, Twin, twin_of
+from tormag_lab.twin.force import EXPONENT, PIVOT_MM, STRENGTH, along, fresh_along
+from tormagd.simulation.parameters import Assumed, PlantParameters, load_plant
+
+MAX_FILES = 10
+BELIEVED = 0.4
+"No device of the plant card is further from sample 1's strength."
+
+
+SLIDE = "slide the handle both ways at over 20 mm/s for a minute, at several forces"
+STEPS = "step from the least force to the most and back, ten times"
+HOLD = "hold the most force for a minute and the least for a minute, five times, the handle turning"
+SLOWLY = "turn the handle to and fro from a stop up to 40 mm/s, ten times"
+DATASHEET = "no motion tells it: take it from its data sheet"
+MOTIONS: Mapping[str, str] = {
+    "elastomer.kinetic_friction": SLIDE,
+    "elastomer.shear_modulus_kPa": "no motion tells it from the field's exponent: characterise the insert",
+    "elastomer.relative_permeability": "no motion tells it from the strength: characterise the insert",
+    "field.coefficient": "no motion tells it from the strength: measure the field at a gap of 67 mm",
+    "field.exponent": STEPS,
+    "field.hysteresis_percent": STEPS,
+    "relaxation": HOLD,
+    "friction": SLOWLY,
+    "thermal": "record a device that warms by 5 K",
+    "motor": "step from the least force to the most and back, ten times, without pauses",
+    "gear.efficiency": "log the motor alone: tormagctl calibrate --motors and tormag-lab identify-motor",
+    "gear.output_friction_Nm": "step from the least force to the most and back, ten times, without pauses",
+    "screw.friction_coefficient": "no motion tells it from the gearbox: turn the screw by hand with a scale",
+    "screw.drag_left_N": "no motion tells it from the gearbox: push the carriage with a scale, nut off",
+    "screw.drag_right_N": "no motion tells it from the gearbox: push the carriage with a scale, nut off",
+    "screw.backlash_um": "no motion tells it: the encoder is on the motor's side of the play; use a dial gauge",
+    "screw.stiffness_N_um": "no motion tells it: use a dial gauge and a weight",
+    "force_sensor.rate_Hz": "it is as fast as the control ticks: take it from its data sheet",
+    "force_sensor.drift_mN_min": "record ten minutes, the handle going both ways",
+    "force_sensor.delay_ms": "turn the handle round within 0.1 s, ten times",
+}
+"What would tell a key, or the keys of a table."
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="recordings of one device, unthinned")
+    parser.add_argument("--out", type=Path, metavar="PLANT.toml", help="write the plant, a new file")
+    parser.add_argument("--prior", default="sample_1", metavar="PLANT", help="what is believed before (sample_1)")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw measured and explained force")
+
+
+def run(options: argparse.Namespace) -> Found:
+    if options.out is not None and options.out.exists():
+        raise LabError(f"{options.out} exists; allowed is a new file")
+    if options.plot is not None and options.plot.suffix != ".png":
+        raise LabError(f"--plot {options.plot}: allowed is a name that ends with .png")
+    if len(options.files) > MAX_FILES:
+        raise LabError(f"{len(options.files)} recordings: allowed are {MAX_FILES}")
+    prior = load_plant(options.prior)
+    ways = [excerpt_of(path) for path in options.files]
+    twin = twin_of(prior, ways)
+    figures = figures_of(twin, prior, ways)
+    head = [*figures["says"], f"fitted by tormag-lab twin to {', '.join(way.name for way in ways)}"]
+    if options.out is not None:
+        write_plant(options.out, twin, head)
+    if options.plot is not None:
+        draw(options.plot, twin, ways[0])
+    return Found(figures, exit_code=0 if twin.is_explained else 1)
+
+
+def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> dict[str, Any]:
+    strength = value_at(twin.plant, STRENGTH) / value_at(prior, STRENGTH)
+    error_mN, noise_mN = 1e3 * twin.force.error_N, 1e3 * twin.noise_N
+    says = [
+        f"force is {strength:.3g} of the prior's: magnets, insert and the sensor's gain share that; a weight tells the "
+        "gain (tormagctl commission --weight-N)"
+    ]
+    if abs(strength - 1.0) > BELIEVED:
+        says.append("NOT BELIEVED as the device's without a weight: a sensor of another gain looks like that")
+    if not twin.is_explained:
+        says.append(
+            f"NOT EXPLAINED: the laws leave {error_mN:.0f} mN of the force and {twin.gap_error_mm:.2g} mm of the gap"
+        )
+    unknown = [key for key in keys_of(prior) if key not in twin.keys]
+    return {
+        "says": says,
+        "cut_out": twin.force.cut_out,
+        "field_law": twin.plant.field.law,
+        "told": [
+            {"name": name, "value": told.value, "half_width": told.half_width}
+            for name, told in (twin.combinations | twin.keys).items()
+            if told.half_width == told.half_width
+        ],
+        "unknown": [{"name": key, "prior": value_at(prior, key), "motion": motion_for(key)} for key in unknown],
+        "sensors": [{"file": way.name, **zero} for way, zero in zip(ways, twin.force.zeros, strict=True)],
+        "model_error": {
+            "force_mN": error_mN,
+            "sensor_noise_mN": noise_mN,
+            "gap_mm": twin.gap_error_mm,
+            "is_explained": twin.is_explained,
+        },
+    }
+
+
+def draw(path: Path, twin: Twin, way: Excerpt) -> None:
+    zero_N = 1e-3 * (twin.force.zeros[0]["zero_mN"] + twin.force.zeros[0]["drift_mN_min"] * way.minute)
+    explained_N = along(twin.plant, way, twin.force.memory_N, fresh_along(twin.plant, way)) + zero_N
+    draw_beside(
+        path,
+        way.time_s,
+        way.force_N,
+        explained_N,
+        labels=("by the plant's laws", "force, N", "difference, mN"),
+        title=f"Model error {1e3 * twin.force.error_N:.1f} mN RMS, allowed {1e3 * EXPLAINED_N:g}",
+        finer=1e3,
+    )
+
+
+def motion_for(key: str) -> str:
+    """Say what would tell a key that the recordings do not: a motion, or else a data sheet."""
+    return MOTIONS.get(key) or MOTIONS.get(key.split(".")[0], DATASHEET)
+
+
+def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
+    text = "\n".join([*(f"# {line}" for line in head), *_lines(twin)]) + "\n"
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+        load_plant(path)
+    except FileExistsError as error:
+        raise LabError(f"{path} exists; allowed is a new file") from error
+    except ValueError as error:
+        path.unlink()
+        raise LabError(f"what fits best is no plant: {error}") from error
+
+
+def _lines(twin: Twin) -> Iterator[str]:
+    tables: dict[str, Any] = msgspec.to_builtins(twin.plant)
+    usual = msgspec.to_builtins(Assumed())
+    for title in PlantParameters.__struct_fields__:
+        table = tables[title]
+        if table is None or (title == "assumed" and table == usual):
+            continue
+        yield f"\n[{title}]"
+        for name, value in table.items():
+            key = f"{title}.{name}"
+            yield f"{name} = {msgspec.json.encode(_short(value)).decode()}  # {_comment(twin, key, value)}"
+
+
+def _short(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_short(each) for each in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def _comment(twin: Twin, key: str, value: Any) -> str:
+    """Say how sure a key's value is, or what would tell it."""
+    if isinstance(value, list | tuple):
+        told = [twin.keys.get(f"{key}.{place}") for place in range(len(value))]
+        if any(told):
+            words = ["unknown" if each is None else f"± {each.half_width:.2g}" for each in told]
+            return f"told: {', '.join(words)}" + ("" if all(told) else f"; {motion_for(key)}")
+    elif key in twin.keys:
+        share = ", for all that shares it" if key in STANDS_FOR else ""
+        return f"told: ± {twin.keys[key].half_width:.2g}{share}"
+    if key == "field.law":
+        return "chosen: it leaves less of the force than the other law"
+    if key == "field.coefficient" and EXPONENT in twin.keys:
+        return f"turned with the exponent about {PIVOT_MM:g} mm"
+    if key.startswith("assumed."):
+        return "assumed, as in the prior"
+    return f"unknown, the prior's: {motion_for(key)}"

@@ -1,0 +1,586 @@
+"""Training: data, the network, the law, the commands, the relaxation-aware model."""
+
+import datetime
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, strategies as st
+
+from tormag_lab.arrays import rms
+from tormag_lab.errors import LabError
+from tormag_lab.main import main
+from tormag_lab.training import train_model
+from tormag_lab.training.bench_sweep import LOADED_MM, LOADED_STEP_MM, loading, sliding, strokes
+from tormag_lab.training.dataset import (
+    ALLOWED,
+    COLUMNS,
+    Dataset,
+    fit_metrics,
+    leave_cycles_out,
+    leave_one_out,
+    not_rising_share,
+    random_split,
+    read_csv,
+    write_csv,
+)
+from tormag_lab.training.fitting import fit_network
+from tormag_lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series, relaxed_N
+from tormag_lab.training.law import Law, fit_law, fit_law_model
+from tormag_lab.training.levenberg_marquardt import jacobian, train
+from tormag_lab.training.unremembered import identify
+from tormagd.config import Config, Rates
+from tormagd.control.assembly.build import build_core
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.records import Handle, Measured
+from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.element.model.features import FIELD
+from tormagd.element.model.memory import NO_MEMORY, Memory
+from tormagd.element.model.model_file import ForceModel, load_model, model_path
+from tormagd.element.model.network import ForceNetwork
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.inserts import insert
+from tormagd.element.physics.relaxation import PronySeries
+
+HEADER = "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N"
+GOOD = "0.5,10,300,40,1.5"
+
+
+def write(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def dataset(rows: int = 40, cycles: int | None = 8) -> Dataset:
+    rng = np.random.default_rng(1)
+    features = rng.uniform((0, 0, 100, 40), (1, 60, 800, 40.0001), (rows, 4))
+    cycle = None if cycles is None else np.arange(rows) * cycles // rows
+    return Dataset(features, rng.uniform(0, 6, rows), cycle, np.arange(rows) * 0.01)
+
+
+@given(
+    st.lists(
+        st.tuples(*(st.floats(*ALLOWED[name]) for name in COLUMNS), st.integers(0, 10**9), st.floats(0, 1e9)),
+        min_size=2,
+        max_size=20,
+    )
+)
+def test_round_trip_keeps_every_bit(tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[float, ...]]) -> None:
+    path = tmp_path_factory.mktemp("csv") / "data.csv"
+    table = np.array(rows)
+    written = Dataset(table[:, :4], table[:, 4], table[:, 5].astype(np.int64), table[:, 6])
+    write_csv(path, written)
+    read = read_csv(path)
+    for name, column in written.columns().items():
+        np.testing.assert_array_equal(read.columns()[name], column)
+    assert read.sha256() == written.sha256()
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "", "1e9", "-1e9", "abc", "1_0", "0x10", "1e999"])
+def test_a_bad_value_is_named(tmp_path: Path, column: str, value: str) -> None:
+    cells = GOOD.split(",")
+    cells[COLUMNS.index(column)] = value
+    path = write(tmp_path / "d.csv", HEADER, GOOD, ",".join(cells), GOOD)
+    low, high = ALLOWED[column]
+    with pytest.raises(LabError, match=rf"row 3, {column}: .*{value}.* only numbers {low:g} to {high:g}"):
+        read_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ((), "row 1: header"),
+        (("",), "row 1: header"),
+        ((HEADER,), "0 rows"),
+        ((HEADER, GOOD), "1 rows"),
+        ((HEADER + ",colour", GOOD + ",1"), "row 1: header: 'colour' is not known; needed is"),
+        ((HEADER + ",cycle,cycle", GOOD + ",1,1"), "row 1: header: 'cycle' stands twice"),
+        ((HEADER.removesuffix(",force_N") + ",time_s", GOOD, GOOD), "row 1: header: 'force_N' is missing"),
+        ((HEADER, GOOD, "1,2,3"), "row 3: 3 values; needed are 5"),
+        ((HEADER, GOOD, GOOD + ",1"), "row 3: 6 values; needed are 5"),
+        ((HEADER, GOOD, ""), "row 3: 0 values"),
+        ((HEADER + ",cycle", GOOD + ",1.5"), "row 2, cycle: '1.5' is not allowed, only whole numbers"),
+        ((HEADER + ",time_s", GOOD + ",-1"), "row 2, time_s"),
+        ((HEADER, GOOD, '"' + "1" * 200_000), "row 3: not CSV"),
+        ((HEADER, GOOD, '"0.5"x,10,300,40,1'), "row 3: not CSV"),
+        ((HEADER, "\xff\xfe\x00\x01"), "UTF-8"),
+    ],
+)
+def test_a_malformed_file_is_refused(tmp_path: Path, lines: tuple[str, ...], message: str) -> None:
+    path = tmp_path / "d.csv"
+    path.write_text("".join(f"{line}\n" for line in lines), "latin-1")
+    with pytest.raises(LabError, match=message):
+        read_csv(path)
+
+
+def test_columns_may_stand_in_any_order(tmp_path: Path) -> None:
+    lines = (HEADER + ",cycle,time_s", GOOD + ",1,2", GOOD + ",3,4")
+    turned = [",".join(reversed(line.split(","))) for line in lines]
+    known, other = (read_csv(write(tmp_path / "d.csv", *each)) for each in (lines, turned))
+    assert known.sha256() == other.sha256()
+
+
+def test_a_split_keeps_cycles_whole() -> None:
+    data = dataset()
+    training, validation = data.split(0.25, seed=3)
+    assert set(training.cycle) & set(validation.cycle) == set()
+    assert (len(set(validation.cycle)), len(training) + len(validation)) == (2, len(data))
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan"), 0.01])
+def test_a_split_without_two_sides_is_refused(share: float) -> None:
+    with pytest.raises(LabError, match="validation_share"):
+        dataset().split(share, seed=0)
+
+
+@pytest.fixture
+def grouped() -> Dataset:
+    field, cip = np.repeat([0.0, 50.0, 99.0], 20), np.tile(np.repeat([25.0, 45.0], 10), 3)
+    features = np.column_stack((np.linspace(0, 4, 60), np.ones(60), field, cip))
+    return Dataset(features, np.linspace(0, 1, 60), np.arange(60) // 4)
+
+
+def test_random_split_has_its_share_and_its_seed() -> None:
+    held = random_split(1000, 3)
+    assert held.sum() == 300
+    assert (held == random_split(1000, 3)).all()
+    assert (held != random_split(1000, 4)).any()
+
+
+@pytest.mark.parametrize(("feature", "column", "values"), [("field_mT", 2, [0, 50, 99]), ("cip_percent", 3, [25, 45])])
+def test_each_value_is_left_out_once(grouped: Dataset, feature: str, column: int, values: list[float]) -> None:
+    folds = list(leave_one_out(grouped, feature))
+    assert [value for value, _ in folds] == values
+    for value, held in folds:
+        assert set(grouped.features[held, column]) == {value}
+        assert value not in grouped.features[~held, column]
+    assert (np.sum([held for _, held in folds], axis=0) == 1).all()
+
+
+def test_cycles_stay_whole(grouped: Dataset) -> None:
+    folds = [held for _, held in leave_cycles_out(grouped, 4, seed=0)]
+    assert (np.sum(folds, axis=0) == 1).all()
+    assert grouped.cycle is not None
+    assert not any(set(grouped.cycle[held]) & set(grouped.cycle[~held]) for held in folds)
+
+
+NOISE_N = 0.02
+
+
+def forces_N(features: np.ndarray) -> np.ndarray:
+    """Saturates in displacement, rises with the field, falls a little with the rate."""
+    displacement, rate, field, _ = features.T
+    return (1 - np.exp(-displacement / 0.3)) * (0.3 + 4 * (field / 800) ** 2) * (1 + 0.2 * np.exp(-rate / 20))
+
+
+def synthetic(rows: int, seed: int, noise_N: float = NOISE_N) -> Dataset:
+    rng = np.random.default_rng(seed)
+    features = np.column_stack(
+        (rng.uniform(0, 1, rows), rng.uniform(0, 60, rows), rng.uniform(100, 800, rows), np.full(rows, 40.0))
+    )
+    return Dataset(features, forces_N(features) + noise_N * rng.normal(size=rows), np.arange(rows) // 50)
+
+
+def network_for(data: Dataset, hidden: int = 10, seed: int = 0) -> ForceNetwork:
+    return ForceNetwork(data.scaling(), hidden, seed=seed)
+
+
+def test_the_jacobian_is_that_of_automatic_differentiation() -> None:
+    network = network_for(synthetic(50, 0), hidden=7)
+    inputs = torch.randn(20, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    output, derivatives = jacobian(network, inputs)
+    expected = network.forward_scaled(inputs)
+    slopes = [torch.autograd.grad(row, list(network.parameters()), retain_graph=True) for row in expected]
+    rows = torch.stack([torch.cat([each.flatten() for each in row]) for row in slopes])
+    torch.testing.assert_close(output, expected, rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(derivatives, rows, rtol=1e-12, atol=1e-14)
+
+
+def test_every_step_lowers_the_training_error_and_the_weights_left_are_the_best_on_validation() -> None:
+    training, validation = synthetic(60, 1, noise_N=0.3), synthetic(400, 2, noise_N=0.3)  # few rows: it overfits
+    network = network_for(training, hidden=20)
+    result = train(network, training, validation, epochs=100, patience=5)
+    errors_N = [step.train_rmse_N for step in result.history]
+    assert errors_N == sorted(errors_N, reverse=True)
+    assert [step.epoch for step in result.history] == list(range(1, len(errors_N) + 1))
+    assert result.stopped_by == "validation"
+    assert result.best.epoch < len(result.history)
+    assert result.best.validation_rmse_N == min(step.validation_rmse_N for step in result.history)
+    assert missed_N(network, validation) == pytest.approx(result.best.validation_rmse_N, rel=1e-9)
+
+
+def test_a_constant_column_neither_divides_by_zero_nor_matters() -> None:
+    training, validation = synthetic(400, 1), synthetic(200, 2)
+    network = network_for(training)
+    train(network, training, validation, epochs=15)
+    row = torch.tensor([[0.5, 10.0, 400.0, 40.0], [0.5, 10.0, 400.0, 12.0]], dtype=torch.float64)
+    with torch.no_grad():
+        force = network(row)
+    assert torch.isfinite(force).all()
+    assert float(force[0]) == pytest.approx(float(force[1]), rel=1e-13)
+    assert (network.hidden_weight[:, 3] == 0).all()
+
+
+def missed_N(network: ForceNetwork, data: Dataset) -> float:
+    with torch.no_grad():
+        return rms(network(torch.tensor(data.features)).numpy() - data.force_N)
+
+
+def test_a_rising_force_rises_everywhere_and_fits() -> None:
+    training, fresh = synthetic(2000, 1), synthetic(1000, 3, noise_N=0.0)
+    network = network_for(training, hidden=12)
+    train(network, training, synthetic(500, 2), epochs=150, rising=True)
+    assert missed_N(network, fresh) < 0.01 * np.ptp(fresh.force_N)
+    corners = np.random.default_rng(0).uniform((-1, -100, -500, 0), (3, 400, 2000, 80), (2000, 4))
+    features = torch.tensor(corners, requires_grad=True)
+    (slope,) = torch.autograd.grad(network(features).sum(), features)
+    assert float(slope[:, FIELD].min()) >= 0.0
+
+
+def test_a_rising_force_rises_where_the_data_fall() -> None:
+    data = synthetic(500, 1)
+    falling = Dataset(data.features, -data.force_N)
+    network = network_for(falling, hidden=6)
+    train(network, falling, falling, epochs=20, rising=True)
+    assert bool((network.hidden_weight[:, FIELD] * network.output_weight > 0.0).all())
+
+
+def test_what_cannot_be_trained_is_refused() -> None:
+    data = synthetic(50, 1)
+    for name, refused in (
+        ("force_N", lambda: Dataset(data.features, np.ones(50)).scaling()),
+        ("hidden", lambda: network_for(data, hidden=0)),
+        ("epochs", lambda: train(network_for(data), data, data, epochs=0)),
+        ("patience", lambda: train(network_for(data), data, data, patience=0)),
+    ):
+        with pytest.raises(DomainError, match=name):
+            refused()
+
+
+LAW = Law(0.1, -0.7, 1.1, 0.05, 0.15, 2.0, 0.01, 2e-4, 1.8, 0.5)
+OF_LAW = {"insert_name": "MRE-50-40", "data_sha256": "0" * 64, "created": datetime.date(2024, 1, 1)}
+
+
+def lawful(rows: int, least_mm: float = 2.0, noise_N: float = NOISE_N) -> Dataset:
+    rng, fitted = np.random.default_rng(4), insert("MRE-50-40")
+    rates = np.exp(rng.uniform(np.log(0.5), np.log(310.0), rows))
+    features = np.column_stack(
+        (rng.uniform(least_mm, 2.0, rows), rates, rng.uniform(150, 850, rows), np.full(rows, 40.0))
+    )
+    return Dataset(features, LAW.forces_N(features, fitted) + noise_N * rng.normal(size=rows))
+
+
+def test_fifty_rows_tell_the_law() -> None:
+    fresh = lawful(2000, noise_N=0.0)
+    found_N = fit_law(lawful(50), insert("MRE-50-40")).forces_N(fresh.features, insert("MRE-50-40"))
+    assert np.abs(found_N - fresh.force_N).mean() < 0.01
+
+
+def test_a_law_becomes_a_network_that_rises_and_is_near_it() -> None:
+    data, fresh = lawful(400, least_mm=0.0), lawful(500, noise_N=0.0)
+    model = fit_law_model(data, data, **OF_LAW, epochs=80)
+    metrics = model.metadata.metrics
+    assert np.abs(model.predict(fresh.features) - fresh.force_N).mean() < 0.015  # of 4.3 N, within the fit's own errors
+    assert metrics["law_mae_N"] < 0.04
+    assert metrics["not_rising_share"] == 0.0
+    assert metrics["law_exponent"] == pytest.approx(LAW.exponent, abs=0.02)
+    assert (model.physical.hidden_weight[:, FIELD] > 0.0).all()
+    assert (model.output_weight > 0.0).all()
+
+
+def test_a_law_of_one_field_is_refused() -> None:
+    data = lawful(50)
+    data.features[:, FIELD] = 300.0
+    with pytest.raises(DomainError, match="field_mT = 300"):
+        fit_law_model(data, data, **OF_LAW)
+
+
+KINETIC_N, STIFFNESS_N_MM = 2.0, 8.0
+
+
+@pytest.mark.parametrize("speed_mm_s", [0.6, 20.0, 300.0])
+def test_displacement_counts_from_where_the_elastomer_bears_nothing(speed_mm_s: float) -> None:
+    lasts_s = max(0.4, 4.0 / speed_mm_s)
+    speeds = np.repeat([100.0, 0.0, -speed_mm_s, 0.0], [300, 300, round(1e3 * lasts_s), 300])
+    friction, deflection_mm, forces = Friction(STIFFNESS_N_MM, 0.0, 1.0, 5.0), 0.0, []
+    for speed in speeds.tolist():
+        force_N, deflection_mm = friction.advance(deflection_mm, speed, KINETIC_N, 1e-3)
+        forces.append(force_N)
+    handle_mm, signed_N = np.cumsum(speeds) * 1e-3, np.array(forces)
+    rate_mm_s, displacement_mm = loading(handle_mm, np.full(len(speeds), 60.0), signed_N)
+    kept = np.flatnonzero(~np.isnan(displacement_mm) & (rate_mm_s < 0.0))
+    found_mm = displacement_mm[kept]
+    assert len(kept) >= min(LOADED_MM / LOADED_STEP_MM, 0.5 * LOADED_MM / (speed_mm_s * 1e-3))
+    assert 0.0 <= found_mm.min() <= found_mm.max() <= LOADED_MM
+    assert rate_mm_s[kept] == pytest.approx(-speed_mm_s, rel=1e-6)
+    expected_N = KINETIC_N * -np.expm1(-STIFFNESS_N_MM * found_mm / KINETIC_N)
+    # a tick of a fast handle is a part of the way
+    assert -signed_N[kept] == pytest.approx(expected_N, abs=STIFFNESS_N_MM * speed_mm_s * 1e-3 * 0.1 + 1e-3)
+    assert not sliding(handle_mm, np.full(len(speeds), 60.0))[1][kept].any()
+
+
+def test_while_the_gap_moves_no_row_is_kept() -> None:
+    handle_mm = np.cumsum(np.repeat([20.0, -20.0], 400)) * 1e-3
+    signed_N = np.where(np.arange(800) < 500, 1.0, -1.0)
+    assert not np.isnan(loading(handle_mm, np.full(800, 60.0), signed_N)[1]).all()
+    assert np.isnan(loading(handle_mm, 60.0 + 5e-3 * np.arange(800), signed_N)[1]).all()
+
+
+def test_a_stroke_mobilises_before_it_creeps() -> None:
+    hand, ends_s = strokes(3, seed=1)
+    assert len(ends_s) == 3
+    positions = np.array([hand.position_mm(time_s) for time_s in np.arange(0.0, ends_s[-1], 1e-3).tolist()])
+    assert positions.max() - positions[0] > 9.0
+    assert ends_s == sorted(ends_s)
+
+
+def test_what_inserts_of_one_matrix_remember_is_found_in_all_their_records() -> None:
+    fraction, random, time_s = 0.06, np.random.default_rng(0), np.arange(0.0, 160.0)
+    records = []
+    for iron, greatest_mT in ((20.0, 400.0), (40.0, 800.0), (20.0, 400.0), (40.0, 800.0)):
+        shares = np.concatenate(([1.0], random.uniform(0.4, 1.0, 7)))
+        field_mT = greatest_mT * np.repeat(shares, 20)
+        level_N = 4.0 * (field_mT / 800.0) ** 2
+        slow_N = last_N = level_N[0]
+        for tick, drive_N in enumerate(level_N.tolist()):
+            mean_N, last_N = (drive_N + last_N) / 2.0, drive_N
+            slow_N = mean_N + (slow_N - mean_N) * np.exp(-1.0 / 8.0)
+            level_N[tick] -= fraction * slow_N
+        displacement_mm = np.where(time_s % 5.0 == 4.0, 0.2, MOBILISED_MM)
+        borne_N = level_N * -np.expm1(-STIFFNESS_N_MM * displacement_mm / level_N)
+        force_N = np.where(displacement_mm < MOBILISED_MM, borne_N, level_N)
+        rate = 20.0 + 60.0 * (time_s % 7.0)
+        records.append((np.column_stack((displacement_mm, rate, field_mT, np.full(160, iron))), force_N))
+    features, forces_N = (np.concatenate(part) for part in zip(*records, strict=True))
+    memory, free = identify(Dataset(features, forces_N, np.repeat(np.arange(4), 160), np.tile(time_s, 4)))
+    assert (memory.fractions, memory.times_s[0]) == (
+        pytest.approx((fraction, 0.0, 0.0), abs=0.002),
+        pytest.approx(8.0, rel=0.05),
+    )
+    slid = features[:, 0] >= MOBILISED_MM
+    fresh_N = 4.0 * (features[:, 2] / 800.0) ** 2
+    assert free.force_N[slid] == pytest.approx(fresh_N[slid], rel=0.01)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "synthetic.csv"
+    write_csv(path, synthetic(3000, 0, noise_N=0.01))
+    return path
+
+
+def command(data: Path, out: Path, *more: str) -> list[str]:
+    required = ["train-model", str(data), "--element", "torque", "--insert", "MRE-50-40", "--out", str(out)]
+    return [*required, "--hidden", "15", "--epochs", "40", "--created", "2024-01-01", *more]
+
+
+def test_from_csv_to_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "model.safetensors"
+    assert main(command(data, out, "--json")) == 0
+    report = json.loads(capsys.readouterr().out)
+    model = load_model(out, element="torque", insert="MRE-50-40")
+    assert report["validation_r2"] > 0.999
+    assert report["validation_mae_N"] < 0.015
+    assert 0 < report["train_mae_percent"] < 1
+    assert 0 <= report["not_rising_share"] < 0.2
+    assert (report["train_rows"], report["data_sha256"]) == (2100, model.metadata.training_data_sha256)
+    assert model.metadata.metrics["validation_r2"] == report["validation_r2"]
+    near_the_corner = np.array([[0.9, 50.0, 750.0, 40.0]])
+    assert model.predict(near_the_corner) == pytest.approx(forces_N(near_the_corner), abs=0.05)
+
+
+def test_several_inserts_are_told_apart_by_their_iron(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows, both, out = read_csv(data), tmp_path / "both.csv", tmp_path / "model.safetensors"
+    assert rows.cycle is not None
+    features = np.concatenate((rows.features, rows.features * (1.0, 1.0, 0.5, 0.5)))  # half the field, half the iron
+    joined_N, cycle = np.concatenate((rows.force_N, rows.force_N / 3.0)), np.concatenate((rows.cycle, rows.cycle + 100))
+    write_csv(both, Dataset(features, joined_N, cycle))
+    arguments = [*command(both, out, "--rising", "--epochs", "10"), "--insert", "MRE-50-20", "MRE-50-40"]
+    assert main(arguments) == 0
+    whole, strong = (load_model(out, element="torque", insert=name) for name in (None, "MRE-50-40"))
+    assert (whole.metadata.insert, whole.metadata.ranges["cip_percent"]) == ("MRE-50", (20.0, 40.0))
+    assert (strong.metadata.ranges["cip_percent"], strong.field_range_mT[1]) == (
+        (40.0, 40.0),
+        pytest.approx(800.0, rel=0.01),
+    )
+    assert load_model(out, element="torque", insert="MRE-50-20").field_range_mT[1] == pytest.approx(400.0, rel=0.01)
+    assert whole.metadata.metrics["not_rising_share"] == 0.0
+    assert main([*arguments[:-1], "MRE-50-30"]) == 2
+    assert "insert = MRE-50-30 is not allowed: one that there are rows of" in capsys.readouterr().err
+
+
+def test_the_same_command_gives_the_same_bytes(data: Path, tmp_path: Path) -> None:
+    written = []
+    for seed in ("1", "1", "2"):
+        assert main(command(data, tmp_path / "m.safetensors", "--epochs", "5", "--seed", seed)) == 0
+        written.append((tmp_path / "m.safetensors").read_bytes())
+    assert written[0] == written[1] != written[2]
+
+
+def test_what_was_taken_out_of_the_data_is_in_the_file(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = Memory(fractions=(0.05,), times_s=(8.0,), lag_mT=7.0, turn_mT=70.0)
+    monkeypatch.setattr(train_model, "identify", lambda rows: (memory, rows))
+    for name, more, expected in (("with", ["--without-memory"], memory), ("plain", [], NO_MEMORY)):
+        out = tmp_path / f"{name}.safetensors"
+        assert main(command(data, out, "--epochs", "2", *more)) == 0
+        assert load_model(out, element="torque").metadata.memory == expected
+
+
+SERIES = PronySeries((0.02, 0.06, 0.04, 0.03), (1.2, 9.0, 120.0, 900.0))
+FIELD_SERIES = PronySeries((0.03, 0.09, 0.05, 0.02), (1.2, 9.0, 120.0, 900.0))
+
+
+def parts(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    displacement, rate, field, _ = features.T
+    free = 4 * displacement * (1 + 0.1 * displacement) * (1 + 0.02 * rate)
+    return free, free * 0.5 * (field / 300) ** 2
+
+
+def records(displacement: np.ndarray, time_s: np.ndarray, fields: tuple[float, ...]) -> Dataset:
+    rate = np.gradient(displacement, time_s)
+    pressed, field = np.column_stack((displacement, rate)), np.repeat(fields, len(time_s))
+    features = np.column_stack((np.tile(pressed, (len(fields), 1)), field, np.full_like(field, 45)))
+    cycle = np.arange(len(field)) // (len(time_s) // 4)
+    empty = Dataset(features, np.zeros(len(field)), cycle, np.tile(time_s, len(fields)))
+    free, added = parts(features)
+    force = relaxed_N(SERIES, free, empty) + relaxed_N(FIELD_SERIES, added, empty)
+    return replace(empty, force_N=force + np.random.default_rng(0).normal(0, NOISE_N, len(force)))
+
+
+@pytest.fixture(scope="module")
+def cycles() -> Dataset:
+    time_s = np.arange(1, 401) * 0.1
+    return records(2 - 2 * np.cos(2 * np.pi * time_s / 10), time_s + 200, (0.0, 75.0, 150.0, 225.0, 300.0))
+
+
+@pytest.fixture(scope="module")
+def holds() -> Dataset:
+    time_s = np.concatenate((np.linspace(0, 4, 21), 4 + np.geomspace(0.1, 3600, 120)))
+    return records(np.minimum(time_s, 4.0), time_s, (0.0, 150.0, 300.0))
+
+
+@pytest.fixture(scope="module")
+def grey(cycles: Dataset, holds: Dataset) -> GreyBox:
+    return fit_grey_box(cycles, np.ones(len(cycles), dtype=bool), holds, hidden=20, epochs=40, settling_epochs=20)
+
+
+def test_a_series_is_recovered_from_holds_even_when_the_level_is_wrong(holds: Dataset) -> None:
+    free, added = parts(holds.features)
+    found, field_found = fit_series(holds, (1.05 * free, 1.05 * added))
+    assert (found.times_s, found.fractions) == (
+        pytest.approx(SERIES.times_s, rel=0.2),
+        pytest.approx(SERIES.fractions, abs=0.01),
+    )
+    assert sum(field_found.fractions) == pytest.approx(sum(FIELD_SERIES.fractions), abs=0.03)
+
+
+def test_records_that_begin_late_were_run_before() -> None:
+    # after n passes of 10 s a constant force has relaxed for n * 10 s
+    for passes in (0, 3):
+        data = Dataset(np.zeros((10, 4)), np.zeros(10), None, np.arange(1.0, 11.0) + 10 * passes)
+        force = relaxed_N(PronySeries((0.5,), (20.0,)), np.full(10, 8.0), data)
+        ramp = 20.0 * (1 - np.exp(-1 / 20.0))  # the first step is a ramp of 1 s
+        remembered = 4.0 * ramp * np.exp(-(9 + 10 * passes) / 20.0)
+        assert force[-1] == pytest.approx(4.0 + remembered, rel=1e-9)
+
+
+def test_the_grey_box_sees_through_the_memory(grey: GreyBox, cycles: Dataset, holds: Dataset) -> None:
+    alone, _ = fit_network(cycles, np.ones(len(cycles), dtype=bool), 20, epochs=40)
+    error, error_alone = (
+        np.abs(found_N - holds.force_N).mean() for found_N in (grey.predict(holds), alone.predict(holds.features))
+    )
+    assert 5 * error < error_alone
+    assert error < 3 * NOISE_N
+
+
+def test_the_memory_inverts_itself(grey: GreyBox) -> None:
+    model = grey.model
+    memory, told = GreyBoxMemory(grey, 0.5), GreyBoxMemory(grey, 0.5)
+    solver = NearestFieldSearch(field_grid((0.0, 300.0), 1.0))
+    last = None
+    for step in range(200):
+        field = 180 + 60 * np.sin(step / 9)
+        force = told.advance(3.5, 0.0, field, 45.0)
+        last = solver.solve(model.curve(3.5, 0.0, 45.0), memory.elastic_N(3.5, 0.0, force, 45.0), last).field_mT
+        assert last == pytest.approx(field, abs=0.1)
+        memory.advance(3.5, 0.0, last, 45.0)
+
+
+def test_steps_and_records_agree(grey: GreyBox) -> None:
+    fields = 150 + 100 * np.sin(np.arange(1, 41) / 5)
+    features = np.column_stack((np.full(40, 3.0), np.zeros(40), fields, np.full(40, 45.0)))
+    data = Dataset(features, np.zeros(40), None, np.arange(1, 41) * 0.25 - 0.25)
+    memory = GreyBoxMemory(grey, 0.25)
+    stepped = [memory.advance(3.0, 0.0, field, 45.0) for field in fields.tolist()]
+    # the record begins with a jump, the steps with a ramp, and the difference fades
+    assert grey.predict(data)[1:] == pytest.approx(stepped[1:], rel=5e-3)
+
+
+def test_a_memory_needs_times(grey: GreyBox, cycles: Dataset) -> None:
+    with pytest.raises(DomainError, match="time_s"):
+        grey.predict(Dataset(cycles.features, cycles.force_N))
+
+
+def test_forces_held_out_are_not_looked_at(cycles: Dataset) -> None:
+    known = np.arange(len(cycles)) % 3 > 0
+    spoiled = Dataset(cycles.features, np.where(known, cycles.force_N, 900.0), cycles.cycle, cycles.time_s)
+    models = [fit_network(data, known, 5, epochs=3)[0].predict(cycles.features) for data in (cycles, spoiled)]
+    assert models[0] == pytest.approx(models[1])
+
+
+def shipped(name: str) -> ForceModel:
+    return load_model(model_path(name, Path()), element="torque")
+
+
+def test_metrics_of_a_known_error() -> None:
+    model = shipped("torque_mre_50_40")
+    low, high = np.array(model.feature_ranges).T
+    rows = np.random.default_rng(3).uniform(low, high, (300, 4))
+    data = Dataset(rows, model.predict(rows) + np.where(np.arange(300) % 2, 0.5, -0.5))
+    r2 = 1 - 0.25 / np.var(data.force_N)
+    expected = {"mae_N": 0.5, "rmse_N": 0.5, "max_N": 0.5, "mae_percent": 50 / model.force_span_N, "r2": r2}
+    assert fit_metrics(model, data) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("name", ["torque_mre_50_40", "torque_mre_50"])
+def test_not_rising_counts_where_the_force_falls_with_the_field(name: str) -> None:
+    model = shipped(name)
+
+    def share(field_weights: list[float], bias: list[float]) -> float:
+        hidden, unused = model.metadata.hidden, model.metadata.hidden - 2
+        weight = np.zeros((hidden, 4))
+        weight[:2, FIELD] = field_weights
+        changed = {"hidden_weight": weight, "hidden_bias": np.array(bias + [0.0] * unused)}
+        return not_rising_share(replace(model, **changed, output_weight=np.ones(hidden)))
+
+    assert (share([1.0, 0.0], [0.0, 0.0]), share([-1.0, 0.0], [0.0, 0.0])) == (0, 1)
+    # a hill: rises in the lower half of the fields, falls in the upper
+    assert 0.3 < share([8.0, -8.0], [4.0, 4.0]) < 1.0
+
+
+def test_the_daemon_remembers_what_the_grey_box_does() -> None:
+    model = load_model(model_path("tactile_mre_c", Path()), element="tactile")
+    grey = GreyBox(model, model.metadata.memory.free, model.metadata.memory.added)
+    element = build_core(Config(scene="radial_pulse", rates=Rates(control_hz=500, inference_hz=83))).element
+    gap_range_mm = element.portrait.gap_mm[-1], element.portrait.gap_mm[0]
+    lab, memory = GreyBoxMemory(grey, 0.01), ElementMemory(element.memory, element.nominal, element.field, gap_range_mm)
+    memory.free, memory.added = element.memory.free.relaxed(0.0), element.memory.added.relaxed(0.0)
+    memory.field_mT, memory.time_s = 140.0, 0.0
+    draw = np.random.default_rng(4)
+    for step in range(1, 300):
+        place = min(0.01 * step, 2.0), 0.3, float(draw.uniform(140.0, 360.0))
+        expected_N = lab.advance(*place, 45.0)
+        at_mm, handle = element.field.gap_mm(place[2]) / 2.0, Handle(*place[:2], Turn(1.0, 0.0, 0.0))
+        seen = Measured(step, True, 0.0, at_mm, at_mm, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+        memory.update(0.01 * step, seen)
+        assert memory.force_N(element.nominal.now(seen)) == pytest.approx(expected_N, abs=1e-6)

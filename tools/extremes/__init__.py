@@ -1,1 +1,0 @@
-"""The cases of `numerics.py`, and their steps through time."""

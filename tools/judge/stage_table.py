@@ -1,0 +1,565 @@
+"""The stages of the core in the order in which data flow, and how each is fed: see `stages.py`."""
+
+import math
+import random
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from firmware_protocol.codec import (
+    DeviceFault,
+    DeviceMode,
+    Sense,
+    State,
+    Status,
+    Switches,
+)
+from judge.stages import Draw, Stage
+from tormagd.config import Config, Motor, Position
+from tormagd.control.aim.aim import Aim
+from tormagd.control.aim.portrait import Portrait, PortraitSearch, ceiling_mm, lawful_mT
+from tormagd.control.ask.forecast import Forecast, Skill
+from tormagd.control.ask.governor import Governor
+from tormagd.control.ask.path import TIMES_S, Path
+from tormagd.control.ask.way import Way
+from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.believe.anchor import Anchor
+from tormagd.control.believe.believe import Believe
+from tormagd.control.believe.carriage_lag import CarriageLag
+from tormagd.control.believe.freshness import Freshness
+from tormagd.control.believe.handle import HandleWatch
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.believe.ripple import Ripple
+from tormagd.control.believe.sensor import SensorTrust
+from tormagd.control.believe.sensor_zero import SensorZero
+from tormagd.control.believe.slow_friction import SlowFriction
+from tormagd.control.believe.strength import UNSEEN, Strength, device_bounds
+from tormagd.control.contact import Pressing, Sliding
+from tormagd.control.core import Planner, Stepper
+from tormagd.control.interpolation import Rising, at_step, interpolated, low_pass
+from tormagd.control.measure import Measure
+from tormagd.control.move.carriages import Carriages
+from tormagd.control.move.homing import Homing
+from tormagd.control.move.motor import full_speed_mm_s, margins
+from tormagd.control.move.opening import Opening
+from tormagd.control.move.pid import Pid
+from tormagd.control.move.reference import Reference, Speeds, follow, target_of
+from tormagd.control.move.watch import Watch
+from tormagd.control.nominal import FieldOfGap
+from tormagd.control.plausible import is_contradicted, is_outside, leap_between
+from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
+from tormagd.control.safety.codes import Fault
+from tormagd.control.safety.operating_state import Conditions, SafetyState, command
+from tormagd.control.sight import Sight
+from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, named
+from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.element.model.model_file import load_model, model_path
+from tormagd.element.physics.errors import DomainError
+from tormagd.hardware.link import DeviceLink
+from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.link_statistics import DeviceClock
+from tormagd.hardware.measurement import DeviceRequest, Measurement
+
+PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
+"Periods of a tick and of a plan, and the longest tick of `Stepper`."
+BEGINS_S = 9.9
+CONFIG = Config(scene="coronary")
+BOUNDS = device_bounds(CONFIG.trim)
+READY = Conditions(True, True, True, False, False)
+OWN, MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
+    "",
+    "Stepper, of measurements",
+    "ask/governor, of setpoints",
+    "firmware_protocol: codec",
+    "config",
+    "Planner, of plans",
+)
+"Checks in front of a stage, beside its own."
+
+
+@cache
+def core() -> Core:
+    return build_core(CONFIG)
+
+
+# -- inputs, all of them at the time of the draw -------------------------------------------------------------------
+
+
+def measurement(draw: Draw) -> Measurement:
+    """Return a healthy homed device's measurement at a gap of 80 mm, except for what is drawn."""
+    return Measurement(
+        number=draw.steps,
+        received_s=draw(draw.now_s),
+        device_time_s=draw(draw.now_s),
+        left_mm=draw(-7.5),
+        right_mm=draw(-7.5),
+        left_current_A=draw(0.1),
+        right_current_A=draw(0.1),
+        force_N=draw(1.1),
+        handle_mm=draw(42.0 * draw.now_s),
+        mode=DeviceMode.RUN,
+        switches=Switches.HOMED,
+        faults=DeviceFault(0),
+        temperature_C=draw(23.0),
+        supply_V=draw(12.0),
+        sensed_s=draw(draw.now_s),
+        reported_s=draw(draw.now_s),
+        delay_s=draw(0.0),
+        link=LinkQuality(0.0, 0.0, 0.0, draw(2e-3), draw(0.0)),
+    )
+
+
+def measured(draw: Draw) -> Measured:
+    some, now_s = draw.bounded, draw.now_s
+    turn = Turn(1.0 if some(1.0) >= 0.0 else -1.0, some(0.0), some(42.0 * now_s))
+    handle = Handle(min(abs(some(MOBILISED_MM)), MOBILISED_MM), some(42.0), turn, abs(some(42.0)))
+    return Measured(
+        number=draw.steps,
+        is_homed=True,
+        device_time_s=some(now_s),
+        left_mm=some(40.0),
+        right_mm=some(40.0),
+        left_mm_s=some(0.0),
+        right_mm_s=some(0.0),
+        force_N=some(1.1),
+        handle=handle,
+        handle_mm=some(42.0 * now_s),
+        sensed_s=some(now_s),
+        handle_time_s=some(now_s),
+    )
+
+
+def setpoint(draw: Draw) -> TimedSetpoint:
+    """Return about 1.2 N, in a third of the steps with a preview, in a quarter with a wall."""
+    preview = tuple([draw(1.2) for _ in range(8)]) if draw.steps % 3 == 0 else ()
+    made = TimedSetpoint(draw(1.2), draw(draw.now_s), draw(0.1), None, None, preview, draw(0.05) if preview else 0.0)
+    if draw.steps % 4 == 1:
+        made = made.replaced(withdraw_N=draw(0.5), wall=Wall(draw(5.0), draw(0.3), draw(0.5)))
+    return made.replaced(displacement_mm=draw(MOBILISED_MM), rate_mm_s=draw(42.0)) if draw.steps % 2 else made
+
+
+def plan(draw: Draw) -> Plan:
+    at_s = draw(draw.now_s)
+    at = Plan(1, at_s, 1.2, draw(0.0), draw(1.2), draw(1.1), draw(200.0), draw(79.0), draw(-5.0), draw(1.0), ())
+    return at.replaced(gap_acceleration_mm_s2=draw(0.0), min_gap_mm=draw(45.0), sensor_doubted_s=draw(0.0))
+
+
+def usual(now_s: float) -> Draw:
+    draw = Draw(random.Random(0), ())
+    draw.now_s = now_s
+    return draw
+
+
+# -- the core through its entries ----------------------------------------------------------------------------------
+
+
+def stepper() -> Stepper:
+    made = core().stepper(BEGINS_S)
+    for tick in range(1, 4):
+        draw = usual(BEGINS_S + tick * PERIOD_S)
+        draw.steps = -tick
+        hold = Plan(1, draw.now_s, None, None, 0.0, None, 0.0, 80.0, 0.0, 1.0, ())
+        made.step(draw.now_s, measurement(draw), hold)
+    made.command("enable", BEGINS_S + 0.01, READY)
+    return made
+
+
+def step(stage: Stepper, draw: Draw) -> object:
+    duty = stage.step(draw(draw.now_s), measurement(draw), plan(draw))
+    faults = stage.safety.faults
+    if Fault.NOT_FINITE in faults:
+        raise DomainError("measurement or plan", Fault.NOT_FINITE, "finite numbers")
+    return [duty, list(faults), stage.measured]
+
+
+def planner() -> Planner:
+    return core().planner(BEGINS_S)
+
+
+def planning(stage: Planner, draw: Draw) -> object:
+    now_s, told_s = draw.now_s, draw(draw.now_s)
+    try:
+        made = stage.plan(now_s if math.isfinite(told_s) else told_s, setpoint(draw), measured(draw))
+    except DomainError as error:
+        stage.afresh(now_s)
+        try:
+            stage.plan(now_s, setpoint(usual(now_s)), measured(usual(now_s)))
+        except DomainError as again:
+            raise AssertionError(f"afresh after {error}") from again
+        raise
+    stage.foresee()
+    return made
+
+
+# -- measure -------------------------------------------------------------------------------------------------------
+
+
+def measure(stage: Measure, draw: Draw) -> object:
+    return stage.update(draw.last_s, draw.now_s, measurement(draw), False)
+
+
+def sight(stage: Sight, draw: Draw) -> object:
+    stage.update(draw.last_s, draw.now_s, draw(1.0) > 0.0)
+    return stage.is_blind
+
+
+def plausible(_: object, draw: Draw) -> object:
+    one, other = measured(draw), measured(draw)
+    leap = leap_between(one, other, 8.0, draw.now_s, draw.bounded(draw.now_s))
+    is_back = leap is not None and leap.has_come_back(one, 8.0, draw.now_s)
+    return [leap, is_back, is_outside(other, 45.0, 95.0), is_contradicted(other, 0, 45.0, 95.0)]
+
+
+# -- believe -------------------------------------------------------------------------------------------------------
+
+
+def believing(stage: Believe, draw: Draw) -> object:
+    seen = measured(draw)
+    belief = stage.update(draw.now_s, seen)
+    stage.learn_lag(0.0, seen, draw(1.0), draw(80.0))
+    return [belief, stage.learned(), stage.min_N]
+
+
+def strength(stage: Strength, draw: Draw) -> object:
+    stage.update(draw(1.1), draw(1.2), draw.positive(PLAN_S))
+    fit = stage.fit
+    return [fit.force_N(1.1), fit.model_N(1.1), fit.deviation_N(1.1), fit.surely_within_N(2.5, BOUNDS)]
+
+
+def slow_friction(stage: SlowFriction, draw: Draw) -> object:
+    stage.follow(draw(1.1), draw(10.0))
+    stage.rescale(draw(1.1), draw(1.1), abs(draw(5.0)))
+    if UNSEEN.force_N(stage.followed_N) > 0.1:  # as in `believe`
+        stage.update(UNSEEN, abs(draw(1.0)) % 6.0, draw(1.2), PLAN_S)
+    return stage.factor_at(abs(draw(1.0)))
+
+
+def sensor_zero(stage: SensorZero, draw: Draw) -> object:
+    stage.begin(draw.now_s)
+    direction = 1.0 if draw.steps // 4 % 2 else -1.0
+    stage.update(
+        draw.now_s,
+        direction,
+        draw(1.1),
+        draw(1.1),
+        abs(draw(42.0)),
+        draw.positive(0.2),
+        1.0,
+        0.1,
+        is_disputed=draw.steps % 2 > 0,
+    )
+    return [stage.sd_N(draw.now_s), stage.way]
+
+
+def freshness(stage: Freshness, draw: Draw) -> object:
+    stage.update(abs(draw(1.0)), draw(1.1), draw(1.1), draw.positive(PLAN_S), learns=True)
+    return stage.changed_N
+
+
+def sensor(stage: SensorTrust, draw: Draw) -> object:
+    dt_s = draw.positive(PLAN_S)
+    taught_N = stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), draw(1.1), abs(draw(0.02)), dt_s, learns=True)
+    return taught_N or 0.0
+
+
+def anchor(stage: Anchor, draw: Draw) -> object:
+    stage.learn(draw(1.1), draw(1.2), draw.positive(PLAN_S))
+    return [stage.force_N(1.1), stage.deviation_N(1.1), stage.model_N(2.15)]
+
+
+def ripple(stage: Ripple, draw: Draw) -> object:
+    stage.update(draw(10.0), draw(42.0), draw(1.1), draw(1.2), Anchor(UNSEEN))
+    return stage.share(draw(10.0))
+
+
+def carriage_lag(stage: CarriageLag, draw: Draw) -> object:
+    stage.update(draw(PLAN_S), draw(80.0), draw(80.1), draw(-5.0), 38.0)
+    return stage.lag_s
+
+
+def handle_watch(stage: HandleWatch, draw: Draw) -> object:
+    stage.update(draw.now_s, draw(10.0), draw(1.1), draw(1.1))
+    return stage.moved_gap_at_rest(1.1)
+
+
+def memory(stage: ElementMemory, draw: Draw) -> object:
+    stage.update(draw.now_s, measured(draw))
+    return [stage.lag_at_mT(draw(200.0)), stage.force_N(core().element.nominal.only)]
+
+
+# -- ask -----------------------------------------------------------------------------------------------------------
+
+
+def way(stage: Way, draw: Draw) -> object:
+    return stage.update(measured(draw), draw.bounded(0.4), draw.steps % 2 > 0)
+
+
+def governor(stage: Governor, draw: Draw) -> object:
+    travel = Travel(draw.bounded(6.0), draw.bounded(20.0), draw.steps % 3 > 0)
+    asked = stage.update(draw.now_s, setpoint(draw), UNSEEN, abs(draw.bounded(0.02)), travel)
+    stage.foresee()
+    return asked
+
+
+def forecast(stage: Forecast, draw: Draw) -> object:
+    if not stage.history or len(stage.history) < 800:  # what it needs to forecast
+        for place in range(150):
+            stage.update(draw.step(0.01), 1.2 + 0.2 * math.sin(0.6 * place))
+    stage.update(draw.step(0.01), draw(1.2))
+    stage.foresee(draw(1.0))
+    ahead = stage.forces_N(0.0, TIMES_S) if stage.trust > 0.0 else []
+    return [stage.trust, *ahead, *np.frombuffer(stage.history).tolist()]
+
+
+def path(stage: Path, draw: Draw) -> object:
+    wanted_N = [draw(1.2) for _ in TIMES_S]
+    forces_N, sent_mm = stage.pursue(draw(70.0), draw(70.0), abs(draw.bounded(PLAN_S)), wanted_N, UNSEEN, 0.02)
+    return [forces_N, sent_mm, stage.is_near(70.0, draw(1.2), UNSEEN)]
+
+
+def skill(stages: list[Skill], draw: Draw) -> object:
+    before = stages[0].score
+    stages[0] = stages[0].after(draw(0.01), draw(0.02), 0.05)
+    return [before, stages[0].score]
+
+
+# -- aim -----------------------------------------------------------------------------------------------------------
+
+
+def aim() -> list[Any]:
+    made, believe = core(), planner().believe
+    begun = Aim(CONFIG, made.scene, made.element)
+    begun.begin(BEGINS_S, 0, 0.0)
+    return [begun, believe.memory, believe.update(BEGINS_S, None)]
+
+
+def aiming(stage: list[Any], draw: Draw) -> object:
+    begun, remembered, believed = stage
+    asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), is_meant=True)
+    return begun.update(draw.now_s, setpoint(usual(draw.now_s)), asked, believed, remembered, measured(draw))
+
+
+def floors(_: object, draw: Draw) -> object:
+    element = core().element
+    return [
+        ceiling_mm(element.portrait, UNSEEN, draw(2.5), BOUNDS),
+        lawful_mT(element.law, draw(1.2), draw.bounded(200.0)),
+    ]
+
+
+def portrait(stage: Portrait, draw: Draw) -> object:
+    force_N = draw(1.2)
+    return [
+        *stage.gap_and_slope_at(force_N),
+        stage.force_N_at(draw(70.0)),
+        stage.force_rate_N_s(force_N, draw.bounded(38.0)),
+        stage.gap_mm_at(draw(1.2)),
+    ]
+
+
+# -- move ----------------------------------------------------------------------------------------------------------
+
+
+def carriages() -> Carriages:
+    made = Carriages(CONFIG, core().scene)
+    made.begin(80.0)
+    return made
+
+
+def driving(stage: Carriages, draw: Draw) -> object:
+    seen, dt_s, planned = measured(draw), elapsed_s(draw), plan(draw)
+    reading = measurement(usual(draw.now_s)).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
+    return [stage.update(draw.now_s, dt_s, planned, reading, seen, False), stage.reference, stage.expected]
+
+
+def elapsed_s(draw: Draw) -> float:
+    """Return a time between two ticks, as `Stepper` bounds it."""
+    return min(draw.positive(PERIOD_S), LONGEST_S)
+
+
+def pid(stage: Pid, draw: Draw) -> object:
+    stage.rest(draw.bounded(0.1), PERIOD_S)
+    return stage.update(draw(0.1), draw(1.0), draw(0.1), elapsed_s(draw), draw.bounded(0.0) > 0.0)
+
+
+def reference(stages: list[Reference], draw: Draw) -> object:
+    to = target_of(plan(draw), draw.now_s, 2e-3, 45.0, 95.0)
+    stages[0], *_ = follow(1600.0, stages[0], to, elapsed_s(draw), Speeds(40.0, 38.0, 38.0), 45.0)
+    return stages[0]
+
+
+def motor(_: object, draw: Draw) -> object:
+    """Feed a motor with some configuration keys at an end of what is accepted."""
+    if not draw.is_hostile:
+        return []
+    ends = [
+        usual_is if draw(1.0) == 1.0 else (least if draw.steps % 2 else most)
+        for least, usual_is, most in MOTORS.values()
+    ]
+    made = Motor(**dict(zip(MOTORS, ends, strict=True)))
+    return [*margins(made, Position(), PERIOD_S), full_speed_mm_s(made)]
+
+
+MOTORS = {
+    "supply_V": (3.0, 12.0, 60.0),
+    "resistance_ohm": (0.05, 2.2, 100.0),
+    "inductance_mH": (0.01, 1.5, 100.0),
+    "back_emf_V_s": (1e-4, 0.011, 1.0),
+    "inertia_kg_m2": (1e-9, 8e-7, 1e-2),
+    "gear_ratio": (1.0, 70.0, 1_000.0),
+    "screw_lead_mm": (0.2, 8.0, 50.0),
+}
+
+
+def homing(stage: Homing, draw: Draw) -> object:
+    mode = DeviceMode.HOMING if draw.steps % 8 else DeviceMode.IDLE
+    stage.update(draw.now_s, measurement(draw).replaced(mode=mode))
+    return [*stage.faults, *stage.went_back_mm]
+
+
+def opening(stage: Opening, draw: Draw) -> object:
+    mode = DeviceMode.RETRACTING if draw.steps % 4 else DeviceMode.IDLE
+    seen = measurement(draw).replaced(mode=mode)
+    stage.update(seen, draw.steps % 3 > 0, draw.steps % 5 == 0, SafetyState().ask(DeviceRequest.RETRACT))
+    return [*stage.faults, stage.left_late_s, stage.right_late_s, stage.waits_s]
+
+
+def watch(stage: Watch, draw: Draw) -> object:
+    seen, said, seeing = measured(draw), measurement(draw), Sight(PERIOD_S)
+    stage.update(PERIOD_S, seen, draw(80.0), draw(0.1), draw(0.1))
+    faults = stage.faults(draw.now_s, SafetyState(), said, seen, seeing, None, draw(0.0))
+    return [*faults, *stage.limits(draw.now_s, said, seen, seeing)]
+
+
+# -- what several stages use ---------------------------------------------------------------------------------------
+
+
+def filtered(values: list[float], draw: Draw) -> object:
+    values[0] = low_pass(values[0], draw(1.0), abs(draw(PERIOD_S)), draw.positive(0.01))
+    return values
+
+
+def tables(_: object, draw: Draw) -> object:
+    """Feed five points: also equal ones, and some that are a denormal apart or do not rise."""
+    points = [draw(each) for each in (0.0, 1.0, 2.0, 3.0, 4.0)]
+    points = points if draw.steps % 3 else sorted(points)
+    gaps_mm = [95.0, 80.0, 65.0, 50.0, 35.0]
+    degenerate, value = Portrait(gaps_mm, points, [0.1] * 5), draw(points[draw.steps % 5])
+    return [
+        interpolated(value, Rising(points), gaps_mm),
+        at_step(abs(draw(1.5)), gaps_mm),
+        *degenerate.gap_and_slope_at(value),
+        degenerate.force_N_at(draw(70.0)),
+    ]
+
+
+def field(stage: FieldOfGap, draw: Draw) -> object:
+    return [stage.field_mT(draw(80.0)), stage.gap_mm(draw(200.0))]
+
+
+def contact(stages: list[Any], draw: Draw) -> object:
+    seen, asked = measured(draw), setpoint(draw)
+    return [[*each.planned(asked, seen), *each.motion_now(seen), each.is_known(seen)] for each in stages]
+
+
+def curve(_: object, draw: Draw) -> object:
+    made = core().element.nominal._network.curve(draw(2.0), draw(42.0), draw(40.0))
+    field_mT = draw.bounded(200.0)
+    return [made.force_N(field_mT), *made.force_and_slope(field_mT), made.confidence(field_mT, draw.bounded(0.1))]
+
+
+def search(stage: Any, draw: Draw) -> object:
+    found = stage.solve(core().element.nominal.only, draw(1.2), draw(200.0) if draw.steps % 2 else None)
+    return [found.field_mT, found.predicted_force_N, found.confidence]
+
+
+# -- the borders ---------------------------------------------------------------------------------------------------
+
+
+def link() -> DeviceLink:
+    made = DeviceLink(BEGINS_S)
+    made.receive(BEGINS_S, Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, 1))
+    made.receive(BEGINS_S, Sense(0.1, 0.1, 0.6, 0.0))
+    return made
+
+
+def linked(stage: DeviceLink, draw: Draw) -> object:
+    now_s = draw.now_s
+    if draw.steps % 20 == 0:
+        stage.receive(now_s, Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), draw(23.0), draw(12.0), 0, 1))
+    stage.receive(now_s, State(draw(-7.5), draw(-7.5), draw(now_s % 0.65536), draw.steps % 256))
+    stage.receive(now_s, Sense(draw(0.1), draw(0.1), draw(0.6), draw(1.0)))
+    return stage.measurement
+
+
+def clock(stage: DeviceClock, draw: Draw) -> object:
+    stage.add(draw.now_s, draw(draw.now_s))
+    return [stage.drift, stage.fit()]
+
+
+def safety(stages: list[SafetyState], draw: Draw) -> object:
+    some = READY.replaced(
+        round_trip_s=abs(draw(2e-3)),
+        clock_drift=draw(0.0),
+        apart_mm=abs(draw(0.0)),
+        most_apart_mm=1.0,
+        most_round_trip_s=0.01,
+        most_clock_drift=0.1,
+    )
+    stages[0] = command(SafetyState(), "enable", draw.step(PERIOD_S), some)
+    return [some.round_trip_s, some.clock_drift, some.apart_mm]
+
+
+def stages() -> list[Stage]:
+    made, position = core(), CONFIG.position
+    element = made.element
+    range_mT, scene = element.nominal.fields_mT, made.scene
+    model = load_model(model_path(scene.insert.model, made.models), element=scene.element)
+    return [
+        Stage("hardware/link", link, linked, CODEC, PERIOD_S),
+        Stage("hardware/link_statistics", DeviceClock, clock, CODEC, 0.6),
+        Stage("safety/operating_state", lambda: [SafetyState()], safety),
+        Stage("Stepper", stepper, step, OWN, PERIOD_S),
+        Stage("Planner", planner, planning, OWN, PLAN_S),
+        Stage("measure", lambda: Measure(47.5, 0.003, True, 8.0, PERIOD_S), measure, MEASUREMENT, PERIOD_S),
+        Stage("plausible", lambda: None, plausible, MEASUREMENT, PERIOD_S),
+        Stage("sight", lambda: Sight(PERIOD_S), sight, MEASUREMENT, PERIOD_S),
+        Stage("believe/believe", lambda: planner().believe, believing, MEASUREMENT, PLAN_S),
+        Stage("believe/strength", lambda: Strength(0.5, BOUNDS, (True, True)), strength, MEASUREMENT),
+        Stage("believe/slow_friction", partial(SlowFriction, BOUNDS), slow_friction, MEASUREMENT),
+        Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT, PLAN_S),
+        Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
+        Stage("believe/anchor", partial(Anchor, UNSEEN), anchor, MEASUREMENT),
+        Stage("believe/ripple", Ripple, ripple, MEASUREMENT),
+        Stage("believe/sensor", partial(SensorTrust, BOUNDS, 0.08), sensor, MEASUREMENT),
+        Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
+        Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT, PLAN_S),
+        Stage("believe/memory", lambda: planner().believe.memory, memory, MEASUREMENT, PLAN_S),
+        Stage("ask/way", lambda: Way(-1), way, MEASUREMENT, PLAN_S),
+        Stage("ask/governor", lambda: planner().governor, governor, OWN, PLAN_S),
+        Stage("ask/forecast", Forecast, forecast, SETPOINT),
+        Stage("ask/path", lambda: Path(made.portrait, 38.0), path),
+        Stage("ask/skill", lambda: [Skill(0.0, 0.0)], skill, SETPOINT),
+        Stage("aim/aim", aim, aiming, OWN, PLAN_S),
+        Stage("aim/floors", lambda: None, floors),
+        Stage("aim/portrait", lambda: made.portrait, portrait),
+        Stage("move/carriages", carriages, driving, OWN, PERIOD_S),
+        Stage("move/pid", lambda: Pid(position), pid),
+        Stage("move/reference", lambda: [Reference(80.0)], reference, PLANNED, PERIOD_S),
+        Stage("move/motor", lambda: None, motor, CONFIGURATION),
+        Stage("move/homing", lambda: Homing(2.6), homing, MEASUREMENT, PERIOD_S),
+        Stage("move/opening", lambda: Opening(CONFIG, made.scene), opening, MEASUREMENT, PERIOD_S),
+        Stage("move/watch", lambda: Watch(CONFIG, made.scene), watch, MEASUREMENT, PERIOD_S),
+        Stage("filter", lambda: [0.0], filtered, MEASUREMENT),
+        Stage("interpolation", lambda: None, tables),
+        Stage("field_of_gap", lambda: element.field, field),
+        Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT, PLAN_S),
+        Stage("model/force_curve", lambda: None, curve),
+        # on few fields: a number travels through one as through a thousand, row by row
+        *[
+            Stage(f"inverse: {name}", partial(build, choice, range_mT, model, rises=True), search)
+            for name, choice in ((name, named(name)._replace(step_mT=10.0)) for name in RUNTIME_SOLVERS)
+        ],
+        Stage("inverse: portrait", lambda: PortraitSearch(made.portrait, element.field), search),
+    ]

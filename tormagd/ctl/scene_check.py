@@ -1,0 +1,138 @@
+"""`tormagctl scene check`: whether a daemon takes a scene, how it serves it, and at what cost; a scene as text."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, answer_of, as_usage_error, folded
+from tormagd.scenes.measured import MeasuredScene, Measurements, OperatingPoint, measured
+from tormagd.scenes.scene import Force, Scene, load_scene
+from tormagd_client.endpoints import ConfigError
+
+LONGEST_S = 30.0
+"The daemon's own check takes half a second."
+
+
+def check_scene(name: str, config: Path | None) -> Outcome:
+    """Say whether a daemon with this configuration takes the scene, how it serves it, and at what cost."""
+    scene = loaded(name)
+    derived = derived_of(name, config)
+    file = measured()
+    share = file.share(way_of(derived)) if not derived["terms_out"] else None
+    if share is not None and share.daemon > scene.budget.core_share:
+        raise CommandError(
+            Exit.REFUSED,
+            "budget",
+            f"scene {scene.name}: a daemon takes {share.daemon:.1%} of a processor for it: allowed is "
+            f"budget.core_share = {scene.budget.core_share:g}",
+            "tormagctl scene explain says what other rates and searches take",
+        )
+    force, signal, least_N = scene.force, scene.signal, derived["least_N"]
+    lines = [
+        f"{scene.name}: taken",
+        f"forces     {force.least_N:g}..{force.most_N:g} N of the device's {least_N:.2f}..{derived['most_N']:.2f}"
+        + torque_range(scene),
+        f"resolution {force.resolution_N:g} N, the device's is {derived['least_resolution_N']:.2g}",
+        *(
+            [f"           below {least_N:.2f} N it gets that: a passive device has a least force (limit F_MIN)"]
+            if force.least_N < least_N
+            else []
+        ),
+        "signal     not stated: nothing is known of how fast the force changes"
+        if derived["missed_rms_N"] is None
+        else f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
+        f"{1e3 * force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster",
+        *(
+            [f"           its publisher sends {signal.setpoint_hz:g} times a second"]
+            if signal is not None and signal.setpoint_hz is not msgspec.UNSET
+            else []
+        ),
+        *_waiting(force, derived["approaches_s"]),
+        f"served     {way_of(derived)}",
+        "cost       not measured of these rates, search and terms"
+        if share is None
+        else f"cost       {share.daemon:.1%} of a processor for the daemon, {scene.budget.core_share:.0%} are allowed",
+    ]
+    result = {
+        "scene": scene.name,
+        "core_share": share and share.daemon,
+        "core_share_allowed": scene.budget.core_share,
+    } | derived
+    return Outcome(result, folded("\n".join(lines)))
+
+
+def torque_range(scene: Scene) -> str:
+    """Return the scene's forces and resolution as torques at the handle's shaft, mNm."""
+    radius_mm, force = scene.roller_radius_mm, scene.force
+    if radius_mm is None:
+        return ""
+    return (
+        f", {force.least_N * radius_mm:g}..{force.most_N * radius_mm:g} mNm in {force.resolution_N * radius_mm:g} mNm"
+    )
+
+
+def _waiting(force: Force, approaches_s: list[tuple[float, float]]) -> list[str]:
+    """Return a line on how soon a force comes from where the brake waits."""
+    if not approaches_s:
+        return []
+    (wait_N, now_s), *nearer = approaches_s
+    others = ", ".join(f"{standby_N:.2f} N {later_s:.2f} s" for standby_N, later_s in nearer)
+    return [
+        f"waiting    at {wait_N:.2f} N: {(wait_N + force.most_N) / 2.0:.2f} N come after {now_s:.2f} s; with "
+        f"force.standby_N, which is felt as drag: {others}"
+    ]
+
+
+def derived_of(name: str, config: Path | None) -> dict[str, Any]:
+    """Run the daemon's own check in a process, and return what it derives."""
+    arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
+    try:
+        derived: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.daemon.main", arguments, LONGEST_S))["derived"]
+    except TimeoutError as error:
+        raise CommandError(
+            Exit.REFUSED, "not_checked", f"scene {name!r} could not be checked: {error}", "try it again"
+        ) from error
+    except ChildProcessError as error:
+        raise CommandError(
+            Exit.REFUSED,
+            "refused",
+            str(error).removeprefix("tormagd: "),
+            "tormagctl guide scenes says what each key asks of the device",
+        ) from error
+    return derived
+
+
+def way_of(derived: dict[str, Any]) -> OperatingPoint:
+    return OperatingPoint(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
+
+
+def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
+    """Return what was measured of a scene that asks for the same, under whatever name."""
+    found = file.scene(scene.fingerprint)
+    if found is None:
+        raise CommandError(
+            Exit.REFUSED,
+            "not_measured",
+            f"scene {scene.name} was not measured as it is now",
+            "tormagctl guide scene says how that is done, in some minutes",
+        )
+    return found
+
+
+def loaded(name: str) -> Scene:
+    with as_usage_error(ConfigError, hint="tormagctl scene list shows the shipped ones"):
+        return load_scene(name)
+
+
+def as_toml(tables: dict[str, Any]) -> str:
+    lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
+    for title, table in tables.items():
+        if isinstance(table, dict):
+            lines += ["", f"[{title}]", *(_line(key, value) for key, value in table.items())]
+    return "\n".join(lines)
+
+
+def _line(key: str, value: object) -> str:
+    # numbers and texts read the same in JSON and TOML
+    return f"{key} = {msgspec.json.encode(value).decode()}"
