@@ -16,7 +16,7 @@ from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.ripple import Ripple
-from tormagd.control.believe.sensor import KNOWN_N, NAMED_S, SLACK_N, Disputed, SensorTrust
+from tormagd.control.believe.sensor import KNOWN_N, SLACK_N, Disputed, SensorTrust
 from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
 from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
@@ -259,7 +259,7 @@ class Believe:
             )
         taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
         self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
-        if sensor.is_doubted or sensor.outside_s > NAMED_S:
+        if sensor.is_disputed:
             self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
         # of a zero that is not known only a force that it does not explain teaches
         unknown_N = 0.0 if zero_sd_N <= self._unknown_sd_N or sensor.is_disputed else SURE * zero_sd_N + SLACK_N

@@ -29,7 +29,7 @@ KNOWN_N: Final = 0.02
 "An anchor that is known so well at a force, as a standard deviation, learns no more there."
 SLACK_N: Final = 0.05
 "Noise, hysteresis, a creep and a kelvin move a force by so much."
-VISCOUS_N_S_MM: Final = 6e-4
+VISCOUS_N_S_MM: Final = 1e-3
 "And by so much for each mm/s between the handle's rate and that at which the anchor was learned."
 FALLS_1_S: Final = 0.2
 "The leash gives way by this share of the anchor a second."
@@ -58,7 +58,7 @@ class SensorTrust:
     share: float = 1.0
     "Share of the anchor to which the fit may fall."
     low_s: float = 0.0
-    "How long the readings have been below that."
+    "How long the readings have been below that share."
     outside_s: float = 0.0
     "How long the readings have been outside the leash; 0 once they have been inside for INSIDE_S."
     inside_s: float = 0.0
@@ -82,7 +82,7 @@ class SensorTrust:
 
     @property
     def is_disputed(self) -> bool:
-        return self.is_doubted or self.outside_s > 0.0
+        return self.is_doubted or self.outside_s > NAMED_S
 
     def update(
         self,
@@ -128,12 +128,13 @@ class SensorTrust:
             surely_N, shown_N = SURE * deviation_N if self.has_slid else math.inf, taught_N / self.fallen
             self.anchor.learn(model_N, min(max(shown_N, force_N - surely_N), force_N + surely_N), dt_s)
         if self.has_slid:
-            self._give_way(believed, low_N, dt_s)
+            self._give_way(believed, force_N, dt_s)
         return taught_N
 
-    def _give_way(self, believed: float, low_N: float, dt_s: float) -> None:
+    def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share that is `believed`."""
-        self.low_s = self.low_s + dt_s if self.measured_N < low_N else 0.0
+        # what is lost in the slack is given way, too: readings at its end would teach only their noise
+        self.low_s = self.low_s + dt_s if self.measured_N < self.share * force_N else 0.0
         falls = FALLS_1_S * dt_s if self.low_s > LEARNS_S else 0.0
         self.share = min(max(self.share - falls, believed, 1.0 - self._leash), 1.0)
 
