@@ -31,7 +31,7 @@ SLACK_N: Final = 0.05
 "Noise, hysteresis, a creep and a kelvin move a force by so much."
 VISCOUS_N_S_MM: Final = 1e-3
 "And by so much for each mm/s between the handle's rate and that at which the anchor was learned."
-FALLS_1_S: Final = 0.2
+FALLS_1_S: Final = 0.3
 "The leash gives way by this share of the anchor a second."
 NAMED_S: Final = 0.1
 "Readings that have been outside for longer are named."
