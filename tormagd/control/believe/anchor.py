@@ -40,7 +40,8 @@ class Anchor:
         return _dot(self.values, _terms(model_N))
 
     def model_N(self, force_N: float) -> float:
-        """Return the model's force, N, that gives `force_N`, over LEAST_N; one beyond where the device gives most, if none does."""
+        """Return the model's force, N, over LEAST_N, that gives `force_N`; one beyond where the device gives most, if
+        none does."""
         scale, offset_N, curve, _ = self.values
         slope, left_N = scale - 2.0 * MIDDLE_N * curve, offset_N + MIDDLE_N * MIDDLE_N * curve - force_N
         return -2.0 * left_N / (slope + math.sqrt(max(slope * slope - 4.0 * curve * left_N, 0.0)))

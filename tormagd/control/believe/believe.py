@@ -258,13 +258,7 @@ class Believe:
                 is_disputed=sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
             )
         taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
-        self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
-        if sensor.is_disputed:
-            self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
-        # of a zero that is not known only a force that it does not explain teaches
-        unknown_N = 0.0 if zero_sd_N <= self._unknown_sd_N or sensor.is_disputed else SURE * zero_sd_N + SLACK_N
-        if unknown_N > 0.0:
-            self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
+        unknown_N = self._unknown_N(zero_sd_N)
         least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
         if taught_N is None or (unknown_N > 0.0 and reading_N < least_N):
             self.strength.settle()
@@ -272,6 +266,17 @@ class Believe:
         if self._nominal.contact.slides and not self.strength.is_held:
             self.ripple.update(angle, measured.handle.rate_mm_s, model_N, sensor.measured_N, sensor.anchor)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
+
+    def _unknown_N(self, zero_sd_N: float) -> float:
+        """Update `limits`, and return what a zero that is known to within `zero_sd_N` may explain, if that is much."""
+        sensor = self.sensor
+        self.limits = (Limit.SENSOR_ZERO,) if abs(self.zero.zero_N) > UNTARED_N else ()
+        if sensor.is_disputed:
+            self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
+        elif zero_sd_N > self._unknown_sd_N:
+            self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
+            return SURE * zero_sd_N + SLACK_N
+        return 0.0
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing."""

@@ -55,8 +55,8 @@ class SensorTrust:
     "Mean of the handle's rate while the anchor was learned."
     fallen: float = 1.0
     "Share of the anchor that the fit gave where the anchor was last known."
-    share: float = 1.0
-    "Share of the anchor to which the fit may fall."
+    share: float = 0.0
+    "Share of the anchor to which the fit may fall; 0 until the device has slid."
     low_s: float = 0.0
     "How long the readings have been below that share."
     outside_s: float = 0.0
@@ -104,21 +104,14 @@ class SensorTrust:
         weakest_N = self._bounds.min_scale * (1.0 - WEAKENED) * model_N - unsure_N
         strongest_N = self._bounds.max_scale * (1.0 + WEAKENED) * model_N + unsure_N
         is_strange = self.freshness.is_frozen or not weakest_N <= self.measured_N <= strongest_N
-        self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
-        self.is_doubted = self.is_doubted or self.wrong_s > WRONG_S
-        self.doubted_s = self.doubted_s + dt_s if self.is_doubted else 0.0
-        if not is_strange and not self.is_doubted:
-            self.known_s = min(self.known_s + dt_s, LEARNS_S)
         force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
         unsure_N += VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
         beyond_N = abs(self.measured_N - force_N) - self._leash * force_N - unsure_N - KNOWN_N
-        is_inside = beyond_N <= SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
-        self._judge(is_strange, is_inside or not self.has_slid, dt_s)
-        is_taken = self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
-        if not (is_taken and weakest_N <= reading_N <= strongest_N):
+        self._doubt(is_strange, dt_s)
+        self._judge(is_strange, beyond_N <= SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0), dt_s)
+        if not (self._teaches and weakest_N <= reading_N <= strongest_N):
             return None
-        low_N = self.share * force_N - unsure_N if self.has_slid else -math.inf
-        taught_N = max(reading_N, low_N)
+        taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
         if deviation_N <= KNOWN_N:
             self.fallen = min(max(believed, self._bounds.min_scale), 1.0)
@@ -131,6 +124,10 @@ class SensorTrust:
             self._give_way(believed, force_N, dt_s)
         return taught_N
 
+    @property
+    def _teaches(self) -> bool:
+        return self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
+
     def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share that is `believed`."""
         # what is lost in the slack is given way, too: readings at its end would teach only their noise
@@ -138,10 +135,18 @@ class SensorTrust:
         falls = FALLS_1_S * dt_s if self.low_s > LEARNS_S else 0.0
         self.share = min(max(self.share - falls, believed, 1.0 - self._leash), 1.0)
 
+    def _doubt(self, is_strange: bool, dt_s: float) -> None:
+        """Count how long the readings have been such as no device gives, and how long the device has slid."""
+        self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
+        self.is_doubted = self.is_doubted or self.wrong_s > WRONG_S
+        self.doubted_s = self.doubted_s + dt_s if self.is_doubted else 0.0
+        if not is_strange and not self.is_doubted:
+            self.known_s = min(self.known_s + dt_s, LEARNS_S)
+
     def _judge(self, is_strange: bool, is_inside: bool, dt_s: float) -> None:
         """Count how long the readings have been outside or inside the leash; a doubted sensor may be believed again."""
         self.inside_s = self.inside_s + dt_s if is_inside and not is_strange else 0.0
-        if not is_inside:
+        if self.has_slid and not is_inside:
             self.outside_s += dt_s
         elif self.inside_s > INSIDE_S:
             self.outside_s = 0.0
