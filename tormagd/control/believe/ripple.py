@@ -19,7 +19,7 @@ AGREES: Final = 0.5
 "Two turns agree where they differ by at most this share of the wave."
 STEP_RAD: Final = 0.1
 "Changes are taken over this angle; none over three times as much without a reading."
-STEEPEST: Final = 0.045
+STEEPEST: Final = 0.06
 "No ripple changes by a greater share over STEP_RAD, nor moves the gap by as much."
 STEADY_MM_S: Final = 8.0
 "Over a turn the handle's rate may change by so much: friction differs with the rate."
