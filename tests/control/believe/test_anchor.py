@@ -17,7 +17,7 @@ def device_N(model_N: float) -> float:
 @pytest.fixture
 def known() -> Anchor:
     anchor = Anchor(UNSEEN)
-    for model_N in (0.6, 1.3, 2.0):
+    for model_N in (0.6, 0.9, 1.3, 2.0):
         for _ in range(900):
             anchor.learn(model_N, device_N(model_N), PERIOD_S)
     return anchor
