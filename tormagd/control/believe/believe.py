@@ -98,7 +98,8 @@ class Believe:
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self._leash: Final = trim.leash
         self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
-        self.ripple, self._radius_mm = Ripple(), scene.insert.roller_radius_mm
+        self.ripple = Ripple()
+        self._radius_mm: Final = scene.insert.roller_radius_mm
         self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
