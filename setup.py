@@ -35,6 +35,8 @@ COMPILED = {
             "slow_friction",
             "sensor_zero",
             "freshness",
+            "anchor",
+            "ripple",
             "sensor",
             "carriage_lag",
             "handle",

@@ -182,6 +182,8 @@ class Trim(Strict, frozen=True):
     "Least offset of the force."
     most_offset_N: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.3
     "Greatest offset; more counts as the sensor's zero."
+    leash: Annotated[float, Meta(ge=0.02, le=0.3)] = 0.08
+    "Share of the force first shown by which a falling reading is followed."
 
 
 class Limits(Strict, frozen=True):

@@ -141,7 +141,7 @@ def test_a_profile_that_the_first_slide_contradicts_is_dropped_by_name(known: Ri
 
 def test_what_a_disputed_sensor_taught_is_not_kept(rig: Rig, tmp_path: Path) -> None:
     rig.look(7, False, True, learned=STRONG)
-    rig.believe.sensor.is_disputed = True
+    rig.believe.sensor.outside_s = 1.0
     rig.look(7, False)
     assert (rig.learned, list(tmp_path.iterdir())) == (STRONG, [])
 

@@ -629,7 +629,7 @@ def test_fifty_changes_of_the_scene_leave_nothing_behind(alone: Running) -> None
 def test_an_operator_settles_a_dispute_and_a_mark_stands_in_every_snapshot_that_follows(alone: Running) -> None:
     assert [alone.refused("confirm", what=what) for what in ("both", "device")] == ["bad_confirmation", "not_disputed"]
     sensor = alone.daemon._inference.planner.believe.sensor
-    sensor.is_disputed = True
+    sensor.outside_s = 1.0
     assert (alone.command("confirm", what="sensor"), sensor.is_doubted) == ({"confirmed": "sensor"}, True)
     assert {alone.refused("mark", text=text) for text in ("", "a\nb", "x" * 201, 3)} == {"bad_mark"}
     told = alone.command("mark", text="it stuck")

@@ -24,11 +24,13 @@ from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.path import TIMES_S, Path
 from tormagd.control.ask.way import Way
 from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.believe.ripple import Ripple
 from tormagd.control.believe.sensor import SensorTrust
 from tormagd.control.believe.sensor_zero import SensorZero
 from tormagd.control.believe.slow_friction import SlowFriction
@@ -236,8 +238,18 @@ def slow_friction(stage: SlowFriction, draw: Draw) -> object:
 def sensor_zero(stage: SensorZero, draw: Draw) -> object:
     stage.begin(draw.now_s)
     direction = 1.0 if draw.steps // 4 % 2 else -1.0
-    stage.update(draw.now_s, direction, draw(1.1), draw(1.1), abs(draw(42.0)), draw.positive(0.2), 1.0, 0.1)
-    return stage.sd_N(draw.now_s)
+    stage.update(
+        draw.now_s,
+        direction,
+        draw(1.1),
+        draw(1.1),
+        abs(draw(42.0)),
+        draw.positive(0.2),
+        1.0,
+        0.1,
+        is_disputed=draw.steps % 2 > 0,
+    )
+    return [stage.sd_N(draw.now_s), stage.way]
 
 
 def freshness(stage: Freshness, draw: Draw) -> object:
@@ -247,9 +259,18 @@ def freshness(stage: Freshness, draw: Draw) -> object:
 
 def sensor(stage: SensorTrust, draw: Draw) -> object:
     dt_s = draw.positive(PLAN_S)
-    stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), 1.0, draw(1.1), abs(draw(0.02)), dt_s)
-    stage.fit_moved(draw(0.0), draw(1.1), dt_s)
-    return stage.lead_N, stage.back_N
+    taught_N = stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), draw(1.1), abs(draw(0.02)), dt_s, learns=True)
+    return taught_N or 0.0
+
+
+def anchor(stage: Anchor, draw: Draw) -> object:
+    stage.learn(draw(1.1), draw(1.2), draw.positive(PLAN_S))
+    return [stage.force_N(1.1), stage.deviation_N(1.1), stage.model_N(2.15)]
+
+
+def ripple(stage: Ripple, draw: Draw) -> object:
+    stage.update(draw(10.0), draw(42.0), draw(1.1), draw(1.2), Anchor(UNSEEN))
+    return stage.share(draw(10.0))
 
 
 def carriage_lag(stage: CarriageLag, draw: Draw) -> object:
@@ -509,7 +530,9 @@ def stages() -> list[Stage]:
         Stage("believe/slow_friction", partial(SlowFriction, BOUNDS), slow_friction, MEASUREMENT),
         Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT, PLAN_S),
         Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
-        Stage("believe/sensor", partial(SensorTrust, BOUNDS), sensor, MEASUREMENT),
+        Stage("believe/anchor", partial(Anchor, UNSEEN), anchor, MEASUREMENT),
+        Stage("believe/ripple", Ripple, ripple, MEASUREMENT),
+        Stage("believe/sensor", partial(SensorTrust, BOUNDS, 0.08), sensor, MEASUREMENT),
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT, PLAN_S),
         Stage("believe/memory", lambda: planner().believe.memory, memory, MEASUREMENT, PLAN_S),

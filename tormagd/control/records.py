@@ -189,6 +189,7 @@ class Belief(Value):
         predicted_N: float | None,
         limits: tuple[Limit, ...],
         sensor_doubted_s: float,
+        anchor_N: float | None = None,
     ) -> None:
         self.device: Final = device
         self.at_speed: Final = at_speed
@@ -197,6 +198,7 @@ class Belief(Value):
         self.predicted_N: Final = predicted_N
         self.limits: Final = limits
         self.sensor_doubted_s: Final = sensor_doubted_s
+        self.anchor_N: Final = anchor_N
 
 
 @final

@@ -46,7 +46,7 @@ def test_what_friction_has_not_followed_yet_is_no_weak_device(core, hear, planne
 @pytest.mark.parametrize("is_known", [True, False])
 def test_a_force_is_a_pull_only_where_the_sensors_zero_is_known(planner, planned, moving, is_known: bool) -> None:
     if not is_known:
-        planner.believe.zero.doubt()
+        planner.believe.zero.variance_N2 = MAX_SD_N**2
     planned(planner, 1.0, moving(force_N=-0.15, **RESTING))
     assert planner.way.travel.is_pushing is not is_known
 
@@ -89,7 +89,7 @@ def test_without_learning_no_reading_teaches_and_the_sensor_is_judged_all_the_sa
         hear(planner, 0.4, moving(force_N=1.4, **changes))
     assert planner.believe.learned() == learned
     assert Limit.SENSOR in hear(planner, 0.4, moving(force_N=9.0)).planned.limits
-    assert planner.believe.zero.sd_N(planner.planned.time_s) == MAX_SD_N
+    assert not planner.believe.knows_zero(planner.planned.time_s)
 
 
 @pytest.mark.parametrize(

@@ -31,22 +31,25 @@ def strokes(
     rest_s: float = 0.2,
     scale: float = 1.0,
     from_s: float = 0.0,
+    way: float = 0.0,
     model_N: tuple[float, float] = (1.5, 1.5),
     rate_mm_s: tuple[float, float] = (42.0, 42.0),
 ) -> tuple[SensorZero, float]:
     """After strokes to and fro on a device whose sensor is off by that, with noise; and when."""
     zero = zero or SensorZero()
     if not is_tared:
-        zero.doubt()
+        zero.variance_N2 = MAX_SD_N**2
     random, now_s = np.random.default_rng(2), from_s
     for stroke in range(number):
         direction = -1.0 if stroke % 2 else 1.0
         force_N = model_N[stroke % 2]
         for noise_N in random.normal(0.0, 0.01, round(stroke_s / PERIOD_S)).tolist():
             now_s += PERIOD_S
-            reading_N = scale * force_N + direction * off_N + noise_N
+            reading_N = scale * force_N * (1.0 + way * direction) + direction * off_N + noise_N
             zero.begin(now_s)
-            zero.update(now_s, direction, reading_N, force_N, rate_mm_s[stroke % 2], PERIOD_S, scale, 0.02)
+            zero.update(
+                now_s, direction, reading_N, force_N, rate_mm_s[stroke % 2], PERIOD_S, scale, 0.02, is_disputed=False
+            )
         now_s += rest_s
     return zero, now_s
 
@@ -68,14 +71,21 @@ def test_reversals_tell_the_zero_whatever_the_device(
     off_N: float, turns: dict[str, Any], within_N: float, most_sd_N: float
 ) -> None:
     zero, now_s = strokes(off_N, **turns)
-    assert zero.zero_N == pytest.approx(off_N, abs=within_N)
+    force_N = turns.get("scale", 1.0) * turns.get("model_N", (1.5, 1.5))[1]
+    assert zero.zero_N + zero.way * force_N == pytest.approx(off_N, abs=within_N)
     assert zero.sd_N(now_s) < most_sd_N
 
 
-def test_of_a_doubted_sensor_as_little_is_known_as_after_an_hour_of_drift() -> None:
-    zero, _ = strokes(0.1)
-    zero.doubt()
-    assert zero.variance_N2 == pytest.approx(MAX_SD_N**2)
+@pytest.mark.parametrize("way", [0.05, -0.03])
+def test_a_friction_that_differs_by_the_way_is_no_zero_of_a_tared_sensor(way: float) -> None:
+    zero, _ = strokes(0.0, way=way)
+    assert zero.way == pytest.approx(way, abs=0.012)
+    assert zero.zero_N + 1.5 * zero.way == pytest.approx(1.5 * way, abs=0.01)
+
+
+def test_what_no_way_explains_is_a_zero() -> None:
+    zero, _ = strokes(0.3, number=2)
+    assert (zero.zero_N, zero.way) == (pytest.approx(0.3, abs=0.03), pytest.approx(0.0, abs=0.02))
 
 
 def test_without_a_reversal_nothing_is_told_and_less_and_less_is_known() -> None:
@@ -114,7 +124,7 @@ def test_a_level_is_a_mean_that_forgets() -> None:
 def test_a_level_takes_its_time() -> None:
     zero, now_s = strokes(0.3, is_tared=False, number=1)
     for reading in range(1, 50):
-        zero.update(now_s + reading * PERIOD_S, -1.0, 1.2, 1.5, 42.0, PERIOD_S, 1.0, 0.02)
+        zero.update(now_s + reading * PERIOD_S, -1.0, 1.2, 1.5, 42.0, PERIOD_S, 1.0, 0.02, is_disputed=False)
         assert (zero.zero_N > 0.2) is (reading * PERIOD_S > LEVEL_S)
 
 
@@ -142,7 +152,9 @@ def test_no_history_makes_it_impossible(history: list[tuple[float, float, float,
     for gone_s, direction, reading_N, model_N, rate_mm_s in history:
         now_s += gone_s + PERIOD_S
         zero.begin(now_s)
-        zero.update(now_s, direction, reading_N, model_N, rate_mm_s, min(gone_s + PERIOD_S, 0.02), 1.0, 0.17)
+        zero.update(
+            now_s, direction, reading_N, model_N, rate_mm_s, min(gone_s + PERIOD_S, 0.02), 1.0, 0.17, is_disputed=False
+        )
         assert abs(zero.zero_N) <= MAX_ZERO_N
         assert 0.0 < zero.variance_N2 <= MAX_SD_N**2
         assert math.isfinite(zero.sd_N(now_s + 1.0))

@@ -117,6 +117,8 @@ LAW_SHARE: Final = 0.12
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
     """Return the least gap allowed for the believed device, and for an unseen one where there is one."""
     known_mm = ceiling_mm(portrait, belief.device, ceiling_N, bounds)
+    if belief.anchor_N is not None:
+        known_mm = max(known_mm, portrait.gap_mm_at(belief.anchor_N))
     if belief.unseen is None:
         return known_mm
     return max(known_mm, ceiling_mm(portrait, belief.unseen, ceiling_N, bounds))

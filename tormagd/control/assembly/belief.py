@@ -1,5 +1,7 @@
 """What the core believes of the device, as one table for `status`, `top` and the dashboard."""
 
+import math
+
 from tormagd.control.believe.believe import MIN_FORESIGHT
 from tormagd.control.core import Planner, Stepper
 from tormagd.scenes.scene import Terms
@@ -10,12 +12,15 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
     """Return each thing believed of the device at `now_s`, by name, and whether it acts."""
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
+    ripple = max(math.hypot(*believe.ripple.shares[at : at + 2]) for at in (0, 2, 4))
     is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust
     return {
         "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),
         "offset": _told(fit.offset_N, fit.offset_sd_N, "N", terms.offset),
         "low_speed_factor": _told(believe.slow.factor_at(0.0), None, "", terms.creep),
         "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", believe.knows_zero(now_s)),
+        "way": _told(believe.zero.way, math.sqrt(believe.zero.way_variance), "", believe.zero.way != 0.0),
+        "ripple": _told(ripple, None, "", ripple > 0.0),
         "carriage_lag": _told(believe.carriages.lag_s, None, "s", terms.motor and is_ahead),
         "acceleration_scale": _told(stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),
         "forecast_trust": _told(trust, None, "", trust > 0.0 and plan.foresight > 0.0),

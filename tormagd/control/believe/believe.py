@@ -11,13 +11,15 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.config import Config
+from tormagd.control.believe.anchor import MIDDLE_N, Anchor
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.sensor import Disputed, SensorTrust
-from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
+from tormagd.control.believe.ripple import Ripple
+from tormagd.control.believe.sensor import KNOWN_N, SLACK_N, Disputed, SensorTrust
+from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
-from tormagd.control.believe.strength import UNSEEN, DeviceFit, Strength, device_bounds
+from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Belief, Measured
 from tormagd.control.safety.codes import Limit
@@ -43,6 +45,10 @@ CONTRADICTED_N: Final = 0.4
 "A reading further off than this contradicts a fit from another day: no rest, warmth or zero explains it."
 MIN_FORESIGHT: Final = 0.5
 "With less foresight a plan's gap leaps, and any carriages come late: no lag is learned."
+OVER_N: Final = 0.15
+"The device as it first showed itself gives no more than the scene's greatest force and this."
+MOST_RIPPLE: Final = 0.15
+"No friction varies by a greater share over angle and way."
 
 
 @final
@@ -75,16 +81,12 @@ class Believe:
     "Number of the newest measurement that taught; -1 before the first."
     read_s: float
     "When that measurement taught; -inf before the first."
-    heard_N: float = 0.0
-    "The model's force at the newest reading at speed."
     limits: tuple[Limit, ...] = ()
     "What is wrong with the sensor or with the fit, as the newest reading at speed shows."
-    taught: DeviceFit = UNSEEN
-    "The fit from another day that was taught; UNSEEN without one."
     is_prior: bool = False
     "Whether a fit from another day was taught, and no reading has contradicted it."
     is_contradicted: bool = False
-    "Whether the first slide has shown another device than `taught`."
+    "Whether the first slide has shown another device than the one taught."
 
     def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
         """Begin with an unseen device."""
@@ -94,7 +96,11 @@ class Believe:
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
-        self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
+        self._leash: Final = trim.leash
+        self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
+        self.ripple = Ripple()
+        self._radius_mm: Final = scene.insert.roller_radius_mm
+        self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
@@ -108,12 +114,7 @@ class Believe:
 
     @property
     def device(self) -> DeviceFit:
-        """Return the fit of the device's force to the model's without memory, at speed, with the element as relaxed as
-        now."""
-        fit, lead_N = self.strength.fit, self.sensor.lead_N
-        if lead_N > 0.0:
-            fit = fit.times(1.0 + lead_N / max(fit.force_N(self.heard_N), MIN_EXPECTED_N))
-        return fit.relaxed(self.memory.relaxed_N)
+        return self.strength.fit.relaxed(self.memory.relaxed_N)
 
     @property
     def min_N(self) -> float:
@@ -121,7 +122,7 @@ class Believe:
 
     def knows_zero(self, now_s: float) -> bool:
         """Tell whether the sensor's zero is known to within what the scene tolerates: else readings teach nothing."""
-        return self.zero.sd_N(now_s) <= self._unknown_sd_N
+        return not self.sensor.is_disputed and self.zero.sd_N(now_s) <= self._unknown_sd_N
 
     def learned(self) -> Learned:
         """Return what is known of this device now, to `teach` on another day."""
@@ -132,11 +133,11 @@ class Believe:
         """Replace all that is known of the device by `learned`, and begin its estimators anew."""
         self.strength.forget(learned.device)
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
-        self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
+        self.sensor, self.carriages = SensorTrust(self._bounds, self._leash, learned.device), CarriageLag()
+        self.ripple = Ripple()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
-        self.taught = learned.device
         self.is_prior, self.is_contradicted = learned.device is not UNSEEN, False
 
     def forget(self) -> None:
@@ -171,16 +172,30 @@ class Believe:
     def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
         """Return the belief, and change nothing."""
         at_speed = self.device
-        device = at_speed.times(self.slow.factor_at(self.slow.creep_mm_s)) if self._has_creep else at_speed
         predicted_N: float | None = None
         if measured is not None and slid_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-            predicted_N = self.strength.fit.force_N(slid_N) * slow
+            predicted_N = self.strength.fit.force_N(slid_N) * slow * self._ripple(measured)
         is_unseen = self.is_prior and not self.sensor.has_slid
         unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
+        slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
+        ripple = self._ripple(measured) if measured is not None else 1.0
+        anchor_N: float | None = None
+        if self.sensor.has_slid:
+            anchor, most_N = self.sensor.anchor, self._surely_N
+            most_N += SURE * max(anchor.deviation_N(most_N) - 2.0 * KNOWN_N, 0.0)
+            anchor_N = anchor.model_N(most_N / (slow * max(ripple, 1.0))) + self.memory.relaxed_N
+        device = at_speed.times(slow * ripple)
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
-        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, self.sensor.doubted_s)
+        doubted_s = self.sensor.doubted_s
+        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, doubted_s, anchor_N)
+
+    def _ripple(self, measured: Measured) -> float:
+        """Return the friction at the handle's place and way, over its mean."""
+        share = self.ripple.share(measured.handle_mm / self._radius_mm)
+        share += self.zero.way * measured.handle.turn.direction
+        return 1.0 + min(max(share, -MOST_RIPPLE), MOST_RIPPLE)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
         """Learn from the newest reading, with the model's force `model_N` at the measured gap."""
@@ -194,24 +209,21 @@ class Believe:
         dt_s = min(now_s - self.read_s, MAX_DT_S)
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
+        reading_N = (measured.force_N - measured.handle.turn.direction * self.zero.zero_N) / self._ripple(measured)
         is_mobilised = self._nominal.contact.is_known(measured)
-        is_slow = slides and (
-            rate_mm_s < MOVING_MM_S or self._is_stuck(measured, model_N) or self.handle.moved_gap_at_rest(model_N)
-        )
-        if is_mobilised and not is_slow:
-            self._hear_at_speed(now_s, measured, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
+        # a hand that meets a wall stops within 10 ms
+        is_low = reading_N < self.strength.fit.force_N(model_N) - STUCK_N
+        is_stuck = is_low and abs(measured.handle.quick_mm_s) < STOPPING_MM_S
+        if is_mobilised and not (
+            slides and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
+        ):
+            self._hear_at_speed(now_s, measured, reading_N, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
         else:
-            self._hear_at_creep(now_s, measured, dt_s, is_mobilised)
+            self._hear_at_creep(now_s, measured, reading_N, dt_s, is_mobilised)
 
-    def _is_stuck(self, measured: Measured, model_N: float) -> bool:
-        """Tell whether the handle has stopped, with a force that is less than friction by more than STUCK_N."""
-        handle = measured.handle
-        if abs(handle.quick_mm_s) >= STOPPING_MM_S:
-            return False
-        reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
-        return reading_N < self.strength.fit.force_N(model_N) - STUCK_N
-
-    def _hear_at_creep(self, now_s: float, measured: Measured, dt_s: float, is_mobilised: bool) -> None:
+    def _hear_at_creep(
+        self, now_s: float, measured: Measured, reading_N: float, dt_s: float, is_mobilised: bool
+    ) -> None:
         """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise."""
         self.strength.settle()
         if not (self._has_creep and self.learns) or self.sensor.is_disputed:
@@ -222,66 +234,62 @@ class Believe:
         if not is_creep or not SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S:
             return
         expected_N = self.strength.fit.force_N(self.slow.followed_N)
-        reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
         is_lesson = self.knows_zero(now_s) and (is_mobilised or reading_N > expected_N)
         if expected_N > MIN_EXPECTED_N and is_lesson:
             self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
 
-    def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
+    def _hear_at_speed(self, now_s: float, measured: Measured, reading_N: float, model_N: float, dt_s: float) -> None:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit."""
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
         zero, fit, sensor = self.zero, self.strength.fit, self.sensor
-        reading_N, zero_sd_N = measured.force_N - direction * zero.zero_N, zero.sd_N(now_s)
-        self.heard_N = model_N
+        angle, zero_sd_N = measured.handle_mm / self._radius_mm, zero.sd_N(now_s)
         zero.begin(now_s)
-        known_N = zero.zero_N
-        if self.learns and zero.update(
-            now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd
-        ):
-            self.strength.shift(sensor.zero_moved(zero.zero_N - known_N))
-        was_disputed = sensor.is_disputed
-        sensor.update(fit, model_N, rate_mm_s, direction, reading_N, zero_sd_N, dt_s)
-        self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
-        if sensor.is_disputed:
+        if self.learns:
+            # an anchor that was learned one way only was misread
+            sensor.anchor.values[1] += zero.update(
+                now_s,
+                direction,
+                measured.force_N / (1.0 + self.ripple.share(angle)),
+                model_N,
+                rate_mm_s,
+                dt_s,
+                fit.scale,
+                fit.scale_sd,
+                is_disputed=sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
+            )
+        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
+        unknown_N = self._unknown_N(zero_sd_N)
+        least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
+        if taught_N is None or (unknown_N > 0.0 and reading_N < least_N):
             self.strength.settle()
-            if sensor.is_named or sensor.is_doubted:
-                self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
-        elif not zero_sd_N <= self._unknown_sd_N:
-            self.strength.settle()
-            sensor.compare(fit, model_N)
-            self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
-        else:
-            self._fit(model_N, rate_mm_s, reading_N, dt_s)
-        if sensor.is_disputed and not was_disputed:
-            self._dispute(model_N, rate_mm_s)
-        elif was_disputed and not sensor.is_disputed:
-            zero.trust()
+            return
+        if self._nominal.contact.slides and not self.strength.is_held:
+            self.ripple.update(angle, measured.handle.rate_mm_s, model_N, sensor.measured_N, sensor.anchor)
+        self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
-    def _dispute(self, model_N: float, rate_mm_s: float) -> None:
-        """Take the device for what it was before the readings left the fit, and the zero for unknown."""
-        self.zero.doubt()
-        before_N = self.strength.fit.force_N(model_N)
-        if self.sensor.has_slid:
-            self.strength.shift(self.sensor.back_N)
-        else:
-            self.strength.forget(self.taught)  # all else known of the device came from this sensor
-        self.slow.rescale(before_N, self.strength.fit.force_N(model_N), rate_mm_s)
+    def _unknown_N(self, zero_sd_N: float) -> float:
+        """Update `limits`, and return what a zero that is known to within `zero_sd_N` may explain, if that is much."""
+        sensor = self.sensor
+        self.limits = (Limit.SENSOR_ZERO,) if abs(self.zero.zero_N) > UNTARED_N else ()
+        if sensor.is_disputed:
+            self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
+        elif zero_sd_N > self._unknown_sd_N:
+            self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
+            return SURE * zero_sd_N + SLACK_N
+        return 0.0
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing."""
-        if self.sensor.freshness.is_stale or self.sensor.wrong_s > 0.0:
-            return  # the reading may be old or wrong
         if not (self.learns and self._fits):
-            self.sensor.compare(self.strength.fit, model_N)
             return
         before_N = self.strength.fit.force_N(model_N)
         if self.is_prior and not self.sensor.has_slid and abs(reading_N - before_N) > CONTRADICTED_N:
             self.is_prior, self.is_contradicted = False, True
             self.strength.forget()
+            self.sensor.anchor = Anchor(UNSEEN)
         self.strength.update(model_N, reading_N, dt_s)
         after_N = self.strength.fit.force_N(model_N)
-        self.sensor.fit_moved(after_N - before_N, after_N, dt_s)
         # the force at a slower creep stays while scale and offset are learned
         self.slow.rescale(before_N, after_N, rate_mm_s)
         if self.strength.is_held:
@@ -291,7 +299,10 @@ class Believe:
         """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
         if not self.sensor.is_disputed:
             return
-        self.sensor.confirm(wrong)
+        fit = self.strength.fit
         if wrong == "device":
-            self.zero.trust()
-            self.strength.forget(self.strength.fit.unsure())
+            self.sensor = SensorTrust(self._bounds, self._leash)
+        else:
+            fit = fit.shifted(self.sensor.anchor.force_N(MIDDLE_N) - fit.force_N(MIDDLE_N))
+            self.sensor.is_doubted = True
+        self.strength.forget(fit.unsure())

@@ -1,107 +1,68 @@
-"""Who is right where the readings leave the believed device: the sensor, or a device that has changed.
+"""Leash of the fit: how far the readings of the force sensor may lead what is believed of a device.
 
-    moved    d    what the fit has learned of late, N, where it is now; forgotten as fast as an elastomer relaxes
-    excused  e    what it has learned because conditions changed, N: no more than the distance from the usual explains
-    dispute  |d| > what a device changes by itself: the fit goes back by d, and learns nothing more
-    lead     l    by how much the readings are over the fit's force, N: the device is taken for that much stronger
-    agreed   the readings come back to the fit: it learns again
+    anchor   a    what the device first showed, at each force until it is known there
+    share    h    of the anchor to which the fit may fall: (1 - leash) to 1; it rises with the fit, and falls slowly
+    low           h a - SLACK_N: lesser readings count as this
+    outside       readings beyond (1 -+ leash) a and SLACK_N: sensor or device is another
 
-In a dispute the gap follows the explanation with more force. So a rising reading opens the gap, and a falling one moves
-nothing. A sensor that shows what no device gives is wrong, and opens nothing.
+A reading that rises is followed, and opens the gap. One that falls is followed within the leash. A sensor that shows
+what no device gives is wrong, and teaches nothing.
 """
 
+import math
 from typing import Final, Literal, final
 
+from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
-from tormagd.control.believe.strength import SURE, DeviceBounds, DeviceFit
+from tormagd.control.believe.strength import SURE, UNSEEN, DeviceBounds, DeviceFit
 from tormagd.control.interpolation import low_pass
 
 Disputed = Literal["device", "sensor"]
-"What an operator may say in a dispute: the device has changed, or the sensor is wrong."
+"What an operator may say of readings outside: the device has changed, or the sensor is wrong."
 
 FILTER_S: Final = 0.01
 "Time constant of the readings' mean."
 LEARNS_S: Final = 0.5
-"A device that has not slid for so long has shown nothing to dispute."
-MOVED_N: Final = 0.12
-"Hysteresis, a creep and a kelvin may move a device's force so far at once."
-SHAPE: Final = 0.25
-"A device's force may move by this share of the change of the model's force of late: field laws differ in shape."
-VISCOUS_N_S_MM: Final = 6e-4
-"A device's force may also move by so much for each mm/s by which the handle's rate has changed of late."
-LATELY_S: Final = 1.0
-"Time constant of what counts as of late."
+"A device that has not slid for so long has shown nothing: it has no leash. What is over sooner moves no leash."
+KNOWN_N: Final = 0.02
+"An anchor that is known so well at a force, as a standard deviation, learns no more there."
 SLACK_N: Final = 0.05
-"So much slack a gap that hardly moves gives, too: it excuses nothing."
-USUAL_S: Final = 60.0
-"Time constant of what counts as usual."
-EXCUSED: Final = 0.08
-"A fit may err by this share of the force's distance from the usual: field laws differ in shape."
-EXCUSED_N: Final = 0.05
-"So much may be excused at the usual force, too."
-RELAXES_1_S: Final = 0.012
-"An elastomer may lose, or win back, this share of its force a second beyond what its model remembers."
-RELAXED: Final = 0.12
-"An elastomer may lose no more than this share altogether, or in SLOWEST_S again."
-SLOWEST_S: Final = 900.0
-AGREES_N: Final = 0.06
-AGREES_S: Final = 0.2
-"Readings within AGREES_N of the fit for so long agree with it."
-DRIFTS_S: Final = 10.0
-"So long they have to agree at most, however slowly they have left the fit."
+"Noise, hysteresis, a creep and a kelvin move a force by so much."
+VISCOUS_N_S_MM: Final = 1e-3
+"And by so much for each mm/s between the handle's rate and that at which the anchor was learned."
+FALLS_1_S: Final = 0.3
+"The leash gives way by this share of the anchor a second."
 NAMED_S: Final = 0.1
-"A dispute is reported once it has lasted for longer."
-RISES_N_S: Final = 2.0
-"Greatest rate of `lead_N`: a device that is 20% stronger at once is followed in 0.2 s."
-LEADS_S: Final = 0.03
-"Time constant of `lead_N`."
-NOISE_N: Final = 0.05
-"What noise, a creep and the model's shape leave of a device at one of its bounds."
+"Readings that have been outside for longer are named."
+INSIDE_S: Final = 0.2
+"Readings have to be inside for so long before they are no longer in dispute; those of a wrong sensor five times."
 WRONG_S: Final = 0.05
 "Evidence for so long shows that the sensor is wrong."
-TRUSTED_AGAIN_S: Final = 1.0
-"The readings of a wrong sensor have to agree for longer than this."
+WEAKENED: Final = 0.12
+"Any device may be weaker or stronger than its bounds by this share and SLACK_N: relaxed, or warm."
 
 
 @final
 class SensorTrust:
-    """Judge of one force sensor against the fit of its device. Finds, follows and ends their disputes."""
+    """Judge of one force sensor: what of its readings may teach the fit. It keeps the anchor."""
 
     known_s: float = 0.0
     "How long the device has slid, LEARNS_S at most."
     measured_N: float = 0.0
     "Mean of the readings over FILTER_S."
-    model_N: float = 0.0
-    "Mean of the model's force over LATELY_S."
     rate_mm_s: float = 0.0
-    "Mean of the handle's rate over LATELY_S."
-    direction: float = 0.0
-    "The way the handle goes, 1 or -1; 0 before the first reading."
-    usual_N: float = 0.0
-    "Mean of the model's force over USUAL_S."
-    slack_N: float = 0.0
-    "What the fit may learn at once, as model force, rate or zero have changed of late."
-    moved_N: float = 0.0
-    "What the fit has learned of late, and would have to unlearn in a dispute."
-    leaves_s: float = 0.0
-    "For how long `moved_N` has been over half of MOVED_N."
-    excused_N: float = 0.0
-    "What the fit has learned besides, as far as the distance of the force from the usual explains it."
-    relaxed_N: float = 0.0
-    "How much force the device has lost by relaxing, beyond what its model remembers; below 0 where it has gained."
-    is_disputed: bool = False
-    "Whether sensor and device are in dispute: the fit does not learn."
-    disputed_s: float = 0.0
-    "How long the dispute has lasted, in time of sliding."
-    back_N: float = 0.0
-    "By how much the fit had to change when the newest dispute began."
-    began_way: float = 0.0
-    "The handle's `direction` when the newest dispute began."
-    agreed_s: float = 0.0
-    "How long the readings have agreed with the fit in the dispute."
-    lead_N: float = 0.0
-    "By how much the device is taken for stronger than its fit, at the model's present force."
+    "Mean of the handle's rate while the anchor was learned."
+    fallen: float = 1.0
+    "Share of the anchor that the fit gave where the anchor was last known."
+    share: float = 0.0
+    "Share of the anchor to which the fit may fall; 0 until the device has slid."
+    low_s: float = 0.0
+    "How long the readings have been below that share."
+    outside_s: float = 0.0
+    "How long the readings have been outside the leash; 0 once they have been inside for INSIDE_S."
+    inside_s: float = 0.0
+    "How long they have been inside."
     is_doubted: bool = False
     "Whether the sensor is shown to be wrong."
     doubted_s: float = 0.0
@@ -109,149 +70,85 @@ class SensorTrust:
     wrong_s: float = 0.0
     "How long the readings have been such as no device gives; falls while they are not."
 
-    def __init__(self, bounds: DeviceBounds) -> None:
+    def __init__(self, bounds: DeviceBounds, leash: float, known: DeviceFit = UNSEEN) -> None:
         self._bounds: Final = bounds
+        self._leash: Final = leash
         self.freshness = Freshness()
+        self.anchor = Anchor(known)
 
     @property
     def has_slid(self) -> bool:
         return self.known_s >= LEARNS_S
 
     @property
-    def is_named(self) -> bool:
-        return self.is_disputed and self.disputed_s > NAMED_S
+    def is_disputed(self) -> bool:
+        return self.is_doubted or self.outside_s > NAMED_S
 
     def update(
         self,
         fit: DeviceFit,
         model_N: float,
         rate_mm_s: float,
-        direction: float,
         reading_N: float,
         zero_sd_N: float,
         dt_s: float,
-    ) -> None:
-        """Take one reading and judge it against `fit`."""
-        if self.is_disputed:
-            zero_sd_N = 0.0  # a reversal has to tell the zero first
+        *,
+        learns: bool,
+    ) -> float | None:
+        """Take one reading, and return what of it may teach `fit`, N; None where it is old or wrong."""
         self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
-        self._hear(model_N, reading_N, dt_s)
-        self._update_slack(fit, model_N, rate_mm_s, direction, zero_sd_N, dt_s)
-        self._judge(self.measured_N - fit.force_N(model_N), self._is_strange(model_N, zero_sd_N), dt_s)
-
-    def fit_moved(self, learned_N: float, force_N: float, dt_s: float) -> None:
-        """Take the change `learned_N` that one reading made to the fit's force, which now is `force_N`."""
-        if not self.has_slid:
-            return
-        self.moved_N += learned_N
-        self.leaves_s = self.leaves_s + dt_s if abs(self.moved_N) > 0.5 * MOVED_N else 0.0
-        if abs(self.moved_N) > MOVED_N + self.slack_N:
-            self._begin(self.moved_N)
-        else:
-            self._fade_moved(max(force_N, 0.0), dt_s)
-
-    def compare(self, fit: DeviceFit, model_N: float) -> None:
-        """Begin a dispute where the mean of the last readings has left `fit`, unless the device has slid for under
-        LEARNS_S."""
-        over_N = self.measured_N - fit.force_N(model_N)
-        if self.has_slid and abs(over_N) > MOVED_N + self.slack_N + SURE * fit.deviation_N(model_N):
-            self._begin(over_N)
-
-    def zero_moved(self, found_N: float) -> float:
-        """Take a change `found_N` of the sensor's zero, shown by a reversal, and return how far it shifts
-        the fit, N."""
-        self.relaxed_N = 0.0
-        return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
-
-    def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute."""
-        if wrong == "device":
-            self._settle()
-            self.known_s = self.excused_N = 0.0
-        else:
-            self.is_doubted = True
-
-    def _hear(self, model_N: float, reading_N: float, dt_s: float) -> None:
         if self.known_s == 0.0:
-            self.measured_N, self.model_N, self.usual_N = reading_N, model_N, model_N
-        self.known_s = min(self.known_s + dt_s, LEARNS_S)
+            self.measured_N, self.rate_mm_s = reading_N, rate_mm_s
         self.measured_N = low_pass(self.measured_N, reading_N, dt_s, FILTER_S)
+        unsure_N = SLACK_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
+        weakest_N = self._bounds.min_scale * (1.0 - WEAKENED) * model_N - unsure_N
+        strongest_N = self._bounds.max_scale * (1.0 + WEAKENED) * model_N + unsure_N
+        is_strange = self.freshness.is_frozen or not weakest_N <= self.measured_N <= strongest_N
+        force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
+        unsure_N += VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
+        beyond_N = abs(self.measured_N - force_N) - self._leash * force_N - unsure_N - KNOWN_N
+        self._doubt(is_strange, dt_s)
+        self._judge(is_strange, beyond_N <= SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0), dt_s)
+        if not (self._teaches and weakest_N <= reading_N <= strongest_N):
+            return None
+        taught_N = max(reading_N, self.share * force_N - unsure_N)
+        believed = fit.force_N(model_N) / max(force_N, SLACK_N)
+        if deviation_N <= KNOWN_N:
+            self.fallen = min(max(believed, self._bounds.min_scale), 1.0)
+        elif learns and zero_sd_N <= UNKNOWN_SD_N:
+            self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
+            # what has fallen at the forces that are known has fallen here, too
+            surely_N, shown_N = SURE * deviation_N if self.has_slid else math.inf, taught_N / self.fallen
+            self.anchor.learn(model_N, min(max(shown_N, force_N - surely_N), force_N + surely_N), dt_s)
+        if self.has_slid:
+            self._give_way(believed, force_N, dt_s)
+        return taught_N
 
-    def _update_slack(
-        self, fit: DeviceFit, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float, dt_s: float
-    ) -> None:
-        """Update `slack_N`: what the device may show that its fit did not, as conditions have changed of late."""
-        # where the handle has turned a wrong zero counts twice
-        is_turned = direction * self.direction < 0.0
-        slack_N = (
-            SURE * max(fit.deviation_N(model_N) - fit.deviation_N(self.model_N), 0.0)
-            + SHAPE * abs(model_N - self.model_N)
-            + VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
-            + SURE * (2.0 * zero_sd_N if is_turned else max(zero_sd_N - UNKNOWN_SD_N, 0.0))
-        )
-        self.direction = direction
-        self.slack_N = max(low_pass(self.slack_N, 0.0, dt_s, LATELY_S), slack_N)
-        self.model_N = low_pass(self.model_N, model_N, dt_s, LATELY_S)
-        self.usual_N = low_pass(self.usual_N, model_N, dt_s, USUAL_S)
-        self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LATELY_S)
+    @property
+    def _teaches(self) -> bool:
+        return self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
 
-    def _judge(self, over_N: float, is_strange: bool, dt_s: float) -> None:
-        """Judge who is right by how much the readings are over the fit's force, `over_N`."""
-        agrees = not is_strange and abs(over_N) <= AGREES_N
+    def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:
+        """Move the `share` that the fit may fall to, beside the share that is `believed`."""
+        # what is lost in the slack is given way, too: readings at its end would teach only their noise
+        self.low_s = self.low_s + dt_s if self.measured_N < self.share * force_N else 0.0
+        falls = FALLS_1_S * dt_s if self.low_s > LEARNS_S else 0.0
+        self.share = min(max(self.share - falls, believed, 1.0 - self._leash), 1.0)
+
+    def _doubt(self, is_strange: bool, dt_s: float) -> None:
+        """Count how long the readings have been such as no device gives, and how long the device has slid."""
         self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
-        if self.wrong_s > WRONG_S and not self.is_doubted:
-            if not self.is_disputed:
-                self._begin(0.0)
-            self.is_doubted, self.doubted_s = True, 0.0
-        if not self.is_disputed:
-            return
-        self.disputed_s += dt_s
-        self.agreed_s = self.agreed_s + dt_s if agrees else 0.0
-        if self.is_doubted:
-            self.doubted_s += dt_s
-        wanted_N = 0.0 if is_strange or self.is_doubted else max(over_N, 0.0)
-        change_N = low_pass(self.lead_N, wanted_N, dt_s, LEADS_S) - self.lead_N
-        self.lead_N += min(max(change_N, -RISES_N_S * dt_s), RISES_N_S * dt_s)
-        least_s = TRUSTED_AGAIN_S if self.is_doubted else AGREES_S
-        if self.agreed_s > max(least_s, min(2.0 * self.leaves_s, DRIFTS_S)):
-            self._settle()
+        self.is_doubted = self.is_doubted or self.wrong_s > WRONG_S
+        self.doubted_s = self.doubted_s + dt_s if self.is_doubted else 0.0
+        if not is_strange and not self.is_doubted:
+            self.known_s = min(self.known_s + dt_s, LEARNS_S)
 
-    def _settle(self) -> None:
-        """End the dispute, if any: the sensor is believed again."""
-        self.is_disputed = self.is_doubted = False
-        self.disputed_s = self.agreed_s = self.doubted_s = self.wrong_s = 0.0
-        self.lead_N = self.moved_N = self.leaves_s = 0.0
-
-    def _begin(self, over_N: float) -> None:
-        """Begin a dispute with readings `over_N` over the fit's force, and note how far the fit has to go back."""
-        self.is_disputed, self.disputed_s, self.agreed_s = True, 0.0, 0.0
-        self.lead_N, self.began_way = max(over_N, 0.0), self.direction
-        self.back_N, self.moved_N = -self.moved_N, 0.0
-
-    def _fade_moved(self, force_N: float, dt_s: float) -> None:
-        """Bring `moved_N` towards 0 by what is excused, and by what the device relaxes in `dt_s`."""
-        self._excuse(dt_s)
-        self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
-        relaxes_N = RELAXES_1_S * force_N * dt_s
-        most_N = max(RELAXED * force_N, abs(self.relaxed_N))  # at a greater force before, more may have relaxed
-        relaxed_N = self.relaxed_N + min(max(-self.moved_N, -relaxes_N), relaxes_N)
-        relaxed_N = min(max(relaxed_N, -most_N), most_N)
-        self.moved_N += relaxed_N - self.relaxed_N
-        self.relaxed_N = relaxed_N
-
-    def _excuse(self, dt_s: float) -> None:
-        """Move from `moved_N` to `excused_N` what the slack of the last `dt_s` explains."""
-        most_N = EXCUSED * abs(self.model_N - self.usual_N) + EXCUSED_N
-        by_slack_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
-        now_N = self.excused_N + min(max(self.moved_N, -by_slack_N), by_slack_N)
-        now_N = min(max(now_N, -most_N), most_N)
-        self.moved_N -= now_N - self.excused_N
-        self.excused_N = now_N
-
-    def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
-        """Tell whether no device gives the newest readings: they are frozen, or beyond the bounds of all devices."""
-        if self.freshness.is_frozen:
-            return True
-        unknown_N = NOISE_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
-        weakest_N = self._bounds.min_scale * (1.0 - RELAXED) * model_N - unknown_N
-        return not weakest_N <= self.measured_N <= self._bounds.max_scale * (1.0 + RELAXED) * model_N + unknown_N
+    def _judge(self, is_strange: bool, is_inside: bool, dt_s: float) -> None:
+        """Count how long the readings have been outside or inside the leash; a doubted sensor may be believed again."""
+        self.inside_s = self.inside_s + dt_s if is_inside and not is_strange else 0.0
+        if self.has_slid and not is_inside:
+            self.outside_s += dt_s
+        elif self.inside_s > INSIDE_S:
+            self.outside_s = 0.0
+        if self.is_doubted and self.inside_s > 5.0 * INSIDE_S:
+            self.is_doubted, self.doubted_s, self.wrong_s = False, 0.0, 0.0

@@ -12,6 +12,7 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
+from tormagd.control.believe.strength import SURE
 
 TARED_SD_N: Final = 0.02
 TARED_VARIANCE_N2: Final = TARED_SD_N * TARED_SD_N
@@ -23,6 +24,9 @@ MAX_SD_N: Final = 0.3
 "Greatest deviation of the zero, however long nothing was heard."
 UNKNOWN_SD_N: Final = 0.05
 "With more than this, and than the scene tolerates, readings teach nothing: ten minutes without a reversal."
+WAY_VARIANCE: Final = 0.04 * 0.04
+"Spread of the share by which friction differs from its mean one way and the other, squared."
+MAX_WAY: Final = 0.06
 MAX_ZERO_N: Final = 0.4
 "A zero further off is not taken: no sensor drifts so far."
 LEVEL_S: Final = 0.15
@@ -69,8 +73,9 @@ class SensorZero:
     "What the sensor reads without a force."
     variance_N2: float = TARED_VARIANCE_N2
     "Variance of the zero at `told_s`."
-    undoubted_N2: float = TARED_VARIANCE_N2
-    "Variance before the zero was doubted."
+    way: float = 0.0
+    "By which share friction is greater one way, and less the other."
+    way_variance: float = WAY_VARIANCE
     told_s: float = math.inf
     "When the variance was told: at the first reading, or the newest reversal; inf before."
     direction: float = 0.0
@@ -90,14 +95,6 @@ class SensorZero:
         """Note the first reading at `now_s`: from then on the variance grows."""
         self.told_s = min(self.told_s, now_s)
 
-    def doubt(self) -> None:
-        """Set the variance to its greatest, and keep the old one for `trust`: the zero may be any."""
-        self.undoubted_N2, self.variance_N2 = self.variance_N2, MAX_SD_N * MAX_SD_N
-
-    def trust(self) -> None:
-        """Take back the last `doubt`: the variance from before returns, unless a reversal has made it smaller."""
-        self.variance_N2 = min(self.variance_N2, self.undoubted_N2)
-
     def update(
         self,
         now_s: float,
@@ -108,35 +105,53 @@ class SensorZero:
         dt_s: float,
         scale: float,
         scale_sd: float,
-    ) -> bool:
-        """Take one reading, and return whether a reversal has told the zero just now."""
+        *,
+        is_disputed: bool,
+    ) -> float:
+        """Take one reading, and return by how much those of the way before the first reversal were too small."""
         level = self.level
         if level is None or direction != self.direction:
             # a mean over too short a time is no level
             self.before = level if level is not None and level.heard_s >= LEVEL_S else None
             self.level, self.direction = Level(reading_N, model_N, rate_mm_s, dt_s, now_s), direction
-            return False
+            return 0.0
         began_s = now_s - level.heard_s
         level = self.level = level.heard(reading_N, model_N, rate_mm_s, dt_s, now_s)
         if self.before is None or level.heard_s < LEVEL_S:
-            return False
+            return 0.0
         before, self.before = self.before, None
-        return self._compare(now_s, before, level, began_s - before.until_s, scale, scale_sd)
+        return self._compare(now_s, before, level, began_s - before.until_s, scale, scale_sd, is_disputed)
 
     def _compare(
-        self, now_s: float, before: Level, level: Level, between_s: float, scale: float, scale_sd: float
-    ) -> bool:
-        """Learn the zero from the levels before and after a reversal, and return whether they told it."""
+        self,
+        now_s: float,
+        before: Level,
+        level: Level,
+        between_s: float,
+        scale: float,
+        scale_sd: float,
+        is_disputed: bool,
+    ) -> float:
+        """Learn zero and way from the levels before and after a reversal."""
         by_model_N = level.model_N - before.model_N
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - scale * by_model_N)
         if between_s > LONGEST_TURN_S or abs(found_N) > MAX_ZERO_N:
-            return False
+            return 0.0
         by_scale_N = 0.5 * scale_sd * by_model_N
         by_speed_N = 0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s)
         by_time_N = 0.5 * RELAXES_N_S * between_s
         read_N2 = READ_SD_N * READ_SD_N + by_scale_N * by_scale_N + by_speed_N * by_speed_N + by_time_N * by_time_N
-        variance_N2 = self.sd_N(now_s) ** 2
-        gain = variance_N2 / (variance_N2 + read_N2)
-        self.zero_N += gain * (found_N - self.zero_N)
-        self.variance_N2, self.told_s = (1.0 - gain) * variance_N2, now_s
-        return True
+        # at one force a friction that differs by the way looks like a zero
+        force_N, zero_N2 = 0.5 * scale * (level.model_N + before.model_N), self.sd_N(now_s) ** 2
+        error_N, way_N2 = found_N - self.zero_N - force_N * self.way, force_N * force_N * self.way_variance
+        if error_N * error_N > SURE * SURE * (zero_N2 + way_N2 + read_N2):
+            zero_N2 = MAX_SD_N * MAX_SD_N  # neither a drift nor a way explains it
+        known_N2 = zero_N2 + read_N2
+        share = error_N / (known_N2 + way_N2)
+        is_first = self.way_variance == WAY_VARIANCE and not is_disputed
+        self.zero_N += zero_N2 * share
+        self.way = min(max(self.way + force_N * self.way_variance * share, -MAX_WAY), MAX_WAY)
+        # halved: a way stays, and what drifts afterwards is the zero
+        self.way_variance *= 0.5 * known_N2 / (known_N2 + way_N2)
+        self.variance_N2, self.told_s = zero_N2 * read_N2 / known_N2, now_s
+        return self.direction * share * (zero_N2 + way_N2) if is_first else 0.0

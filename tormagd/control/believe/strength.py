@@ -234,11 +234,6 @@ class Strength:
         """Set `surprise_N` to 0 and `is_held` to False, while no reading teaches."""
         self.surprise_N, self.is_held = 0.0, False
 
-    def shift(self, by_N: float) -> None:
-        """Shift the fit's force by `by_N`, and forget the surprise: the last readings were misread."""
-        self.fit = self.fit.shifted(by_N)
-        self.settle()
-
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
         """Replace the fit by `fit`, and forget the surprise."""
         self.fit = fit

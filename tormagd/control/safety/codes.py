@@ -484,8 +484,8 @@ LIMITS: dict[Limit, Explanation] = {
         "while the handle slides",
     ),
     Limit.DEVICE_OR_SENSOR: Explanation(
-        "the readings disagree with what was learned: the device changed or the sensor is wrong; the gap follows "
-        "whichever brakes more",
+        "the readings differ from what the device first showed by more than trim.leash: the device changed or the "
+        "sensor is wrong; a fall is followed only so far",
         "turn the handle back and forth once; then tormagctl confirm device, or tormagctl confirm sensor",
         Reaction.HELD,
         500.0,
@@ -499,7 +499,8 @@ LIMITS: dict[Limit, Explanation] = {
         "at reversals of the handle",
     ),
     Limit.OFFSET_UNKNOWN: Explanation(
-        "the handle has not reversed for so long that the sensor's zero may have drifted; its offset is not learned",
+        "the handle has not reversed for so long that the sensor's zero may have drifted; only what that does not "
+        "explain is learned",
         "turn the handle back and forth once, by 10 mm",
         Reaction.HELD,
         480100.0,

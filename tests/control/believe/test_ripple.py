@@ -1,0 +1,66 @@
+"""Friction that varies over the angle of the handle (synthetic)."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from tormagd.control.believe.anchor import Anchor
+from tormagd.control.believe.ripple import Ripple
+from tormagd.control.believe.strength import UNSEEN
+
+STEP_RAD = 0.01
+
+Shape = Callable[[float], float]
+"By angle, the device's force over its mean."
+
+
+def turned(shape: Shape, turns: float, way: float = 1.0, stroke_rad: float = math.inf) -> Ripple:
+    """After so many turns at 1.5 N, one way or to and fro."""
+    ripple, anchor, angle = Ripple(), Anchor(UNSEEN), 0.2
+    for step in range(round(turns * math.tau / STEP_RAD)):
+        now = way if (step * STEP_RAD) // stroke_rad % 2 == 0 else -way
+        angle += STEP_RAD * now
+        ripple.update(angle, 42.0 * now, 1.5, 1.5 * shape(angle) / (1.0 + ripple.share(angle)), anchor)
+    return ripple
+
+
+def waves(*harmonics: tuple[int, float]) -> Shape:
+    return lambda angle: 1.0 + sum(share * math.sin(k * angle + 0.5 * k) for k, share in harmonics)
+
+
+@pytest.mark.parametrize("turn", [{}, {"way": -1.0}, {"stroke_rad": 10.0}])
+@pytest.mark.parametrize("shape", [waves((1, 0.08)), waves((3, 0.12)), waves((1, 0.05), (2, 0.04), (3, 0.03))])
+def test_turns_teach_once_twice_and_three_times_a_turn(shape: Shape, turn: dict[str, float]) -> None:
+    ripple = turned(shape, 8.0, **turn)
+    for angle in range(7):
+        assert 1.0 + ripple.share(angle) == pytest.approx(shape(angle), abs=0.015)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        lambda angle: 1.0 - 0.002 * angle,  # it fades
+        lambda angle: 0.8 if angle > 7.5 else 1.0,  # it leaps
+    ],
+    ids=["fades", "leaps"],
+)
+def test_what_does_not_come_again_at_the_same_angle_is_no_ripple(shape: Shape) -> None:
+    ripple = turned(shape, 5.2)
+    assert [ripple.share(angle) for angle in range(7)] == [0.0] * 7
+
+
+def test_another_force_is_no_ripple() -> None:
+    ripple, anchor = Ripple(), Anchor(UNSEEN)
+    for step in range(4000):
+        model_N = 0.8 if step % 400 < 200 else 1.6
+        ripple.update(step * STEP_RAD, 42.0, model_N, 1.06 * model_N - 0.04, anchor)
+    assert [ripple.share(angle) for angle in range(7)] == [0.0] * 7
+
+
+def test_another_rate_is_no_ripple() -> None:
+    ripple, anchor, rate_mm_s = Ripple(), Anchor(UNSEEN), 300.0
+    for step in range(4000):
+        rate_mm_s += 0.1 * ((300.0 if step % 400 < 200 else 42.0) - rate_mm_s)
+        ripple.update(step * STEP_RAD, rate_mm_s, 1.0, 1.0 + 5e-4 * rate_mm_s, anchor)
+    assert [ripple.share(angle) for angle in range(7)] == [0.0] * 7
