@@ -125,6 +125,14 @@ def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, ctl, status_with, so
     assert (known["link"] if command == "status" else known)["port"].endswith(EVIL)
 
 
+def test_a_refusal_is_one_printable_line_and_a_hint(fake_daemon, ctl):
+    error = {"code": EVIL, "message": "no" + EVIL, "hint": "next" + EVIL}
+    fake_daemon.answers["pause"] = lambda: {"ok": False, "error": error}
+    said = ctl(*fake_daemon.at, "pause").ended(1).err
+    assert is_harmless(said)
+    assert len(said.splitlines()) == 2
+
+
 @pytest.mark.parametrize("what", ["key", "value", "name"])
 def test_a_file_cannot_either(tmp_path: Path, ctl, what: str) -> None:
     path = tmp_path / ("\x1b[2J.toml" if what == "name" else "a.toml")

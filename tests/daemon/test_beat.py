@@ -161,7 +161,7 @@ def test_the_times_of_the_parts_are_reported(rig: Rig) -> None:
     }
 
 
-# -- the heartbeat: tests wait for its descriptor, never for a time ----------------------------------------------------
+# -- the heartbeat -----------------------------------------------------------------------------------------------------
 
 
 PERIOD_NS = 20_000_000

@@ -536,7 +536,7 @@ def test_what_may_not_be_done_yet_is_refused_and_whatever_else_is_commanded_ends
     assert armed.answer(look)["is_busy"]
     for name in ("arm", "disable"):
         armed.command(name)
-    armed.tick(3_000)  # nothing closes by itself
+    armed.tick(3_000)
     status = armed.command("status")
     assert (status["operating_state"], status["faults"]) == ("DISABLED", [])
     assert (status["arm"]["given"], status["arm"]["error"]["code"]) == ([], "overtaken")
@@ -655,7 +655,6 @@ def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming_and_o
     control, connection = armed.daemon._control, armed.daemon._connection
     armed.port.is_mute = True
     armed.tick()
-    # the measurement that the step was given is kept, though driving lost the device
     assert (control.measurement is None, connection.measurement) == (False, None)
     armed.tick()
     assert control.measurement is None

@@ -321,12 +321,10 @@ def test_it_arrives_when_the_gap_has_gone_there_and_the_carriages_have_come(core
         (0.1, (Limit.F_MIN,), None, ("F_MIN",)),
         (None, (Limit.STALE, Limit.SENSOR), None, ("STALE",)),
         (None, (Limit.STALE, Limit.OTHER_SOURCE), None, ("STALE", "OTHER_SOURCE")),
-        # what only makes it late, or concerns others
         *(
             (1.5, (limit,), None, ())
             for limit in (Limit.RATE, Limit.TAKEOVER, Limit.OTHER_SOURCE, Limit.LOW_CONFIDENCE)
         ),
-        # the model's range, where its field was not followed
         (1.5, (Limit.MODEL_RANGE,), Outside("rate_mm_s", 300.0, 84.0), ()),
         (1.5, (Limit.MODEL_RANGE,), Outside(FEATURES[2], 120.0, 100.0), ("MODEL_RANGE",)),
     ],
