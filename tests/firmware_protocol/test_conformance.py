@@ -51,7 +51,7 @@ from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 from firmware_protocol.conformance.rules import MODES, RULES, TAKES
 from firmware_protocol.conformance.taking import MISFITS, MISMATCHED, PLACES
-from firmware_protocol.framing import DELIMITER, FrameDecoder, cobs_decode, cobs_encode, encode_frame
+from firmware_protocol.framing import DELIMITER, Frame, FrameDecoder, cobs_decode, cobs_encode, encode_frame
 from tormagd.simulation.can_device import DEVICE, CanDevice
 from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.compiled_firmware import CompiledFirmware
@@ -1250,19 +1250,21 @@ def called(message: Message) -> str:
     return f"Hello that {fits}" if isinstance(message, Hello) else type(message).__name__
 
 
+def is_refused(frame: Frame, real: Firmware) -> bool:
+    try:
+        message = decode(frame.function, frame.payload)
+    except DecodeError:
+        return True
+    return isinstance(message, Drive) and message.counter == real._drive_counter
+
+
 def mutated(mutant: Mutant) -> SerialLine:
     """Return a device with a drawn error, which sees also what its decoder refuses."""
     due, decoder = deque[bytes](maxlen=1), FrameDecoder()
 
     def down(line: Wire, data: bytes) -> bytes:
-        for frame in decoder.feed(data):
-            try:
-                message = decode(frame.function, frame.payload)
-            except DecodeError:
-                due.append(data)
-                continue
-            if isinstance(message, Drive) and message.counter == line.device.messages.firmware.real._drive_counter:
-                due.append(data)
+        real = line.device.messages.firmware.real
+        due.extend(data for frame in decoder.feed(data) if is_refused(frame, real))
         return data
 
     def ticks(device: Rogue, time_s: float) -> None:

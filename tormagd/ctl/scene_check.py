@@ -20,10 +20,8 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     """Say whether a daemon with this configuration takes the scene, how it serves it, and at what cost."""
     scene = loaded(name)
     derived = derived_of(name, config)
-    way, sent_hz = way_of(derived), UNSET if scene.signal is None else scene.signal.setpoint_hz
-    plans_hz = way.inference_hz if sent_hz is UNSET or not derived["plan_every_setpoint"] else sent_hz
-    plans_hz = max(plans_hz, way.inference_hz)
-    share = None if derived["terms_out"] else measured().daemon_share(way, machine_us(), plans_hz)
+    sent_hz = UNSET if scene.signal is None else scene.signal.setpoint_hz
+    share, plans_hz = _price(derived, 0.0 if sent_hz is UNSET else sent_hz)
     if share is not None and share > scene.budget.core_share:
         raise CommandError(
             Exit.REFUSED,
@@ -49,7 +47,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
         f"{1e3 * force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster",
         *([] if sent_hz is UNSET else [f"           its publisher sends {sent_hz:g} times a second"]),
         *_waiting(force, derived["approaches_s"]),
-        f"served     {way}",
+        f"served     {way_of(derived)}",
         "cost       not measured of these rates, search and terms"
         if share is None
         else f"cost       {share:.1%} of a processor of this machine for {plans_hz:g} plans a second, "
@@ -61,6 +59,13 @@ def check_scene(name: str, config: Path | None) -> Outcome:
         "core_share_allowed": scene.budget.core_share,
     } | derived
     return Outcome(result, folded("\n".join(lines)))
+
+
+def _price(derived: dict[str, Any], sent_hz: float) -> tuple[float | None, float]:
+    """Return the share of this machine's processor, if it was measured, and the plans a second that it is for."""
+    way = way_of(derived)
+    plans_hz = max(way.inference_hz, sent_hz if derived["plan_every_setpoint"] else 0.0)
+    return None if derived["terms_out"] else measured().daemon_share(way, machine_us(), plans_hz), plans_hz
 
 
 def torque_range(scene: Scene) -> str:
