@@ -237,7 +237,7 @@ def test_a_topic_has_listeners_only_where_it_was_asked_for_by_its_name(rig: Rig)
     snapshots.subscribe(TELEMETRY_TOPIC)
     motions.subscribe(MOTION_TOPIC)
     rig.until(lambda: motions.poll(5) > 0 and snapshots.poll(5) > 0, tell)
-    assert listeners.has(MOTION_TOPIC)
+    rig.until(lambda: listeners.has(MOTION_TOPIC), tell)
     assert not listeners.has(VERDICT_TOPIC)
     topic, data = motions.recv_multipart()
     assert (topic, decode(data, Motion)) == (MOTION_TOPIC, motion)
@@ -487,7 +487,7 @@ def test_a_subscriber_that_says_too_much_is_cut_off_and_named_and_may_come_back(
 
     def churn() -> None:
         topic = next(topics).encode()
-        for sign in (b"\x01", b"\x00") * 20:
+        for sign in (b"\x01", b"\x00") * 4:
             churning.send(sign + topic)
         rig.tell()
         rig.look()
