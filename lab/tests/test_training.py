@@ -309,7 +309,7 @@ def test_some_hundred_rows_tell_an_elastomer_of_another_law() -> None:
 
 def test_a_law_becomes_a_network_that_rises_and_is_near_it() -> None:
     data, fresh = lawful(400, least_mm=0.0), lawful(500, noise_N=0.0)
-    model = fit_law_model(data, data, **OF_LAW, epochs=80)
+    model = fit_law_model(data, data, **OF_LAW, epochs=40)
     metrics = model.metadata.metrics
     assert np.abs(model.predict(fresh.features) - fresh.force_N).mean() < 0.015  # of 4.3 N, within the fit's own errors
     assert metrics["law_mae_N"] < 0.04
