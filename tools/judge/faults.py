@@ -32,10 +32,10 @@ SAFE_N = 1.0
 OPEN_MM = 94.0
 LOSS_MS = 50
 "A loss of force is what a hand feels of it: the greatest in this time."
-MAX_OFF_N = 0.22
-"A held force is off by no more, in the mean of the last second: the leash at 1.6 N, and what the zero leaves;"
+MAX_OFF_N = 0.15
+"A held force is off by no more, in the mean of the last second,"
 MAX_OVER_N = 0.3
-"it is too great by no more at any time."
+"and too great by no more at any time."
 MAX_CLOSED_MM = 3.0
 REFUSED_MS = 100.0
 
