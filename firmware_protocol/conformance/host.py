@@ -352,12 +352,11 @@ class Host:
     ) -> None:
         goals = left_mm, right_mm
         targets = places(self.last(State))
-        way_mm = max(abs(goal - at) for goal, at in zip(goals, targets, strict=True))
-        end_s = self._next_s + way_mm / mm_s + MOVED_S
+        end_s = self._next_s + max(map(abs, ways_mm(self.last(State), goals))) / mm_s + MOVED_S
         step_mm = mm_s * PERIOD_S
         while not ends():
             at_mm = places(self.last(State))
-            if max(abs(goal - at) for goal, at in zip(goals, at_mm, strict=True)) < ARRIVED_MM:
+            if max(map(abs, ways_mm(self.last(State), goals))) < ARRIVED_MM:
                 return
             left_to, right_to = (at + clamped(goal - at, step_mm) for at, goal in zip(targets, goals, strict=True))
             targets = left_to, right_to
@@ -413,6 +412,10 @@ def shown(status: Status) -> str:
 
 def places(state: State) -> tuple[float, float]:
     return state.left_position_mm, state.right_position_mm
+
+
+def ways_mm(state: State, since: tuple[float, float]) -> list[float]:
+    return [at - began for at, began in zip(places(state), since, strict=True)]
 
 
 def clamped(value: float, most: float) -> float:

@@ -27,6 +27,7 @@ from firmware_protocol.conformance.host import (
     positions,
     shown,
     unless,
+    ways_mm,
 )
 from firmware_protocol.conformance.taking import DUTY, PLACES, SPARSE_S, Sent, opens_fully, put_off, refused, taken
 from firmware_protocol.conformance.telling import columns
@@ -80,9 +81,9 @@ def home_homes(host: Host) -> str:
         modes = [status.mode for _, status in host.all_of(Status)]
         homed_s = next((time_s for time_s, status in host.all_of(Status) if is_homed(status)), math.inf)
         first = next((each for time_s, each in host.all_of(State) if time_s > homed_s), state)
-        jumps_mm = [abs(there - here) for there, here in zip(places(first), places(state), strict=True)]
+        jump_mm = max(map(abs, ways_mm(first, places(state))))
         seen.append(f"{seconds:.1f} s, first {positions(first)}, then {positions(state)}")
-        is_off = beat is DriveMode.OFF and (max(map(abs, places(state))) > ZERO_MM or max(jumps_mm) > JUMP_MM)
+        is_off = beat is DriveMode.OFF and (max(map(abs, places(state))) > ZERO_MM or jump_mm > JUMP_MM)
         wrong = is_off or DeviceMode.HOMING not in modes or seconds > LAST_S
         host.shows(DeviceMode.IDLE, homed=True, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=wrong)
     return "; ".join(seen)
@@ -111,15 +112,16 @@ def _duty_moves(side: int, host: Host) -> str:
     while duty > -MAX_DUTY:
         duty -= RAMP_PER_S * PERIOD_S
         host.beat(DriveMode.RUN, 0.0 if side else duty, duty if side else 0.0)
-        ways_mm = [at - began for at, began in zip(places(host.last(State)), start, strict=True)]
+        moved_mm = ways_mm(host.last(State), start)
         sense = host.last(Sense)
         currents_A = abs(sense.left_current_A), abs(sense.right_current_A)
         seen = (
-            f"by {ways_mm[0]:+.2f} and {ways_mm[1]:+.2f} mm, {currents_A[0]:.2f} and {currents_A[1]:.2f} A, {duty:.2f}"
+            f"by {moved_mm[0]:+.2f} and {moved_mm[1]:+.2f} mm, "
+            f"{currents_A[0]:.2f} and {currents_A[1]:.2f} A, {duty:.2f}"
         )
-        if ways_mm[side] <= -MOVED_MM and abs(ways_mm[1 - side]) < MOVED_MM / 2:
+        if moved_mm[side] <= -MOVED_MM and abs(moved_mm[1 - side]) < MOVED_MM / 2:
             return unless(currents_A[side] <= currents_A[1 - side], seen)
-        unless(max(map(abs, ways_mm)) >= MOVED_MM, seen)
+        unless(max(map(abs, moved_mm)) >= MOVED_MM, seen)
     raise Unmet(f"{seen}, {shown(host.status)}")
 
 
@@ -140,12 +142,12 @@ def open_switch_stops(host: Host) -> str:
         first = len(host.rows)
         host.pass_time(0.2, DriveMode.RUN, duty=MAX_DUTY if any(inside) else AT_STOP_DUTY)
         rows = columns(host, first)
-        ways_mm = np.array([rows[name][-1] - rows[name][0] for name in ("left_mm", "right_mm")])
+        moved_mm = np.array([rows[name][-1] - rows[name][0] for name in ("left_mm", "right_mm")])
         most_A = np.array([np.abs(rows[name]).max() for name in ("left_A", "right_A")])
-        seen.append(f"by {ways_mm[0]:+.2f} and {ways_mm[1]:+.2f} mm, {most_A[0]:.2f} and {most_A[1]:.2f} A at most")
-        stirs = (most_A > AT_STOP_A) | (np.abs(ways_mm) > AT_STOP_MM)
+        seen.append(f"by {moved_mm[0]:+.2f} and {moved_mm[1]:+.2f} mm, {most_A[0]:.2f} and {most_A[1]:.2f} A at most")
+        stirs = (most_A > AT_STOP_A) | (np.abs(moved_mm) > AT_STOP_MM)
         host.shows(
-            DeviceMode.RUN, DriveMode.RUN, besides=seen[-1], wrong=np.where(inside, ways_mm < MOVED_MM, stirs).any()
+            DeviceMode.RUN, DriveMode.RUN, besides=seen[-1], wrong=np.where(inside, moved_mm < MOVED_MM, stirs).any()
         )
     return "; ".join(seen)
 
@@ -195,7 +197,7 @@ def duties_make_currents(host: Host) -> str:
     start_mm = places(host.last(State))
     # the second Drive measures what the first began; an answer that lags shows a motor at rest
     host.pass_time(2 * STARTED_S, DriveMode.RUN, STARTED_S, duty=1.0)
-    sense, way_mm = host.last(Sense), min(np.subtract(places(host.last(State)), start_mm))
+    sense, way_mm = host.last(Sense), min(ways_mm(host.last(State), start_mm))
     seen = [f"{sense.left_current_A:+.2f} and {sense.right_current_A:+.2f} A, {way_mm:+.2f} mm at once"]
     starting_A = np.array((sense.left_current_A, sense.right_current_A))
     unless(way_mm < STARTED_MM or (starting_A < STARTING_A[0]).any() or (starting_A > STARTING_A[1]).any(), seen[-1])
@@ -265,7 +267,7 @@ def keeps_still(host: Host, when: str) -> str:
     host.pass_time(ANSWER_S)
     start = places(host.last(State))
     host.pass_time(SEEN_S, DriveMode.RUN, duty=DUTY)
-    way_mm = max(abs(at - began) for at, began in zip(places(host.last(State)), start, strict=True))
+    way_mm = max(map(abs, ways_mm(host.last(State), start)))
     return host.shows(
         DeviceMode.IDLE, DriveMode.RUN, besides=f"{when} moved by {way_mm:.2f} mm", wrong=way_mm > AT_STOP_MM
     )

@@ -49,6 +49,7 @@ from firmware_protocol.conformance.host import (
     places,
     shown,
     unless,
+    ways_mm,
 )
 from firmware_protocol.conformance.rules import MODES, REFUSED_COMMANDS, REFUSED_DRIVES, TAKES
 from firmware_protocol.conformance.telling import Array, columns
@@ -225,9 +226,10 @@ def _changes(host: Host, one: Sent, before: Status) -> dict[str, bool]:
 
 def _stirs(host: Host, start: tuple[float, float]) -> dict[str, bool]:
     """Return how far a device at rest moved, and what it drew, and whether that is too much."""
-    moved_mm = max(abs(at - began) for at, began in zip(places(host.last(State)), start, strict=True))
-    senses = [sense for _, sense in host.all_of(Sense)]
-    most_A = max((abs(A) for each in senses for A in (each.left_current_A, each.right_current_A)), default=0.0)
+    moved_mm = max(map(abs, ways_mm(host.last(State), start)))
+    most_A = max(
+        (abs(A) for _, sense in host.all_of(Sense) for A in (sense.left_current_A, sense.right_current_A)), default=0.0
+    )
     return {f"moved by {moved_mm:.2f} mm": moved_mm > MOVED_MM, f"{most_A:.2f} A": most_A > RESTING_A}
 
 
@@ -277,10 +279,10 @@ def _say(host: Host, name: str, beat: Beat, misfit: Hello) -> None:
 
 def _begun(host: Host, place: Place, to: str, start: tuple[float, float], inward_mm: float) -> str:
     """Compare the mode after a message, and what RUN ends with, with what must be."""
-    ways_mm = [at - began for _, state in host.all_of(State) for at, began in zip(places(state), start, strict=True)]
+    way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
-    seen = f"{min(ways_mm):+.2f} mm at the innermost, {min(ways_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_closing = place.mode is DeviceMode.RUN and (min(ways_mm) < -inward_mm or min(ways_mm[-2:]) < BEGUN_MM)
+    seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
+    is_closing = place.mode is DeviceMode.RUN and (min(way_mm) < -inward_mm or min(way_mm[-2:]) < BEGUN_MM)
     return unless(is_closing or modes[:1] != [to] * (to in MODES), seen)
 
 

@@ -172,14 +172,14 @@ class Believe:
     def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
         """Return the belief, and change nothing."""
         at_speed = self.device
+        ripple = self._ripple(measured) if measured is not None else 1.0
         predicted_N: float | None = None
         if measured is not None and slid_N is not None and self._nominal.contact.is_known(measured):
-            slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-            predicted_N = self.strength.fit.force_N(slid_N) * slow * self._ripple(measured)
+            now_slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
+            predicted_N = self.strength.fit.force_N(slid_N) * now_slow * ripple
         is_unseen = self.is_prior and not self.sensor.has_slid
         unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
         slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
-        ripple = self._ripple(measured) if measured is not None else 1.0
         anchor_N: float | None = None
         if self.sensor.has_slid:
             anchor, most_N = self.sensor.anchor, self._surely_N
