@@ -29,7 +29,7 @@ from tormagd.hardware.measurement import DeviceRequest
 from tormagd.record.keeper_messages import MISSING as MISSING, READ, WROTE
 from tormagd_client.messages import TickRecord
 
-FORMAT = 17
+FORMAT = 18
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),

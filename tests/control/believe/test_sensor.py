@@ -46,11 +46,15 @@ def test_readings_that_fall_are_followed_within_the_leash(known, hear, moving, s
     assert known.planned.limits == ()
 
 
-@pytest.mark.parametrize("share", [0.85, 0.75, 0.3, 0.0, -1.0])
-def test_readings_that_fall_further_are_followed_to_its_end_and_named(known, hear, moving, share: float) -> None:
+@pytest.mark.parametrize(
+    ("share", "end_N"), [(0.85, END_N), (0.75, END_N), (0.65, MODEL_N), (0.3, MODEL_N), (0.0, MODEL_N), (-1.0, MODEL_N)]
+)
+def test_readings_that_fall_further_are_followed_to_its_end_or_not_at_all_and_named(
+    known, hear, moving, share: float, end_N: float
+) -> None:
     for _ in range(5):
         believe = hear(known, 1.0, moving(force_N=share * MODEL_N)).believe
-        assert force_N(believe) > END_N - 0.01
+        assert force_N(believe) > end_N - 0.01
     assert {Limit.DEVICE_OR_SENSOR, Limit.SENSOR} & set(known.planned.limits)
 
 

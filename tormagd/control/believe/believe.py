@@ -265,7 +265,8 @@ class Believe:
             self.strength.settle()
             return
         if self._nominal.contact.slides and not self.strength.is_held:
-            self.ripple.update(angle, measured.handle.rate_mm_s, model_N, sensor.measured_N, sensor.anchor)
+            anchor_N = max(sensor.anchor.force_N(model_N), MIN_EXPECTED_N)
+            self.ripple.update(angle, measured.handle.rate_mm_s, anchor_N, reading_N)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
     def _unknown_N(self, zero_sd_N: float) -> float:

@@ -1,90 +1,109 @@
-"""How one device's friction varies over the angle of its handle: once, twice and three times a turn.
+"""How one device's friction varies over the angle of its handle.
 
-    share    sum of a_k cos k angle + b_k sin k angle                   k = 1, 2, 3
-    turn     a_k = -1/(pi k) sum of sin k angle de,  b_k = 1/(pi k) sum of cos k angle de    over one whole turn
+    share     a polygon over the angle: a corner amid each of PLACES; its mean over the places seen twice is 0
+    slope     by how much the share rises from one place to the next
+    update    a slope by what its two newest passes agree in
 
-e is by which share a reading, the known ripple taken off, is over what the device first showed. Only its changes de
-count: a force that falls all the while is no ripple. Two turns that agree teach; in each the rate stays.
+A pass compares the mean readings at two neighbouring places, the known ripple taken off, each as a share of what the
+device first showed. A force that falls all the while rises on the way back, or has fallen by as much as a whole turn
+did: it has no slope. In a pass the rate stays. Places not yet seen close the turn.
 """
 
 import math
+from itertools import accumulate
 from typing import Final, final
 
-from tormagd.control.believe.anchor import Anchor
-
-HARMONICS: Final = (1, 2, 3)
-QUIET: Final = 0.01
-"A smaller wave is none: noise and relaxing leave as much."
-AGREES: Final = 0.5
-"Two turns agree where they differ by at most this share of the wave."
-STEP_RAD: Final = 0.1
-"Changes are taken over this angle; none over three times as much without a reading."
-STEEPEST: Final = 0.06
-"No ripple changes by a greater share over STEP_RAD, nor moves the gap by as much."
+PLACES: Final = 36
+"Waves of up to three a turn are cut by 4 % at most."
+STEEPEST: Final = 0.12
+"No ripple changes by a greater share from place to place, nor moves the gap by as much."
 STEADY_MM_S: Final = 8.0
-"Over a turn the handle's rate may change by so much: friction differs with the rate."
-SETTLES_RAD: Final = 0.5
-"After a change of rate or gap a turn begins so much later."
-LEAST_N: Final = 0.1
-"Least force that a share is of."
+"In a pass the handle's rate may change by so much: friction differs with the rate."
+SETTLES: Final = 3
+"After a change of rate or gap so many passes teach nothing."
 
 
 @final
 class Ripple:
-    """Estimator of the friction's share over the handle's angle. It keeps the turn that is being read, and the last."""
+    """Estimator of the friction's share over the handle's angle."""
 
     shares: list[float]
-    "a_1, b_1, a_2, b_2, a_3, b_3."
-    turn: list[float]
-    "The same of the turn that is being read."
+    "At each place, by which share friction is greater than its mean."
+    slopes: list[float]
     before: list[float]
-    "The same of the whole turn before, less what it taught."
-    left_rad: float = 0.0
-    "How far it is to the turn's end."
+    "What the newest pass of each place had left to teach."
+    is_seen: list[bool]
+    "Whether it was passed twice."
+    place: int = 0
+    "Where the handle is."
+    total: float = 0.0
+    "Sum of the readings there, over the anchor, the known ripple put on."
+    readings: int = 0
+    "How many they are."
+    last: int = -1
+    "The place before."
+    mean: float = 0.0
+    "Their mean there."
+    force_N: float = math.inf
+    "The anchor's force as the handle left it."
     rate_mm_s: float = 0.0
-    "The handle's rate as the turn began."
-    at_rad: float = math.inf
-    "The angle of the newest reading."
-    reading_N: float = 0.0
-    "That reading."
-    model_N: float = 0.0
-    "The model's force there."
+    "And its rate."
+    passes: int = -SETTLES
+    "How many passes one way have taught; less than 0 while something settles."
+    risen: float = 0.0
+    "By how much the share rose in them, along the way."
+    fade: float = 0.0
+    "By how much it rose in a mean pass of the last whole turn: whatever the angle."
 
     def __init__(self) -> None:
-        self.shares, self.turn, self.before = [0.0] * 6, [0.0] * 6, [0.0] * 6
+        self.shares, self.slopes, self.before = [0.0] * PLACES, [0.0] * PLACES, [0.0] * PLACES
+        self.is_seen = [False] * PLACES
 
     def share(self, angle: float) -> float:
         """Return by which share the friction at the handle's `angle` is greater than its mean over a turn."""
-        share = 0.0
-        for k in HARMONICS:
-            share += self.shares[2 * k - 2] * math.cos(k * angle) + self.shares[2 * k - 1] * math.sin(k * angle)
-        return share
+        corner = angle * PLACES / math.tau - 0.5
+        at = math.floor(corner)
+        here, there = self.shares[at % PLACES], self.shares[(at + 1) % PLACES]
+        return here + (corner - at) * (there - here)
 
-    def update(self, angle: float, rate_mm_s: float, model_N: float, reading_N: float, anchor: Anchor) -> None:
-        """Take a mean of readings at the handle's `angle`, the known ripple taken off."""
-        step_rad = angle - self.at_rad
-        if abs(step_rad) < STEP_RAD:
-            return
-        force_N, before_N = max(anchor.force_N(model_N), LEAST_N), max(anchor.force_N(self.model_N), LEAST_N)
-        change = math.copysign(1.0, step_rad) * (reading_N / force_N - self.reading_N / before_N)
-        is_steady = abs(step_rad) <= 3.0 * STEP_RAD and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S
-        if not is_steady or max(abs(change), abs(before_N / force_N - 1.0)) > STEEPEST:
-            self.turn, self.left_rad, self.rate_mm_s = [0.0] * 6, 2.0 * math.pi + SETTLES_RAD, rate_mm_s
-        elif self.left_rad <= 2.0 * math.pi:
-            for k in HARMONICS:
-                self.turn[2 * k - 2] -= change / (math.pi * k) * math.sin(k * (angle - 0.5 * step_rad))
-                self.turn[2 * k - 1] += change / (math.pi * k) * math.cos(k * (angle - 0.5 * step_rad))
-        self.at_rad, self.model_N, self.reading_N = angle, model_N, reading_N
-        self.left_rad -= abs(step_rad)
-        if self.left_rad <= 0.0:
-            self._learn()
+    def update(self, angle: float, rate_mm_s: float, force_N: float, reading_N: float) -> None:
+        """Take a reading at the handle's `angle`, the known ripple taken off, beside the anchor's `force_N` > 0."""
+        place = math.floor(angle * PLACES / math.tau)
+        if place != self.place:
+            if self.readings > 0:
+                self._pass(rate_mm_s, force_N)
+            self.place, self.total, self.readings = place, 0.0, 0
+        self.total += reading_N / force_N * (1.0 + self.share(angle))
+        self.readings += 1
 
-    def _learn(self) -> None:
-        """Learn the waves in which the turn agrees with the turn before, and begin another."""
-        for at in (0, 2, 4):
-            wave, before = self.turn[at : at + 2], self.before[at : at + 2]
-            if math.hypot(*wave) > max(QUIET, math.dist(wave, before) / AGREES):
-                self.shares[at] += 0.5 * (wave[0] + before[0])
-                self.shares[at + 1] += 0.5 * (wave[1] + before[1])
-                self.turn[at], self.turn[at + 1] = 0.0, 0.0
-        self.before, self.turn, self.left_rad = self.turn, [0.0] * 6, 2.0 * math.pi
+    def _pass(self, rate_mm_s: float, force_N: float) -> None:
+        """Compare the place that the handle leaves with the place before."""
+        mean, way, at = self.total / self.readings, self.place - self.last, min(self.place, self.last) % PLACES
+        rose = mean - self.mean
+        is_steady = abs(way) == 1 and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S
+        if not is_steady or max(abs(rose), abs(self.force_N / force_N - 1.0)) > STEEPEST:
+            self.passes, self.risen = -SETTLES, 0.0
+        else:
+            self.passes += 1
+        if self.passes > 0:
+            rise = way * rose - self.shares[(at + 1) % PLACES] + self.shares[at]
+            self.risen += way * rise
+            if self.passes == PLACES:
+                self.fade, self.passes, self.risen = self.risen / PLACES, 0, 0.0
+            self._learn(at, rise - way * self.fade)
+        self.last, self.mean, self.force_N, self.rate_mm_s = self.place, mean, force_N, rate_mm_s
+
+    def _learn(self, at: int, rise: float) -> None:
+        """Learn the slope at a place from what its passes agree in, and draw the shares anew."""
+        before = self.before[at]
+        agreed = math.copysign(min(abs(rise), abs(before)), rise) if rise * before > 0.0 else 0.0
+        self.before[at] = rise - agreed
+        self.slopes[at] += agreed
+        self.is_seen[at] = self.is_seen[at] or before != 0.0
+        unseen = self.is_seen.count(False)
+        closing, places = sum(self.slopes) / (unseen or PLACES), list(zip(self.slopes, self.is_seen, strict=True))
+        rises = [slope - (0.0 if unseen and is_seen else closing) for slope, is_seen in places]
+        shares = [0.0, *accumulate(rises[:-1])]
+        seen = [share for share, (_, is_seen) in zip(shares, places, strict=True) if is_seen]
+        mean = sum(seen) / max(len(seen), 1)
+        self.shares = [share - mean for share in shares]

@@ -39,6 +39,8 @@ INSIDE_S: Final = 0.2
 "Readings have to be inside for so long before they are no longer in dispute; those of a wrong sensor five times."
 WRONG_S: Final = 0.05
 "Evidence for so long shows that the sensor is wrong."
+LEAPT: Final = 0.25
+"A reading below the anchor by a greater share is no device's: no friction falls so far without a word."
 WEAKENED: Final = 0.12
 "Any device may be weaker or stronger than its bounds by this share and SLACK_N: relaxed, or warm."
 
@@ -101,25 +103,23 @@ class SensorTrust:
             self.measured_N, self.rate_mm_s = reading_N, rate_mm_s
         self.measured_N = low_pass(self.measured_N, reading_N, dt_s, FILTER_S)
         unsure_N = SLACK_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
-        weakest_N = self._bounds.min_scale * (1.0 - WEAKENED) * model_N - unsure_N
-        strongest_N = self._bounds.max_scale * (1.0 + WEAKENED) * model_N + unsure_N
-        is_strange = self.freshness.is_frozen or not weakest_N <= self.measured_N <= strongest_N
+        least_N = self._bounds.min_scale * (1.0 - WEAKENED) * model_N - unsure_N
+        most_N = self._bounds.max_scale * (1.0 + WEAKENED) * model_N + unsure_N
+        is_strange = self.freshness.is_frozen or not least_N <= self.measured_N <= most_N
         force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
+        surely_N = SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
         unsure_N += VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
-        beyond_N = abs(self.measured_N - force_N) - self._leash * force_N - unsure_N - KNOWN_N
+        beyond_N = abs(self.measured_N - force_N) - self._leash * force_N - unsure_N - KNOWN_N - surely_N
         self._doubt(is_strange, dt_s)
-        self._judge(is_strange, beyond_N <= SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0), dt_s)
-        if not (self._teaches and weakest_N <= reading_N <= strongest_N):
+        self._judge(is_strange, beyond_N <= 0.0, dt_s)
+        if self.has_slid:
+            least_N = max(least_N, (1.0 - LEAPT) * force_N - unsure_N - surely_N)
+        if not (self._teaches and least_N <= reading_N <= most_N):
             return None
         taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
-        if deviation_N <= KNOWN_N:
-            self.fallen = min(max(believed, self._bounds.min_scale), 1.0)
-        elif learns and zero_sd_N <= UNKNOWN_SD_N:
-            self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
-            # what has fallen at the forces that are known has fallen here, too
-            surely_N, shown_N = SURE * deviation_N if self.has_slid else math.inf, taught_N / self.fallen
-            self.anchor.learn(model_N, min(max(shown_N, force_N - surely_N), force_N + surely_N), dt_s)
+        is_known = zero_sd_N <= UNKNOWN_SD_N and beyond_N <= 0.0 and learns
+        self._learn(model_N, force_N, deviation_N, rate_mm_s, taught_N, believed, dt_s, is_known=is_known)
         if self.has_slid:
             self._give_way(believed, force_N, dt_s)
         return taught_N
@@ -127,6 +127,27 @@ class SensorTrust:
     @property
     def _teaches(self) -> bool:
         return self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
+
+    def _learn(
+        self,
+        model_N: float,
+        force_N: float,
+        deviation_N: float,
+        rate_mm_s: float,
+        taught_N: float,
+        believed: float,
+        dt_s: float,
+        *,
+        is_known: bool,
+    ) -> None:
+        """Teach the anchor a force at which it is not known."""
+        if deviation_N <= KNOWN_N:
+            self.fallen = min(max(believed, self._bounds.min_scale), 1.0)
+        elif is_known:
+            self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
+            # what has fallen at the forces that are known has fallen here, too
+            within_N, shown_N = SURE * deviation_N if self.has_slid else math.inf, taught_N / self.fallen
+            self.anchor.learn(model_N, min(max(shown_N, force_N - within_N), force_N + within_N), dt_s)
 
     def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share that is `believed`."""
