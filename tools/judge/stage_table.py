@@ -269,7 +269,7 @@ def anchor(stage: Anchor, draw: Draw) -> object:
 
 
 def ripple(stage: Ripple, draw: Draw) -> object:
-    stage.update(draw(10.0), draw(42.0), draw(1.1), draw(1.2), Anchor(UNSEEN))
+    stage.update(draw(10.0), draw(42.0), 1.1, draw(1.2))
     return stage.share(draw(10.0))
 
 
