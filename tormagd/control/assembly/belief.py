@@ -12,7 +12,7 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
     """Return each thing believed of the device at `now_s`, by name, and whether it acts."""
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
-    ripple = max(believe.ripple.shares)
+    ripple = believe.ripple.trust * max(believe.ripple.shares)
     is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust
     return {
         "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),

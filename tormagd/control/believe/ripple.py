@@ -13,6 +13,8 @@ import math
 from itertools import accumulate
 from typing import Final, final
 
+QUIET: Final = 0.015
+"A ripple that nowhere exceeds this is none: noise and relaxing leave as much."
 PLACES: Final = 36
 "Waves of up to three a turn are cut by 4 % at most."
 STEEPEST: Final = 0.12
@@ -29,6 +31,8 @@ class Ripple:
 
     shares: list[float]
     "At each place, by which share friction is greater than its mean."
+    trust: float = 0.0
+    "How much of that acts."
     slopes: list[float]
     before: list[float]
     "What the newest pass of each place had left to teach."
@@ -64,7 +68,7 @@ class Ripple:
         corner = angle * PLACES / math.tau - 0.5
         at = math.floor(corner)
         here, there = self.shares[at % PLACES], self.shares[(at + 1) % PLACES]
-        return here + (corner - at) * (there - here)
+        return self.trust * (here + (corner - at) * (there - here))
 
     def update(self, angle: float, rate_mm_s: float, force_N: float, reading_N: float) -> None:
         """Take a reading at the handle's `angle`, the known ripple taken off, beside the anchor's `force_N` > 0."""
@@ -107,3 +111,4 @@ class Ripple:
         seen = [share for share, (_, is_seen) in zip(shares, places, strict=True) if is_seen]
         mean = sum(seen) / max(len(seen), 1)
         self.shares = [share - mean for share in shares]
+        self.trust = 1.0 - (QUIET / max(QUIET, *map(abs, self.shares))) ** 2
