@@ -41,8 +41,8 @@ AFTER_FAULT_S = 2.0
 BUFFER_BYTES = 4_000_000
 "Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
 LEAVING_S = 2.0
-AGAIN_S = 1.0, 60.0
-"How soon a keeper that has ended is replaced: after a long life, and at most."
+AGAIN_S = 1.0
+"How soon a keeper that has ended is replaced."
 MAX_REQUESTED, MAX_ASKED = 8, 28
 "Boxes that somebody asked for and that are still to be written, at most; and all that wait for the keeper."
 
@@ -75,7 +75,7 @@ class BlackBox:
         self._folder, self._begun = folder, Begin(str(folder), header)
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
-        self._started_s, self._due_s, self._wait_s = -math.inf, math.inf, 0.5 * AGAIN_S[0]
+        self._due_s = math.inf
         self.journal, self._packer = Journal(is_kept=False), Packer()
         if folder is None:
             self._refusal = "no folder is named for black boxes"
@@ -93,7 +93,7 @@ class BlackBox:
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with a snapshot of both states, which are those before the first tick."""
-        if self._started_s > -math.inf:
+        if self._folder is not None:
             self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
@@ -134,7 +134,7 @@ class BlackBox:
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
         the ms."""
-        if self._folder is None or self._beside is None:
+        if self._folder is None or (self._beside is None and (reason == REQUEST or not self.is_missing)):
             raise RefusedError(
                 "no_black_box",
                 f"there is no black box: {self._refusal}",
@@ -154,6 +154,11 @@ class BlackBox:
         self._send_requests()
         return self._folder / name
 
+    @property
+    def is_missing(self) -> bool:
+        """Whether the keeper has ended, and another one has not begun; what a fault asks for meanwhile waits for it."""
+        return self._due_s < math.inf
+
     def look(self) -> None:
         """Send the keeper the requests that wait, and note its answers in `report` and in the log."""
         self._send_requests()
@@ -170,7 +175,7 @@ class BlackBox:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
         self._stop_if_gone()
-        if self._beside is None and time.monotonic() >= self._due_s:
+        if time.monotonic() >= self._due_s:
             self._start(msgspec.structs.replace(self._begun, is_again=True))
 
     def report(self) -> BlackBoxReport:
@@ -215,7 +220,7 @@ class BlackBox:
 
     def _start(self, begun: Begin) -> None:
         """Start the keeper; where that fails, it is tried again."""
-        self._started_s, self._due_s = time.monotonic(), math.inf
+        self._due_s = math.inf
         try:
             self._beside = ChildProcess(KEEPER)
         except OSError as error:
@@ -226,12 +231,9 @@ class BlackBox:
         self._send(begun)
 
     def _stop(self, reason: str) -> None:
-        """Close the socket, stop the journal, drop its entries, and start another keeper soon: the sooner, the longer
-        this one has kept."""
-        now_s = time.monotonic()
-        self._wait_s = AGAIN_S[0] if now_s - self._started_s > AGAIN_S[1] else min(2.0 * self._wait_s, AGAIN_S[1])
-        self._refusal, self._due_s = reason, now_s + self._wait_s
-        log.error("no black box is kept: %s; another one starts in %.0f s", reason, self._wait_s)
+        """Close the socket, stop the journal, drop its entries, and start another keeper soon."""
+        log.error("no black box is kept: %s; another one starts in %g s", reason, AGAIN_S)
+        self._refusal, self._due_s = reason, time.monotonic() + AGAIN_S
         if self._beside is not None:
             self._beside.close()
         self._beside = None

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from tormagd.config import Config
 from tormagd.control.assembly.belief import beliefs
 from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Limit
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.commands import Commands
@@ -119,6 +120,7 @@ class TelemetryLoop:
             self.topics.handle(),
             self.topics.verdict(),
             self._commands.mark,
+            (Limit.NO_BLACK_BOX,) * self._box.is_missing,
         )
 
     def histograms(self) -> Iterator[Histogram]:

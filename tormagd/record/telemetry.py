@@ -113,6 +113,7 @@ def snapshot(
     handle: tuple[float, float] | None = None,
     verdict: Verdict | None = None,
     mark: Mark | None = None,
+    beside: tuple[str, ...] = (),
 ) -> Telemetry:
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
@@ -134,7 +135,7 @@ def snapshot(
         measured_jp=(left, right) if known else None,
         skew_mm=left - right if known else None,
         duty=(tick.left_duty, tick.right_duty),
-        limits=tick.limits,
+        limits=tick.limits + beside,
         faults=tick.faults,
         setpoint_age_ms=None if age_s is None else age_s * 1e3,
         confidence=tick.confidence,
