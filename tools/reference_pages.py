@@ -19,6 +19,7 @@ from tormagd import config
 from tormagd.ctl import main as ctl
 from tormagd.daemon import main as daemon
 from tormagd.hardware import can_backend, serial_backend
+from tormagd.record import telemetry
 from tormagd.simulation import __main__ as simulation
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
@@ -35,11 +36,18 @@ _COMMANDS_HEAD = """# Commands: every option
 
 `python tools/reference_pages.py` writes this page from the argument parsers.
 """
+_TICKS_HEAD = """# Control ticks: every column
+
+`python tools/reference_pages.py` writes this page from the core's records; [messages](../messages.md#tickrecord) says
+what the columns mean.
+
+"""
 BOUNDS = {"ge": "{}", "gt": "over {}", "le": "to {}", "lt": "under {}"}
 
 
 def main() -> int:
-    for name, page in (("configuration.md", configuration_page()), ("commands.md", commands_page())):
+    made = {"configuration.md": configuration_page(), "commands.md": commands_page(), "ticks.md": ticks_page()}
+    for name, page in made.items():
         (FOLDER / name).write_text(page, encoding="utf-8")
     return 0
 
@@ -84,6 +92,12 @@ def commands_page() -> str:
             if own:
                 parts.append("\n".join(own) + "\n")
     return "\n".join(parts)
+
+
+def ticks_page() -> str:
+    of = telemetry.CONCLUDED, telemetry.OF_PLAN, telemetry.OF_DUTY, telemetry.OF_MEASUREMENT, telemetry.OF_LINK
+    told = zip(("concluded", "plan", "duty", "measurement", "link"), of, strict=True)
+    return _TICKS_HEAD + "".join(f"- {name}: {', '.join(f'`{each}`' for each in columns)}\n" for name, columns in told)
 
 
 def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:

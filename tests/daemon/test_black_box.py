@@ -21,8 +21,8 @@ from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.record.journal import MAX_ENTRIES, TEACH, Journal
-from tormagd.record.keeper_messages import Begin, End, Part, Said, Write, Written
-from tormagd.record.telemetry import tick_record
+from tormagd.record.keeper import Begin, End, Part, Said, Write, Written
+from tormagd.record.telemetry import tick_of
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
@@ -56,7 +56,7 @@ class Rig:
         for _ in range(times):
             self.box.journal.stepped()
             self.box.ticked(
-                tick_record(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
+                tick_of(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
             )
 
     def heard(self) -> list[Said]:

@@ -220,7 +220,12 @@ def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
     rig.until(lambda: subscriber.poll(5) > 0, tell)
     for _ in range(5_000):
         rig.endpoint.publish_ticks(rows, ("a", "b"))
-    assert msgpack.unpackb(subscriber.recv()) == {"v": VERSION, "columns": ["a"], "rows": [list(range(30))] * 100}
+    assert msgpack.unpackb(subscriber.recv()) == {
+        "v": VERSION,
+        "columns": ["a"],
+        "rows": [list(range(30))] * 100,
+        "core": b"",
+    }
 
 
 def test_a_topic_has_listeners_only_where_it_was_asked_for_by_its_name(rig: Rig) -> None:

@@ -19,17 +19,15 @@ from tormagd.daemon.black_box import header
 from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
-from tormagd.record.black_box import is_tick, write_black_box
-from tormagd.record.journal import Journal, Packer
-from tormagd.record.keeper import Ring
-from tormagd.record.keeper_messages import Part
+from tormagd.record.black_box import write_black_box
+from tormagd.record.journal import Journal, Packer, core_hash
+from tormagd.record.keeper import Part, Ring
 from tormagd.record.replay.rerun import Rerun, rerun
-from tormagd.record.telemetry import tick_record
+from tormagd.record.telemetry import COLUMNS, tick_of
+from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
-from tormagd_client.messages import TickRecord
 
-COLUMNS = TickRecord.__struct_fields__
 PART_TICKS, SNAPSHOT_TICKS = 20, 500
 NS = 1_000_000_000
 
@@ -71,11 +69,11 @@ class Flight:
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
         self._inference.foresee(beat)
-        record = tick_record(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
+        record = tick_of(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
         self._journal.ticked(record)
         self._ticks += 1
         if self._ticks % PART_TICKS == 0:
-            self.ring.put(Part(sample.time_s, record.t_ns, self._packed()))
+            self.ring.put(Part(sample.time_s, self._packed()))
             if self._ticks % SNAPSHOT_TICKS == 0:
                 self._remember()
         return sample
@@ -108,7 +106,8 @@ class Flight:
         self._is_stepped = True
 
     def _remember(self) -> None:
-        self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory())
+        core = core_hash(self.core.config, self.core.scene, self.core.model)
+        self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory(), core)
 
     def _drain(self, setpoint: TimedSetpoint | None) -> bool:
         before = self._inbox.newest
@@ -122,7 +121,7 @@ class Flight:
     def _packed(self) -> bytes:
         packer = Packer()
         packer.add(self._journal.take())
-        return packer.take()
+        return packer.take()[0]
 
     def command(self, name: str) -> None:
         conditions, is_refused = self.loop.conditions(), False

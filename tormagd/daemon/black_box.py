@@ -1,10 +1,11 @@
-"""The black box: hands all inputs of the core, and all traffic with the device, to a process that keeps the newest.
+"""The stream: all inputs of the core, and all traffic with the device, for the black box's process and for recorders.
 
-The control thread writes references into a journal, and encodes them behind each tick. The entries of 20 ticks go into
-a socket. It never waits: what the socket does not take is lost and counted. That process writes the files, and outlives
-the daemon, however the daemon ends.
+The control thread writes references into a journal, and encodes them once, behind each tick. The entries of 20 ticks go
+to recorders by ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not
+take is lost and counted. That process writes the files, and outlives the daemon, however the daemon ends.
 """
 
+import contextlib
 import hashlib
 import importlib.util
 import json
@@ -15,6 +16,7 @@ import subprocess
 import time
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -26,14 +28,25 @@ from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
-from tormagd.record.journal import FORMAT, Journal, Packer
-from tormagd.record.keeper_messages import REQUEST, Begin, End, Part, Said, Write, Written
-from tormagd_client.messages import BlackBoxReport, TickRecord
+from tormagd.record.journal import FORMAT, Journal, Packer, core_hash
+from tormagd.record.keeper import REQUEST, Begin, End, Part, Said, Write, Written
+from tormagd.record.telemetry import COLUMNS
+from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
 "The keeper's main module, with its socket's descriptor as the argument."
 PART_TICKS = 20
 "Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
+OF_CORE = (
+    "format",
+    "sources_sha256",
+    "platform",
+    "configuration_sha256",
+    "scene_sha256",
+    "scene_folder",
+    "core_sha256",
+)
+"What a replay needs beside what `describe` says anyway."
 SNAPSHOT_S = 1.0
 "Time between snapshots: a replay may begin at each."
 AFTER_FAULT_S = 2.0
@@ -50,7 +63,7 @@ log = logging.getLogger(__name__)
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
-    """Return the header of a black box of `core`: what a replay needs to build the same core again."""
+    """Return what a replay needs to build the same core again."""
     configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
         "format": str(FORMAT),
@@ -58,13 +71,14 @@ def header(config: Config, core: Core) -> dict[str, str]:
         "build": str(settle()),
         "sources_sha256": sources_hash(),
         "platform": platform_name(),
-        "config": configured.decode(),
-        "config_sha256": hashlib.sha256(configured).hexdigest(),
+        "configuration": configured.decode(),
+        "configuration_sha256": hashlib.sha256(configured).hexdigest(),
         "scene": scene.decode(),
         "scene_sha256": hashlib.sha256(scene).hexdigest(),
         "scene_folder": str(core.models),
-        "model_sha256": core.model,
-        "columns": json.dumps(TickRecord.__struct_fields__),
+        "model": core.model,
+        "core_sha256": core_hash(core.config, core.scene, core.model),
+        "columns": json.dumps(COLUMNS),
     }
 
 
@@ -72,7 +86,9 @@ class BlackBox:
     """Hands the core's journal to the keeper, a process that writes black boxes into `folder`."""
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
-        self._folder, self._begun = folder, Begin(str(folder), header)
+        self._folder, self.begun = folder, Begin(str(folder), header)
+        self.is_heard = False
+        "Whether there are recorders."
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
         self._due_s = math.inf
@@ -83,7 +99,7 @@ class BlackBox:
             self._refusal = "mcap is not installed: pip install 'tormagd[record]'"
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
-            self._start(self._begun)
+            self._start(self.begun)
         self.journal.is_kept = not self._refusal
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
@@ -93,43 +109,44 @@ class BlackBox:
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with a snapshot of both states, which are those before the first tick."""
-        if self._folder is not None:
-            self._connection, connection.traffic = connection, self.journal
+        self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
         """Begin anew with the core of another scene, from a snapshot of these states."""
-        self.journal.take()
-        self._packer.take()
-        self._begun = Begin(str(self._folder), header)
-        self._send(self._begun)
+        self._forget()
+        self.begun = Begin(str(self._folder), header)
+        self._send(self.begun)
         self._snapshot(stepper, planner)
 
-    def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
-        """Add the record of a control period to the journal, and encode all entries since the last call."""
-        if self._beside is None:
-            return
-        if not self.journal.is_kept:  # another keeper has begun: from the end of this period
-            self.journal.is_kept, self._ticks = True, 0
-            self.journal.missed()
-            self._snapshot(stepper, planner)
-            return
+    def ticked(self, record: Any, stepper: Stepper, planner: Planner) -> tuple[bytes, bytes] | None:
+        """Add a control period's tick to the journal, and encode all entries since the last call; return a part that is
+        whole, and its ticks' rows."""
+        was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
+        if not (was_kept and self.journal.is_kept):
+            self._forget()
+            self._ticks = 0
+            if self.journal.is_kept:  # another keeper has begun, or a recorder: from the end of this period
+                self.journal.missed()
+                self._snapshot(stepper, planner)
+            return None
         self.journal.ticked(record)
         try:
             self._packer.add(self.journal.take())
         except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
             self._stop(f"an entry that cannot be written: {error}")
-            return
+            return None
         self._ticks += 1
         if self._ticks % PART_TICKS:
-            return
-        entries = self._packer.take()
-        is_taken = self._send(Part(record.monotonic_s, record.t_ns, entries))
+            return None
+        part, rows = self._packer.take()
+        is_taken = self._beside is None or self._send(Part(record.monotonic_s, part))
         if not is_taken:
             self._dropped += 1
             self.journal.missed()
         if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
             self._snapshot(stepper, planner)
+        return part, rows
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
@@ -176,7 +193,7 @@ class BlackBox:
                 log.info("black box: %s/%s", self._folder, answer.name)
         self._stop_if_gone()
         if time.monotonic() >= self._due_s:
-            self._start(msgspec.structs.replace(self._begun, is_again=True))
+            self._start(msgspec.structs.replace(self.begun, is_again=True))
 
     def report(self) -> BlackBoxReport:
         """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since
@@ -191,22 +208,20 @@ class BlackBox:
     def close(self) -> None:
         """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and
         leave it then."""
-        beside = self._beside
-        if beside is not None:
+        if (beside := self._beside) is not None:
             self._send(End())
             self._beside, self._due_s = None, math.inf
             beside.close()
-            try:
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it goes on writing
                 beside.process.wait(LEAVING_S)
-            except subprocess.TimeoutExpired:
-                log.info("the black box is still being written, and will be there when its process has ended")
 
     def _send_requests(self) -> None:
         while self._asked and self._send(self._asked[0]):
             self._asked.popleft()
 
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
-        self.journal.snapshot(stepper, planner, None if self._connection is None else self._connection.memory())
+        memory = None if self._connection is None else self._connection.memory()
+        self.journal.snapshot(stepper, planner, memory, self.begun.header.get("core_sha256", ""))
 
     def _send(self, what: Said) -> bool:
         """Send one message to the keeper, and return whether the socket took it."""
@@ -238,5 +253,8 @@ class BlackBox:
             self._beside.close()
         self._beside = None
         self.journal.is_kept = False
+        self._forget()
+
+    def _forget(self) -> None:
         self.journal.take()
         self._packer.take()

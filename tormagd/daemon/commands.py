@@ -19,7 +19,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.scene_change import SceneChange
 from tormagd.hardware.connection import Connection
-from tormagd.record.keeper_messages import REQUEST
+from tormagd.record.keeper import REQUEST
 from tormagd_client.messages import MAX_MARK_CHARACTERS, Mark, Request
 
 log = logging.getLogger(__name__)

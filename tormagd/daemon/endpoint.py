@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import msgspec
 import zmq
 
 from tormagd.config import Sources
@@ -23,6 +24,8 @@ from tormagd.daemon.peers import Allowance, Peer, Tally
 from tormagd.daemon.requests import FIRST, Arrivals, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.ground.access_keys import KeyRing
+from tormagd.record.telemetry import COLUMNS
+from tormagd.record.ticks import encode_ticks
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
@@ -34,11 +37,9 @@ from tormagd_client.messages import (
     Reply,
     Request,
     Telemetry,
-    TickRecord,
     Verdict,
     decode,
     encode,
-    encode_ticks,
 )
 
 DRAIN = 32
@@ -140,9 +141,11 @@ class Endpoint:
         first part."""
         self._send(self._telemetry, *topic, encode(message))
 
-    def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
-        """Send control ticks to all subscribers of the recording, a row each with the fields `columns`."""
-        self._send(self._recording, encode_ticks(rows, columns))
+    def publish_ticks(
+        self, rows: Sequence[object] | msgspec.Raw, columns: tuple[str, ...] = COLUMNS, core: bytes = b""
+    ) -> None:
+        """Send control ticks to all subscribers of the recording, a row each, and all entries that they are among."""
+        self._send(self._recording, encode_ticks(rows, columns, core))
 
     def hear(self) -> None:
         """Read what subscribers say, for TAKEN_NS at each socket; cut off those that say too much."""

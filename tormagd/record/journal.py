@@ -4,6 +4,7 @@
 results stand in the journal for comparison only.
 """
 
+import hashlib
 import struct
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import msgspec
 
 from firmware_protocol.codec import DeviceMode, Switches
+from tormagd.config import Config
 from tormagd.control.ask.forecast import Guess, Skill
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor_zero import Level
@@ -26,8 +28,10 @@ from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.keeper_messages import MISSING as MISSING, READ, WROTE
-from tormagd_client.messages import TickRecord
+from tormagd.record.telemetry import TickRecord
+from tormagd.record.ticks import MISSING, READ, TOLD, WROTE
+from tormagd.scenes.scene import Scene
+from tormagd_client.messages import Telemetry
 
 FORMAT = 18
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
@@ -41,7 +45,7 @@ STEP = "step"
 PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
-"A conversation began or ended. READ and WROTE are in `keeper_messages`."
+"A conversation began or ended. READ and WROTE are in `ticks`."
 STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."
@@ -50,7 +54,12 @@ _LENGTH = struct.Struct(">I")
 _NONE = b"\xdd" + _LENGTH.pack(0)
 "An empty array whose length has four bytes."
 
-Entry = str | TickRecord | tuple[Any, ...]
+Entry = Any
+
+
+def core_hash(config: Config, scene: Scene, model: str) -> str:
+    """Return what tells one core from another: snapshots of others are not those of a replay."""
+    return hashlib.sha256(msgspec.json.encode((config, scene, model))).hexdigest()
 
 
 class Journal:
@@ -64,7 +73,7 @@ class Journal:
         """Note that a step is about to run; its inputs follow with `ticked`."""
         self._add(STEP)
 
-    def ticked(self, record: TickRecord) -> None:
+    def ticked(self, record: Any) -> None:
         self._add(record)
 
     def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
@@ -107,10 +116,14 @@ class Journal:
         """Note that a conversation begins from the state `memory`, or with None that it is over."""
         self._add((CONNECTED, memory))
 
-    def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
-        """Note the whole state of the core and of the conversation: a replay may begin here."""
+    def snapshot(self, stepper: Stepper, planner: Planner, connection: Any, core: str) -> None:
+        """Note the whole state of the core, whose hash is `core`, and of the conversation: a replay may begin here."""
         if self.is_kept:
-            self._add((STATE, plain(stepper), plain(planner), connection))
+            self._add((STATE, plain(stepper), plain(planner), connection, core))
+
+    def told(self, snapshot: Telemetry) -> None:
+        """Note a snapshot as it is published: people look at it, and a replay passes it over."""
+        self._add((TOLD, snapshot))
 
     def missed(self) -> None:
         self._add((MISSING,))
@@ -129,20 +142,27 @@ class Journal:
 
 
 class Packer:
-    """Writes entries as one growing msgpack array."""
+    """Writes entries as one growing msgpack array, and the ticks among them as another."""
 
     def __init__(self) -> None:
         self._bytes, self._count = bytearray(_NONE), 0
+        self._rows, self._row_count = bytearray(_NONE), 0
 
     def add(self, entries: Sequence[Entry]) -> None:
         for entry in entries:
+            at = len(self._bytes)
             _ENCODER.encode_into(entry, self._bytes, -1)
             self._count += 1
+            if isinstance(entry, TickRecord):
+                self._rows += self._bytes[at:]
+                self._row_count += 1
 
-    def take(self) -> bytes:
+    def take(self) -> tuple[bytes, bytes]:
+        """Return all entries, and the ticks' rows, and forget both."""
         _LENGTH.pack_into(self._bytes, 1, self._count)
-        packed = bytes(self._bytes)
-        self._bytes, self._count = bytearray(_NONE), 0
+        _LENGTH.pack_into(self._rows, 1, self._row_count)
+        packed = bytes(self._bytes), bytes(self._rows)
+        self.__init__()  # type: ignore[misc]
         return packed
 
 

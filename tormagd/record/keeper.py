@@ -22,8 +22,9 @@ from pathlib import Path
 import msgspec
 
 from tormagd.ground.terminal import write_line
-from tormagd.record.keeper_messages import REQUEST, Begin, End, Part, Said, Write, Written
 
+REQUEST = "REQUEST"
+"Reason of a black box that somebody asked for; any other is a fault's."
 KEPT_S = 30.0
 MAX_BYTES = 48_000_000
 """The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB."""
@@ -39,6 +40,44 @@ SHARED_MEMORY = "/dev/shm"
 LENGTH = struct.Struct("<I")
 "Of what follows it in a file of the ring."
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
+    """First message: the folder for black boxes, and the header of each; `is_again` where a keeper has ended before."""
+
+    folder: str
+    header: dict[str, str]
+    is_again: bool = False
+
+
+class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
+    """Some control periods, as entries of `journal.py`; the time is the last period's."""
+
+    time_s: float
+    entries: bytes
+
+
+class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
+    """Request to write the kept entries, and those of the next `after_s`, to the file `name`."""
+
+    name: str
+    reason: str
+    after_s: float
+    details: dict[str, str]
+
+
+class End(msgspec.Struct, frozen=True, array_like=True, tag="end"):
+    """Last message of a daemon that ends as it should; one that ends without it leaves a black box."""
+
+
+class Written(msgspec.Struct, frozen=True, array_like=True, tag="written"):
+    """Answer of the keeper: the black box `name` is on the disk, or a `refusal`."""
+
+    name: str
+    refusal: str = ""
+
+
+Said = Begin | Part | Write | End
 
 
 def in_shared_memory(folder: str) -> list[int]:

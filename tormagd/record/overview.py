@@ -26,6 +26,10 @@ Floats = NDArray[np.float64]
 QUANTITIES = (
     "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "gap_setpoint_mm", "left_duty", "right_duty", "field_mT",
 )  # fmt: skip
+LOOKED_AT = (
+    *(*QUANTITIES, "t_ns", "left_mm", "right_mm", "reference_gap_mm", "lateness_us"),
+    *("handle_mm", "handle_rate_mm_s", "handle_mm_s"),
+)
 KINDS = ("operating_state", "limits", "faults")
 BREAK_S = 0.1
 "Between messages further apart, nothing is known."
@@ -52,28 +56,16 @@ Words = Annotated[tuple[Word, ...], Meta(max_length=256)]
 Code = Annotated[str, Meta(pattern=rf"\A{CODE.pattern}\Z")]
 
 
-class Glance(TypedDict, total=False):
-    t_ns: float | None
-    setpoint_cf: float | None
-    governed_cf: float | None
-    measured_cf: float | None
-    field_mT: float | None
-    gap_mm: float | None
-    gap_setpoint_mm: float | None
-    left_mm: float | None
-    right_mm: float | None
-    reference_gap_mm: float | None
-    left_duty: float | None
-    right_duty: float | None
-    duty: tuple[float, float] | None
-    operating_state: Word | None
-    limits: Words | None
-    faults: Words | None
-    handle_mm: float | None
-    handle_rate_mm_s: float | None
-    handle_mm_s: float | None
-    lateness_us: float | None
-    mark: Mark | None
+def glance(*numbers: str, **others: Any) -> Any:
+    """Return the type as which a message is decoded: what an overview shows of it, and further fields."""
+    fields = dict.fromkeys((*LOOKED_AT, *numbers), float | None) | {
+        **dict.fromkeys(("limits", "faults"), Words | None),
+        **{"duty": tuple[float, float] | None, "operating_state": Word | None, "mark": Mark | None},
+    }
+    return TypedDict("Glance", fields | others, total=False)  # type: ignore[operator]
+
+
+Glance = glance()
 
 
 class Curves(msgspec.Struct, frozen=True):
