@@ -36,18 +36,14 @@ _COMMANDS_HEAD = """# Commands: every option
 
 `python tools/reference_pages.py` writes this page from the argument parsers.
 """
-_TICKS_HEAD = """# Control ticks: every column
-
-`python tools/reference_pages.py` writes this page from the core's records; [messages](../messages.md#tickrecord) says
-what the columns mean.
-
-"""
 BOUNDS = {"ge": "{}", "gt": "over {}", "le": "to {}", "lt": "under {}"}
 
 
 def main() -> int:
-    made = {"configuration.md": configuration_page(), "commands.md": commands_page(), "ticks.md": ticks_page()}
-    for name, page in made.items():
+    for name, page in (
+        *(("configuration.md", configuration_page()), ("commands.md", commands_page())),
+        ("ticks.md", ticks_page()),
+    ):
         (FOLDER / name).write_text(page, encoding="utf-8")
     return 0
 
@@ -95,9 +91,18 @@ def commands_page() -> str:
 
 
 def ticks_page() -> str:
-    of = telemetry.CONCLUDED, telemetry.OF_PLAN, telemetry.OF_DUTY, telemetry.OF_MEASUREMENT, telemetry.OF_LINK
-    told = zip(("concluded", "plan", "duty", "measurement", "link"), of, strict=True)
-    return _TICKS_HEAD + "".join(f"- {name}: {', '.join(f'`{each}`' for each in columns)}\n" for name, columns in told)
+    return """# Control ticks: every column
+
+`python tools/reference_pages.py` writes this page from the core's records; [messages](../messages.md#tickrecord) says
+what they mean.
+
+""" + "".join(
+        f"- {name}: {', '.join(f'`{each}`' for each in columns)}\n"
+        for name, columns in (
+            *(("plan", telemetry.OF_PLAN), ("concluded", telemetry.CONCLUDED), ("duty", telemetry.OF_DUTY)),
+            *(("measurement", telemetry.OF_MEASUREMENT), ("link", telemetry.OF_LINK)),
+        )
+    )
 
 
 def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:

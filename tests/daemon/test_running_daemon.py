@@ -28,6 +28,7 @@ from tormagd.daemon.daemon import Daemon
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.backend import BackendError
 from tormagd.record.telemetry import COLUMNS
+from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import VirtualPort
 from tormagd.simulation.device import VirtualDevice
@@ -277,15 +278,16 @@ def test_however_seldom_telemetry_is_told_every_tick_is_recorded(
     endpoint, numbers = running.daemon._endpoint, list[int]()
     at = COLUMNS.index("tick")
 
-    def note(rows: msgspec.Raw, core: bytes) -> None:
-        told = [row[at] for row in msgspec.msgpack.decode(rows)]
-        assert told == [entry[at] for entry in msgspec.msgpack.decode(core) if is_tick(entry)]
+    def note(data: bytes) -> None:
+        batch = decode_ticks(data)
+        told = [row[at] for row in batch.rows]
+        assert told == [entry[at] for entry in msgspec.msgpack.decode(batch.core) if is_tick(entry)]
         numbers.extend(told)
 
     monkeypatch.setattr(endpoint, "publish_ticks", note)
     monkeypatch.setattr(endpoint.admission, "connections", lambda: Counter(recording=1))
     running.tick(450)
-    assert numbers == [*range(numbers[0], numbers[0] + 400)]
+    assert numbers == [*range(numbers[0], numbers[0] + 440)]
 
 
 def test_a_daemon_describes_what_it_runs(alone: Running) -> None:

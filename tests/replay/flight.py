@@ -20,7 +20,7 @@ from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd.record.black_box import write_black_box
-from tormagd.record.journal import Journal, Packer, core_hash
+from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal, Packer, core_hash
 from tormagd.record.keeper import Part, Ring
 from tormagd.record.replay.rerun import Rerun, rerun
 from tormagd.record.telemetry import COLUMNS, tick_of
@@ -70,7 +70,7 @@ class Flight:
         self._stepped()
         self._inference.foresee(beat)
         record = tick_of(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
-        self._journal.ticked(record)
+        self._journal.add(record)
         self._ticks += 1
         if self._ticks % PART_TICKS == 0:
             self.ring.put(Part(sample.time_s, self._packed()))
@@ -97,12 +97,12 @@ class Flight:
 
     def connected(self, memory: Any) -> None:
         if memory is None:
-            self._journal.lost_link()
+            self._journal.note(LOSE_LINK)
         self._journal.connected(memory)
 
     def _stepped(self) -> None:
         if not self._is_stepped:
-            self._journal.stepped()
+            self._journal.note(STEP)
         self._is_stepped = True
 
     def _remember(self) -> None:
@@ -115,7 +115,7 @@ class Flight:
         return setpoint is not None and (before is None or setpoint.stamp_s > before.stamp_s)
 
     def _fail(self) -> None:
-        self._journal.latched(Fault.PLAN_FAILED)
+        self._journal.note(LATCH, str(Fault.PLAN_FAILED))
         self.loop.stepper.latch(Fault.PLAN_FAILED)
 
     def _packed(self) -> bytes:
@@ -129,7 +129,7 @@ class Flight:
             self.loop.command(name)
         except RefusedError:
             is_refused = True
-        self._journal.commanded(name, self.loop.now_s, conditions, is_refused=is_refused)
+        self._journal.note(COMMAND, name, self.loop.now_s, is_refused, conditions)
 
     def confirm(self, wrong: Disputed) -> None:
         self._inference.confirm(wrong)

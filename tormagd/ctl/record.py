@@ -14,7 +14,6 @@ from tormagd.config import Config, Recordings
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.record.folder import Budget, RecordingFolder
-from tormagd.record.telemetry import COLUMNS
 from tormagd.record.ticks import decode_ticks, listening
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
@@ -80,13 +79,12 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
-    """Ask the daemon what it runs, as a recording's metadata; with COLUMNS, a replay has all that it needs."""
+    """Ask the daemon what it runs, as metadata."""
     with Client(endpoints, wait_s) as client:
         known = msgspec.to_builtins(client.describe())
-    core: dict[str, str] = known.pop("core")
-    return core | {
+    return {
         name: value if isinstance(value, str) else msgspec.json.encode(value).decode()
-        for name, value in {**known, "columns": COLUMNS}.items()
+        for name, value in (known | known.pop("core")).items()
         if value is not None
     }
 

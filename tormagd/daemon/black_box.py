@@ -8,7 +8,6 @@ take is lost and counted. That process writes the files, and outlives the daemon
 import contextlib
 import hashlib
 import importlib.util
-import json
 import logging
 import math
 import socket
@@ -31,6 +30,7 @@ from tormagd.hardware.connection import Connection
 from tormagd.record.journal import FORMAT, Journal, Packer, core_hash
 from tormagd.record.keeper import REQUEST, Begin, End, Part, Said, Write, Written
 from tormagd.record.telemetry import COLUMNS
+from tormagd.record.ticks import MISSING
 from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
@@ -45,6 +45,7 @@ OF_CORE = (
     "scene_sha256",
     "scene_folder",
     "core_sha256",
+    "columns",
 )
 "What a replay needs beside what `describe` says anyway."
 SNAPSHOT_S = 1.0
@@ -53,9 +54,8 @@ AFTER_FAULT_S = 2.0
 "How long a black box goes on after its fault: the gap opens."
 BUFFER_BYTES = 4_000_000
 "Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
-LEAVING_S = 2.0
-AGAIN_S = 1.0
-"How soon a keeper that has ended is replaced."
+LEAVING_S, AGAIN_S = 2.0, 1.0
+"How long the end of a keeper is waited for, and how soon one that has ended is replaced."
 MAX_REQUESTED, MAX_ASKED = 8, 28
 "Boxes that somebody asked for and that are still to be written, at most; and all that wait for the keeper."
 
@@ -78,7 +78,7 @@ def header(config: Config, core: Core) -> dict[str, str]:
         "scene_folder": str(core.models),
         "model": core.model,
         "core_sha256": core_hash(core.config, core.scene, core.model),
-        "columns": json.dumps(COLUMNS),
+        "columns": msgspec.json.encode(COLUMNS).decode(),
     }
 
 
@@ -87,11 +87,10 @@ class BlackBox:
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
         self._folder, self.begun = folder, Begin(str(folder), header)
-        self.is_heard = False
-        "Whether there are recorders."
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
-        self._due_s = math.inf
+        self._due_s, self.is_heard = math.inf, False
+        "When another keeper is due, and whether there are recorders."
         self.journal, self._packer = Journal(is_kept=False), Packer()
         if folder is None:
             self._refusal = "no folder is named for black boxes"
@@ -123,14 +122,13 @@ class BlackBox:
         """Add a control period's tick to the journal, and encode all entries since the last call; return a part that is
         whole, and its ticks' rows."""
         was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
-        if not (was_kept and self.journal.is_kept):
+        if not (was_kept and self.journal.is_kept):  # nobody listens, or begins to: from the end of this period
             self._forget()
             self._ticks = 0
-            if self.journal.is_kept:  # another keeper has begun, or a recorder: from the end of this period
-                self.journal.missed()
-                self._snapshot(stepper, planner)
+            self.journal.note(MISSING)
+            self._snapshot(stepper, planner)
             return None
-        self.journal.ticked(record)
+        self.journal.add(record)
         try:
             self._packer.add(self.journal.take())
         except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
@@ -143,7 +141,7 @@ class BlackBox:
         is_taken = self._beside is None or self._send(Part(record.monotonic_s, part))
         if not is_taken:
             self._dropped += 1
-            self.journal.missed()
+            self.journal.note(MISSING)
         if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
             self._snapshot(stepper, planner)
         return part, rows
@@ -220,8 +218,9 @@ class BlackBox:
             self._asked.popleft()
 
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
-        memory = None if self._connection is None else self._connection.memory()
-        self.journal.snapshot(stepper, planner, memory, self.begun.header.get("core_sha256", ""))
+        if self.journal.is_kept:
+            memory = None if self._connection is None else self._connection.memory()
+            self.journal.snapshot(stepper, planner, memory, self.begun.header.get("core_sha256", ""))
 
     def _send(self, what: Said) -> bool:
         """Send one message to the keeper, and return whether the socket took it."""
@@ -235,13 +234,12 @@ class BlackBox:
 
     def _start(self, begun: Begin) -> None:
         """Start the keeper; where that fails, it is tried again."""
-        self._due_s = math.inf
+        self._due_s, self._refusal, self.journal.is_kept = math.inf, "", False
         try:
             self._beside = ChildProcess(KEEPER)
         except OSError as error:
             self._stop(f"the process that keeps it did not start: {error.strerror}")
             return
-        self._refusal = ""
         self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         self._send(begun)
 

@@ -9,10 +9,9 @@ import logging
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import msgspec
 import zmq
 
 from tormagd.config import Sources
@@ -24,8 +23,6 @@ from tormagd.daemon.peers import Allowance, Peer, Tally
 from tormagd.daemon.requests import FIRST, Arrivals, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.ground.access_keys import KeyRing
-from tormagd.record.telemetry import COLUMNS
-from tormagd.record.ticks import encode_ticks
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
@@ -141,11 +138,9 @@ class Endpoint:
         first part."""
         self._send(self._telemetry, *topic, encode(message))
 
-    def publish_ticks(
-        self, rows: Sequence[object] | msgspec.Raw, columns: tuple[str, ...] = COLUMNS, core: bytes = b""
-    ) -> None:
-        """Send control ticks to all subscribers of the recording, a row each, and all entries that they are among."""
-        self._send(self._recording, encode_ticks(rows, columns, core))
+    def publish_ticks(self, batch: bytes) -> None:
+        """Send control ticks to all subscribers of the recording."""
+        self._send(self._recording, batch)
 
     def hear(self) -> None:
         """Read what subscribers say, for TAKEN_NS at each socket; cut off those that say too much."""

@@ -21,6 +21,7 @@ from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.topics import Topics
 from tormagd.record.force_following import Following
 from tormagd.record.telemetry import snapshot, tick_of
+from tormagd.record.ticks import TOLD, encode_ticks
 from tormagd_client.messages import Telemetry
 
 REQUESTS = 16
@@ -78,8 +79,7 @@ class TelemetryLoop:
         )
         part = self._box.ticked(self._tick, control.stepper, self._inference.planner)
         if part is not None and self._box.is_heard:
-            entries, rows = part
-            self._endpoint.publish_ticks(msgspec.Raw(rows), core=entries)
+            self._endpoint.publish_ticks(encode_ticks(msgspec.Raw(part[1]), core=part[0]))
 
     def publish(self, beat: Beat) -> bool:
         if self._left > 0 or self._tick is None:
@@ -116,7 +116,7 @@ class TelemetryLoop:
             )
             endpoint.publish(self.newest)
         if is_kept:
-            box.journal.told(self.newest)
+            box.journal.note(TOLD, self.newest)
         self.timing.record(beat.due_ns, start_ns, time.monotonic_ns())
         return True
 

@@ -56,9 +56,9 @@ def read_black_box(path: Path) -> BlackBoxFile:
         damage = damage_in(file)
     if not found.entries:
         raise RecordingError(f"{path}: {NO_BLACK_BOX}")
-    if is_complete and found.expected and not found.odd:
-        topic, number, *_ = found.expected[0]
-        found.odd = f"message {number} is missing in {topic}, and {CORE_TOPIC} has it"
+    for topic, expected in found.expected.items() if is_complete else ():
+        if expected and not found.odd:
+            found.odd = f"message {expected[0][0]} is missing in {topic}, and {CORE_TOPIC} has it"
     return BlackBoxFile(found.metadata, found.entries, is_complete, found.odd or damage)
 
 
@@ -69,7 +69,7 @@ class _Reading(Contents):
         super().__init__()
         self._name = name
         self.entries: list[Any] = []
-        self.expected: deque[tuple[str, int, int, bytes]] = deque()
+        self.expected: dict[str, deque[tuple[int, int, bytes]]] = {TICKS_TOPIC: deque(), FRAMES_TOPIC: deque()}
         self.odd, self.is_over = "", False
         self._derived = Derived()
         self._size = 0
@@ -81,9 +81,9 @@ class _Reading(Contents):
         topic = self.topics.get(sent.channel_id, "")
         if topic == CORE_TOPIC and not self.is_over:
             self._part(sent.data)
-        elif topic in (TICKS_TOPIC, FRAMES_TOPIC) and not (self.odd or self.lost or self.is_over):
-            told = topic, sent.sequence, sent.log_time, sent.data
-            if not self.expected or told != self.expected.popleft():
+        elif topic in self.expected and not (self.odd or self.is_over):
+            expected = self.expected[topic]
+            if not expected or (sent.sequence, sent.log_time, sent.data) != expected.popleft():
                 self.odd = f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has"
 
     def lose(self, what: str) -> None:
@@ -100,7 +100,7 @@ class _Reading(Contents):
         self.entries.extend(entries)
         columns = msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...])
         try:
-            for topic, t_ns, sequence, shown in () if self.lost else self._derived.of(columns, entries):
-                self.expected.append((topic, sequence, t_ns, msgspec.json.encode(shown)))
+            for topic, t_ns, number, shown in self._derived.of(columns, entries) if self.expected else ():
+                self.expected[topic].append((number, t_ns, msgspec.json.encode(shown)))
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"

@@ -29,9 +29,8 @@ from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
 from tormagd.record.telemetry import TickRecord
-from tormagd.record.ticks import MISSING, READ, TOLD, WROTE
+from tormagd.record.ticks import MISSING, READ, WROTE
 from tormagd.scenes.scene import Scene
-from tormagd_client.messages import Telemetry
 
 FORMAT = 18
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
@@ -42,10 +41,16 @@ KNOWN = kinds(
 )
 "All types that `plain_values` reads back."
 STEP = "step"
-PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
+"A step is about to run; its inputs are in the tick that follows."
+PLAN, FORESEE, AFRESH = "plan", "foresee", "afresh"
+"`[PLAN, now_s, setpoint]`, `[FORESEE]`; `[AFRESH, now_s]` where one of them failed, and planning began anew."
+TEACH, CONFIRM, ANSWER = "teach", "confirm", "answer"
+"""What is known from another day, the operator's word in a dispute ("device" has changed, or "sensor" is wrong), and
+what a search beside the plans has found."""
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
+"`[COMMAND, name, now_s, is_refused, conditions]`, `[LATCH, fault]`, `[LOSE_LINK]`."
 CONNECTED = "connected"
-"A conversation began or ended. READ and WROTE are in `ticks`."
+"`[CONNECTED, memory]`: a conversation began from this state, or with None is over. READ and WROTE are in `ticks`."
 STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."
@@ -63,77 +68,35 @@ def core_hash(config: Config, scene: Scene, model: str) -> str:
 
 
 class Journal:
-    """The core's inputs since the last `take`. Every other method adds an entry."""
+    """The core's inputs since the last `take`, as entries: a tick, or a name and what belongs to it."""
 
     def __init__(self, *, is_kept: bool = True) -> None:
         self.is_kept = is_kept
         self._entries: list[Entry] = []
 
-    def stepped(self) -> None:
-        """Note that a step is about to run; its inputs follow with `ticked`."""
-        self._add(STEP)
-
-    def ticked(self, record: Any) -> None:
-        self._add(record)
-
-    def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        self._add((PLAN, now_s, setpoint))
-
-    def foresaw(self) -> None:
-        self._add((FORESEE,))
-
-    def began_afresh(self, now_s: float) -> None:
-        """Note that a plan or forecast failed, and that planning began anew."""
-        self._add((AFRESH, now_s))
-
-    def taught(self, learned: Learned) -> None:
-        """Note that the estimators were set to what is known from another day."""
-        self._add((TEACH, learned))
-
-    def confirmed(self, what: str) -> None:
-        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong."""
-        self._add((CONFIRM, what))
-
-    def answered(self, answer: Answer) -> None:
-        self._add((ANSWER, answer))
-
-    def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
-        self._add((COMMAND, name, now_s, is_refused, conditions))
-
-    def latched(self, fault: Fault) -> None:
-        self._add((LATCH, str(fault)))
-
-    def lost_link(self) -> None:
-        self._add((LOSE_LINK,))
+    def note(self, name: str, *what: Any) -> None:
+        self.add((name, *what))
 
     def read(self, now_s: float, raw: Received) -> None:
-        self._add((READ, now_s, raw))
+        self.add((READ, now_s, raw))
 
     def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        self._add((WROTE, now_s, raw, unsent))
+        self.add((WROTE, now_s, raw, unsent))
 
     def connected(self, memory: Any) -> None:
         """Note that a conversation begins from the state `memory`, or with None that it is over."""
-        self._add((CONNECTED, memory))
+        self.add((CONNECTED, memory))
 
     def snapshot(self, stepper: Stepper, planner: Planner, connection: Any, core: str) -> None:
         """Note the whole state of the core, whose hash is `core`, and of the conversation: a replay may begin here."""
-        if self.is_kept:
-            self._add((STATE, plain(stepper), plain(planner), connection, core))
-
-    def told(self, snapshot: Telemetry) -> None:
-        """Note a snapshot as it is published: people look at it, and a replay passes it over."""
-        self._add((TOLD, snapshot))
-
-    def missed(self) -> None:
-        self._add((MISSING,))
+        self.add((STATE, plain(stepper), plain(planner), connection, core))
 
     def take(self) -> list[Entry]:
         """Return and remove all entries."""
         entries, self._entries = self._entries, []
         return entries
 
-    def _add(self, entry: Entry) -> None:
+    def add(self, entry: Entry) -> None:
         if not self.is_kept:
             return
         if len(self._entries) >= MAX_ENTRIES:

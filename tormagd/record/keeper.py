@@ -24,17 +24,16 @@ import msgspec
 from tormagd.ground.terminal import write_line
 
 REQUEST = "REQUEST"
-"Reason of a black box that somebody asked for; any other is a fault's."
+"Reason of a black box that somebody asked for."
 KEPT_S = 30.0
 MAX_BYTES = 48_000_000
-"""The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB."""
+"The ring's bounds; half a minute at 1 kHz is 18 MB."
 MAX_FILES = 20
-"The oldest file of a fault is deleted when there are more, and likewise of a request."
+"Of faults, and of requests; the oldest goes."
 MAX_PACKET = 4_000_000
 MAX_DUE = 28
-"How many files may wait to be written; more are refused."
+"Files that wait to be written."
 LOOK_S = 0.05
-"Period of looking whether a file is due."
 DIED = "DAEMON-DIED"
 SHARED_MEMORY = "/dev/shm"
 LENGTH = struct.Struct("<I")

@@ -24,8 +24,8 @@ Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 
 
 class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
-    """Control ticks as rows of one value per column. The first column is `t_ns`, CLOCK_REALTIME; None is not known.
-    `core` has all entries of the journal up to the last tick, as a black box keeps them; empty where none is kept."""
+    """Control ticks as rows. The first column is `t_ns`, CLOCK_REALTIME; None is not known. `core` has the journal's
+    entries, or nothing."""
 
     v: int
     columns: tuple[str, ...]
@@ -67,7 +67,7 @@ class Axis:
         return self._newest_ns
 
     def of_frame(self, monotonic_s: float) -> int:
-        """Place what passed between daemon and device; a tick of about then has been placed before."""
+        """Place what passed between daemon and device."""
         return max(round(monotonic_s * 1e9) + (self._offset_ns or 0), 0)
 
     def of_snapshot(self, t_ns: int) -> int:

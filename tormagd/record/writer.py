@@ -1,9 +1,8 @@
 """Writing a recording or a black box: MCAP, compressed with zstd.
 
-`/core` has the journal's entries as they came, in msgpack, for a replay. Of those `/ticks` and `/frames` are derived, a
-message for every control tick and every piece between daemon and device; `/telemetry` has the daemon's snapshots. These
-are JSON with plain schemas, which Foxglove and PlotJuggler open: a number there cannot be null, so what is not known is
-left out. An overview stands at the end.
+`/core` has the journal's entries as they came, in msgpack, for a replay. `/ticks` and `/frames` are derived of them,
+and `/telemetry` has snapshots, in JSON with plain schemas, for Foxglove and PlotJuggler: a number there cannot be null,
+so what is not known is left out. An overview stands at the end.
 """
 
 import contextlib
@@ -66,7 +65,7 @@ class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def frames_in(entry: Any) -> list[Frame]:
-    """Return the frames in one entry of the journal, in their order; empty for an entry of another kind."""
+    """Return the frames in one entry of the journal."""
     if not isinstance(entry, list) or not entry or entry[0] not in (READ, WROTE):
         return []
     direction, time_s, raw, *_ = entry
@@ -77,7 +76,7 @@ def frames_in(entry: Any) -> list[Frame]:
 
 
 def is_tick(entry: Any) -> bool:
-    """Return whether an entry of the journal is a tick: a list that begins with an integer."""
+    """Return whether an entry is a tick: a list that begins with an integer."""
     return isinstance(entry, list) and bool(entry) and type(entry[0]) is int
 
 
@@ -89,7 +88,7 @@ class Derived:
         self._numbers = {TICKS_TOPIC: count(), FRAMES_TOPIC: count(1)}
 
     def of(self, columns: Sequence[str], entries: Sequence[Any]) -> Iterator[Shown]:
-        """Yield the messages derived from some entries, in their order: one a tick, one a frame."""
+        """Yield a message for each tick and frame."""
         monotonic_at = columns.index("monotonic_s") if "monotonic_s" in columns else 0
         for tick in filter(is_tick, entries):  # frames before it have its offset
             self.axis.of_tick(tick[0], tick[monotonic_at])
@@ -182,7 +181,7 @@ class RecordingWriter:
             self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write a batch: all it has for a replay, and each tick as a message, or some of the ticks alone."""
+        """Write a batch; of ticks that are thinned, nothing for a replay."""
         entries = [list(row) for row in batch.rows]
         if batch.core and self._thinning.every == 1:
             entries = msgspec.msgpack.decode(batch.core, type=list[Any])
@@ -191,7 +190,7 @@ class RecordingWriter:
             self._rotate(self._folder)
 
     def entries(self, columns: Sequence[str], entries: Sequence[Any], core: bytes) -> None:
-        """Write entries of the journal, which `core` has as they came: first it, then what is derived, thinned."""
+        """Write `core`, which has these entries, and then what is derived of them."""
         shown = list(self._derived.of(columns, entries))
         if core and self._thinning.every == 1:
             self._add(Shown(CORE_TOPIC, shown[-1].t_ns if shown else self._chunk_ns, 0, core))
