@@ -93,8 +93,8 @@ def commands_page() -> str:
 def ticks_page() -> str:
     return """# Control ticks: every column
 
-`python tools/reference_pages.py` writes this page from the core's records; [messages](../messages.md#tickrecord) says
-what they mean.
+`python tools/reference_pages.py` writes this page from the core's records. Their meaning is in
+[messages](../messages.md#control-ticks).
 
 """ + "".join(
         f"- {name}: {', '.join(f'`{each}`' for each in columns)}\n"

@@ -166,7 +166,7 @@ def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: Ca
 def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, is_heard: bool
 ) -> None:
-    rig.box.is_heard = is_heard  # a recorder goes on without a keeper
+    rig.box.is_heard = is_heard
     monkeypatch.setattr("tormagd.daemon.child_process.start_child", rig.start)
     waits: list[float] = []
     for _ in range(4):
@@ -185,7 +185,7 @@ def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(
     assert names(part)[:4] == ["missing", "state", "step", "tick"]
     rig.its.close()
     rig.box.look()
-    path = rig.box.write("SKEW", 0.0, {})  # the next one is asked for what a fault needs meanwhile
+    path = rig.box.write("SKEW", 0.0, {})
     monkeypatch.setattr(rig.box, "_due_s", ended_s)
     assert rig.box.is_missing
     rig.box.look()

@@ -135,7 +135,7 @@ def test_the_pages_of_reference_are_those_of_the_types():
     assert (ROOT / "docs/reference/configuration.md").read_text(encoding="utf-8") == configuration_page()
     assert (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8") == commands_page()
     assert (ROOT / "docs/reference/ticks.md").read_text(encoding="utf-8") == ticks_page()
-    told = (ROOT / "docs/messages.md").read_text(encoding="utf-8").partition("### TickRecord\n")[2]
+    told = (ROOT / "docs/messages.md").read_text(encoding="utf-8").partition("## Control ticks\n")[2]
     assert set(re.findall(r"^- `(\w+)`:", told, re.MULTILINE)) - {*COLUMNS} == set()
 
 

@@ -47,7 +47,7 @@ OF_CORE = (
     "core_sha256",
     "columns",
 )
-"What a replay needs beside what `describe` says anyway."
+"What a replay needs beside what `describe` says."
 SNAPSHOT_S = 1.0
 "Time between snapshots: a replay may begin at each."
 AFTER_FAULT_S = 2.0
@@ -90,7 +90,6 @@ class BlackBox:
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
         self._due_s, self.is_heard = math.inf, False
-        "When another keeper is due, and whether there are recorders."
         self.journal, self._packer = Journal(is_kept=False), Packer()
         if folder is None:
             self._refusal = "no folder is named for black boxes"
@@ -119,10 +118,9 @@ class BlackBox:
         self._snapshot(stepper, planner)
 
     def ticked(self, record: Any, stepper: Stepper, planner: Planner) -> tuple[bytes, bytes] | None:
-        """Add a control period's tick to the journal, and encode all entries since the last call; return a part that is
-        whole, and its ticks' rows."""
+        """Add a tick to the journal, and encode all entries since the last; return a whole part, and its rows."""
         was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
-        if not (was_kept and self.journal.is_kept):  # nobody listens, or begins to: from the end of this period
+        if not (was_kept and self.journal.is_kept):  # from the end of this period
             self._forget()
             self._ticks = 0
             self.journal.note(MISSING)
@@ -155,9 +153,8 @@ class BlackBox:
                 f"there is no black box: {self._refusal}",
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
-        now_ns = time.time_ns()
-        stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000))
-        name = f"{stamp}.{now_ns // 1_000_000 % 1_000:03d}Z-{reason}.mcap"
+        now_ms = time.time_ns() // 1_000_000
+        name = time.strftime(f"%Y%m%dT%H%M%S.{now_ms % 1_000:03d}Z-{reason}.mcap", time.gmtime(now_ms // 1_000))
         if reason == REQUEST:
             if len(self._requested) >= MAX_REQUESTED:
                 raise RefusedError(
@@ -171,7 +168,7 @@ class BlackBox:
 
     @property
     def is_missing(self) -> bool:
-        """Whether the keeper has ended, and another one has not begun; what a fault asks for meanwhile waits for it."""
+        """Whether another keeper is due."""
         return self._due_s < math.inf
 
     def look(self) -> None:
@@ -210,7 +207,7 @@ class BlackBox:
             self._send(End())
             self._beside, self._due_s = None, math.inf
             beside.close()
-            with contextlib.suppress(subprocess.TimeoutExpired):  # it goes on writing
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
 
     def _send_requests(self) -> None:

@@ -45,12 +45,11 @@ STEP = "step"
 PLAN, FORESEE, AFRESH = "plan", "foresee", "afresh"
 "`[PLAN, now_s, setpoint]`, `[FORESEE]`; `[AFRESH, now_s]` where one of them failed, and planning began anew."
 TEACH, CONFIRM, ANSWER = "teach", "confirm", "answer"
-"""What is known from another day, the operator's word in a dispute ("device" has changed, or "sensor" is wrong), and
-what a search beside the plans has found."""
+"What is known from another day, an operator's word in a dispute, and what a search beside the plans found."
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 "`[COMMAND, name, now_s, is_refused, conditions]`, `[LATCH, fault]`, `[LOSE_LINK]`."
 CONNECTED = "connected"
-"`[CONNECTED, memory]`: a conversation began from this state, or with None is over. READ and WROTE are in `ticks`."
+"`[CONNECTED, memory]`: a conversation began, or with None is over. READ and WROTE are in `ticks`."
 STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."
@@ -63,7 +62,7 @@ Entry = Any
 
 
 def core_hash(config: Config, scene: Scene, model: str) -> str:
-    """Return what tells one core from another: snapshots of others are not those of a replay."""
+    """Return what tells one core from another."""
     return hashlib.sha256(msgspec.json.encode((config, scene, model))).hexdigest()
 
 

@@ -27,7 +27,7 @@ TIME_COLUMN = "t_ns"
 
 
 def _columns(record: type[Value], prefix: str, without: str, named: Mapping[str, str]) -> tuple[tuple[str, ...], Any]:
-    """Return the columns of a record's fields, as `named` or behind `prefix`, and the function that reads them."""
+    """Return a record's columns, and what reads them."""
     fields = [name for name in record.__match_args__ if name not in without.split()]
     return tuple([named.get(name, prefix + name) for name in fields]), attrgetter(*fields)
 
@@ -56,7 +56,7 @@ _UNKNOWN = (None,) * len(OF_MEASUREMENT + OF_LINK)
 
 
 def kind_of(column: str) -> Any:
-    """Return the type of a column's values by its name: a time, codes, a word, or else a number or None."""
+    """Return the type of a column's values by its name."""
     if column.endswith(("limits", "faults", "switches", "outside")):
         return tuple[str, ...]
     if column in ("request", "operating_state", "drive_mode", "device_mode"):
@@ -79,7 +79,6 @@ def tick_of(
     exec_us: float,
     number: int = 0,
 ) -> Any:
-    """Return the newest tick of `stepper` as a TickRecord."""
     measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
     is_placed = measured is not None and measured.is_homed
     return TickRecord(
@@ -151,7 +150,7 @@ def snapshot(
     mark: Mark | None = None,
     beside: tuple[str, ...] = (),
 ) -> Telemetry:
-    """Return the telemetry message of a tick: fields of the same name are a tick's columns."""
+    """Return the telemetry message of a tick, with its columns of the same names."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
     fields: dict[str, Any] = {name: getattr(tick, name) for name in _SHARED}
