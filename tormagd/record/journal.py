@@ -32,7 +32,7 @@ from tormagd.record.telemetry import TickRecord
 from tormagd.record.ticks import MISSING, READ, WROTE
 from tormagd.scenes.scene import Scene
 
-FORMAT = 18
+FORMAT = 19
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
