@@ -19,6 +19,7 @@ from tormagd import config
 from tormagd.ctl import main as ctl
 from tormagd.daemon import main as daemon
 from tormagd.hardware import can_backend, serial_backend
+from tormagd.record import telemetry
 from tormagd.simulation import __main__ as simulation
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
@@ -39,7 +40,10 @@ BOUNDS = {"ge": "{}", "gt": "over {}", "le": "to {}", "lt": "under {}"}
 
 
 def main() -> int:
-    for name, page in (("configuration.md", configuration_page()), ("commands.md", commands_page())):
+    for name, page in (
+        *(("configuration.md", configuration_page()), ("commands.md", commands_page())),
+        ("ticks.md", ticks_page()),
+    ):
         (FOLDER / name).write_text(page, encoding="utf-8")
     return 0
 
@@ -84,6 +88,21 @@ def commands_page() -> str:
             if own:
                 parts.append("\n".join(own) + "\n")
     return "\n".join(parts)
+
+
+def ticks_page() -> str:
+    return """# Control ticks: every column
+
+`python tools/reference_pages.py` writes this page from the core's records. Their meaning is in
+[messages](../messages.md#control-ticks).
+
+""" + "".join(
+        f"- {name}: {', '.join(f'`{each}`' for each in columns)}\n"
+        for name, columns in (
+            *(("plan", telemetry.OF_PLAN), ("concluded", telemetry.CONCLUDED), ("duty", telemetry.OF_DUTY)),
+            *(("measurement", telemetry.OF_MEASUREMENT), ("link", telemetry.OF_LINK)),
+        )
+    )
 
 
 def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:

@@ -35,7 +35,6 @@ from tormagd_client.messages import (
     Status,
     Telemetry,
     Tick,
-    TickRecord,
     Verdict,
     WayReport,
 )
@@ -83,15 +82,8 @@ V1: dict[type[msgspec.Struct], str] = {
     Explained: "code cause remedy",
     StallReport: "ms culprit",
     BlackBoxReport: "folder newest refusal dropped",
-    TickRecord: "t_ns monotonic_s plan setpoint_cf plan_setpoint_age_s governed_cf plan_governed_cf predicted_cf "
-    "field_mT plan_gap_mm plan_gap_speed_mm_s plan_gap_acceleration_mm_s2 plan_least_gap_mm plan_limits plan_outside "
-    "plan_sensor_doubted_s foresight plan_time_s confidence trim measurement received_s delay_s sensed_s "
-    "reported_s link_unanswered link_damaged link_unsent link_round_trip_s device_clock_drift device_time_s "
-    "device_left_mm device_right_mm device_handle_mm device_force_N device_mode device_switches device_faults "
-    "device_temperature_C left_current_A right_current_A supply_V reference_gap_mm measured_cf left_mm right_mm "
-    "handle_mm handle_rate_mm_s operating_state limits step_limits faults drive_mode left_duty right_duty request "
-    "request_number lateness_us exec_us tick search_age_s",
-    Description: "version build configuration scene model profile firmware serial_number portrait configuration_file",
+    Description: "version build configuration scene model profile firmware serial_number portrait configuration_file "
+    "core",
     PortraitReport: "force_N rate_N_s",
 }
 "The keys of `v: 1`, with the meaning and the unit of docs/messages.md."

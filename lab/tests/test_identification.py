@@ -24,7 +24,7 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
 from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
-from tormagd.record.telemetry import tick_record
+from tormagd.record.telemetry import COLUMNS as OF_TICK, tick_of
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd.simulation.closed_loop import ClosedLoop
@@ -32,7 +32,7 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.static_laws import pull_of_magnets_N
-from tormagd_client.messages import VERSION, TickRecord
+from tormagd_client.messages import VERSION
 
 MASS, VISCOUS, COULOMB, OFFSET, GAIN, DELAY_S = 80.0, 150.0, 12.0, -2.0, 30.0, 0.003
 
@@ -231,10 +231,10 @@ def record(path: Path, plant: PlantParameters) -> None:
             at_s = number * 1e-3
             force_N = LEVELS_N[int(at_s / 2.0) % len(LEVELS_N)] + 0.1 * math.sin(math.tau * 1.2 * at_s)
             sample = loop.tick(TimedSetpoint(force_N, loop.now_s, 0.25))
-            made = tick_record(loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, number)
+            made = tick_of(loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, number)
             rows.append(msgspec.structs.replace(made, t_ns=round(sample.time_s * 1e9), monotonic_s=sample.time_s))
             if len(rows) == 20:
-                batch = {"v": VERSION, "columns": TickRecord.__struct_fields__, "rows": rows}
+                batch = {"v": VERSION, "columns": OF_TICK, "rows": rows}
                 writer.ticks(decode_ticks(msgspec.msgpack.encode(batch)))
                 rows.clear()
 

@@ -15,17 +15,16 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.record.telemetry import tick_record
+from tormagd.record.telemetry import COLUMNS as OF_TICK, tick_of
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, ReversingHand
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.plant import Truth
-from tormagd_client.messages import TickRecord
 
 CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
-PLACES = [TickRecord.__struct_fields__.index(name) for name in COLUMNS]
+PLACES = [OF_TICK.index(name) for name in COLUMNS]
 MONOTONIC = COLUMNS.index("monotonic_s")
 Altered = Callable[[float, Message], Message]
 
@@ -87,9 +86,9 @@ class Bench:
             for _ in range(self._stall_ticks if number == 0 else 0):
                 self.loop.skip()
             sample = self.loop.tick(setpoint)
-            record = tick_record(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
+            record = tick_of(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
             row = msgspec.to_builtins(record)
-            row[TickRecord.__struct_fields__.index("monotonic_s")] = sample.time_s
+            row[OF_TICK.index("monotonic_s")] = sample.time_s
             rows.append([row[place] for place in PLACES])
         return Heard(self.loop.now_s, rows)
 

@@ -18,6 +18,7 @@ from tormagd.daemon import admission
 from tormagd.daemon.admission import AT_ONCE, PLAIN
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.ground.access_keys import KeyRing
+from tormagd.record.ticks import encode_ticks
 from tormagd_client.endpoints import Curve, Endpoints
 from tormagd_client.keys import KeyPair, fingerprint, generate, load_pair
 from tormagd_client.messages import VERSION, Reply, Request, decode, encode
@@ -90,7 +91,7 @@ class Rig:
             self.endpoint.admission.update()
             self.endpoint.tell(time.monotonic())
             self.endpoint.hear()
-            self.endpoint.publish_ticks([(1,)], ("a",))
+            self.endpoint.publish_ticks(encode_ticks([(1,)], ("a",)))
             time.sleep(0.002)
 
     def answer(self, request: Request) -> dict[str, Any]:

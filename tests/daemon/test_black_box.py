@@ -20,9 +20,9 @@ from tormagd.daemon.profiles import state_folder
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.record.journal import MAX_ENTRIES, TEACH, Journal
-from tormagd.record.keeper_messages import Begin, End, Part, Said, Write, Written
-from tormagd.record.telemetry import tick_record
+from tormagd.record.journal import MAX_ENTRIES, PLAN, STEP, TEACH, Journal
+from tormagd.record.keeper import Begin, End, Part, Said, Write, Written
+from tormagd.record.telemetry import tick_of
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
@@ -54,9 +54,9 @@ class Rig:
 
     def tick(self, times: int = 1) -> None:
         for _ in range(times):
-            self.box.journal.stepped()
+            self.box.journal.note(STEP)
             self.box.ticked(
-                tick_record(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
+                tick_of(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
             )
 
     def heard(self) -> list[Said]:
@@ -81,7 +81,7 @@ def names(part: Part) -> list[str]:
 
 def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) -> None:
     rig.tick(PART_TICKS // 2 - 1)
-    rig.box.journal.planned(1.0, TimedSetpoint(1.5, 1.0, 0.1))
+    rig.box.journal.note(PLAN, 1.0, TimedSetpoint(1.5, 1.0, 0.1))
     first, *parts = rig.heard()
     for _ in range(302):
         rig.tick(10)
@@ -162,7 +162,11 @@ def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: Ca
     rig.box.close()
 
 
-def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_heard", [False, True])
+def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, is_heard: bool
+) -> None:
+    rig.box.is_heard = is_heard
     monkeypatch.setattr("tormagd.daemon.child_process.start_child", rig.start)
     waits: list[float] = []
     for _ in range(4):
@@ -170,16 +174,23 @@ def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(rig: Rig, mon
         ended_s = time.monotonic()
         rig.box.look()
         waits.append(round(rig.box._due_s - ended_s))
+        rig.tick(3)
         monkeypatch.setattr(rig.box, "_due_s", ended_s)
         rig.box.look()
-    assert (waits, rig.box.report().refusal) == ([1, 2, 4, 8], "")  # none lived for long
+    assert (waits, rig.box.report().refusal) == ([1] * 4, "")
     rig.tick(PART_TICKS + 1)
     begun, part = rig.heard()
     assert begun == Begin("/boxes", {"format": "1"}, is_again=True)
     assert isinstance(part, Part)
     assert names(part)[:4] == ["missing", "state", "step", "tick"]
-    rig.box.write("SKEW", 0.0, {})
-    assert len(rig.heard()) == 1
+    rig.its.close()
+    rig.box.look()
+    path = rig.box.write("SKEW", 0.0, {})
+    monkeypatch.setattr(rig.box, "_due_s", ended_s)
+    assert rig.box.is_missing
+    rig.box.look()
+    rig.box.look()
+    assert (rig.heard()[1:], rig.box.is_missing) == ([Write(path.name, "SKEW", 0.0, {})], False)
 
 
 def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) -> None:
@@ -200,7 +211,7 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     assert state_folder("", "blackbox") is None
     box = BlackBox(None, {}, 1_000)
     box.begin(core.stepper(), core.planner(), closed_loop(core).connection)
-    box.journal.stepped()
+    box.journal.note(STEP)
     assert box.journal.take() == []
     with pytest.raises(RefusedError, match="no folder is named"):
         box.write("REQUEST", 0.0, {})
@@ -232,6 +243,6 @@ def test_what_is_not_there_is_named_and_no_reason_not_to_run(
 def test_a_journal_that_nobody_takes_is_bounded_and_says_so() -> None:
     journal = Journal()
     for _ in range(3 * MAX_ENTRIES + 5):
-        journal.stepped()
+        journal.note(STEP)
     entries = journal.take()
     assert (entries[0], len(entries) < MAX_ENTRIES) == (("missing",), True)

@@ -24,6 +24,7 @@ from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
 from tormagd.daemon.listeners import PEERS as MOST_LISTENERS, TOPICS, Listeners
 from tormagd.daemon.peers import PEERS, Allowance, Peer
 from tormagd.daemon.requests import FIRST, WAITING, WAITING_PER_CLIENT, Requests, Waiting, may_go_first
+from tormagd.record.ticks import encode_ticks
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import (
     MOTION_TOPIC,
@@ -134,7 +135,7 @@ class Rig:
         """Publishes on both sockets."""
         self.endpoint.hear()
         self.endpoint.publish(TELEMETRY)
-        self.endpoint.publish_ticks([(1,)], ("a",))
+        self.endpoint.publish_ticks(encode_ticks([(1,)], ("a",)))
 
     def is_answered(self) -> bool:
         """Whether a new client has its status."""
@@ -215,12 +216,17 @@ def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
 
     def tell() -> None:
         rig.endpoint.hear()
-        rig.endpoint.publish_ticks(rows, ("a",))
+        rig.endpoint.publish_ticks(encode_ticks(rows, ("a",)))
 
     rig.until(lambda: subscriber.poll(5) > 0, tell)
     for _ in range(5_000):
-        rig.endpoint.publish_ticks(rows, ("a", "b"))
-    assert msgpack.unpackb(subscriber.recv()) == {"v": VERSION, "columns": ["a"], "rows": [list(range(30))] * 100}
+        rig.endpoint.publish_ticks(encode_ticks(rows, ("a", "b")))
+    assert msgpack.unpackb(subscriber.recv()) == {
+        "v": VERSION,
+        "columns": ["a"],
+        "rows": [list(range(30))] * 100,
+        "core": b"",
+    }
 
 
 def test_a_topic_has_listeners_only_where_it_was_asked_for_by_its_name(rig: Rig) -> None:

@@ -27,6 +27,9 @@ from tormagd.daemon.beat import KERNEL, Beat, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.backend import BackendError
+from tormagd.record.telemetry import COLUMNS
+from tormagd.record.ticks import decode_ticks
+from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import VirtualPort
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
@@ -273,10 +276,18 @@ def test_however_seldom_telemetry_is_told_every_tick_is_recorded(
 ) -> None:
     running.start(Rates(telemetry_hz=5))
     endpoint, numbers = running.daemon._endpoint, list[int]()
-    monkeypatch.setattr(endpoint, "publish_ticks", lambda rows: numbers.extend(row.tick for row in rows))
+    at = COLUMNS.index("tick")
+
+    def note(data: bytes) -> None:
+        batch = decode_ticks(data)
+        told = [row[at] for row in batch.rows]
+        assert told == [entry[at] for entry in msgspec.msgpack.decode(batch.core) if is_tick(entry)]
+        numbers.extend(told)
+
+    monkeypatch.setattr(endpoint, "publish_ticks", note)
     monkeypatch.setattr(endpoint.admission, "connections", lambda: Counter(recording=1))
     running.tick(450)
-    assert numbers == [*range(numbers[0], numbers[0] + 400)]
+    assert numbers == [*range(numbers[0], numbers[0] + 440)]
 
 
 def test_a_daemon_describes_what_it_runs(alone: Running) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from reference_pages import commands_page, configuration_page, keys, subparsers, tables
+from reference_pages import commands_page, configuration_page, keys, subparsers, tables, ticks_page
 
 from firmware_protocol.conformance import __main__ as conformance
 from tormag_lab.pages import KEY, figures_of, stamp
@@ -20,6 +20,7 @@ from tormagd.ctl.commands import COMMANDS
 from tormagd.daemon import main as daemon
 from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
+from tormagd.record.telemetry import COLUMNS
 from tormagd.scenes.measured import measured
 from tormagd.simulation import __main__ as simulation
 
@@ -133,6 +134,9 @@ def test_every_table_of_a_configuration_that_is_shown_is_taken(page):
 def test_the_pages_of_reference_are_those_of_the_types():
     assert (ROOT / "docs/reference/configuration.md").read_text(encoding="utf-8") == configuration_page()
     assert (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8") == commands_page()
+    assert (ROOT / "docs/reference/ticks.md").read_text(encoding="utf-8") == ticks_page()
+    told = (ROOT / "docs/messages.md").read_text(encoding="utf-8").partition("## Control ticks\n")[2]
+    assert set(re.findall(r"^- `(\w+)`:", told, re.MULTILINE)) - {*COLUMNS} == set()
 
 
 def test_every_key_of_the_configuration_says_what_it_is_for():

@@ -114,22 +114,22 @@ FILES: dict[str, Callable[[], bytes]] = {
 }
 BOXES: dict[str, Callable[[], bytes]] = {
     "entries of brackets": lambda: messages(
-        b"\x91" * 100_000 + b"\xc0", topic="/core", encoding="msgpack", header={"a": ""}
+        b"\x91" * 100_000 + b"\xc0", topic="/core", encoding="msgpack", header={"format": ""}
     ),
     "an array that says 2^32": lambda: messages(
-        b"\xdd\xff\xff\xff\xff", topic="/core", encoding="msgpack", header={"a": ""}
+        b"\xdd\xff\xff\xff\xff", topic="/core", encoding="msgpack", header={"format": ""}
     ),
     "a hundred million entries": lambda: messages(
         *[b"\xdd" + struct.pack(">I", 6_000_000) + b"\xc0" * 6_000_000] * 12,
         topic="/core",
         encoding="msgpack",
-        header={"a": ""},
+        header={"format": ""},
     ),
     "columns of brackets": lambda: messages(
-        msgpack.packb(["step"]), topic="/core", encoding="msgpack", header={"columns": "[" * 200_000}
+        msgpack.packb(["step"]), topic="/core", encoding="msgpack", header={"format": "", "columns": "[" * 200_000}
     ),
     "columns that are a number": lambda: messages(
-        msgpack.packb(["step"]), topic="/core", encoding="msgpack", header={"columns": "5"}
+        msgpack.packb(["step"]), topic="/core", encoding="msgpack", header={"format": "", "columns": "5"}
     ),
     "no header, and a long recording": lambda: messages(*[b"{}"] * 10_000),
 }

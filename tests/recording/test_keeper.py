@@ -14,16 +14,30 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.daemon.black_box import KEEPER
 from tormagd.record import keeper
-from tormagd.record.black_box import is_tick, read_black_box
-from tormagd.record.keeper import DIED, KEPT_S, MAX_BYTES, MAX_DUE, MAX_FILES, Ring, ring_paths
-from tormagd.record.keeper_messages import Begin, End, Part, Said, Write, Written
+from tormagd.record.black_box import read_black_box
+from tormagd.record.keeper import (
+    DIED,
+    KEPT_S,
+    MAX_BYTES,
+    MAX_DUE,
+    MAX_FILES,
+    Begin,
+    End,
+    Part,
+    Ring,
+    Said,
+    Write,
+    Written,
+    ring_paths,
+)
+from tormagd.record.writer import is_tick
 
 PATIENCE_S = 60.0
-HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}
+HEADER = {"format": "0", "columns": json.dumps(["t_ns", "x"])}
 
 
 def part(time_s: float, size: int = 100) -> Part:
-    return Part(time_s, round(time_s * 1e9), bytes(size))
+    return Part(time_s, bytes(size))
 
 
 def kept(ring: Ring) -> int:
@@ -101,7 +115,7 @@ def process() -> Iterator[Process]:
 
 def ticks(first: int, count: int) -> Part:
     entries = [item for number in range(first, first + count) for item in ("step", [number, 0.5])]
-    return Part(first * 1e-3, first, msgspec.msgpack.encode(entries))
+    return Part(first * 1e-3, msgspec.msgpack.encode(entries))
 
 
 def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process, tmp_path: Path) -> None:
@@ -128,7 +142,7 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     process.say(Write("x.mcap", "SKEW", 0.0, {}))
     assert "x.mcap" in process.heard().refusal
     # so does a part that is none
-    process.say(Begin(str(folder), HEADER), Part(0.0, 1, b"\xc1"), Write("y.mcap", "SKEW", 0.0, {}))
+    process.say(Begin(str(folder), HEADER), Part(0.0, b"\xc1"), Write("y.mcap", "SKEW", 0.0, {}))
     assert process.heard().refusal.startswith(f"{folder}/y.mcap: DecodeError")
     # no word, no daemon: it was killed. Each beginning is of another scene, and keeps nothing of the one before
     process.say(Begin(str(folder), HEADER), ticks(41, 20), Write("2031Z-LATER.mcap", "LATER", 3_600.0, {}))

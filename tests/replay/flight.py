@@ -19,17 +19,15 @@ from tormagd.daemon.black_box import header
 from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
-from tormagd.record.black_box import is_tick, write_black_box
-from tormagd.record.journal import Journal, Packer
-from tormagd.record.keeper import Ring
-from tormagd.record.keeper_messages import Part
+from tormagd.record.black_box import write_black_box
+from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal, Packer, core_hash
+from tormagd.record.keeper import Part, Ring
 from tormagd.record.replay.rerun import Rerun, rerun
-from tormagd.record.telemetry import tick_record
+from tormagd.record.telemetry import COLUMNS, tick_of
+from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
-from tormagd_client.messages import TickRecord
 
-COLUMNS = TickRecord.__struct_fields__
 PART_TICKS, SNAPSHOT_TICKS = 20, 500
 NS = 1_000_000_000
 
@@ -71,11 +69,11 @@ class Flight:
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
         self._inference.foresee(beat)
-        record = tick_record(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
-        self._journal.ticked(record)
+        record = tick_of(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
+        self._journal.add(record)
         self._ticks += 1
         if self._ticks % PART_TICKS == 0:
-            self.ring.put(Part(sample.time_s, record.t_ns, self._packed()))
+            self.ring.put(Part(sample.time_s, self._packed()))
             if self._ticks % SNAPSHOT_TICKS == 0:
                 self._remember()
         return sample
@@ -99,16 +97,17 @@ class Flight:
 
     def connected(self, memory: Any) -> None:
         if memory is None:
-            self._journal.lost_link()
+            self._journal.note(LOSE_LINK)
         self._journal.connected(memory)
 
     def _stepped(self) -> None:
         if not self._is_stepped:
-            self._journal.stepped()
+            self._journal.note(STEP)
         self._is_stepped = True
 
     def _remember(self) -> None:
-        self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory())
+        core = core_hash(self.core.config, self.core.scene, self.core.model)
+        self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory(), core)
 
     def _drain(self, setpoint: TimedSetpoint | None) -> bool:
         before = self._inbox.newest
@@ -116,13 +115,13 @@ class Flight:
         return setpoint is not None and (before is None or setpoint.stamp_s > before.stamp_s)
 
     def _fail(self) -> None:
-        self._journal.latched(Fault.PLAN_FAILED)
+        self._journal.note(LATCH, str(Fault.PLAN_FAILED))
         self.loop.stepper.latch(Fault.PLAN_FAILED)
 
     def _packed(self) -> bytes:
         packer = Packer()
         packer.add(self._journal.take())
-        return packer.take()
+        return packer.take()[0]
 
     def command(self, name: str) -> None:
         conditions, is_refused = self.loop.conditions(), False
@@ -130,7 +129,7 @@ class Flight:
             self.loop.command(name)
         except RefusedError:
             is_refused = True
-        self._journal.commanded(name, self.loop.now_s, conditions, is_refused=is_refused)
+        self._journal.note(COMMAND, name, self.loop.now_s, is_refused, conditions)
 
     def confirm(self, wrong: Disputed) -> None:
         self._inference.confirm(wrong)

@@ -116,10 +116,10 @@ def test_another_frame_that_was_written_is_found(core: Core, box: BlackBoxFile) 
 
 def test_a_memory_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "state", DAMAGED_TICK)
-    _, step, plan, connection = box.entries[place]
+    _, step, plan, connection, of = box.entries[place]
     link = connection["link"]["DeviceLink"]
     altered = {**connection, "link": {"DeviceLink": link | {"_least_delay_s": link["_least_delay_s"] + 1e-9}}}
-    entries = [*box.entries[:place], ["state", step, plan, altered], *box.entries[place + 1 :]]
+    entries = [*box.entries[:place], ["state", step, plan, altered, of], *box.entries[place + 1 :]]
     assert again(core, entries, SNAPSHOT_S - 0.5).difference.field == "state.connection.link._least_delay_s"
 
 

@@ -22,12 +22,14 @@ from tormagd.config import Config, Device
 from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
-from tormagd.record.black_box import BlackBoxFile, Derived, read_black_box, write_black_box
-from tormagd.record.journal import ANSWER, CONFIRM, FORMAT, MISSING
-from tormagd.record.keeper_messages import Part
+from tormagd.record.black_box import BlackBoxFile, read_black_box, write_black_box
+from tormagd.record.journal import ANSWER, CONFIRM, FORMAT
+from tormagd.record.keeper import Part
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd.record.replay.rebuild import ReplayError, differences, rebuilt, recorded
 from tormagd.record.replay.rerun import rerun, ticks_of
+from tormagd.record.ticks import MISSING
+from tormagd.record.writer import Derived
 
 CHANGED_TICK = 3_210
 TICKS = 4_000
@@ -36,7 +38,7 @@ FORMER = (
     f"format = '4', written by tormagd {__version__!r}: allowed is {FORMAT}, which tormagd {__version__} writes; "
     "replay it with the version that wrote it"
 )
-NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]
+NO_TICKS = [Part(0.0, msgspec.msgpack.encode(["step"]))]
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +212,7 @@ def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: B
     ("edit", "said"),
     [
         (
-            lambda shown: shown._replace(data=shown.data.replace(b"DISABLED", b"ENABLED")),
+            lambda shown: shown._replace(message=shown.message | {"operating_state": "ENABLED"}),
             "message 300 in /ticks is not",
         ),
         (lambda shown: shown._replace(t_ns=shown.t_ns + 1), "message 300 in /ticks is not"),
@@ -224,8 +226,8 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
     head = box.entries[: list(ticks_of(COLUMNS, box.entries))[600]]
     derived = Derived.of
 
-    def other(self: Derived, entries: Any) -> Any:
-        for shown in derived(self, entries):
+    def other(self: Derived, columns: Any, entries: Any) -> Any:
+        for shown in derived(self, columns, entries):
             is_it = shown.topic == "/ticks" and shown.sequence == 300
             if not is_it:
                 yield shown
@@ -233,7 +235,7 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
                 yield edited
 
     monkeypatch.setattr(Derived, "of", other)
-    write_black_box(tmp_path / "edited.mcap", box.header, [Part(0.0, 1, msgspec.msgpack.encode(head))])
+    write_black_box(tmp_path / "edited.mcap", box.header, [Part(0.0, msgspec.msgpack.encode(head))])
     monkeypatch.undo()
     assert read_black_box(tmp_path / "edited.mcap").odd.startswith(said)
 
@@ -264,7 +266,7 @@ def stated(path: Path, header: dict[str, str], encoding: str, data: bytes) -> Pa
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        writer.add_metadata("black_box", header)
+        writer.add_metadata("tormagd", header)
         channel = writer.register_channel(topic="/core", message_encoding=encoding, schema_id=0)
         writer.add_message(channel, log_time=1, data=data, publish_time=1)
         writer.finish()
@@ -299,12 +301,12 @@ def test_random_and_damaged_bytes_are_refused(path: Path, tmp_path: Path) -> Non
 
 
 def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
-    assert "allowed is msgpack" in refusal(stated(tmp_path / "other.mcap", {}, "json", b"{}"))
+    assert "no black box" in refusal(stated(tmp_path / "other.mcap", {}, "json", b"{}"))
     for number, (header, said) in enumerate(
         (
             (box.header | {"format": "4"}, FORMER),
-            (box.header | {"config": '{"scene": "pulse"}'}, "config: its hash"),
-            (box.header | {"model_sha256": "f" * 64}, "the model with the hash 'ffffffffffff'"),
+            (box.header | {"configuration": '{"scene": "pulse"}'}, "configuration: its hash"),
+            (box.header | {"model": "f" * 64}, "the model with the hash 'ffffffffffff'"),
             (box.header | {"columns": json.dumps(["t_ns"])}, "no column 'monotonic_s'"),
             ({name: text for name, text in box.header.items() if name != "scene"}, "its header has no 'scene'"),
             (box.header, "no tick in it"),

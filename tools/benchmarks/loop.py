@@ -43,7 +43,7 @@ from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.headroom.bare_timer import beat
-from tormagd.record.ticks import listening
+from tormagd.record.ticks import encode_ticks, listening
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request
@@ -382,7 +382,7 @@ async def _bare(config: Config) -> None:
             left -= endpoint.serve(reply, left)
         rows.append((time.time_ns(), (now_ns - heartbeat.due_ns) * 1e-3, 0.0))
         if len(rows) >= TELEMETRY_EVERY:
-            endpoint.publish_ticks(rows, ("t_ns", "lateness_us", "exec_us"))
+            endpoint.publish_ticks(encode_ticks(rows, ("t_ns", "lateness_us", "exec_us")))
             rows.clear()
             left = endpoint.requests.count
 

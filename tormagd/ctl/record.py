@@ -79,12 +79,12 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
-    """Ask the daemon what it runs, as a recording's metadata."""
+    """Ask the daemon what it runs, as metadata."""
     with Client(endpoints, wait_s) as client:
         known = msgspec.to_builtins(client.describe())
     return {
         name: value if isinstance(value, str) else msgspec.json.encode(value).decode()
-        for name, value in known.items()
+        for name, value in (known | known.pop("core")).items()
         if value is not None
     }
 

@@ -11,6 +11,7 @@ from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.control.safety.operating_state import next_commands
 from tormagd.daemon.beat import Beat, Phases
+from tormagd.daemon.black_box import OF_CORE
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.commands import Commands
 from tormagd.daemon.control_loop import ControlLoop
@@ -97,6 +98,7 @@ class Answers:
                 rate_N_s=tuple(round(scaled_mm_s * slope, 4) for slope in portrait.slope_N_mm[::PORTRAIT_STEP]),
             ),
             configuration_file=self._config_file,
+            core={name: self._commands.box.begun.header[name] for name in OF_CORE},
         )
 
     def status(self) -> Status:

@@ -1,13 +1,13 @@
-"""The black box: hands all inputs of the core, and all traffic with the device, to a process that keeps the newest.
+"""The stream: all inputs of the core, and all traffic with the device, for the black box's process and for recorders.
 
-The control thread writes references into a journal, and encodes them behind each tick. The entries of 20 ticks go into
-a socket. It never waits: what the socket does not take is lost and counted. That process writes the files, and outlives
-the daemon, however the daemon ends.
+The control thread writes references into a journal, and encodes them once, behind each tick. The entries of 20 ticks go
+to recorders by ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not
+take is lost and counted. That process writes the files, and outlives the daemon, however the daemon ends.
 """
 
+import contextlib
 import hashlib
 import importlib.util
-import json
 import logging
 import math
 import socket
@@ -15,6 +15,7 @@ import subprocess
 import time
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -26,23 +27,35 @@ from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
-from tormagd.record.journal import FORMAT, Journal, Packer
-from tormagd.record.keeper_messages import REQUEST, Begin, End, Part, Said, Write, Written
-from tormagd_client.messages import BlackBoxReport, TickRecord
+from tormagd.record.journal import FORMAT, Journal, Packer, core_hash
+from tormagd.record.keeper import REQUEST, Begin, End, Part, Said, Write, Written
+from tormagd.record.telemetry import COLUMNS
+from tormagd.record.ticks import MISSING
+from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
 "The keeper's main module, with its socket's descriptor as the argument."
 PART_TICKS = 20
 "Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
+OF_CORE = (
+    "format",
+    "sources_sha256",
+    "platform",
+    "configuration_sha256",
+    "scene_sha256",
+    "scene_folder",
+    "core_sha256",
+    "columns",
+)
+"What a replay needs beside what `describe` says."
 SNAPSHOT_S = 1.0
 "Time between snapshots: a replay may begin at each."
 AFTER_FAULT_S = 2.0
 "How long a black box goes on after its fault: the gap opens."
 BUFFER_BYTES = 4_000_000
 "Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
-LEAVING_S = 2.0
-AGAIN_S = 1.0, 60.0
-"How soon a keeper that has ended is replaced: after a long life, and at most."
+LEAVING_S, AGAIN_S = 2.0, 1.0
+"How long the end of a keeper is waited for, and how soon one that has ended is replaced."
 MAX_REQUESTED, MAX_ASKED = 8, 28
 "Boxes that somebody asked for and that are still to be written, at most; and all that wait for the keeper."
 
@@ -50,7 +63,7 @@ log = logging.getLogger(__name__)
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
-    """Return the header of a black box of `core`: what a replay needs to build the same core again."""
+    """Return what a replay needs to build the same core again."""
     configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
         "format": str(FORMAT),
@@ -58,13 +71,14 @@ def header(config: Config, core: Core) -> dict[str, str]:
         "build": str(settle()),
         "sources_sha256": sources_hash(),
         "platform": platform_name(),
-        "config": configured.decode(),
-        "config_sha256": hashlib.sha256(configured).hexdigest(),
+        "configuration": configured.decode(),
+        "configuration_sha256": hashlib.sha256(configured).hexdigest(),
         "scene": scene.decode(),
         "scene_sha256": hashlib.sha256(scene).hexdigest(),
         "scene_folder": str(core.models),
-        "model_sha256": core.model,
-        "columns": json.dumps(TickRecord.__struct_fields__),
+        "model": core.model,
+        "core_sha256": core_hash(core.config, core.scene, core.model),
+        "columns": msgspec.json.encode(COLUMNS).decode(),
     }
 
 
@@ -72,10 +86,10 @@ class BlackBox:
     """Hands the core's journal to the keeper, a process that writes black boxes into `folder`."""
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
-        self._folder, self._begun = folder, Begin(str(folder), header)
+        self._folder, self.begun = folder, Begin(str(folder), header)
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
-        self._started_s, self._due_s, self._wait_s = -math.inf, math.inf, 0.5 * AGAIN_S[0]
+        self._due_s, self.is_heard = math.inf, False
         self.journal, self._packer = Journal(is_kept=False), Packer()
         if folder is None:
             self._refusal = "no folder is named for black boxes"
@@ -83,7 +97,7 @@ class BlackBox:
             self._refusal = "mcap is not installed: pip install 'tormagd[record]'"
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
-            self._start(self._begun)
+            self._start(self.begun)
         self.journal.is_kept = not self._refusal
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
@@ -93,56 +107,54 @@ class BlackBox:
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with a snapshot of both states, which are those before the first tick."""
-        if self._started_s > -math.inf:
-            self._connection, connection.traffic = connection, self.journal
+        self._connection, connection.traffic = connection, self.journal
         self._snapshot(stepper, planner)
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
         """Begin anew with the core of another scene, from a snapshot of these states."""
-        self.journal.take()
-        self._packer.take()
-        self._begun = Begin(str(self._folder), header)
-        self._send(self._begun)
+        self._forget()
+        self.begun = Begin(str(self._folder), header)
+        self._send(self.begun)
         self._snapshot(stepper, planner)
 
-    def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
-        """Add the record of a control period to the journal, and encode all entries since the last call."""
-        if self._beside is None:
-            return
-        if not self.journal.is_kept:  # another keeper has begun: from the end of this period
-            self.journal.is_kept, self._ticks = True, 0
-            self.journal.missed()
+    def ticked(self, record: Any, stepper: Stepper, planner: Planner) -> tuple[bytes, bytes] | None:
+        """Add a tick to the journal, and encode all entries since the last; return a whole part, and its rows."""
+        was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
+        if not (was_kept and self.journal.is_kept):  # from the end of this period
+            self._forget()
+            self._ticks = 0
+            self.journal.note(MISSING)
             self._snapshot(stepper, planner)
-            return
-        self.journal.ticked(record)
+            return None
+        self.journal.add(record)
         try:
             self._packer.add(self.journal.take())
         except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
             self._stop(f"an entry that cannot be written: {error}")
-            return
+            return None
         self._ticks += 1
         if self._ticks % PART_TICKS:
-            return
-        entries = self._packer.take()
-        is_taken = self._send(Part(record.monotonic_s, record.t_ns, entries))
+            return None
+        part, rows = self._packer.take()
+        is_taken = self._beside is None or self._send(Part(record.monotonic_s, part))
         if not is_taken:
             self._dropped += 1
-            self.journal.missed()
+            self.journal.note(MISSING)
         if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
             self._snapshot(stepper, planner)
+        return part, rows
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
         the ms."""
-        if self._folder is None or self._beside is None:
+        if self._folder is None or (self._beside is None and (reason == REQUEST or not self.is_missing)):
             raise RefusedError(
                 "no_black_box",
                 f"there is no black box: {self._refusal}",
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
-        now_ns = time.time_ns()
-        stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000))
-        name = f"{stamp}.{now_ns // 1_000_000 % 1_000:03d}Z-{reason}.mcap"
+        now_ms = time.time_ns() // 1_000_000
+        name = time.strftime(f"%Y%m%dT%H%M%S.{now_ms % 1_000:03d}Z-{reason}.mcap", time.gmtime(now_ms // 1_000))
         if reason == REQUEST:
             if len(self._requested) >= MAX_REQUESTED:
                 raise RefusedError(
@@ -153,6 +165,11 @@ class BlackBox:
         self._asked.append(Write(name, reason, after_s, details))
         self._send_requests()
         return self._folder / name
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether another keeper is due."""
+        return self._due_s < math.inf
 
     def look(self) -> None:
         """Send the keeper the requests that wait, and note its answers in `report` and in the log."""
@@ -170,8 +187,8 @@ class BlackBox:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
         self._stop_if_gone()
-        if self._beside is None and time.monotonic() >= self._due_s:
-            self._start(msgspec.structs.replace(self._begun, is_again=True))
+        if time.monotonic() >= self._due_s:
+            self._start(msgspec.structs.replace(self.begun, is_again=True))
 
     def report(self) -> BlackBoxReport:
         """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since
@@ -186,22 +203,21 @@ class BlackBox:
     def close(self) -> None:
         """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and
         leave it then."""
-        beside = self._beside
-        if beside is not None:
+        if (beside := self._beside) is not None:
             self._send(End())
             self._beside, self._due_s = None, math.inf
             beside.close()
-            try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
-            except subprocess.TimeoutExpired:
-                log.info("the black box is still being written, and will be there when its process has ended")
 
     def _send_requests(self) -> None:
         while self._asked and self._send(self._asked[0]):
             self._asked.popleft()
 
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
-        self.journal.snapshot(stepper, planner, None if self._connection is None else self._connection.memory())
+        if self.journal.is_kept:
+            memory = None if self._connection is None else self._connection.memory()
+            self.journal.snapshot(stepper, planner, memory, self.begun.header.get("core_sha256", ""))
 
     def _send(self, what: Said) -> bool:
         """Send one message to the keeper, and return whether the socket took it."""
@@ -215,26 +231,25 @@ class BlackBox:
 
     def _start(self, begun: Begin) -> None:
         """Start the keeper; where that fails, it is tried again."""
-        self._started_s, self._due_s = time.monotonic(), math.inf
+        self._due_s, self._refusal, self.journal.is_kept = math.inf, "", False
         try:
             self._beside = ChildProcess(KEEPER)
         except OSError as error:
             self._stop(f"the process that keeps it did not start: {error.strerror}")
             return
-        self._refusal = ""
         self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         self._send(begun)
 
     def _stop(self, reason: str) -> None:
-        """Close the socket, stop the journal, drop its entries, and start another keeper soon: the sooner, the longer
-        this one has kept."""
-        now_s = time.monotonic()
-        self._wait_s = AGAIN_S[0] if now_s - self._started_s > AGAIN_S[1] else min(2.0 * self._wait_s, AGAIN_S[1])
-        self._refusal, self._due_s = reason, now_s + self._wait_s
-        log.error("no black box is kept: %s; another one starts in %.0f s", reason, self._wait_s)
+        """Close the socket, stop the journal, drop its entries, and start another keeper soon."""
+        log.error("no black box is kept: %s; another one starts in %g s", reason, AGAIN_S)
+        self._refusal, self._due_s = reason, time.monotonic() + AGAIN_S
         if self._beside is not None:
             self._beside.close()
         self._beside = None
         self.journal.is_kept = False
+        self._forget()
+
+    def _forget(self) -> None:
         self.journal.take()
         self._packer.take()

@@ -19,7 +19,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.scene_change import SceneChange
 from tormagd.hardware.connection import Connection
-from tormagd.record.keeper_messages import REQUEST
+from tormagd.record.keeper import REQUEST
 from tormagd_client.messages import MAX_MARK_CHARACTERS, Mark, Request
 
 log = logging.getLogger(__name__)
@@ -63,12 +63,15 @@ class Commands:
 
     def keep(self, reason: str, after_s: float) -> Path:
         link = self.connection.report()
-        details = {
-            "firmware": link.firmware or "",
-            "serial_number": "" if link.serial_number is None else f"{link.serial_number:08x}",
-            "profile_sha256": self.profiles.digest if self.profiles.report().is_used else "",
-        }
-        return self.box.write(reason, after_s, details)
+        return self.box.write(
+            reason,
+            after_s,
+            {
+                "firmware": link.firmware or "",
+                "serial_number": "" if link.serial_number is None else f"{link.serial_number:08x}",
+                "profile_sha256": self.profiles.digest if self.profiles.report().is_used else "",
+            },
+        )
 
     def carry_out(self, request: Request) -> dict[str, Any]:
         """Carry out a request that changes something."""

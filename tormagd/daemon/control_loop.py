@@ -14,7 +14,7 @@ from tormagd.daemon.beat import Beat
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
-from tormagd.record.journal import Journal
+from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal
 
 REPEATED_S = 1.0
 
@@ -36,7 +36,7 @@ class ControlLoop:
     def drive(self, beat: Beat, plan: Plan) -> None:
         now_s = time.monotonic()  # not the beat's start: a stall within the beat counts, too
         self.used, self.measurement = plan, self._connection.measurement
-        self._journal.stepped()
+        self._journal.note(STEP)
         output = self.output = self.stepper.step(now_s, self.measurement, plan)
         self._connection.exchange(
             now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
@@ -71,9 +71,9 @@ class ControlLoop:
         try:
             self.stepper.command(name, now_s, conditions)
         except RefusedError:
-            self._journal.commanded(name, now_s, conditions, is_refused=True)
+            self._journal.note(COMMAND, name, now_s, True, conditions)
             raise
-        self._journal.commanded(name, now_s, conditions, is_refused=False)
+        self._journal.note(COMMAND, name, now_s, False, conditions)
         told_s, count = self._told.get(name, (-REPEATED_S, 0))
         if source is self.stepper.safety.operating_state and now_s - told_s < REPEATED_S:
             self._told[name] = told_s, count + 1
@@ -82,11 +82,11 @@ class ControlLoop:
         log.info("%s: %s%s", name, reason(name, source), f"; {count} times more before" if count else "")
 
     def latch(self, fault: Fault) -> None:
-        self._journal.latched(fault)
+        self._journal.note(LATCH, str(fault))
         self.stepper.latch(fault)
 
     def lose_link(self) -> None:
-        self._journal.lost_link()
+        self._journal.note(LOSE_LINK)
         self.stepper.lose_link()
 
     def is_busy(self) -> bool:

@@ -79,7 +79,7 @@ class Daemon:
         rates = config.rates
         period_ns = NS // rates.control_hz
         self._phases = Phases(ERROR_PERIODS * period_ns)
-        self._box = box or BlackBox(None, {}, rates.control_hz)
+        self._box = box or BlackBox(None, header(config, core), rates.control_hz)
         self._control = ControlLoop(core.stepper(time.monotonic()), self._connection, period_ns, self._box.journal)
         self._inference = InferenceLoop(
             core.planner(time.monotonic()),

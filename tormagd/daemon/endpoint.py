@@ -9,7 +9,7 @@ import logging
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import zmq
@@ -34,11 +34,9 @@ from tormagd_client.messages import (
     Reply,
     Request,
     Telemetry,
-    TickRecord,
     Verdict,
     decode,
     encode,
-    encode_ticks,
 )
 
 DRAIN = 32
@@ -140,9 +138,9 @@ class Endpoint:
         first part."""
         self._send(self._telemetry, *topic, encode(message))
 
-    def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
-        """Send control ticks to all subscribers of the recording, a row each with the fields `columns`."""
-        self._send(self._recording, encode_ticks(rows, columns))
+    def publish_ticks(self, batch: bytes) -> None:
+        """Send control ticks to all subscribers of the recording."""
+        self._send(self._recording, batch)
 
     def hear(self) -> None:
         """Read what subscribers say, for TAKEN_NS at each socket; cut off those that say too much."""

@@ -13,7 +13,7 @@ from tormagd.daemon.beat import Beat
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.search_process import SearchProcess
-from tormagd.record.journal import Journal
+from tormagd.record.journal import AFRESH, ANSWER, CONFIRM, FORESEE, PLAN, TEACH, Journal
 
 log = logging.getLogger(__name__)
 
@@ -39,11 +39,11 @@ class InferenceLoop:
         self._due_ns = 0
 
     def teach(self, learned: Learned) -> None:
-        self._journal.taught(learned)
+        self._journal.note(TEACH, learned)
         self.planner.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
-        self._journal.confirmed(wrong)
+        self._journal.note(CONFIRM, wrong)
         self.planner.confirm(wrong)
 
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
@@ -55,9 +55,9 @@ class InferenceLoop:
         now_s, setpoint, beside = start_ns * 1e-9, self._inbox.newest, self.beside
         answer = None if beside is None else beside.answer()
         if answer is not None:
-            self._journal.answered(answer)
+            self._journal.note(ANSWER, answer)
             self.planner.answered(answer)
-        self._journal.planned(now_s, setpoint)
+        self._journal.note(PLAN, now_s, setpoint)
         try:
             self.planner.plan(now_s, setpoint, measured, is_followed)
         except PLAN_ERRORS as error:
@@ -77,7 +77,7 @@ class InferenceLoop:
             self._begin_afresh(self._clock_ns() * 1e-9, error)
             return True
         if is_made:
-            self._journal.foresaw()
+            self._journal.note(FORESEE)
         return is_made
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
@@ -88,5 +88,5 @@ class InferenceLoop:
             )
         self._inbox.withdraw(f"no gap could be planned: {error}")
         self._on_failure()
-        self._journal.began_afresh(now_s)
+        self._journal.note(AFRESH, now_s)
         self.planner.afresh(now_s)

@@ -62,8 +62,7 @@ async def _run(
     raise_open_files()
     # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
-    known = {} if folder is None else header(config, core)
-    box = BlackBox(folder, known, config.rates.control_hz)
+    box = BlackBox(folder, header(config, core), config.rates.control_hz)
     beside = SearchProcess(core) if core.element.is_beside else None
     refused = prepare(config.realtime)
     file = None if options.config is None else str(options.config.absolute())

@@ -2,10 +2,14 @@
 
 import time
 from collections.abc import Iterator
+from typing import Any
+
+import msgspec
 
 from tormagd.config import Config
 from tormagd.control.assembly.belief import beliefs
 from tormagd.control.assembly.build import Core
+from tormagd.control.safety.codes import Limit
 from tormagd.daemon.beat import Beat
 from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.commands import Commands
@@ -16,10 +20,10 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.topics import Topics
 from tormagd.record.force_following import Following
-from tormagd.record.telemetry import snapshot, tick_record
-from tormagd_client.messages import Telemetry, TickRecord
+from tormagd.record.telemetry import snapshot, tick_of
+from tormagd.record.ticks import TOLD, encode_ticks
+from tormagd_client.messages import Telemetry
 
-MAX_TICKS = 100
 REQUESTS = 16
 "Answered in a telemetry period: a client that keeps asking must not keep a `stop` waiting."
 FORGETS_S = 5.0
@@ -45,7 +49,7 @@ class TelemetryLoop:
         if inference.beside is not None:
             self.groups.append(inference.beside.timing)
         self.newest: Telemetry
-        self._ticks: list[TickRecord] = []
+        self._tick: Any = None
         self.way = ForceDelay()
         self.topics = Topics(config, core, control, inference, endpoint)
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // self._hz
@@ -64,7 +68,7 @@ class TelemetryLoop:
         self._left -= 1
         self.way.ticked(control.stepper.time_s, control.used, self._endpoint.inbox.sources.playout_ms * 1e-3)
         timing = control.timing
-        record = tick_record(
+        self._tick = tick_of(
             control.stepper,
             control.output,
             control.used,
@@ -73,18 +77,18 @@ class TelemetryLoop:
             timing.exec_us,
             timing.runs,
         )
-        if len(self._ticks) == MAX_TICKS:  # telemetry is slow: the recording does not wait for it
-            self._publish_ticks()
-        self._ticks.append(record)
-        self._box.ticked(record, control.stepper, self._inference.planner)
+        part = self._box.ticked(self._tick, control.stepper, self._inference.planner)
+        if part is not None and self._box.is_heard:
+            self._endpoint.publish_ticks(encode_ticks(msgspec.Raw(part[1]), core=part[0]))
 
     def publish(self, beat: Beat) -> bool:
-        if self._left > 0 or not self._ticks:
+        if self._left > 0 or self._tick is None:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
         start_ns = time.monotonic_ns()
         endpoint, connections = self._endpoint, self._endpoint.admission.connections()
-        tick = self._ticks[-1]
+        tick, box = self._tick, self._box
+        box.is_heard = connections["recording"] > 0
         self.following.look(
             tick.operating_state,
             tick.limits,
@@ -95,31 +99,26 @@ class TelemetryLoop:
         )
         # requests that wait now are answered with this snapshot, later ones with the next
         self.waiting = min(endpoint.requests.count, REQUESTS)
-        if connections["telemetry"] or self.waiting:
-            self.newest = self._snapshot(start_ns * 1e-9)
+        is_kept = box.journal.is_kept and self.timing.runs % self._hz == 0  # once a second
+        if connections["telemetry"] or self.waiting or is_kept:
+            now_s, in_force = start_ns * 1e-9, endpoint.inbox.in_force
+            self.newest = snapshot(
+                tick,
+                self.timing.runs,
+                self._control.is_homed(),
+                self._control.is_busy(),
+                None if in_force is None else now_s - in_force.stamp_s,
+                beliefs(self._inference.planner, self._control.stepper, now_s, self.core.scene.terms),
+                self.topics.handle(),
+                self.topics.verdict(),
+                self._commands.mark,
+                (Limit.NO_BLACK_BOX,) * box.is_missing,
+            )
             endpoint.publish(self.newest)
-        self._publish_ticks()
+        if is_kept:
+            box.journal.note(TOLD, self.newest)
         self.timing.record(beat.due_ns, start_ns, time.monotonic_ns())
         return True
-
-    def _publish_ticks(self) -> None:
-        if self._endpoint.admission.connections()["recording"]:
-            self._endpoint.publish_ticks(self._ticks)
-        self._ticks = []
-
-    def _snapshot(self, now_s: float) -> Telemetry:
-        in_force = self._endpoint.inbox.in_force
-        return snapshot(
-            self._ticks[-1],
-            self.timing.runs,
-            self._control.is_homed(),
-            self._control.is_busy(),
-            None if in_force is None else now_s - in_force.stamp_s,
-            beliefs(self._inference.planner, self._control.stepper, now_s, self.core.scene.terms),
-            self.topics.handle(),
-            self.topics.verdict(),
-            self._commands.mark,
-        )
 
     def histograms(self) -> Iterator[Histogram]:
         for group in self.groups:

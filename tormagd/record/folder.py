@@ -160,7 +160,7 @@ class RecordingFolder:
         return ""
 
     def _delete(self, segment: Segment) -> bool:
-        """Delete a segment and return True, also where it is gone already."""
+        """Delete a segment; return True also where it is gone."""
         if segment.is_marked or segment.began_s is None or segment.path.is_symlink():
             return False
         with contextlib.suppress(FileNotFoundError), segment.path.open("rb") as file:

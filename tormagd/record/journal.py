@@ -4,6 +4,7 @@
 results stand in the journal for comparison only.
 """
 
+import hashlib
 import struct
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import msgspec
 
 from firmware_protocol.codec import DeviceMode, Switches
+from tormagd.config import Config
 from tormagd.control.ask.forecast import Guess, Skill
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor_zero import Level
@@ -26,10 +28,11 @@ from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.keeper_messages import MISSING as MISSING, READ, WROTE
-from tormagd_client.messages import TickRecord
+from tormagd.record.telemetry import TickRecord
+from tormagd.record.ticks import MISSING, READ, WROTE
+from tormagd.scenes.scene import Scene
 
-FORMAT = 18
+FORMAT = 19
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
@@ -38,10 +41,15 @@ KNOWN = kinds(
 )
 "All types that `plain_values` reads back."
 STEP = "step"
-PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
+"A step is about to run; its inputs are in the tick that follows."
+PLAN, FORESEE, AFRESH = "plan", "foresee", "afresh"
+"`[PLAN, now_s, setpoint]`, `[FORESEE]`; `[AFRESH, now_s]` where one of them failed, and planning began anew."
+TEACH, CONFIRM, ANSWER = "teach", "confirm", "answer"
+"What is known from another day, an operator's word in a dispute, and what a search beside the plans found."
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
+"`[COMMAND, name, now_s, is_refused, conditions]`, `[LATCH, fault]`, `[LOSE_LINK]`."
 CONNECTED = "connected"
-"A conversation began or ended. READ and WROTE are in `keeper_messages`."
+"`[CONNECTED, memory]`: a conversation began, or with None is over. READ and WROTE are in `ticks`."
 STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."
@@ -50,77 +58,44 @@ _LENGTH = struct.Struct(">I")
 _NONE = b"\xdd" + _LENGTH.pack(0)
 "An empty array whose length has four bytes."
 
-Entry = str | TickRecord | tuple[Any, ...]
+Entry = Any
+
+
+def core_hash(config: Config, scene: Scene, model: str) -> str:
+    """Return what tells one core from another."""
+    return hashlib.sha256(msgspec.json.encode((config, scene, model))).hexdigest()
 
 
 class Journal:
-    """The core's inputs since the last `take`. Every other method adds an entry."""
+    """The core's inputs since the last `take`, as entries: a tick, or a name and what belongs to it."""
 
     def __init__(self, *, is_kept: bool = True) -> None:
         self.is_kept = is_kept
         self._entries: list[Entry] = []
 
-    def stepped(self) -> None:
-        """Note that a step is about to run; its inputs follow with `ticked`."""
-        self._add(STEP)
-
-    def ticked(self, record: TickRecord) -> None:
-        self._add(record)
-
-    def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        self._add((PLAN, now_s, setpoint))
-
-    def foresaw(self) -> None:
-        self._add((FORESEE,))
-
-    def began_afresh(self, now_s: float) -> None:
-        """Note that a plan or forecast failed, and that planning began anew."""
-        self._add((AFRESH, now_s))
-
-    def taught(self, learned: Learned) -> None:
-        """Note that the estimators were set to what is known from another day."""
-        self._add((TEACH, learned))
-
-    def confirmed(self, what: str) -> None:
-        """Note the operator's word in a dispute: the "device" has changed, or the "sensor" is wrong."""
-        self._add((CONFIRM, what))
-
-    def answered(self, answer: Answer) -> None:
-        self._add((ANSWER, answer))
-
-    def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
-        self._add((COMMAND, name, now_s, is_refused, conditions))
-
-    def latched(self, fault: Fault) -> None:
-        self._add((LATCH, str(fault)))
-
-    def lost_link(self) -> None:
-        self._add((LOSE_LINK,))
+    def note(self, name: str, *what: Any) -> None:
+        self.add((name, *what))
 
     def read(self, now_s: float, raw: Received) -> None:
-        self._add((READ, now_s, raw))
+        self.add((READ, now_s, raw))
 
     def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        self._add((WROTE, now_s, raw, unsent))
+        self.add((WROTE, now_s, raw, unsent))
 
     def connected(self, memory: Any) -> None:
         """Note that a conversation begins from the state `memory`, or with None that it is over."""
-        self._add((CONNECTED, memory))
+        self.add((CONNECTED, memory))
 
-    def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
-        """Note the whole state of the core and of the conversation: a replay may begin here."""
-        if self.is_kept:
-            self._add((STATE, plain(stepper), plain(planner), connection))
-
-    def missed(self) -> None:
-        self._add((MISSING,))
+    def snapshot(self, stepper: Stepper, planner: Planner, connection: Any, core: str) -> None:
+        """Note the whole state of the core, whose hash is `core`, and of the conversation: a replay may begin here."""
+        self.add((STATE, plain(stepper), plain(planner), connection, core))
 
     def take(self) -> list[Entry]:
         """Return and remove all entries."""
         entries, self._entries = self._entries, []
         return entries
 
-    def _add(self, entry: Entry) -> None:
+    def add(self, entry: Entry) -> None:
         if not self.is_kept:
             return
         if len(self._entries) >= MAX_ENTRIES:
@@ -129,20 +104,27 @@ class Journal:
 
 
 class Packer:
-    """Writes entries as one growing msgpack array."""
+    """Writes entries as one growing msgpack array, and the ticks among them as another."""
 
     def __init__(self) -> None:
         self._bytes, self._count = bytearray(_NONE), 0
+        self._rows, self._row_count = bytearray(_NONE), 0
 
     def add(self, entries: Sequence[Entry]) -> None:
         for entry in entries:
+            at = len(self._bytes)
             _ENCODER.encode_into(entry, self._bytes, -1)
             self._count += 1
+            if isinstance(entry, TickRecord):
+                self._rows += self._bytes[at:]
+                self._row_count += 1
 
-    def take(self) -> bytes:
+    def take(self) -> tuple[bytes, bytes]:
+        """Return all entries, and the ticks' rows, and forget both."""
         _LENGTH.pack_into(self._bytes, 1, self._count)
-        packed = bytes(self._bytes)
-        self._bytes, self._count = bytearray(_NONE), 0
+        _LENGTH.pack_into(self._rows, 1, self._row_count)
+        packed = bytes(self._bytes), bytes(self._rows)
+        self.__init__()  # type: ignore[misc]
         return packed
 
 

@@ -22,23 +22,61 @@ from pathlib import Path
 import msgspec
 
 from tormagd.ground.terminal import write_line
-from tormagd.record.keeper_messages import REQUEST, Begin, End, Part, Said, Write, Written
 
+REQUEST = "REQUEST"
+"Reason of a black box that somebody asked for."
 KEPT_S = 30.0
 MAX_BYTES = 48_000_000
-"""The ring holds no more than either bound. Half a minute at 1 kHz with 500 setpoints a second is 18 MB."""
+"The ring's bounds; half a minute at 1 kHz is 18 MB."
 MAX_FILES = 20
-"The oldest file of a fault is deleted when there are more, and likewise of a request."
+"Of faults, and of requests; the oldest goes."
 MAX_PACKET = 4_000_000
 MAX_DUE = 28
-"How many files may wait to be written; more are refused."
+"Files that wait to be written."
 LOOK_S = 0.05
-"Period of looking whether a file is due."
 DIED = "DAEMON-DIED"
 SHARED_MEMORY = "/dev/shm"
 LENGTH = struct.Struct("<I")
 "Of what follows it in a file of the ring."
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
+    """First message: the folder for black boxes, and the header of each; `is_again` where a keeper has ended before."""
+
+    folder: str
+    header: dict[str, str]
+    is_again: bool = False
+
+
+class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
+    """Some control periods, as entries of `journal.py`; the time is the last period's."""
+
+    time_s: float
+    entries: bytes
+
+
+class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
+    """Request to write the kept entries, and those of the next `after_s`, to the file `name`."""
+
+    name: str
+    reason: str
+    after_s: float
+    details: dict[str, str]
+
+
+class End(msgspec.Struct, frozen=True, array_like=True, tag="end"):
+    """Last message of a daemon that ends as it should; one that ends without it leaves a black box."""
+
+
+class Written(msgspec.Struct, frozen=True, array_like=True, tag="written"):
+    """Answer of the keeper: the black box `name` is on the disk, or a `refusal`."""
+
+    name: str
+    refusal: str = ""
+
+
+Said = Begin | Part | Write | End
 
 
 def in_shared_memory(folder: str) -> list[int]:

@@ -5,9 +5,7 @@ the greatest value of each quantity. The recorder writes the overview at the end
 reader makes it from the messages in the same way.
 """
 
-import math
 import re
-from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
@@ -26,6 +24,10 @@ Floats = NDArray[np.float64]
 QUANTITIES = (
     "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "gap_setpoint_mm", "left_duty", "right_duty", "field_mT",
 )  # fmt: skip
+LOOKED_AT = (
+    *(*QUANTITIES, "t_ns", "left_mm", "right_mm", "reference_gap_mm", "lateness_us"),
+    *("handle_mm", "handle_rate_mm_s", "handle_mm_s"),
+)
 KINDS = ("operating_state", "limits", "faults")
 BREAK_S = 0.1
 "Between messages further apart, nothing is known."
@@ -52,28 +54,16 @@ Words = Annotated[tuple[Word, ...], Meta(max_length=256)]
 Code = Annotated[str, Meta(pattern=rf"\A{CODE.pattern}\Z")]
 
 
-class Glance(TypedDict, total=False):
-    t_ns: float | None
-    setpoint_cf: float | None
-    governed_cf: float | None
-    measured_cf: float | None
-    field_mT: float | None
-    gap_mm: float | None
-    gap_setpoint_mm: float | None
-    left_mm: float | None
-    right_mm: float | None
-    reference_gap_mm: float | None
-    left_duty: float | None
-    right_duty: float | None
-    duty: tuple[float, float] | None
-    operating_state: Word | None
-    limits: Words | None
-    faults: Words | None
-    handle_mm: float | None
-    handle_rate_mm_s: float | None
-    handle_mm_s: float | None
-    lateness_us: float | None
-    mark: Mark | None
+def glance(*numbers: str, **others: Any) -> Any:
+    """Return the type as which a message is decoded: what an overview shows of it, and further fields."""
+    fields = dict.fromkeys((*LOOKED_AT, *numbers), float | None) | {
+        **dict.fromkeys(("limits", "faults"), Words | None),
+        **{"duty": tuple[float, float] | None, "operating_state": Word | None, "mark": Mark | None},
+    }
+    return TypedDict("Glance", fields | others, total=False)  # type: ignore[operator]
+
+
+Glance = glance()
 
 
 class Curves(msgspec.Struct, frozen=True):
@@ -274,13 +264,12 @@ class _Followed(Following):
 
 
 class _Stretches:
-    """The least and greatest values of one kind of message, in stretches of `width_ns`."""
+    """The least and greatest values of one kind of message, in stretches of `width_ns`; NaN where there is none."""
 
     def __init__(self) -> None:
         self.width_ns = FIRST_WIDTH_NS
-        self._numbers = array("q")
-        self._low = [array("f") for _ in QUANTITIES]
-        self._high = [array("f") for _ in QUANTITIES]
+        self._numbers: list[int] = []
+        self._sides = np.full((2, MAX_STRETCHES, len(QUANTITIES)), np.nan)
 
     def add(self, since_ns: int, values: Iterable[float | None]) -> None:
         number = since_ns // self.width_ns
@@ -291,36 +280,24 @@ class _Stretches:
                 self.add(since_ns, values)
                 return
             self._numbers.append(number)
-            for low, high in zip(self._low, self._high, strict=True):
-                low.append(math.inf)
-                high.append(-math.inf)
-        for value, low, high in zip(values, self._low, self._high, strict=True):
-            if value is not None:
-                if value < low[-1]:
-                    low[-1] = value
-                if value > high[-1]:
-                    high[-1] = value
+        known = np.array(values, np.float64)
+        for side, of in zip(self._sides[:, len(self._numbers) - 1], (np.fmin, np.fmax), strict=True):
+            of(side, known, out=side)
 
     def widen(self, width_ns: int) -> None:
         ratio, self.width_ns = width_ns // self.width_ns, width_ns
-        if ratio == 1 or not self._numbers:
-            return
-        numbers = [number // ratio for number in self._numbers]
-        firsts = [i for i, number in enumerate(numbers) if i == 0 or number != numbers[i - 1]]
-        ends = [*firsts[1:], len(numbers)]
-        self._numbers = array("q", [numbers[i] for i in firsts])
-        for sides, of in ((self._low, min), (self._high, max)):
-            for i, side in enumerate(sides):
-                sides[i] = array("f", [of(side[a:b]) for a, b in zip(firsts, ends, strict=True)])
+        if ratio > 1 and self._numbers:
+            numbers, firsts = np.unique(np.array(self._numbers) // ratio, return_index=True)
+            known, self._numbers = self._sides[:, : len(self._numbers)].copy(), numbers.tolist()
+            self._sides[:] = np.nan
+            for side, kept, of in zip(self._sides, known, (np.fmin, np.fmax), strict=True):
+                side[: len(firsts)] = of.reduceat(kept, firsts, axis=0)
 
     def made(self) -> Curves:
-        """Return the curves as bytes; a stretch without a value has NaN."""
-        sides: tuple[dict[str, bytes], dict[str, bytes]] = ({}, {})
-        for known, arrays in zip(sides, (self._low, self._high), strict=True):
-            for name, side in zip(QUANTITIES, arrays, strict=True):
-                values = np.array(side, np.float32)
-                known[name] = np.where(np.isfinite(values), values, np.float32(np.nan)).tobytes()
-        return Curves(self._numbers.tobytes(), *sides)
+        with np.errstate(over="ignore"):  # a file may say any number
+            sides = self._sides[:, : len(self._numbers)].astype(np.float32)
+        low, high = ({name: side[:, at].tobytes() for at, name in enumerate(QUANTITIES)} for side in sides)
+        return Curves(np.array(self._numbers, np.int64).tobytes(), low, high)
 
 
 def _joined(spans: list[list[int]]) -> list[list[int]]:

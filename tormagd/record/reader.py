@@ -33,7 +33,7 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import CONTENTSIZE_UNKNOWN, ZstdError, get_frame_parameters
 
 from tormagd.record.overview import Glance, Overview, OverviewBuilder, unpacked
-from tormagd.record.writer import ABOUT, CUT, OVERVIEW, TELEMETRY_TOPIC, THINNED, TICKS_TOPIC
+from tormagd.record.writer import CUT, OVERVIEW, TELEMETRY_TOPIC, THINNED, TICKS_TOPIC
 from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
@@ -273,7 +273,7 @@ class Contents:
     """Collects topics, metadata, and places of chunks, in the file's order."""
 
     def __init__(self) -> None:
-        self._topics: dict[int, str] = {}
+        self.topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
         self.lost: list[str] = []
@@ -282,8 +282,8 @@ class Contents:
 
     def take(self, record: McapRecord, at: int) -> None:
         if isinstance(record, Channel):
-            self._topics[record.id] = record.topic
-        elif isinstance(record, Metadata) and record.name == ABOUT:
+            self.topics[record.id] = record.topic
+        elif isinstance(record, Metadata):
             self.metadata.update(record.metadata)
         elif isinstance(record, Chunk) and len(self.places) < MAX_INDEX:
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
@@ -293,14 +293,14 @@ class Contents:
         decoder = msgspec.json.Decoder(wanted)
 
         def message(sent: Message) -> None:
-            topic = self._topics.get(sent.channel_id)
+            topic = self.topics.get(sent.channel_id)
             if topic in TOPICS:
                 each(Seen(sent.log_time, topic == TICKS_TOPIC, decoder.decode(sent.data)))
 
         return message
 
     def require(self, name: str) -> None:
-        if set(self._topics.values()).isdisjoint(TOPICS):
+        if set(self.topics.values()).isdisjoint(TOPICS):
             raise RecordingError(
                 f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
             )

@@ -1,17 +1,76 @@
-"""The record of a control tick, and the telemetry message of the newest one."""
+"""A control tick: the core's own records as one row, and the telemetry message of the newest one.
+
+    row       what a step concluded, and then every field of plan, duty, measurement and link, in their own order
+    COLUMNS   the fields' names: a field that a record gets is a column without another word
+
+Black box, recording, replay and telemetry read these columns; docs/reference/ticks.md lists them.
+"""
 
 import time
+from collections.abc import Mapping
 from functools import lru_cache
+from operator import attrgetter
+from typing import Any
+
+import msgspec
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
+from firmware_protocol.value import Value
 from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
 from tormagd.control.safety.operating_state import SafetyState
+from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd_client.messages import VERSION, BeliefReport, Mark, Telemetry, Tick, TickRecord, Verdict
+from tormagd_client.messages import VERSION, BeliefReport, Mark, Telemetry, Tick, Verdict
+
+TIME_COLUMN = "t_ns"
 
 
-def tick_record(
+def _columns(record: type[Value], prefix: str, without: str, named: Mapping[str, str]) -> tuple[tuple[str, ...], Any]:
+    """Return a record's columns, and what reads them."""
+    fields = [name for name in record.__match_args__ if name not in without.split()]
+    return tuple([named.get(name, prefix + name) for name in fields]), attrgetter(*fields)
+
+
+CONCLUDED = (
+    *("governed_cf", "reference_gap_mm", "measured_cf", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s"),
+    *("operating_state", "faults", "limits", "plan_outside", "drive_mode"),
+    *("device_mode", "device_switches", "device_faults", "tick", "lateness_us", "exec_us"),
+)
+"What is no number in its record, or in none."
+OF_PLAN, _of_plan = _columns(
+    *(Plan, "plan_", "outside"),
+    {name: name for name in ("field_mT", "foresight", "confidence", "trim", "search_age_s")}
+    | {"number": "plan", "setpoint_N": "setpoint_cf", "governed_N": "plan_governed_cf"}
+    | {"predicted_N": "predicted_cf", "min_gap_mm": "plan_least_gap_mm"},
+)
+OF_DUTY, _of_duty = _columns(Duty, "", "mode", {"limits": "step_limits"})
+OF_MEASUREMENT, _of_measurement = _columns(
+    *(Measurement, "", "mode switches faults link"),
+    {name: f"device_{name}" for name in ("left_mm", "right_mm", "force_N", "handle_mm", "temperature_C")}
+    | {"number": "measurement"},
+)
+OF_LINK, _of_link = _columns(LinkQuality, "link_", "", {"clock_drift": "device_clock_drift"})
+COLUMNS = (TIME_COLUMN, "monotonic_s", *OF_PLAN, *CONCLUDED, *OF_DUTY, *OF_MEASUREMENT, *OF_LINK)
+_UNKNOWN = (None,) * len(OF_MEASUREMENT + OF_LINK)
+
+
+def kind_of(column: str) -> Any:
+    """Return the type of a column's values by its name."""
+    if column.endswith(("limits", "faults", "switches", "outside")):
+        return tuple[str, ...]
+    if column in ("request", "operating_state", "drive_mode", "device_mode"):
+        return str | None
+    return {TIME_COLUMN: int, "monotonic_s": float}.get(column, float | int | None)
+
+
+TickRecord: Any = msgspec.defstruct(
+    "TickRecord", [(name, kind_of(name)) for name in COLUMNS], array_like=True, frozen=True, gc=False
+)
+"A row whose values have their columns' names."
+
+
+def tick_of(
     stepper: Stepper,
     output: Duty,
     plan: Plan,
@@ -19,72 +78,28 @@ def tick_record(
     lateness_us: float,
     exec_us: float,
     number: int = 0,
-) -> TickRecord:
+) -> Any:
     measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
     is_placed = measured is not None and measured.is_homed
-    link = None if measurement is None else measurement.link
     return TickRecord(
-        time.time_ns(),
-        stepper.time_s,
-        plan.number,
-        plan.setpoint_N,
-        plan.setpoint_age_s,
+        *(time.time_ns(), stepper.time_s),
+        *_of_plan(plan),
         plan.governed_N if safety.is_driven else None,
-        plan.governed_N,
-        plan.predicted_N,
-        plan.field_mT,
-        plan.gap_mm,
-        plan.gap_speed_mm_s,
-        plan.gap_acceleration_mm_s2,
-        plan.min_gap_mm,
-        plan.limits,
-        tuple(f"{each.quantity} {each.asked!r} {each.used!r}" for each in plan.outside) if plan.outside else (),
-        plan.sensor_doubted_s,
-        plan.foresight,
-        plan.time_s,
-        plan.confidence,
-        plan.trim,
-        None if measurement is None else measurement.number,
-        None if measurement is None else measurement.received_s,
-        None if measurement is None else measurement.delay_s,
-        None if measurement is None else measurement.sensed_s,
-        None if measurement is None else measurement.reported_s,
-        None if link is None else link.unanswered,
-        None if link is None else link.damaged,
-        None if link is None else link.unsent,
-        None if link is None else link.round_trip_s,
-        None if link is None else link.clock_drift,
-        None if measurement is None else measurement.device_time_s,
-        None if measurement is None else measurement.left_mm,
-        None if measurement is None else measurement.right_mm,
-        None if measurement is None else measurement.handle_mm,
-        None if measurement is None else measurement.force_N,
-        None if measurement is None else _MODES[measurement.mode],
-        () if measurement is None else _names(measurement.switches),
-        () if measurement is None else _names(measurement.faults),
-        None if measurement is None else measurement.temperature_C,
-        None if measurement is None else measurement.left_current_A,
-        None if measurement is None else measurement.right_current_A,
-        None if measurement is None else measurement.supply_V,
         None if reference is None else reference.gap_mm,
         None if measured is None else measured.force_N,
         measured.left_mm if measured is not None and is_placed else None,
         measured.right_mm if measured is not None and is_placed else None,
         None if measured is None else measured.handle_mm,
         None if measured is None else measured.handle.rate_mm_s,
-        safety.operating_state,
-        limits_held(safety, output, plan),
-        output.limits,
-        safety.faults,
+        *(safety.operating_state, safety.faults, limits_held(safety, output, plan)),
+        tuple([f"{each.quantity} {each.asked!r} {each.used!r}" for each in plan.outside]) if plan.outside else (),
         _DRIVE_MODES[output.mode],
-        output.left_duty,
-        output.right_duty,
-        output.request,
-        output.request_number,
-        lateness_us,
-        exec_us,
-        number,
-        plan.search_age_s,
+        None if measurement is None else _MODES[measurement.mode],
+        () if measurement is None else _names(measurement.switches),
+        () if measurement is None else _names(measurement.faults),
+        *(number, lateness_us, exec_us),
+        *_of_duty(output),
+        *(_UNKNOWN if measurement is None else _of_measurement(measurement) + _of_link(measurement.link)),
     )
 
 
@@ -98,13 +113,33 @@ def _names(bits: Switches | DeviceFault) -> tuple[str, ...]:
     return tuple(str(bit.name) for bit in type(bits) if bit in bits)
 
 
+def measurement_of(tick: Any) -> Measurement | None:
+    """Return the measurement of which a tick was made."""
+    if tick.measurement is None:
+        return None
+    values = msgspec.structs.astuple(tick)[-len(_UNKNOWN) :]
+    if None in values or tick.device_mode is None:
+        raise ValueError("a measurement in parts: allowed is a whole one, or none")
+    fields = [name for name in Measurement.__match_args__ if name not in ("mode", "switches", "faults", "link")]
+    return Measurement(
+        **dict(zip(fields, values, strict=False)),
+        mode=DeviceMode[tick.device_mode],
+        switches=Switches(sum([Switches[name] for name in tick.device_switches])),
+        faults=DeviceFault(sum([DeviceFault[name] for name in tick.device_faults])),
+        link=LinkQuality(*values[len(fields) :]),
+    )
+
+
 def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...]:
     """Return the limits that hold the force back; none while the device is not driven."""
     return tuple(dict.fromkeys((*plan.limits, *output.limits))) if safety.is_driven else ()
 
 
+_SHARED = tuple([name for name in Telemetry.__struct_fields__ if name in COLUMNS])
+
+
 def snapshot(
-    tick: TickRecord,
+    tick: Any,
     sequence: int,
     is_homed: bool,
     is_busy: bool,
@@ -113,36 +148,32 @@ def snapshot(
     handle: tuple[float, float] | None = None,
     verdict: Verdict | None = None,
     mark: Mark | None = None,
+    beside: tuple[str, ...] = (),
 ) -> Telemetry:
+    """Return the telemetry message of a tick, with its columns of the same names."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
-    return Telemetry(
-        v=VERSION,
-        t_ns=tick.t_ns,
-        seq=sequence,
-        operating_state=tick.operating_state,
-        is_homed=is_homed,
-        is_busy=is_busy,
-        setpoint_cf=tick.setpoint_cf,
-        governed_cf=tick.governed_cf,
-        measured_cf=tick.measured_cf,
-        predicted_cf=tick.predicted_cf,
+    fields: dict[str, Any] = {name: getattr(tick, name) for name in _SHARED}
+    fields |= {
+        "v": VERSION,
+        "seq": sequence,
+        "is_homed": is_homed,
+        "is_busy": is_busy,
         # no field is planned for a gap that is open or opening
-        field_mT=None if tick.governed_cf is None else tick.field_mT,
-        gap_mm=left + right if known else None,
-        gap_setpoint_mm=tick.reference_gap_mm,
-        measured_jp=(left, right) if known else None,
-        skew_mm=left - right if known else None,
-        duty=(tick.left_duty, tick.right_duty),
-        limits=tick.limits,
-        faults=tick.faults,
-        setpoint_age_ms=None if age_s is None else age_s * 1e3,
-        confidence=tick.confidence,
-        tick=Tick(lateness_us=tick.lateness_us, exec_us=tick.exec_us),
-        belief=belief,
-        search_age_ms=tick.search_age_s * 1e3,
-        handle_mm=None if handle is None else handle[0],
-        handle_mm_s=None if handle is None else handle[1],
-        verdict=verdict,
-        mark=mark,
-    )
+        "field_mT": None if tick.governed_cf is None else tick.field_mT,
+        "gap_mm": left + right if known else None,
+        "gap_setpoint_mm": tick.reference_gap_mm,
+        "measured_jp": (left, right) if known else None,
+        "skew_mm": left - right if known else None,
+        "duty": (tick.left_duty, tick.right_duty),
+        "limits": tick.limits + beside,
+        "setpoint_age_ms": None if age_s is None else age_s * 1e3,
+        "tick": Tick(lateness_us=tick.lateness_us, exec_us=tick.exec_us),
+        "belief": belief,
+        "search_age_ms": tick.search_age_s * 1e3,
+        "handle_mm": None if handle is None else handle[0],
+        "handle_mm_s": None if handle is None else handle[1],
+        "verdict": verdict,
+        "mark": mark,
+    }
+    return Telemetry(**fields)

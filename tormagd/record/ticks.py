@@ -1,30 +1,36 @@
-"""The recording endpoint's message: the control ticks of the last 20 ms, one row each."""
+"""The recording endpoint's message: control ticks, one row each, and all that running the core again needs."""
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import msgspec
 import zmq
 
+from tormagd.record.telemetry import COLUMNS, TIME_COLUMN
 from tormagd_client.messages import VERSION, MessageError
 from tormagd_client.printable import require
 from tormagd_client.wire import Keys, connect
 
-TIME_COLUMN = "t_ns"
-MAX_BATCH_BYTES = 4_000_000  # 20 ms at 4 kHz with 100 columns is under 1 MB
+MAX_BATCH_BYTES = 4_000_000  # 20 ticks with a snapshot of the core are under 0.1 MB
 MAX_COLUMNS = 256
 MAX_TIME_NS = 2**63
 QUEUE = 10_000
 "Over three minutes for a slow listener."
+READ, WROTE, TOLD, MISSING = "read", "wrote", "told", "missing"
+"""Entries of `core` that are no inputs of the core: what passed between daemon and device, as `[READ, time_s, raw]`, a
+snapshot as published, and that others were lost."""
 
 Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 
 
 class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
-    """Control ticks as rows of one value per column. The first column is `t_ns`, CLOCK_REALTIME; None is not known."""
+    """Control ticks as rows. The first column is `t_ns`, CLOCK_REALTIME; None is not known. `core` has the journal's
+    entries, or nothing."""
 
     v: int
     columns: tuple[str, ...]
     rows: tuple[tuple[Value, ...], ...]
+    core: bytes = b""
 
     def __post_init__(self) -> None:
         require(self.v == VERSION, "v", self.v, f"{VERSION}")
@@ -60,6 +66,10 @@ class Axis:
         self.ahead_ns = t_ns - self._newest_ns
         return self._newest_ns
 
+    def of_frame(self, monotonic_s: float) -> int:
+        """Place what passed between daemon and device."""
+        return max(round(monotonic_s * 1e9) + (self._offset_ns or 0), 0)
+
     def of_snapshot(self, t_ns: int) -> int:
         """Place a snapshot, which may know of a step before the ticks do."""
         at_ns = t_ns - self.ahead_ns
@@ -78,7 +88,12 @@ def listening(
     return socket
 
 
-_DECODER = msgspec.msgpack.Decoder(TickBatch)
+_ENCODER, _DECODER = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(TickBatch)
+
+
+def encode_ticks(rows: Sequence[object] | msgspec.Raw, columns: tuple[str, ...] = COLUMNS, core: bytes = b"") -> bytes:
+    """Return the recording endpoint's message; `rows` may have been encoded before."""
+    return _ENCODER.encode({"v": VERSION, "columns": columns, "rows": rows, "core": core})
 
 
 def decode_ticks(data: bytes) -> TickBatch:

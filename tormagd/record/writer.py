@@ -1,8 +1,8 @@
-"""Writing a recording: MCAP with JSON messages and JSON schemas, compressed with zstd.
+"""Writing a recording or a black box: MCAP, compressed with zstd.
 
-Channel `/telemetry` has the daemon's snapshots as published, `/ticks` one message for every control tick. Foxglove and
-PlotJuggler open the files. Unknown values are left out: viewers read only plain schemas, in which a number cannot be
-null. An overview stands at the end.
+`/core` has the journal's entries as they came, in msgpack, for a replay. `/ticks` and `/frames` are derived of them,
+and `/telemetry` has snapshots, in JSON with plain schemas, for Foxglove and PlotJuggler: a number there cannot be null,
+so what is not known is left out. An overview stands at the end.
 """
 
 import contextlib
@@ -11,11 +11,11 @@ import fcntl
 import math
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from itertools import repeat
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, NoReturn, Self
+from typing import Any, NoReturn, Self
 
 import msgspec
 from mcap.writer import Writer
@@ -23,9 +23,10 @@ from mcap.writer import Writer
 from tormagd import __version__
 from tormagd.record.folder import RecordingFolder
 from tormagd.record.overview import OverviewBuilder
-from tormagd.record.thinning import AROUND_S, Thinning
-from tormagd.record.ticks import Axis, TickBatch, Value
-from tormagd_client.messages import Mark, Telemetry, TickRecord
+from tormagd.record.telemetry import COLUMNS, kind_of
+from tormagd.record.thinning import AROUND_S, Shown, Thinning
+from tormagd.record.ticks import READ, WROTE, Axis, TickBatch, Value
+from tormagd_client.messages import Mark, Telemetry
 
 ABOUT = "tormagd"
 CUT = "cut_by"
@@ -35,7 +36,7 @@ THINNED = "thinned"
 OVERVIEW = "overview 2"
 "Version 2 counts handle and limits in how well a force is followed."
 TELEMETRY_TOPIC = "/telemetry"
-TICKS_TOPIC = "/ticks"
+TICKS_TOPIC, FRAMES_TOPIC, CORE_TOPIC = "/ticks", "/frames", "/core"
 NUMBER_COLUMN = "tick"
 "A missing number is a lost tick."
 CHUNK_NS = 500_000_000
@@ -51,6 +52,54 @@ def disk_room(path: Path, needed_bytes: int) -> str:
     if free >= least:
         return ""
     return f"No space left on device: {free / 1e6:.1f} MB are free, needed are {least / 1e6:.1f}"
+
+
+class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Bytes between daemon and device: one CAN frame, one read of a serial port, or one frame written to it."""
+
+    monotonic_s: float
+    direction: str
+    "By the daemon: read or wrote."
+    data: str
+    identifier: int | None = None
+
+
+def frames_in(entry: Any) -> list[Frame]:
+    """Return the frames in one entry of the journal."""
+    if not isinstance(entry, list) or not entry or entry[0] not in (READ, WROTE):
+        return []
+    direction, time_s, raw, *_ = entry
+    pieces = [(None, each) if isinstance(each, bytes) else each for each in (raw if isinstance(raw, list) else [raw])]
+    if not all(isinstance(data, bytes) for _, data in pieces):
+        raise TypeError("a frame is bytes")
+    return [Frame(time_s, direction, data.hex(), identifier) for identifier, data in pieces]
+
+
+def is_tick(entry: Any) -> bool:
+    """Return whether an entry is a tick: a list that begins with an integer."""
+    return isinstance(entry, list) and bool(entry) and type(entry[0]) is int
+
+
+class Derived:
+    """Derives the messages of `/ticks` and `/frames` from the journal's entries."""
+
+    def __init__(self) -> None:
+        self.axis = Axis()
+        self._numbers = {TICKS_TOPIC: count(), FRAMES_TOPIC: count(1)}
+
+    def of(self, columns: Sequence[str], entries: Sequence[Any]) -> Iterator[Shown]:
+        """Yield a message for each tick and frame."""
+        monotonic_at = columns.index("monotonic_s") if "monotonic_s" in columns else 0
+        for tick in filter(is_tick, entries):  # frames before it have its offset
+            self.axis.of_tick(tick[0], tick[monotonic_at])
+            break
+        for entry in entries:
+            if is_tick(entry):
+                t_ns, message = self.axis.of_tick(entry[0], entry[monotonic_at]), known_values(columns, entry)
+                yield Shown(TICKS_TOPIC, t_ns, next(self._numbers[TICKS_TOPIC]), message)
+            for frame in frames_in(entry):
+                t_ns = self.axis.of_frame(frame.monotonic_s)
+                yield Shown(FRAMES_TOPIC, t_ns, next(self._numbers[FRAMES_TOPIC]), frame)
 
 
 class RecordingWriter:
@@ -80,11 +129,13 @@ class RecordingWriter:
         self._file = path.open("xb")
         with contextlib.suppress(OSError):  # some file systems know no locks
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        self._overview, self._axis = OverviewBuilder(), Axis()
-        self._mcap = begun(self._file, self._about)
+        self._overview, self._derived = OverviewBuilder(), Derived()
+        self._mcap = Writer(self._file, enable_data_crcs=True)
+        self._mcap.start(profile="", library=f"tormagd {__version__}")
+        self._mcap.add_metadata(ABOUT, self._about)
         self._file.flush()
-        self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
-        self._tick_channels: dict[bool, int] = {}
+        self._channels: dict[tuple[str, bool], int] = {}
+        self._channel_of(TELEMETRY_TOPIC, None)
         self._begin_ns = self._chunk_ns = 0
 
     def _rotate(self, folder: RecordingFolder) -> None:
@@ -113,43 +164,53 @@ class RecordingWriter:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
         mark, before, self._mark = message.mark, self._mark, message.mark or self._mark
-        at_ns = self._axis.of_snapshot(message.t_ns)
+        at_ns = self._derived.axis.of_snapshot(message.t_ns)
         if mark is not None and mark != before:
             self._thinning.happened(at_ns)
         known = only_known(msgspec.to_builtins(message))
-        self._add(self._telemetry_channel, at_ns, msgspec.json.encode(known), self.telemetry_count)
+        self._add(Shown(TELEMETRY_TOPIC, at_ns, self.telemetry_count, known))
         self._overview.add(at_ns, False, known | {"mark": mark})
         self.telemetry_count += 1
         # every snapshot has the newest mark, even one from before
         if (
             mark is not None
             and mark != before
-            and mark.t_ns - self._axis.ahead_ns >= self._begin_ns
+            and mark.t_ns - self._derived.axis.ahead_ns >= self._begin_ns
             and self._folder is not None
         ):
             self.path = self._folder.mark_around(self.path)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message, thinned, and count missing ticks."""
-        number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
-        monotonic_at = batch.columns.index("monotonic_s") if "monotonic_s" in batch.columns else 0
-        for row in batch.rows:
-            assert isinstance(row[0], int)
-            t_ns = self._axis.of_tick(row[0], row[monotonic_at])
-            if number_at is not None and isinstance(number := row[number_at], int):
-                if self._last_tick is not None and number > self._last_tick + 1:
-                    self.ticks_lost += number - self._last_tick - 1
-                self._last_tick = number
-            message = known_values(batch.columns, row)
-            self._write(self._thinning.take((t_ns, message)))
-            self._overview.add(t_ns, True, message)
-            self.tick_count += 1
+        """Write a batch; of ticks that are thinned, nothing for a replay."""
+        entries = [list(row) for row in batch.rows]
+        if batch.core and self._thinning.every == 1:
+            entries = msgspec.msgpack.decode(batch.core, type=list[Any])
+        self.entries(batch.columns, entries, batch.core)
         if self._folder is not None:
             self._rotate(self._folder)
 
+    def entries(self, columns: Sequence[str], entries: Sequence[Any], core: bytes) -> None:
+        """Write `core`, which has these entries, and then what is derived of them."""
+        shown = list(self._derived.of(columns, entries))
+        if core and self._thinning.every == 1:
+            self._add(Shown(CORE_TOPIC, shown[-1].t_ns if shown else self._chunk_ns, 0, core))
+        for each in shown:
+            if each.topic != TICKS_TOPIC:
+                self._add(each)
+                continue
+            if isinstance(number := each.message.get(NUMBER_COLUMN), int):
+                if self._last_tick is not None and number > self._last_tick + 1:
+                    self.ticks_lost += number - self._last_tick - 1
+                self._last_tick = number
+            for kept in self._thinning.take(each):
+                self._add(kept)
+            self._overview.add(each.t_ns, True, each.message)
+            self.tick_count += 1
+
     def close(self) -> None:
         if not self._file.closed:
-            self._write(self._thinning.rest(self._thinning.every))
+            for kept in self._thinning.rest(self._thinning.every):
+                self._add(kept)
             self._end()
 
     def _end(self) -> None:
@@ -172,17 +233,21 @@ class RecordingWriter:
         else:
             self.close()
 
-    def _write(self, ticks: Sequence[tuple[int, dict[str, Value]]]) -> None:
-        for t_ns, message in ticks:
-            self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
+    def _channel_of(self, topic: str, message: Any) -> int:
+        fits = topic != TICKS_TOPIC or all(
+            TICK_KINDS.get(name) == _KINDS[type(value)] for name, value in message.items()
+        )
+        if (topic, fits) not in self._channels:
+            schema, schema_id = SCHEMAS[topic] if fits else OTHER_SCHEMA, 0
+            if schema is not None:
+                data = msgspec.json.encode(schema)
+                schema_id = self._mcap.register_schema(name=schema["title"], encoding="jsonschema", data=data)
+            encoding = "msgpack" if schema is None else "json"
+            self._channels[topic, fits] = self._mcap.register_channel(topic, encoding, schema_id)
+        return self._channels[topic, fits]
 
-    def _channel_of(self, message: dict[str, Value]) -> int:
-        fits = all(TICK_KINDS.get(name) == _KINDS[type(value)] for name, value in message.items())
-        if fits not in self._tick_channels:
-            self._tick_channels[fits] = registered(self._mcap, TICKS_TOPIC, TICK_SCHEMA if fits else OTHER_SCHEMA)
-        return self._tick_channels[fits]
-
-    def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
+    def _add(self, shown: Shown) -> None:
+        topic, t_ns, sequence, message = shown
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             index_bytes = self._file.tell() // INDEX_SHARE
@@ -191,19 +256,8 @@ class RecordingWriter:
                 self._give_up(reason)
             self._file.flush()
             self._begin_ns, self._chunk_ns = self._begin_ns or t_ns, t_ns
-        self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
-
-
-def begun(file: BinaryIO, about: dict[str, str]) -> Writer:
-    mcap = Writer(file, enable_data_crcs=True)
-    mcap.start(profile="", library=f"tormagd {__version__}")
-    mcap.add_metadata(ABOUT, about)
-    return mcap
-
-
-def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
-    schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=msgspec.json.encode(schema))
-    return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
+        data = message if topic == CORE_TOPIC else msgspec.json.encode(message)
+        self._mcap.add_message(self._channel_of(topic, message), t_ns, data, t_ns, sequence % 2**32)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
@@ -239,17 +293,20 @@ def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Valu
     }
 
 
-def _tick_schema() -> dict[str, Any]:
-    (schema,), definitions = msgspec.json.schema_components([TickRecord], ref_template="{name}")
-    items = map(_plain, definitions[schema["$ref"]]["prefixItems"], repeat(definitions))
-    columns = dict(zip(TickRecord.__struct_fields__, items, strict=True))
-    whole = {name: {"type": "number"} for name, kind in columns.items() if kind["type"] == "integer"}
-    return {"title": "tormagd.Tick", "type": "object", "properties": columns | whole}
-
-
-_KINDS = {bool: "boolean", str: "string", tuple: "array", int: "number", float: "number"}
-TICK_SCHEMA = _tick_schema()
+_KINDS = {bool: "boolean", str: "string", tuple: "array", list: "array", int: "number", float: "number"}
+_TYPES = {tuple[str, ...]: {"type": "array", "items": {"type": "string"}}, str | None: {"type": "string"}}
+TICK_SCHEMA: dict[str, Any] = {
+    "title": "tormagd.Tick",
+    "type": "object",
+    "properties": {name: _TYPES.get(kind_of(name), {"type": "number"}) for name in COLUMNS},
+}
 TICK_KINDS = {name: kind["type"] for name, kind in TICK_SCHEMA["properties"].items()}
+SCHEMAS: dict[str, Any] = {
+    TELEMETRY_TOPIC: plain_schema(Telemetry),
+    TICKS_TOPIC: TICK_SCHEMA,
+    FRAMES_TOPIC: plain_schema(Frame),
+    CORE_TOPIC: None,
+}
 OTHER_SCHEMA = {"title": "tormagd.OtherTick", "type": "object"}
 
 

@@ -29,7 +29,6 @@ from tormagd.simulation.faults import FaultError, parse_fault
 from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd_client.endpoints import ConfigError
-from tormagd_client.messages import TickRecord
 
 HOMED_S, CONNECTED_S = 8.0, 0.5
 """Times before the file's first tick, in virtual time."""
@@ -173,7 +172,7 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
     return happened
 
 
-def _recorded(ticks: list[TickRecord]) -> Happened:
+def _recorded(ticks: list[Any]) -> Happened:
     happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
     for before, tick in pairwise([ticks[0], *ticks]):
         happened.note(tick.monotonic_s - first_s, tick.faults, tick.limits, tick.monotonic_s - before.monotonic_s)
@@ -184,7 +183,7 @@ def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:
     return setpoint.replaced(stamp_s=setpoint.stamp_s + by_s)
 
 
-def _hand(ticks: list[TickRecord]) -> RecordedHand:
+def _hand(ticks: list[Any]) -> RecordedHand:
     places: dict[float, float] = {}
     for tick in ticks:
         if tick.sensed_s is not None and tick.device_handle_mm is not None:

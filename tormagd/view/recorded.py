@@ -10,12 +10,14 @@ import numpy as np
 
 from tormagd.control.safety.codes import FAULTS, LIMITS
 from tormagd.record.force_following import in_words
-from tormagd.record.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, Glance, codes_in, quantities
+from tormagd.record.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, codes_in, glance, quantities
 from tormagd.record.reader import RecordingFile, Seen
 from tormagd.view.believed import as_said
 from tormagd.view.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
 
+BELIEVED_S = 1.1
+"A black box has a snapshot a second."
 STEP_S = 0.02
 "As in a live page."
 AHEAD_NS = 10_000_000_000
@@ -40,10 +42,7 @@ class Believed(msgspec.Struct, frozen=True):
     acts: bool = False
 
 
-class Moment(Glance, total=False):
-    """What a frame reads from a message: an overview's fields, and the belief."""
-
-    belief: dict[str, Believed]
+Moment = glance(belief=dict[str, Believed])
 
 
 class Moments:
@@ -55,10 +54,10 @@ class Moments:
         known = np.array([quantities(each.message) for each in seen], float)
         self._values = known if seen else np.empty((0, len(QUANTITIES)))
 
-    def newest(self, times_s: Floats) -> list[int]:
-        """Return for each time the index of the newest message; -1 where it is over BREAK_S old."""
+    def newest(self, times_s: Floats, most_s: float = BREAK_S) -> list[int]:
+        """Return for each time the index of the newest message; -1 where it is over `most_s` old."""
         at = np.searchsorted(self.t_s, times_s, side="right") - 1
-        return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= BREAK_S, at, -1).tolist()
+        return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= most_s, at, -1).tolist()
 
     def curve(self, name: str, times_s: Floats) -> list[float | None] | None:
         """Return the newest value of `name` at each time, None where too old."""
@@ -169,7 +168,7 @@ def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Mom
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
     """Return the belief in the newest snapshot up to `at_s`, by quantity."""
-    place = (snapshots.newest(np.array([at_s])) or [-1])[0]
+    place = (snapshots.newest(np.array([at_s]), BELIEVED_S) or [-1])[0]
     told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
     return {
         name: BeliefReport(value=each.value, sd=each.sd, unit=each.unit, acts=each.acts)

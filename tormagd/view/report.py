@@ -11,12 +11,12 @@ import numpy as np
 
 from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation
 from tormagd.record.force_following import in_words
-from tormagd.record.overview import BREAK_NS, LATE_US, Codes
+from tormagd.record.overview import LATE_US, Codes
 from tormagd.record.reader import RecordingFile
 from tormagd.view.believed import as_said
 from tormagd.view.html import page, table
 from tormagd.view.plot import figure, picture
-from tormagd.view.recorded import believed, moments
+from tormagd.view.recorded import BELIEVED_S, believed, moments
 
 MAX_TOLD = 20
 "Moments of one fault that are listed."
@@ -125,7 +125,7 @@ def _belief(of: Sequence[RecordingFile]) -> list[list[str]]:
     found = []
     for each in of:
         end_ns = each.overview.end_ns
-        _, snapshots = moments(each, end_ns - BREAK_NS, end_ns)
+        _, snapshots = moments(each, end_ns - round(BELIEVED_S * 1e9), end_ns)
         found.append(as_said(believed(snapshots, each.overview.duration_s)))
     return _rows(found)
 

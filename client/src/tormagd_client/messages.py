@@ -7,7 +7,6 @@ docs/messages.md lists the fields of all messages, and says when `v` rises.
 """
 
 import re
-from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import msgpack
@@ -481,78 +480,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
     serial_number: int | None
     portrait: PortraitReport | None = None
     configuration_file: str | None = None
-
-
-class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One control tick: all inputs and outputs of the step. Units as in `Telemetry`; times in ns and s."""
-
-    t_ns: int
-    monotonic_s: float
-    # the plan
-    plan: int
-    setpoint_cf: float | None
-    plan_setpoint_age_s: float | None
-    governed_cf: float | None
-    plan_governed_cf: float
-    predicted_cf: float | None
-    field_mT: float
-    plan_gap_mm: float
-    plan_gap_speed_mm_s: float
-    plan_gap_acceleration_mm_s2: float
-    plan_least_gap_mm: float
-    plan_limits: tuple[str, ...]
-    plan_outside: tuple[str, ...]
-    plan_sensor_doubted_s: float
-    foresight: float
-    plan_time_s: float
-    confidence: float
-    trim: float
-    # the measurement
-    measurement: int | None
-    received_s: float | None
-    delay_s: float | None
-    sensed_s: float | None
-    reported_s: float | None
-    link_unanswered: float | None
-    link_damaged: float | None
-    link_unsent: float | None
-    link_round_trip_s: float | None
-    device_clock_drift: float | None
-    device_time_s: float | None
-    device_left_mm: float | None
-    device_right_mm: float | None
-    device_handle_mm: float | None
-    device_force_N: float | None
-    device_mode: str | None
-    device_switches: tuple[str, ...]
-    device_faults: tuple[str, ...]
-    device_temperature_C: float | None
-    left_current_A: float | None
-    right_current_A: float | None
-    supply_V: float | None
-    # the conclusions
-    reference_gap_mm: float | None
-    measured_cf: float | None
-    left_mm: float | None
-    right_mm: float | None
-    handle_mm: float | None
-    handle_rate_mm_s: float | None
-    operating_state: str
-    limits: tuple[str, ...]
-    step_limits: tuple[str, ...]
-    faults: tuple[str, ...]
-    # the command
-    drive_mode: str
-    left_duty: float
-    right_duty: float
-    request: str
-    request_number: int
-    # the tick
-    lateness_us: float
-    exec_us: float
-    tick: int = 0
-    # of a plan whose search runs beside the plans
-    search_age_s: float = 0.0
+    core: dict[str, str] = {}
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True):
@@ -648,11 +576,6 @@ def _in_words(text: str) -> str:
 
 def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -> bytes:
     return _ENCODER.encode(message)
-
-
-def encode_ticks(rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> bytes:
-    """Return the recording endpoint's message with these rows; `tormagd.record.ticks` reads it."""
-    return _ENCODER.encode({"v": VERSION, "columns": columns, "rows": rows})
 
 
 _ENCODER = msgspec.msgpack.Encoder()

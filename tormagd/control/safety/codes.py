@@ -107,6 +107,7 @@ class Limit(StrEnum):
     ENCODER = "ENCODER"
     LINK_DEGRADED = "LINK_DEGRADED"
     CLOCK = "CLOCK"
+    NO_BLACK_BOX = "NO_BLACK_BOX"
 
 
 FAULTS: dict[Fault, Explanation] = {
@@ -569,6 +570,12 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         4000.0,
         "over some seconds",
+    ),
+    Limit.NO_BLACK_BOX: Explanation(
+        "the process that keeps the black box has ended, and another one begins; nothing is held back",
+        "see the daemon's log if it stays",
+        Reaction.HELD,
+        200.0,
     ),
 }
 

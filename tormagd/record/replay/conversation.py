@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import zip_longest
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -25,13 +25,16 @@ KNOWN = kinds(
 )
 
 
-class Found(NamedTuple):
-    """The first difference: its field, both values, and the frame that it belongs to."""
+class Found(msgspec.Struct, frozen=True):
+    """The first difference: its field, both values, and the frame that it belongs to. `tick` counts from 1, `time_s`
+    from the file's first tick."""
 
     field: str
     recorded: Any
     replayed: Any
     frame: int | None = None
+    tick: int = 0
+    time_s: float = 0.0
 
 
 def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:

@@ -11,13 +11,13 @@ from tormagd.config import Config, checked
 from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
 from tormagd.record.black_box import BlackBoxFile
 from tormagd.record.journal import FORMAT
+from tormagd.record.telemetry import COLUMNS
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.endpoints import ConfigError
-from tormagd_client.messages import TickRecord
 
 NEEDED = (
-    "format", "version", "sources_sha256", "platform", "config", "config_sha256", "scene", "scene_sha256",
-    "scene_folder", "model_sha256", "columns",
+    "format", "version", "sources_sha256", "platform", "configuration", "configuration_sha256", "scene",
+    "scene_sha256", "scene_folder", "model", "core_sha256", "columns",
 )  # fmt: skip
 SHOWN = 12
 "Digits of a hash that messages show."
@@ -48,14 +48,14 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
             f"which tormagd {__version__} writes; replay it with the version that wrote it"
         )
     columns = _json(header, "columns", tuple[str, ...])
-    lacking = [name for name in TickRecord.__struct_fields__ if name not in columns]
+    lacking = [name for name in COLUMNS if name not in columns]
     if lacking:
         raise ReplayError(f"its ticks have no column {lacking[0]!r}: tormagd {header['version'][:20]!r} wrote it")
     try:
         return Recorded(
-            checked(_intact(header, "config"), Config),
+            checked(_intact(header, "configuration"), Config),
             checked(_intact(header, "scene"), Scene),
-            header["model_sha256"],
+            header["model"],
             (Path(header["scene_folder"]), beside),
             columns,
             header,
@@ -96,7 +96,7 @@ def differences(known: Recorded, configured: Config | None) -> list[str]:
     else:
         _compare(found, "scene", known.header["scene_sha256"], msgspec.json.encode(scene))
     if configured is not None:
-        _compare(found, "configuration", known.header["config_sha256"], msgspec.json.encode(configured))
+        _compare(found, "configuration", known.header["configuration_sha256"], msgspec.json.encode(configured))
     return found
 
 

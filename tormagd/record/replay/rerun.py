@@ -1,13 +1,10 @@
 """Runs the core over its recorded inputs: it gives the same bits, or the first tick and field that differ."""
 
 from bisect import bisect_right
-from functools import reduce
-from operator import or_
 from typing import Any
 
 import msgspec
 
-from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.control.assembly.build import Core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
@@ -17,15 +14,13 @@ from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.element.inverse.solution import Answer
 from tormagd.ground.plain_values import packed, plain, restore, restored
-from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd.record import journal, keeper_messages as keeping
-from tormagd.record.black_box import frames_in, is_tick
-from tormagd.record.journal import KNOWN
+from tormagd.record import journal, ticks
+from tormagd.record.journal import KNOWN, core_hash
 from tormagd.record.replay.conversation import Conversation, Found, differing
 from tormagd.record.replay.rebuild import ReplayError
-from tormagd.record.telemetry import tick_record
-from tormagd_client.messages import TickRecord
+from tormagd.record.telemetry import COLUMNS, TickRecord, measurement_of, tick_of
+from tormagd.record.writer import frames_in, is_tick
 
 UNTAKEN = (
     TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
@@ -37,40 +32,12 @@ SETPOINT = tuple[
 ]  # fmt: skip
 NOT_THE_CORES = 1
 "Leading columns that the core does not make: `t_ns`, from the clock."
-MEASURED = {
-    "received_s": "received_s",
-    "device_time_s": "device_time_s",
-    "left_mm": "device_left_mm",
-    "right_mm": "device_right_mm",
-    "left_current_A": "left_current_A",
-    "right_current_A": "right_current_A",
-    "force_N": "device_force_N",
-    "handle_mm": "device_handle_mm",
-    "temperature_C": "device_temperature_C",
-    "supply_V": "supply_V",
-    "sensed_s": "sensed_s",
-    "reported_s": "reported_s",
-    "delay_s": "delay_s",
-}
-"By field of a measurement, the column that holds it."
-QUALITY = ("link_unanswered", "link_damaged", "link_unsent", "link_round_trip_s", "device_clock_drift")
 
 
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
     """Return when a recorded plan began, and its setpoint."""
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
     return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
-
-
-class Difference(msgspec.Struct, frozen=True):
-    """Where a replay first differs. `tick` counts from 1, `time_s` from the file's first tick."""
-
-    tick: int
-    time_s: float
-    field: str
-    recorded: str
-    replayed: str
-    frame: int | None
 
 
 class Rerun(msgspec.Struct, frozen=True):
@@ -82,13 +49,12 @@ class Rerun(msgspec.Struct, frozen=True):
     snapshots: int
     gaps: int
     frames: int
-    difference: Difference | None
+    difference: Found | None
 
 
-def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
-    own = TickRecord.__struct_fields__
-    order = None if columns == own else [columns.index(name) for name in own]
-    records: dict[int, TickRecord] = {}
+def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, Any]:
+    order = None if columns == COLUMNS else [columns.index(name) for name in COLUMNS]
+    records: dict[int, Any] = {}
     for place, entry in enumerate(entries):
         if is_tick(entry):
             if len(entry) != len(columns):
@@ -117,8 +83,8 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
     except (ValueError, TypeError) as error:
         raise ReplayError(f"before the start: no frames: {_short(error)}") from error
     number = bisect_right(places, start)
-    from_s, ticks, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
-    difference: Difference | None = None
+    from_s, agreed, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
+    difference: Found | None = None
     for place in range(start, places[-1] + 1):
         # a step's inputs are in the record of its period, which comes after the period's other entries
         record = records[places[number]]
@@ -130,17 +96,17 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
                 f"tick {number + 1}: the core does not take what stands there: {_short(error)}"
             ) from error
         if differs is not None:
-            told = _short(differs.recorded), _short(differs.replayed)
-            difference = Difference(number + 1, round(time_s, 6), differs.field, *told, differs.frame)
+            told = {"recorded": _short(differs.recorded), "replayed": _short(differs.replayed)}
+            difference = msgspec.structs.replace(differs, tick=number + 1, time_s=round(time_s, 6), **told)
             break
         if place in records:
             number += 1
             if running.is_known:
-                ticks, to_s = ticks + 1, time_s
-    return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, running.conversation.frames, difference)
+                agreed, to_s = agreed + 1, time_s
+    return Rerun(agreed, from_s, to_s, running.snapshots, running.gaps, running.conversation.frames, difference)
 
 
-def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
+def _start(entries: list[Any], records: dict[int, Any], until_s: float) -> int:
     """Return the index of the newest snapshot that a tick follows by `until_s`, else of the first."""
     found: int | None = None
     waiting: int | None = None
@@ -158,7 +124,7 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 
 class _Running:
     def __init__(self, core: Core, frame: int) -> None:
-        self.conversation = Conversation(frame)
+        self.conversation, self._core = Conversation(frame), core_hash(core.config, core.scene, core.model)
         self._of_frames: Found | None = None
         self._stepper, self._planner = core.stepper(), core.planner()
         self._used = self._planner.planned
@@ -168,17 +134,19 @@ class _Running:
         self.is_known = False
         self.snapshots = self.gaps = 0
 
-    def take(self, entry: Any, record: TickRecord) -> Found | None:
+    def take(self, entry: Any, record: Any) -> Found | None:
         """Take one entry that is no tick, and return the first difference."""
         name = name_of(entry)
+        if name == ticks.TOLD:
+            return None
         self.conversation.frame += len(frames_in(entry))
         if name == journal.STATE:
             return self._begin(entry)
-        if name == journal.MISSING:
+        if name == ticks.MISSING:
             self.gaps += self.is_known
             self.is_known = False
             self.conversation.begin(None)
-        elif name == keeping.READ:
+        elif name == ticks.READ:
             self.conversation.read(entry)
         elif name == journal.CONNECTED:
             self.conversation.begin(entry[1])
@@ -186,7 +154,7 @@ class _Running:
             return self._run(name, entry, record)
         return None
 
-    def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
+    def _run(self, name: str, entry: Any, record: Any) -> Found | None:
         """Do what one entry tells: step, plan, learning, command or fault."""
         match name:
             case journal.STEP:
@@ -194,7 +162,7 @@ class _Running:
                 self._of_frames = self.conversation.compare(self._measurement)
                 self._used = self._planner.planned
                 self._output = self._stepper.step(record.monotonic_s, self._measurement, self._used)
-            case keeping.WROTE:
+            case ticks.WROTE:
                 if self._output is None:
                     raise ValueError("something written without a step")
                 self._of_frames = self._of_frames or self.conversation.wrote(entry, self._output)
@@ -235,7 +203,7 @@ class _Running:
                 raise ValueError(f"{name[:40]!r}: no entry of a black box")
         return None
 
-    def compare(self, record: TickRecord) -> Found | None:
+    def compare(self, record: Any) -> Found | None:
         """Return the first column that differs from the recorded tick, or else what its frames show."""
         if not self.is_known:
             return None
@@ -244,43 +212,29 @@ class _Running:
         timing = record.lateness_us, record.exec_us, record.tick
         if self._failure is not None:
             return Found("plan", "made", f"failed: {self._failure}")
-        given = tick_record(self._stepper, self._output, self._used, self._measurement, *timing)
+        given = tick_of(self._stepper, self._output, self._used, self._measurement, *timing)
         left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
         if packed(left) == packed(right):
             return self._of_frames
-        rows = zip(TickRecord.__struct_fields__[NOT_THE_CORES:], left, right, strict=True)
+        rows = zip(COLUMNS[NOT_THE_CORES:], left, right, strict=True)
         return next(Found(*row) for row in rows if packed(row[1]) != packed(row[2]))
 
     def _begin(self, entry: Any) -> Found | None:
         """Compare the states with a snapshot's, if they are known, and then take them."""
-        differs, connection = None, entry[3]
+        _, step, plan, connection, core = entry
+        if core != self._core:
+            return Found("core", core, self._core)
+        differs = None
         if self.is_known:
             self.snapshots += 1
-            for what, recorded, own in (("step", entry[1], self._stepper), ("plan", entry[2], self._planner)):
+            for what, recorded, own in (("step", step, self._stepper), ("plan", plan, self._planner)):
                 differs = differs or differing(f"state.{what}", recorded, plain(own))
             differs = differs or self.conversation.compare_memory(connection)
         self.conversation.begin(connection)
-        restore(self._stepper, entry[1], KNOWN)
-        restore(self._planner, entry[2], KNOWN)
+        restore(self._stepper, step, KNOWN)
+        restore(self._planner, plan, KNOWN)
         self._failure, self.is_known = None, True
         return differs
-
-
-def measurement_of(record: TickRecord) -> Measurement | None:
-    if record.measurement is None:
-        return None
-    numbers = {name: getattr(record, column) for name, column in MEASURED.items()}
-    quality = [getattr(record, column) for column in QUALITY]
-    if None in (*numbers.values(), *quality) or record.device_mode is None:
-        raise ValueError("a measurement in parts: allowed is a whole one, or none")
-    return Measurement(
-        number=record.measurement,
-        mode=DeviceMode[record.device_mode],
-        switches=reduce(or_, [Switches[name] for name in record.device_switches], Switches(0)),
-        faults=reduce(or_, [DeviceFault[name] for name in record.device_faults], DeviceFault(0)),
-        link=LinkQuality(*quality),
-        **numbers,
-    )
 
 
 def name_of(entry: Any) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from tormag_lab.arrays import rms
 from tormag_lab.executors import finished
 from tormagd.commission.sequence import MAX_BYTES, Report
-from tormagd.record.overview import Floats, Glance, OverviewBuilder
+from tormagd.record.overview import Floats, OverviewBuilder, glance
 from tormagd.record.reader import Seen, read_open
 
 DAY_S = 86_400.0
@@ -32,12 +32,7 @@ FIGURES = (
 "Numbers of a tick that a summary covers."
 
 
-class Wanted(Glance, total=False):
-    trim: float | None
-    device_clock_drift: float | None
-    device_temperature_C: float | None
-    left_current_A: float | None
-    right_current_A: float | None
+Wanted = glance(*FIGURES)
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
