@@ -184,6 +184,8 @@ class Trim(Strict, frozen=True):
     "Greatest offset; more counts as the sensor's zero."
     leash: Annotated[float, Meta(ge=0.02, le=0.3)] = 0.08
     "Share of the force first shown by which a falling reading is followed."
+    way: Annotated[float, Meta(ge=-0.06, le=0.06)] = 0.0
+    "By which share friction is greater where the handle goes positive, and less the other way: where learning begins."
 
 
 class Limits(Strict, frozen=True):

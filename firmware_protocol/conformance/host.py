@@ -116,6 +116,7 @@ class Host:
         """The greatest lateness of this process since `begin`."""
         self.drive_s = line.port.now_s()
         self.counter = 0
+        self.said: Drive | None = None
         self._next_s = line.port.now_s()
         self._status_s = math.inf
 
@@ -132,7 +133,14 @@ class Host:
         self.counter = (self.counter + 1) % 256
         self.drives += 1
         self.drive_s = self.now_s
-        self.send(Drive(left, right, mode, self.counter))
+        self.said = Drive(left, right, mode, self.counter)
+        self.send(self.said)
+
+    def send_beside(self, message: Message) -> None:
+        """Send a message, and the Drive before it again, which it may not make a new one."""
+        self.send(message)
+        if self.said is not None:
+            self.send(self.said)
 
     def hello(
         self,
@@ -157,7 +165,7 @@ class Host:
                 return False
             if self._next_s >= due_s:
                 due_s += REPEAT_S
-                self.send(kind(nonce))
+                self.send_beside(kind(nonce))
             self.beat(beat)
         return True
 

@@ -3,11 +3,12 @@
 import math
 from collections import deque
 from functools import partial
+from itertools import product
 from typing import Final
 
 import numpy as np
 
-from firmware_protocol.codec import Clear, DeviceFault, DeviceMode, DriveMode, Sense, State, Status
+from firmware_protocol.codec import Clear, DeviceFault, DeviceMode, DriveMode, Home, Sense, State, Status
 from firmware_protocol.conformance.check import Check, Hazard, check
 from firmware_protocol.conformance.host import (
     ANSWER_S,
@@ -48,6 +49,8 @@ NEAR, PAST = 0.85, 1.15
 """Shares of the stroke: that is travelled at a brisk speed; and further than any scale is off, so that a device that
 gets there does not watch."""
 MIDDLE_MM, PULSE_S, SETTLED_S = 10.0, 0.08, 0.04
+PARTS: Final = (slice(6, 16), slice(40, None))
+"States of a pulse: where the motor still starts, a current that is smoothed is not of its duty and speed."
 PAIRED: Final = (
     *((0.02 * step, 0.12 - 0.02 * step) for step in range(1, 6)),
     *((0.4, 0.53), (0.55, 0.46), (0.62, 0.71), (0.75, 0.66), (0.79, 0.88), (0.93, 0.83), (0.97, 1.0), (1.0, 0.86)),
@@ -188,10 +191,10 @@ def duties_make_currents(host: Host) -> str:
         for _ in range(round(PULSE_S / PERIOD_S)):
             host.beat(DriveMode.RUN, left, right)
         unless(host.status.mode is not DeviceMode.RUN, f"{left:+.2f} and {right:+.2f}: {shown(host.status)}")
-        rows = columns(host, -round(SETTLED_S / PERIOD_S) * len(COLUMNS))
-        for side, name, duty in ((0, "left", left), (1, "right", right)):
-            mm_s = float(np.polyfit(rows["device_s"] - rows["device_s"][0], rows[f"{name}_mm"], 1)[0])
-            pulses[side].append((duty, mm_s, float(rows[f"{name}_A"].mean())))
+        rows = columns(host, -round(PULSE_S / PERIOD_S) * len(COLUMNS))
+        for part, (side, name, duty) in product(PARTS, ((0, "left", left), (1, "right", right))):
+            mm_s = float(np.polyfit(rows["device_s"][part] - rows["device_s"][0], rows[f"{name}_mm"][part], 1)[0])
+            pulses[side].append((duty, mm_s, float(rows[f"{name}_A"][part].mean())))
     host.bring(-MIDDLE_MM, -MIDDLE_MM)
     host.pass_time(SETTLED_S, DriveMode.RUN)
     start_mm = places(host.last(State))
@@ -239,26 +242,40 @@ def _has_left(host: Host) -> bool:
 @check(
     Hazard.CLOSES,
     "Modes",
-    f"Retract in RUN, and LATCHED by silence, Clear and Home, Drive RUN of {DUTY:g} going on; then one Drive OFF",
-    "IDLE and still until the Drive OFF, RUN after it",
+    f"Retract in RUN, Drive RUN of {DUTY:g} going on; 4 times silence, Clear, Home, one Drive OFF meanwhile",
+    "IDLE and still until a Drive OFF, RUN after it, in whatever mode it came",
     moves=True,
 )
 def let_go_after_all(host: Host) -> str:
     put_off(host)
     seen = [_has_to_let_go(host)]
-    host.running(INSIDE_MM)
-    host.pass_time(0.1)
-    host.until(host.is_resting, OPENED_S, DriveMode.RUN)
-    host.obeyed(Clear, DriveMode.RUN)
-    host.home(DriveMode.RUN)
-    return "; ".join([*seen, _has_to_let_go(host)])
+    for lets_go in (DeviceMode.RETRACTING, DeviceMode.LATCHED, DeviceMode.HOMING, DeviceMode.IDLE):
+        host.running(INSIDE_MM)
+        host.pass_time(0.1)
+        for mode, commands in (
+            (DeviceMode.RETRACTING, ()),
+            (DeviceMode.LATCHED, (Clear, Home)),
+            (DeviceMode.HOMING, ()),
+        ):
+            if mode is lets_go:
+                host.beat(DriveMode.OFF)
+            for command in commands:
+                host.obeyed(command, DriveMode.RUN)
+            host.until(host.is_resting, OPENED_S, DriveMode.RUN)
+        seen.append(_has_to_let_go(host) if lets_go is DeviceMode.IDLE else _runs(host, f"let go while {lets_go.name}"))
+    return "; ".join(seen)
 
 
 def _has_to_let_go(host: Host) -> str:
     keeps_still(host, "before a Drive OFF")
     host.beat(DriveMode.OFF)
-    host.pass_time(SEEN_S, DriveMode.RUN)
-    return host.shows(DeviceMode.RUN, DriveMode.RUN, besides="IDLE, and after a Drive OFF and Drive RUN again")
+    return _runs(host, "IDLE, and after a Drive OFF and Drive RUN again")
+
+
+def _runs(host: Host, when: str) -> str:
+    host.pass_time(SEEN_S, DriveMode.RUN, duty=DUTY)
+    # a Drive RUN counts whatever its duties are
+    return host.shows(DeviceMode.RUN, DriveMode.RUN, besides=when, wrong=_has_left(host))
 
 
 def keeps_still(host: Host, when: str) -> str:

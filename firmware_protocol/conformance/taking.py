@@ -157,12 +157,12 @@ def taken(host: Host, place: Place) -> Iterator[Sent]:
         cell = TAKES[name][place.mode]
         if cell in STAYS or (kind is Clear and place.name == MISMATCHED):
             nonce = host.new_nonce()
-            yield Sent(name, partial(host.send, kind(nonce)), nonce if cell.startswith("accepted") else None)
+            yield Sent(name, partial(host.send_beside, kind(nonce)), nonce if cell.startswith("accepted") else None)
     if place.beat is DriveMode.OFF and TAKES["Drive RUN"][place.mode] == "answered":
         yield Sent("Drive RUN", partial(host.drive, DriveMode.RUN, DUTY, DUTY))
     if place.name != MISMATCHED:
         for nonce in (host.status.command_nonce, 77, HELLO_NONCE):
-            yield Sent(FITS, partial(host.send, Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce)), nonce, 1)
+            yield Sent(FITS, partial(host.send_beside, Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce)), nonce, 1)
 
 
 def stays(place: Place, host: Host) -> str:
@@ -250,6 +250,8 @@ def acts(place: Place, name: str, host: Host) -> str:
 
 def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
     place.enter(host)
+    host.pass_time(ANSWER_S)
+    unanswered = host.drives - host.states
     is_deep = place.mode is DeviceMode.RUN and period_s == PERIOD_S
     if is_deep:
         host.running(host.stroke_mm - FAR_MM)
@@ -264,16 +266,22 @@ def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
     if is_deep:
         return opens_fully(host, faults, beat)
     host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, beat)
+    if name == MISFITS:
+        unless(host.command(Clear, beat, SEEN_S), f"{seen}, Clear taken: {shown(host.status)}")
+    host.pass_time(ANSWER_S)
+    extra = unanswered - (host.drives - host.states)
+    seen += f", {extra:+d} State besides one for each Drive"
     is_zero_kept = not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED))
     mode = DeviceMode.LATCHED if faults else DeviceMode.IDLE
-    return host.shows(mode, beat, homed=is_zero_kept, opened=True, fault=faults, besides=seen)
+    return host.shows(mode, beat, homed=is_zero_kept, opened=True, fault=faults, besides=seen, wrong=extra)
 
 
 def _say(host: Host, name: str, beat: Beat, misfit: Hello) -> None:
     if name in COMMANDS:
         host.obeyed(COMMANDS[name], beat)
     duty = -1.0 if beat is DriveMode.OFF else 0.0
-    host.beat(beat, duty, duty, besides=partial(host.send, misfit) if name == MISFITS else lambda: None)
+    besides = {MISFITS: partial(host.send_beside, misfit), OFF: partial(host.drive, DriveMode.RUN, -1.0, -1.0)}
+    host.beat(beat, duty, duty, besides=besides.get(name, lambda: None))
     host.pass_time(2.0 * SILENCE_S if name == SILENT else 0.0)
 
 

@@ -279,27 +279,34 @@ def positions_run_on(host: Host) -> str:
 @check(
     Hazard.MISLED,
     "Sense",
-    f"{ALL}; somebody turns the handle by over a turn, within {TURNED_S:g} s",
+    f"{ALL}; somebody turns the handle by over a turn, and back, within {TURNED_S:g} s",
     "no leap, a force against the motion",
 )
 def handle_runs_on(host: Host) -> str:
     """Finds leaps, as of swapped bytes or too few bits, and a force that is not against the motion."""
-    host.ask("turn the handle by over a whole turn, at a steady pace")
+    host.ask("turn the handle by over a whole turn, at a steady pace, and back")
     end_s = host.now_s + TURNED_S
     host.pass_time(0.5, DriveMode.OFF)
-    while host.now_s < end_s and np.ptp(columns(host)["handle_mm"]) < 1.1 * TURN_MM:
+    while host.now_s < end_s and (
+        np.ptp(columns(host)["handle_mm"]) < 1.1 * TURN_MM or len(_along_N(columns(host))) < 2
+    ):
         host.pass_time(0.5, DriveMode.OFF)
     rows = columns(host)
     near = np.diff(rows["device_s"]) < SUCCESSIVE_S
     most_mm = float(np.max(np.abs(np.diff(rows["handle_mm"]))[near], initial=0.0))
     way_mm = float(np.ptp(rows["handle_mm"]))
-    slides = np.abs(rows["handle_mm_s"]) > SLIDES_MM_S
-    along_N = float(np.median((np.sign(rows["handle_mm_s"]) * rows["force_N"])[slides])) if slides.any() else 0.0
-    seen = f"turned by {way_mm:.0f} mm, {most_mm:.3f} mm a step at most, {along_N:+.2f} N against it"
-    unless(most_mm > LEAP_MM or along_N < 0.0, seen)
-    if way_mm < TURN_MM:
-        raise Untested(f"{seen}; turn the handle by over a turn meanwhile, --only handle_runs_on")
+    along_N = _along_N(rows)
+    seen = f"turned by {way_mm:.0f} mm, {most_mm:.3f} mm a step at most, {along_N} N against it"
+    unless(most_mm > LEAP_MM or min(along_N, default=0.0) < 0.0, seen)
+    if way_mm < TURN_MM or len(along_N) < 2:
+        raise Untested(f"{seen}; turn the handle by over a turn and back meanwhile, --only handle_runs_on")
     return seen
+
+
+def _along_N(rows: dict[str, Array]) -> list[float]:
+    """Return the force against the handle's motion, for each way that it went."""
+    along_N = (way * rows["force_N"][way * rows["handle_mm_s"] > SLIDES_MM_S] for way in (1.0, -1.0))
+    return [round(float(np.median(part_N)), 2) for part_N in along_N if part_N.size]
 
 
 @check(

@@ -13,6 +13,7 @@ from tormagd.commission.finding import finding
 from tormagd.commission.sequence import STEPS, Report, Stopped, begun
 from tormagd.config import Config, Rates, load_calibration
 from tormagd.control.assembly.build import build_core
+from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.move.motor import margins
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import load_plant, with_insert
@@ -140,6 +141,17 @@ def with_play(width_N):
     return plays
 
 
+def bent(per_N):
+    return lambda _now_s, force_N: force_N * (1.0 + per_N * abs(force_N))
+
+
+def with_cross_talk(now_s, message):
+    """Let the sensor pick up 10 mN of each ampere."""
+    if not isinstance(message, Sense):
+        return message
+    return message.replaced(force_N=message.force_N + 0.01 * (message.left_current_A + message.right_current_A))
+
+
 def through(sensor):
     return lambda now_s, message: (
         message.replaced(force_N=sensor(now_s, message.force_N)) if isinstance(message, Sense) else message
@@ -164,6 +176,10 @@ NOISE = random.Random(1)
         (("sensor",), {"alters": through(first_order(5.0))}, "sensor's rise after the handle's turn"),
         (("steps",), {"alters": through(read_at(12.0))}, "sensor's readings apart"),
         (("force over gap",), {"alters": through(with_play(0.06))}, "force of a closing gap over an opening one's"),
+        *(
+            (("force over gap",), {"alters": through(bent(per_N))}, "force's curve, of sensor or magnets")
+            for per_N in (0.1, -0.1)
+        ),
         (("carriages",), {"plant": with_part("screw", friction_coefficient=0.7)}, "left friction over the configured"),
         (
             ("carriages",),
@@ -186,14 +202,15 @@ def test_the_row_of_what_a_fault_changes_turns_red(bench, steps, device, expecte
 @pytest.mark.parametrize(
     ("sensor", "steps"),
     [
-        (read_at(50.0), ("sensor", "force over gap", "steps")),
-        (second_order(15.0), ("sensor",)),
-        (with_play(0.03), ("force over gap",)),
+        (through(read_at(50.0)), ("sensor", "force over gap", "steps")),
+        (through(second_order(15.0)), ("sensor",)),
+        (through(with_play(0.03)), ("force over gap",)),
+        (with_cross_talk, ("sensor", "force over gap", "steps")),
     ],
-    ids=["50/s", "15 Hz", "30 mN"],
+    ids=["50/s", "15 Hz", "30 mN", "cross-talk"],
 )
 def test_a_fair_sensor_is_taken(bench, sensor, steps):
-    found, stopped = bench(SAMPLE, alters=through(sensor)).commission(chosen(*steps))
+    found, stopped = bench(SAMPLE, alters=sensor).commission(chosen(*steps))
     assert (red(found), stopped) == ([], None)
 
 
@@ -217,17 +234,43 @@ def test_weak_magnet_wrong_insert_and_sensor_gain_share_a_row_that_names_them(be
     assert red(found)[0] == "force over the model's: magnets, insert, or sensor's gain"
 
 
+@pytest.mark.parametrize("second_N", [0.0, 1.0])
 @pytest.mark.parametrize(("gain", "bent_per_N"), [(1.0, 0.0), (0.55, 0.0), (1.0, 0.1), (1.0, -0.1)])
-def test_a_weight_tells_the_sensors_gain_and_a_bent_line(bench, gain, bent_per_N):
+def test_weights_tell_the_sensors_gain_and_a_bent_line(bench, gain, bent_per_N, second_N):
     def weighs(now_s, force_N):
-        hung_N = force_N + 2.0 * (now_s > 10.0)
+        hung_N = force_N + 1.0 * (now_s > 10.0) + second_N * (now_s > 25.0)
         return gain * hung_N * (1.0 + bent_per_N * hung_N)
 
     hung = bench(SAMPLE, hand=SteadyHand(0.0), alters=through(weighs))
-    found, stopped = hung.commission(chosen("weight"), weight_N=2.0)
-    expected = gain * (1.0 + 2.0 * bent_per_N)
-    assert (found["weight"][0].value, stopped) == (pytest.approx(expected, abs=0.02), None)
-    assert red(found) == ([] if expected == 1.0 else ["sensor's gain, by the weight"])
+    found, stopped = hung.commission(chosen("weight"), weight_N=1.0)
+    expected = [gain * (1.0 + bent_per_N), (1.0 + 3.0 * bent_per_N) / (1.0 + bent_per_N)][: 1 + (second_N > 0.0)]
+    assert ([each.value for each in found["weight"]], stopped) == (pytest.approx(expected, abs=0.02), None)
+    assert [each.is_fine for each in found["weight"]] == [abs(each - 1.0) < 0.05 for each in expected]
+
+
+class Turning:
+    def position_mm(self, time_s):
+        return 66.0 * math.sin(1.05 * time_s)
+
+
+def test_a_friction_that_differs_by_the_way_is_believed_from_the_beginning(bench, tmp_path):
+
+    def rippled(now_s, message):
+        if not isinstance(message, Sense):
+            return message
+        share = 0.04 * math.cos(message.handle_position_mm / 20.0 + 0.7) + 0.03 * math.copysign(1.0, message.force_N)
+        return message.replaced(force_N=message.force_N * (1.0 + share))
+
+    turned = bench(SAMPLE, hand=Turning(), alters=rippled)
+    found, stopped = turned.commission(chosen("force over gap", "memory"))
+    _, way, ripple = found["memory"]
+    assert (way.value, ripple.value, stopped) == (pytest.approx(3.0, abs=0.6), pytest.approx(4.0, abs=0.8), None)
+    file = tmp_path / "00000007.toml"
+    file.write_text(calibration(msgspec.structs.replace(NEW, findings=found), CONFIG))
+    planner = build_core(load_calibration(file, CONFIG, 7)).planner()
+    assert planner.believe.zero.way == pytest.approx(0.03, abs=0.006)
+    planner.teach(NOTHING_LEARNED)
+    assert planner.believe.zero.way == pytest.approx(0.03, abs=0.006)
 
 
 @pytest.mark.parametrize(

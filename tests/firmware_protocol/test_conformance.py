@@ -112,17 +112,24 @@ class Bus(Wire):
         return [(self.time_s, frame.identifier, frame.data) for sender, frame, _ in delivered if sender == DEVICE]
 
 
+class WindingHand:
+    """A hand that turns the handle by over a turn, and back."""
+
+    def position_mm(self, time_s: float) -> float:
+        return 80.0 * math.sin(0.5 * time_s)
+
+
 def serial_line(
     boot: FirmwareKind = Firmware,
     wire: type[Wire] = Wire,
     faults: Sequence[str] = (),
     plant: PlantParameters = NEAR_HOME,
 ) -> SerialLine:
-    return SerialLine(wire(VirtualDevice(plant, SteadyHand(), [parse_fault(fault) for fault in faults], boot=boot)))
+    return SerialLine(wire(VirtualDevice(plant, WindingHand(), [parse_fault(fault) for fault in faults], boot=boot)))
 
 
 def can_line(bus: type[Bus] = Bus, plant: PlantParameters = NEAR_HOME) -> CanLine:
-    return CanLine(bus(CanDevice(MessageDevice(plant, SteadyHand()))), 1)
+    return CanLine(bus(CanDevice(MessageDevice(plant, WindingHand()))), 1)
 
 
 # -- the right device ----------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from tormagd.commission.procedure import PLACES, Columns, Course, Known, Row, gi
 REST_S = 3.0
 BEGINS_S, HOMING_S = 2.0, 15.0
 OPENING_S = 12.0
-HUNG_S, SWINGS_S = 60.0, 3.0
+HUNG_S, SWINGS_S, SECOND_S = 60.0, 3.0, 17.0
 TOLD_S = 0.3
 "By then a device that opens has said so."
 PLACE_MM = (-0.3, 0.3)
@@ -71,19 +71,27 @@ def homing(_known: Known) -> Course[list[Finding]]:
 
 
 def weight(known: Known) -> Course[list[Finding]]:
+    """Have a weight hung from the sensor, and then another one like it, if there is one."""
     assert known.weight_N is not None, "the step is left out without one"
-    before = yield from watch(REST_S, states=ANY_STATE)
-    begins_N = float(np.nanmean(before["device_force_N"]))
-    hung_N = 0.4 * known.weight_N
+    begins_N, hung_N = (yield from _level_N()), 0.4 * known.weight_N
 
     def is_hung(row: Row) -> bool:
         return row[_FORCE] is not None and bool(abs(row[_FORCE] - begins_N) > hung_N)
 
     yield from given("", is_hung, HUNG_S)
-    yield from watch(SWINGS_S, states=ANY_STATE)
-    after = yield from watch(REST_S, states=ANY_STATE)
-    share = np.abs(after["device_force_N"] - begins_N) / known.weight_N
-    return [finding("sensor's gain, by the weight", share, "", (0.95, 1.05), "calibrate the sensor, or replace it")]
+    levels_N = [begins_N, (yield from _level_N(SWINGS_S)), (yield from _level_N(SECOND_S))]
+    first, second = np.abs(np.diff(levels_N)) / known.weight_N
+    found = [finding("sensor's gain, by the weight", first, "", (0.95, 1.05), "calibrate the sensor, or replace it")]
+    if second > 0.4:
+        bent = finding("sensor's second weight over the first", second / first, "", (0.95, 1.05), "replace the sensor")
+        found.append(bent)
+    return found
+
+
+def _level_N(after_s: float = 0.0) -> Course[float]:
+    yield from watch(after_s, states=ANY_STATE)
+    ticks = yield from watch(REST_S, states=ANY_STATE)
+    return float(np.nanmean(ticks["device_force_N"]))
 
 
 def way_back(_known: Known) -> Course[list[Finding]]:

@@ -6,9 +6,11 @@ import math
 import msgspec
 
 from tormagd.commission.carriage_findings import BACK_EMF, FRICTION, INERTIA, RESISTANCE, nominals
+from tormagd.commission.force_findings import WAY
 from tormagd.commission.gains import Corners, stiffest, tunings
 from tormagd.commission.sequence import Report
 from tormagd.config import Config
+from tormagd.control.believe.sensor_zero import MAX_WAY
 
 DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03)
 SURELY = 0.15
@@ -42,7 +44,8 @@ def calibration(report: Report, config: Config) -> str:
     strength = values.get("force over the model's: magnets, insert, or sensor's gain")
     if strength is not None:
         bounds = {"least": min(RELAXED * strength, 1.0), "most": max(RESTED * strength, 1.0)}
-        lines += _table("trim", bounds)
+        way = min(max(1e-2 * values.get(WAY, 0.0), -MAX_WAY), MAX_WAY)
+        lines += _table("trim", bounds | {"way": way})
     return "\n".join(lines) + "\n"
 
 

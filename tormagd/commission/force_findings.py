@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from tormagd.commission.finding import Array, Finding, finding, fitted
 from tormagd.commission.procedure import (
@@ -36,7 +37,6 @@ STEP_S, ARRIVED_S = 2.0, 1.0
 ENABLE_S = 2.0
 _STATE = PLACES["operating_state"]
 RESTED_S, RISEN_S, HELD_S = 4.0, 0.5, 6.0
-FAST_MM_S = 40.0
 WORN = "compare the insert with the scene's; replace one that is worn or swollen"
 STRENGTH = (0.6, 1.5)
 "The lower bound is the default `[trim]` for the weakest device; of 60 healthy draws the weakest has 0.63."
@@ -45,7 +45,18 @@ CHANGING_N_S: Final = 1.0
 STILL_MM_S, STROKE_S, TURNED_MM, RISEN = 2.0, 0.3, 0.5, 0.8
 "The rubber's own way is under TURNED_MM: a force that is not at RISEN by then waits for its sensor."
 SLOW = "set the sensor's amplifier to 15 Hz or more, and to 50 readings a second, or replace it"
+TURN_MM = 40.0 * math.pi
+HARMONICS = (1, 2, 3)
+CURVE = (-0.09, 0.038)
+"""Of 23 healthy devices the field law makes -0.06 to 0.032 1/N at MIDDLE_N; a sensor bent by 10 % a newton 0.07 more,
+or 0.16 less."""
+MIDDLE_N = 1.3
 STICKS = "look for what rubs beside the sensor, and for play in its mount; replace it"
+STUCK_MN = (-5.0, 45.0)
+BENT = "hang up two weights alike (--weight-N): they tell the sensor's curve from the magnets'; replace a bent sensor"
+APART = "sensor's readings apart"
+WAY = "friction one way over its mean"
+SHAFT = "look whether shaft and insert run true, and at the sensor's mount"
 SENSOR = "tare the sensor, look at its cable, shielding and supply"
 ELEMENT = (
     "hang up a weight (--weight-N): it tells the sensor's gain from magnets and insert. Compare both with the scene"
@@ -79,16 +90,11 @@ def sensor(known: Known) -> Course[list[Finding]]:
         for force_N, goes in zip(np.array_split(raw_N, PARTS), np.array_split(way, PARTS), strict=True)
     )
     halves = [(np.mean(up_N) + np.mean(down_N)) / 2.0 for up_N, down_N in both_ways if up_N.size and down_N.size]
-    jumps_N = np.abs(np.diff(raw_N))
     over_model = later["measured_cf"] / later["predicted_cf"]
     slow, fast = (over_model[(speed > low) & (speed <= high)] for low, high in ((MOVING_MM_S, 25.0), (40.0, np.inf)))
-    still = jumps_N[(speed[1:] > SLIDING_MM_S) & (jumps_N > 0.0)]
     return [
         finding("sensor's zero", np.array(halves), "mN", (-60.0, 60.0), SENSOR, 1e3),
-        finding(
-            "sensor's noise", np.sqrt(np.mean(still**2) / 2.0) if still.size else np.nan, "mN", (0.0, 40.0), SENSOR, 1e3
-        ),
-        finding("sensor's resolution", jumps_N[jumps_N > 1e-6].min(initial=np.inf), "mN", (0.0, 25.0), SENSOR, 1e3),
+        *_jumps(raw_N, speed > SLIDING_MM_S),
         finding("sensor's rise after the handle's turn", _rises_s(known, later), "ms", (-300.0, 10.0), SLOW, 1e3),
         finding(
             "force when slow over force at speed, to the model's",
@@ -97,6 +103,24 @@ def sensor(known: Known) -> Course[list[Finding]]:
             (0.85, 1.15),
             "clean shaft and insert; train the insert with these motions",
         ),
+    ]
+
+
+def sensor_at_rest(ticks: Columns) -> list[Finding]:
+    """Judge of a sensor what needs no motion."""
+    whole = np.ones(ticks["device_force_N"].size, dtype=bool)
+    apart_s = _readings_apart_s(ticks, whole)
+    return [*_jumps(ticks["device_force_N"], whole), finding(APART, apart_s, "ms", (0.0, 30.0), SLOW, 1e3)]
+
+
+def _jumps(force_N: Array, counts: npt.NDArray[np.bool_]) -> list[Finding]:
+    """Return noise and resolution from the steps between readings; the noise where it `counts`."""
+    jumps_N = np.abs(np.diff(force_N))
+    known = jumps_N[counts[1:] & (jumps_N > 1e-6)]
+    noise_N, least_N = np.sqrt(np.mean(known**2) / 2.0) if known.size else np.nan, jumps_N[jumps_N > 1e-6]
+    return [
+        finding("sensor's noise", noise_N, "mN", (0.0, 40.0), SENSOR, 1e3),
+        finding("sensor's resolution", least_N.min(initial=np.inf), "mN", (0.0, 25.0), SENSOR, 1e3),
     ]
 
 
@@ -119,7 +143,7 @@ def force_over_gap(known: Known) -> Course[list[Finding]]:
     off_N = np.sqrt(np.mean(means_N**2))
     return [
         _strength(ticks),
-        finding("force of a closing gap over an opening one's", _hysteresis_N(ticks), "mN", (-5.0, 45.0), STICKS, 1e3),
+        *_bent(ticks),
         finding("force over gap, off the learned curve by", off_N, "mN", (0.0, 45.0), ELEMENT, 1e3),
     ]
 
@@ -150,22 +174,22 @@ def steps(known: Known) -> Course[list[Finding]]:
         way_mm = reference[-1] - reference[0]
         beyond_mm = np.max(np.sign(way_mm) * gap) - np.max(np.sign(way_mm) * reference)
         overshoots.append(beyond_mm / abs(way_mm) if abs(way_mm) > 2.0 else 0.0)
+    slope_N_s = np.abs(np.gradient(ticks["predicted_cf"] / ticks["trim"], ticks["monotonic_s"]))
     apart_mm = np.abs(ticks["left_mm"] - ticks["right_mm"])
     limit_mm = known.config.limits.skew_warning_mm
     return [
         finding("steps, off the asked force in the mean", np.array(errors_N).mean(), "mN", (-60.0, 60.0), SENSOR, 1e3),
         finding("steps, at worst", np.abs(errors_N).max(), "mN", (0.0, 100.0), SENSOR, 1e3),
-        finding("sensor's readings apart", _readings_apart_s(ticks), "ms", (0.0, 30.0), SLOW, 1e3),
+        finding(APART, _readings_apart_s(ticks, slope_N_s > CHANGING_N_S), "ms", (0.0, 30.0), SLOW, 1e3),
         finding("carriages overshoot", max(0.0, *overshoots), "%", (0.0, 5.0), GAINS, 100.0),
         finding("carriages apart, of 99 % of the time", np.percentile(apart_mm, 99), "mm", (0.0, limit_mm), GAINS),
     ]
 
 
-def _readings_apart_s(ticks: Columns) -> float:
-    """Return the time between two readings while the force changes fast."""
-    slope_N_s = np.abs(np.gradient(ticks["predicted_cf"] / ticks["trim"], ticks["monotonic_s"]))
+def _readings_apart_s(ticks: Columns, counts: npt.NDArray[np.bool_]) -> float:
+    """Return the time between two readings where it `counts`."""
     changes = np.flatnonzero(np.diff(ticks["device_force_N"]))
-    between_s = np.diff(ticks["monotonic_s"][changes])[slope_N_s[changes[1:]] > CHANGING_N_S]
+    between_s = np.diff(ticks["monotonic_s"][changes])[counts[changes[1:]]]
     # an equal reading hides that it is one
     return float(np.quantile(between_s, 0.25)) if between_s.size else math.nan
 
@@ -183,31 +207,62 @@ def _rises_s(known: Known, ticks: Columns) -> float:
     return float(np.median(rises_s)) * known.period_s if rises_s else math.nan
 
 
-def _hysteresis_N(ticks: Columns) -> float:
-    """Return the force of a closing gap over that of an opening one, of the same model's force."""
-    model_N, gap_mm = ticks["predicted_cf"] / ticks["trim"], _smooth(ticks["reference_gap_mm"], 200)
-    rows = np.column_stack([model_N, model_N**2, -np.sign(np.gradient(gap_mm))])
-    slides = (np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S) & np.isfinite(model_N + ticks["measured_cf"])
-    return float(2.0 * np.linalg.lstsq(rows[slides], ticks["measured_cf"][slides], rcond=None)[0][2])
+def _bent(ticks: Columns) -> list[Finding]:
+    """Compare the force with the model's: of a closing gap with an opening one's, and its curve."""
+    over_N, closes = ticks["predicted_cf"] / ticks["trim"] - MIDDLE_N, -_smooth(ticks["reference_gap_mm"], 200)
+    rows = np.column_stack([np.ones_like(over_N), over_N, over_N**2, np.sign(np.gradient(closes))])
+    slides = (np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S) & np.isfinite(over_N + ticks["measured_cf"])
+    (_, slope, curve, half_N), *_ = np.linalg.lstsq(rows[slides], ticks["measured_cf"][slides], rcond=None)
+    return [
+        finding("force of a closing gap over an opening one's", 2.0 * half_N, "mN", STUCK_MN, STICKS, 1e3),
+        finding("force's curve, of sensor or magnets", curve / slope**2, "1/N", CURVE, BENT),
+    ]
 
 
 def memory(known: Known) -> Course[list[Finding]]:
-    """Step up, hold that gap, and return the share of the force that dies away."""
+    """Hold the gap at a low force, step up and hold it there, and return what the force does meanwhile."""
     low_N, high_N = known.force_N(0.0), known.force_N(1.0)
     yield from ready(low_N)
     yield from watch(RESTED_S, lambda t_s: low_N)
+    low = yield from _held(low_N)
     yield from watch(RISEN_S, lambda t_s: high_N)
-    yield from given("pause", lambda row: bool(row[_STATE] == "PAUSED"), ENABLE_S, high_N)
-    ticks = yield from watch(HELD_S, lambda t_s: high_N, states=("PAUSED",))
-    yield from given("resume", lambda row: bool(row[_STATE] == "ENABLED"), ENABLE_S, high_N)
-    since_s = ticks["monotonic_s"] - ticks["monotonic_s"][0] + RISEN_S
-    slides = (np.abs(ticks["handle_rate_mm_s"]) > FAST_MM_S) & np.isfinite(ticks["measured_cf"])
-    # F = a + b ln t, and the sensor's zero, whose sign the handle's direction turns over
-    rows = np.column_stack([np.ones_like(since_s), np.log(since_s / RISEN_S), _way(known, ticks)])[slides]
-    values, widths = fitted(rows, ticks["measured_cf"][slides], np.floor(since_s[slides]))
-    share = -math.log(10.0) / values[0]
-    dies, width = 100.0 * share * values[1], float(100.0 * abs(share * widths[1]))
-    return [finding("force that dies away from 0.5 to 5 s", dies, "%", (-2.0, 4.5), WORN, half_width=width)]
+    high = yield from _held(high_N)
+    (low_N, _, low_zero_N, *_), _ = _at_held(known, low)
+    (high_N, dies_N, zero_N, *waves_N), widths = _at_held(known, high)
+    dies, width, way = -math.log(10.0) / high_N, widths[1], (zero_N - low_zero_N) / (high_N - low_N)
+    found = [
+        finding(
+            "force that dies away from 0.5 to 5 s",
+            100.0 * dies * dies_N,
+            "%",
+            (-2.0, 4.5),
+            WORN,
+            half_width=100.0 * float(abs(dies) * width),
+        ),
+        finding(WAY, way, "%", (-6.0, 6.0), SHAFT, 100.0),
+    ]
+    if waves_N:
+        largest_N = max(map(math.hypot, waves_N[::2], waves_N[1::2]))
+        found.append(finding("friction's ripple over a turn", largest_N / high_N, "%", (0.0, 8.0), SHAFT, 100.0))
+    return found
+
+
+def _held(force_N: float) -> Course[Columns]:
+    yield from given("pause", lambda row: bool(row[_STATE] == "PAUSED"), ENABLE_S, force_N)
+    ticks = yield from watch(HELD_S, lambda t_s: force_N, states=("PAUSED",))
+    yield from given("resume", lambda row: bool(row[_STATE] == "ENABLED"), ENABLE_S, force_N)
+    return ticks
+
+
+def _at_held(known: Known, ticks: Columns) -> tuple[Array, Array]:
+    """Fit the force along the motion: F = a + b ln t + d z, and over a whole turn a_k cos k angle + b_k sin k angle."""
+    since_s, way = ticks["monotonic_s"] - ticks["monotonic_s"][0] + RISEN_S, _way(known, ticks)
+    slides = np.abs(ticks["handle_rate_mm_s"]) > SLIDING_MM_S
+    angle = math.tau / TURN_MM * ticks["device_handle_mm"]
+    is_whole = np.ptp(angle) > math.tau
+    waves = [wave(k * angle) for k in HARMONICS for wave in (np.cos, np.sin) if is_whole]
+    rows = np.column_stack([np.ones_like(since_s), np.log(since_s / RISEN_S), way, *waves])[slides]
+    return fitted(rows, (way * ticks["device_force_N"])[slides], np.floor(since_s[slides]))
 
 
 def require_sliding(ticks: Columns) -> None:

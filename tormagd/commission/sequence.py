@@ -20,7 +20,10 @@ from tormagd.config import Motor
 MAX_BYTES = 200_000
 VERSION = 1
 Findings = Sequence[Finding]
-HANDLE = "turn the handle to and fro, about 20 turns a minute"
+HANG = (
+    "let go of the handle; in three seconds hang the weight from the sensor, ten later another like it, if there is one"
+)
+HANDLE = "turn the handle to and fro by over a turn, about 20 turns a minute"
 
 
 class Step(NamedTuple):
@@ -34,12 +37,12 @@ class Step(NamedTuple):
 STEPS = (
     Step("link and host", 3.0, "let go of the handle", link),
     Step("homing", 6.0, "let go of the handle", homing, always=True),
-    Step("weight", 15.0, "let go of the handle; in three seconds hang the weight from the sensor", weight),
+    Step("weight", 35.0, HANG, weight),
     Step("sensor", 12.0, HANDLE, sensor),
     Step("force over gap", 30.0, HANDLE, force_over_gap),
     Step("steps", 14.0, HANDLE, steps),
     Step("carriages", 40.0, HANDLE, carriages),
-    Step("memory", 13.0, HANDLE, memory),
+    Step("memory", 19.0, HANDLE, memory),
     Step("way back", 4.0, "let go of the handle", way_back, always=True),
 )
 

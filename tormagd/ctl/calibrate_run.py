@@ -22,6 +22,7 @@ from tormagd.commission.procedure import (
     Known,
     Row,
     StoppedError,
+    columns_of,
     drive,
     watch,
 )
@@ -140,25 +141,39 @@ class Run(Device):
         rows: list[Row] = []
         # whatever waits is read even if this program is late
         while self._ticks.poll(max(0, round((due_s - time.monotonic()) * 1e3))):
-            rows += self._rows(self._ticks.recv_multipart()[-1])
+            rows += _rows(self._ticks.recv_multipart()[-1], self._endpoints)
+            self._heard_s = time.monotonic()
         if time.monotonic() - self._heard_s > SILENT_S:
             raise unreachable(self._endpoints.recording, f"no control ticks for {SILENT_S:g} s")
         return Heard(time.monotonic(), rows)
 
-    def _rows(self, data: bytes) -> list[Row]:
-        """Return a batch's ticks as rows by the course's COLUMNS."""
-        try:
-            batch = decode_ticks(data)
-            places = [batch.columns.index(name) for name in COLUMNS]
-        except (MessageError, ValueError) as error:
-            raise CommandError(
-                Exit.UNREACHABLE,
-                "unintelligible",
-                f"the ticks at {self._endpoints.recording} are not this version's: {error}",
-                "check the endpoint, and that tormagd and tormagctl are of the same version",
-            ) from error
-        self._heard_s = time.monotonic()
-        return [[row[place] for place in places] for row in batch.rows]
+
+def ticks_at_rest(endpoints: Endpoints) -> Columns:
+    """Return a second of the daemon's control ticks; it is told nothing."""
+    context, rows = zmq.Context(), list[Row]()
+    try:
+        ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
+        until_s = time.monotonic() + SILENT_S
+        while time.monotonic() < until_s:
+            rows += _rows(ticks.recv_multipart()[-1], endpoints) if ticks.poll(20) else []
+    finally:
+        context.destroy(linger=0)
+    return columns_of(rows)
+
+
+def _rows(data: bytes, endpoints: Endpoints) -> list[Row]:
+    """Return a batch's ticks as rows by the course's COLUMNS."""
+    try:
+        batch = decode_ticks(data)
+        places = [batch.columns.index(name) for name in COLUMNS]
+    except (MessageError, ValueError) as error:
+        raise CommandError(
+            Exit.UNREACHABLE,
+            "unintelligible",
+            f"the ticks at {endpoints.recording} are not this version's: {error}",
+            "check the endpoint, and that tormagd and tormagctl are of the same version",
+        ) from error
+    return [[row[place] for place in places] for row in batch.rows]
 
 
 def reach(status: Status, scene_most_N: float) -> Range:

@@ -8,7 +8,7 @@ rights are judged. A *fail* keeps tormagd from doing what it is configured to do
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +16,10 @@ from typing import NamedTuple
 import msgspec
 
 from firmware_protocol.build import COST, REMEDY, settle
+from tormagd.commission import finding as commission
+from tormagd.commission.force_findings import sensor_at_rest
 from tormagd.config import Config
+from tormagd.ctl.calibrate_run import ticks_at_rest
 from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rate, measured, rates
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
@@ -90,7 +93,11 @@ def doctor(config: Config, config_file: Path | None, endpoints: Endpoints, wait_
     known: Running | ClientError = running(endpoints, wait_s)
     if isinstance(known, Running):
         config, config_file = known.config, known.file
-    return judged(config, machine, measured(config_file, machine) if measure else None, known)
+    if not measure:
+        return judged(config, machine, None, known)
+    is_met = isinstance(known, Running) and known.status.link.state == "RUNNING"
+    sensed = sensor_at_rest(ticks_at_rest(endpoints)) if is_met else []
+    return judged(config, machine, measured(config_file, machine), known, sensed)
 
 
 def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
@@ -109,7 +116,11 @@ def running(endpoints: Endpoints, wait_s: float) -> Running | ClientError:
 
 
 def judged(
-    config: Config, machine: Machine, found: Headroom | None = None, known: Running | ClientError | None = None
+    config: Config,
+    machine: Machine,
+    found: Headroom | None = None,
+    known: Running | ClientError | None = None,
+    sensed: Sequence[commission.Finding] = (),
 ) -> Outcome:
     if isinstance(known, Running):
         findings = (*of_daemon(known, machine), *(check(_in_force(known), machine) for check in OF_MACHINE))
@@ -118,6 +129,10 @@ def judged(
     if isinstance(known, ClientError):
         unasked = f"none was asked ({known.message}); what it would be granted is judged by who calls this"
         findings = (Finding("daemon", Severity.WARN, unasked, known.hint), *findings)
+    # a sensor without noise does not show how often it is read
+    findings += tuple(
+        _finding(each.name, each.value is None or each.is_fine, each.shown, each.remedy) for each in sensed
+    )
     if found is not None:
         findings += examine_headroom(config, found)
     count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Severity}

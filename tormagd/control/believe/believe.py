@@ -96,6 +96,7 @@ class Believe:
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
+        self.zero.way = self._way = trim.way
         self._leash: Final = trim.leash
         self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
         self.ripple = Ripple()
@@ -135,6 +136,7 @@ class Believe:
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self.sensor, self.carriages = SensorTrust(self._bounds, self._leash, learned.device), CarriageLag()
         self.ripple = Ripple()
+        self.zero.way = self._way
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
