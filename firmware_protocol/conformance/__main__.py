@@ -31,7 +31,7 @@ LISTED: Final = "\n".join(
     )
 )
 WARNING: Final = """\
-{line}: THE DEVICE'S MOTORS WILL MOVE, for about six minutes: homings, duties of up to 1, the whole way to the closed
+{line}: THE DEVICE'S MOTORS WILL MOVE, for about seven minutes: homings, duties of up to 1, the whole way to the closed
 switches, openings because this program falls silent on purpose. A firmware that is wrong may do anything: keep the
 motors' supply switch in reach, take hands and patient's side off the brake, and end the daemon."""
 
@@ -99,15 +99,13 @@ def _examined(line: Line, checks: Sequence[Check], options: argparse.Namespace) 
         reset=partial(_reset, options.reset) if can_reset else None,
         ask=lambda what: _say(f"please {what}", sys.stderr),
     )
-    results: list[Result] = []
 
     def tell(result: Result) -> None:
-        results.append(result)
         _say(told(result), out)
 
     try:
         try:
-            run(host, checks, tell)
+            results = run(host, checks, tell)
         except KeyboardInterrupt:  # a request to end ends the checks, but the gap is still opened
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)

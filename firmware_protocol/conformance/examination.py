@@ -1,6 +1,7 @@
 """All checks in their order, first those that move nothing; and those that need a reset, or a bench."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Final
 
 from firmware_protocol.codec import Clear, DeviceMode, DriveMode, Home, Retract, State
@@ -63,15 +64,19 @@ LIKE_NEW: Final = (
 )
 
 
-@check(Hazard.CLOSES, "Reset", f"in RUN, {FAR_INSIDE_MM:g} mm in, a reset that keeps the memory", LIKE_NEW, moves=True)
-def warm_reset(host: Host) -> str:
-    """A zero that was kept over a reset by watchdog or pin may be off."""
-    return _is_new(host, "warm")
-
-
-@check(Hazard.CLOSES, "Reset", f"in RUN, {FAR_INSIDE_MM:g} mm in, the supply off and on", LIKE_NEW, moves=True)
-def cold_reset(host: Host) -> str:
-    return _is_new(host, "cold")
+RESETS: Final = [
+    Check(
+        f"{how}_reset",
+        Hazard.CLOSES,
+        "Reset",
+        f"in RUN, {FAR_INSIDE_MM:g} mm in, {what}",
+        LIKE_NEW,
+        partial(_is_new, how=how),
+        moves=True,
+        is_gate=False,
+    )
+    for how, what in (("warm", "a reset that keeps the memory"), ("cold", "the supply off and on"))
+]
 
 
 def _by_hand(host: Host) -> str:
@@ -114,8 +119,7 @@ CHECKS: Final = (
     *taking.CHECKS,
     *moving.CHECKS,
     *telling.OVERALL,
-    warm_reset,
-    cold_reset,
+    *RESETS,
     *BY_HAND,
     left_open,
 )

@@ -112,13 +112,10 @@ class Host:
         self._unpaired = deque[State](maxlen=99)
         self.drives = self.states = 0
         """How many Drives that must be answered were sent, and how many State came."""
-        self.stalled_s = 0.0
-        """The greatest lateness of this process since `begin`."""
         self.drive_s = line.port.now_s()
         self.counter = 0
-        self.said: Drive | None = None
-        self._next_s = line.port.now_s()
-        self._status_s = math.inf
+        self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
+        self.begin()
 
     @property
     def now_s(self) -> float:
@@ -139,8 +136,7 @@ class Host:
     def send_beside(self, message: Message) -> None:
         """Send a message, and the Drive before it again, which it may not make a new one."""
         self.send(message)
-        if self.said is not None:
-            self.send(self.said)
+        self.send(self.said)
 
     def hello(
         self,
@@ -206,6 +202,7 @@ class Host:
         """Forget the messages heard and the lateness, and restart the rhythm from now."""
         self.forget()
         self.stalled_s = 0.0
+        """The greatest lateness of this process since `begin`."""
         self._unpaired.clear()
         self._next_s = self.now_s
         self._status_s = math.inf

@@ -56,9 +56,9 @@ PAIRED: Final = (
     *((0.4, 0.53), (0.55, 0.46), (0.62, 0.71), (0.75, 0.66), (0.79, 0.88), (0.93, 0.83), (0.97, 1.0), (1.0, 0.86)),
 )
 "Left and right duties; the smallest leave a motor at rest."
-MAX_OFF, STARTED_S, STARTED_MM, STARTING_A = 0.015, 0.02, 0.05, (0.5, 10.0)
-"""By MAX_OFF of duty a current may differ from what duty and speed make. A motor that starts at the whole duty draws
-STARTING_A; outside, the unit is wrong."""
+MAX_OFF, STALL_A = 0.015, (0.5, 10.0)
+"""By MAX_OFF of duty a current may differ from what duty and speed make; a whole duty makes STALL_A in a motor at rest,
+outside the unit is wrong."""
 SHORT_S, LONG_S, BORNE_S, NOTICED_S = 0.047, 0.053, 0.0495, 0.0515
 "By the device's clock shorter silences are borne, longer ones noticed, with a tick for tolerance."
 SHORTS, LONGS, HELD_S, HOLDS = 12, 5, 37.0, 3
@@ -195,21 +195,13 @@ def duties_make_currents(host: Host) -> str:
         for part, (side, name, duty) in product(PARTS, ((0, "left", left), (1, "right", right))):
             mm_s = float(np.polyfit(rows["device_s"][part] - rows["device_s"][0], rows[f"{name}_mm"][part], 1)[0])
             pulses[side].append((duty, mm_s, float(rows[f"{name}_A"][part].mean())))
-    host.bring(-MIDDLE_MM, -MIDDLE_MM)
-    host.pass_time(SETTLED_S, DriveMode.RUN)
-    start_mm = places(host.last(State))
-    # the second Drive measures what the first began; an answer that lags shows a motor at rest
-    host.pass_time(2 * STARTED_S, DriveMode.RUN, STARTED_S, duty=1.0)
-    sense, way_mm = host.last(Sense), min(ways_mm(host.last(State), start_mm))
-    seen = [f"{sense.left_current_A:+.2f} and {sense.right_current_A:+.2f} A, {way_mm:+.2f} mm at once"]
-    starting_A = np.array((sense.left_current_A, sense.right_current_A))
-    unless(way_mm < STARTED_MM or (starting_A < STARTING_A[0]).any() or (starting_A > STARTING_A[1]).any(), seen[-1])
+    seen = []
     for side, name in enumerate(("left", "right")):
         duty, mm_s, current_A = np.array(pulses[side]).T
         (per_duty, per_mm_s), *_ = np.linalg.lstsq(np.column_stack([duty, mm_s]), current_A, rcond=None)
         off = np.abs(current_A - per_duty * duty - per_mm_s * mm_s) / max(abs(per_duty), 1e-3)
         seen.append(f"{name} {per_duty:.2f} A a duty, {off.max():.3f} off at {duty[off.argmax()]:+.2f}")
-        unless(per_duty <= 0.0 or off.max() > MAX_OFF, "; ".join(seen))
+        unless(not STALL_A[0] < per_duty < STALL_A[1] or off.max() > MAX_OFF, "; ".join(seen))
     return "; ".join(seen)
 
 

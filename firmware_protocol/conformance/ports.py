@@ -36,8 +36,7 @@ class SerialPort:
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             self._port.set_low_latency_mode(True)
 
-    def now_s(self) -> float:
-        return time.monotonic()
+    now_s = staticmethod(time.monotonic)
 
     def write(self, data: bytes) -> None:
         self._port.write(data)
@@ -81,8 +80,7 @@ class CanPort:
         except (can.CanError, ValueError, OSError) as error:
             raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
 
-    def now_s(self) -> float:
-        return time.monotonic()
+    now_s = staticmethod(time.monotonic)
 
     def write(self, identifier: int, data: bytes) -> None:
         try:

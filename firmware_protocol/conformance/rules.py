@@ -62,7 +62,7 @@ RULES: Final = {
         "every_counter latched_stays run_stays only_good_drives_extend"
     ),
     "answer every accepted Drive at once, in every mode, even two within a millisecond.": (
-        "every_drive_answered drives_at_once homing_stays retracting_stays"
+        "every_drive_answered run_drive_off homing_stays retracting_stays"
     ),
     "Without Drive there are none.": "every_drive_answered",
     "is sent every 20 ms on the device's own clock, with or without a host.": "status_rate status_consistent",

@@ -66,6 +66,8 @@ BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM = 0.1, 0.2, 0.8, 0.05, 0.6
 TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 100
 "A Drive and a Status on their way put a Status behind by more than the beats in TWO_STATUS_S."
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
+ENDS_IN: Final = {False: DeviceMode.IDLE, True: DeviceMode.LATCHED}
+"Where an opening ends, without a fault and with one."
 COMMANDS: Final[dict[str, type[Retract | Home | Clear]]] = {"Retract": Retract, "Home": Home, "Clear": Clear}
 FITS, MISFITS, OFF = "Hello that fits", "Hello that does not", "Drive OFF"
 SILENT: Final = "silence"
@@ -262,18 +264,24 @@ def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
     host.forget()
     _say(host, name, beat, MISFITTING[0 if period_s == PERIOD_S else -1])
     host.pass_time(BEGUN_S, beat, period_s, -1.0)
-    seen = _begun(host, place, verdict.partition(",")[0], start, COASTED_MM if is_deep else MOVED_MM)
+    seen = _begun(host, place, verdict.partition(",")[0], start, is_deep)
     if is_deep:
         return opens_fully(host, faults, beat)
     host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, beat)
-    if name == MISFITS:
-        unless(host.command(Clear, beat, SEEN_S), f"{seen}, Clear taken: {shown(host.status)}")
+    is_mended = name == MISFITS and host.command(Clear, beat, SEEN_S)
     host.pass_time(ANSWER_S)
     extra = unanswered - (host.drives - host.states)
-    seen += f", {extra:+d} State besides one for each Drive"
+    seen += f", {extra:+d} State besides one for each Drive" + ", Clear taken" * is_mended
     is_zero_kept = not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED))
-    mode = DeviceMode.LATCHED if faults else DeviceMode.IDLE
-    return host.shows(mode, beat, homed=is_zero_kept, opened=True, fault=faults, besides=seen, wrong=extra)
+    return host.shows(
+        ENDS_IN[bool(faults)],
+        beat,
+        homed=is_zero_kept,
+        opened=True,
+        fault=faults,
+        besides=seen,
+        wrong=extra or is_mended,
+    )
 
 
 def _say(host: Host, name: str, beat: Beat, misfit: Hello) -> None:
@@ -285,12 +293,14 @@ def _say(host: Host, name: str, beat: Beat, misfit: Hello) -> None:
     host.pass_time(2.0 * SILENCE_S if name == SILENT else 0.0)
 
 
-def _begun(host: Host, place: Place, to: str, start: tuple[float, float], inward_mm: float) -> str:
+def _begun(host: Host, place: Place, to: str, start: tuple[float, float], is_deep: bool) -> str:
     """Compare the mode after a message, and what RUN ends with, with what must be."""
     way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_closing = place.mode is DeviceMode.RUN and (min(way_mm) < -inward_mm or min(way_mm[-2:]) < BEGUN_MM)
+    is_closing = place.mode is DeviceMode.RUN and (
+        min(way_mm) < -(COASTED_MM if is_deep else MOVED_MM) or min(way_mm[-2:]) < BEGUN_MM
+    )
     return unless(is_closing or modes[:1] != [to] * (to in MODES), seen)
 
 
@@ -302,8 +312,9 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> s
     means, mosts = zip(*(_speeds(rows["device_s"], rows[name]) for name in ("left_mm", "right_mm")), strict=True)
     seen = f"{min(means):.1f} mm/s on the way, {max(mosts):.1f} at most"
     is_wrong = min(means) < MIN_SHARE * host.opening_mm_s or max(mosts) > MAX_SHARE * host.opening_mm_s
-    mode = DeviceMode.LATCHED if fault else DeviceMode.IDLE
-    return host.shows(mode, beat, homed=not fault, opened=True, fault=fault, besides=seen, wrong=is_wrong)
+    return host.shows(
+        ENDS_IN[bool(fault)], beat, homed=not fault, opened=True, fault=fault, besides=seen, wrong=is_wrong
+    )
 
 
 def _speeds(times_s: Array, at_mm: Array) -> tuple[float, float]:
@@ -316,21 +327,18 @@ def _speeds(times_s: Array, at_mm: Array) -> tuple[float, float]:
 
 def misfits(host: Host) -> str:
     """Send an idle device each Hello that does not fit, and mend it."""
-    host.idle()
+    fault = DeviceFault.SCHEMA_MISMATCH
     for hello in MISFITTING:
-        seen = f"schema {hello.schema_hash:08X}, version {hello.protocol_version}"
+        host.idle()
         host.forget()
         host.hello(hello.schema_hash, hello.protocol_version)
-        count, fault = len(host.all_of(Identity)), DeviceFault.SCHEMA_MISMATCH
+        count, seen = len(host.all_of(Identity)), f"schema {hello.schema_hash:08X}, version {hello.protocol_version}"
         host.shows(DeviceMode.LATCHED, homed=False, fault=fault, besides=seen, wrong=count != 1)
-        unless(
-            host.status.command_nonce != HELLO_NONCE or host.command(Clear, DriveMode.OFF, SEEN_S),
-            f"{seen}: its nonce is not shown, or Clear's is, {shown(host.status)}",
-        )
+        is_taken = host.status.command_nonce != HELLO_NONCE or host.command(Clear, DriveMode.OFF, SEEN_S)
+        unless(is_taken, f"{seen}: its nonce is not shown, or Clear's is, {shown(host.status)}")
         host.hello()
         host.shows(DeviceMode.LATCHED, fault=fault, besides=f"{seen}, then a Hello that fits")
-        host.obeyed(Clear)
-        host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT, besides=f"{seen}, mended")
+    host.idle()
     return f"{len(MISFITTING)} latched, and were mended"
 
 

@@ -31,7 +31,6 @@ from firmware_protocol.conformance.host import (
     ANSWER_S,
     COLUMNS,
     HELLO_NONCE,
-    PERIOD_S,
     STATUS_S,
     SWITCH_MM,
     TIME_SPAN_S,
@@ -44,7 +43,7 @@ from firmware_protocol.conformance.line import SerialLine
 
 Array = npt.NDArray[np.float64]
 WHO, ALL = "Who says what when, ", "everything, from the start on"
-LISTENED_S, CLOCKED_S, FINE_S, DRIVES, PAIRS = 1.0, 3.0, 1.13e-3, 1000, 20
+LISTENED_S, CLOCKED_S, FINE_S, DRIVES = 1.0, 3.0, 1.13e-3, 1000
 STATUS_TOLERANCE, MAX_DRIFT, MAX_LEAP_S, BLOCK = 0.03, 0.01, 2e-3, 100
 "Of BLOCK States the least delayed tells the device's clock from the host's."
 MAX_ANSWER_S: Final = 3e-3
@@ -136,17 +135,6 @@ def every_drive_answered(host: Host) -> str:
     usual_s = float(np.median(delays_s))
     seen = f"{states} State, {senses} Sense, {early} times a Sense before its State, {usual_s * 1e3:.2f} ms as a rule"
     return unless((states, senses) != (DRIVES, DRIVES) or early or usual_s > MAX_ANSWER_S, seen)
-
-
-@check(Hazard.MISLED, WHO + "3", f"{PAIRS} times two Drive OFF at once", "two State for each pair")
-def drives_at_once(host: Host) -> str:
-    """A late host sends two Drives at once."""
-    before = host.states
-    for _ in range(PAIRS):
-        host.beat(DriveMode.OFF, besides=lambda: host.drive(DriveMode.OFF))
-        host.pass_time(5 * PERIOD_S)
-    host.pass_time(ANSWER_S)
-    return unless(host.states - before != 2 * PAIRS, f"{host.states - before} State for {2 * PAIRS} Drives")
 
 
 @check(
@@ -335,7 +323,6 @@ STREAMS: Final = (
     every_nonce,
     status_rate,
     every_drive_answered,
-    drives_at_once,
     every_counter,
     plausible_at_rest,
     frames_as_they_come,

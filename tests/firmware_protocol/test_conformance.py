@@ -150,8 +150,7 @@ LONG = (
     *moving.CHECKS,
     telling.positions_run_on,
     telling.force_follows_gap,
-    examination.warm_reset,
-    examination.cold_reset,
+    *examination.RESETS,
     *BY_HAND,
     left_open,
 )
@@ -1064,7 +1063,7 @@ PLANTED = (
         "idle_without_zero_stays",
         mended=mending(lambda body: clamped(body) if body[6:7] == RUNS else body),
     ),
-    rogue("one Drive a tick", "drives_at_once", hears=only_one_a_tick),
+    rogue("one Drive a tick", "run_drive_off", hears=only_one_a_tick),
     rogue("nonce of 7 bits", "every_nonce", hears=with_nonce(lambda _, nonce: nonce % 128)),
     rogue(
         "nonce compared signed",

@@ -293,7 +293,7 @@ COMMANDS = {
                 dest="weight_N",
                 type=Within(0.05, 50.0, " N"),
                 metavar="N",
-                help="weight to hang from the force sensor, for its gain",
+                help="weight to hang from the force sensor, for its gain; two alike also tell its linearity",
             ),
             option("--conformance", type=Path, metavar="FILE", help="output of the conformance kit with --json"),
             option("--yes", dest="is_agreed", action="store_true", help="arm and move without asking"),

@@ -58,7 +58,7 @@ def _rows(report: Report, step: str) -> list[list[str]]:
     """Return the cells of a step's findings; one row where it was not done."""
     if step not in report.findings:
         is_without = step == "weight" and report.weight_N is None
-        unknown = "--weight-N was not given: neither the sensor's gain nor a bent line is known"
+        unknown = "--weight-N was not given: the sensor's gain is not known"
         return [[unknown if is_without else "not done", *[""] * 6]]
     return [_row(each, report.last.get(each.name)) for each in report.findings[step]]
 
