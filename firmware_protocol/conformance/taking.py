@@ -241,8 +241,15 @@ def _ends(host: Host, place: Place, first: int) -> None:
     rows = columns(host, first)
     deepest_mm = min(rows["left_mm"].min(), rows["right_mm"].min())
     is_deep = deepest_mm < (-HOMING_MM if place.mode is DeviceMode.HOMING else -DEEP_MM - HOMING_MM)
-    seen = f"{deepest_mm:+.2f} mm at the innermost"
-    host.shows(DeviceMode.IDLE, place.beat, homed=True, opened=True, fault=NO_FAULT, besides=seen, wrong=is_deep)
+    host.shows(
+        DeviceMode.IDLE,
+        place.beat,
+        homed=True,
+        opened=True,
+        fault=NO_FAULT,
+        besides=f"{deepest_mm:+.2f} mm at the innermost",
+        wrong=is_deep,
+    )
 
 
 def acts(place: Place, name: str, host: Host) -> str:
@@ -271,7 +278,7 @@ def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
     is_mended = name == MISFITS and host.command(Clear, beat, SEEN_S)
     host.pass_time(ANSWER_S)
     extra = unanswered - (host.drives - host.states)
-    seen += f", {extra:+d} State besides one for each Drive" + ", Clear taken" * is_mended
+    seen += f", {extra:+d} State besides one for each Drive{', Clear taken' * is_mended}"
     is_zero_kept = not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED))
     return host.shows(
         ENDS_IN[bool(faults)],

@@ -48,7 +48,8 @@ STATUS_TOLERANCE, MAX_DRIFT, MAX_LEAP_S, BLOCK = 0.03, 0.01, 2e-3, 100
 "Of BLOCK States the least delayed tells the device's clock from the host's."
 MAX_ANSWER_S: Final = 3e-3
 "The device's own millisecond, and the way there and back by any adapter."
-HANDLE_SPAN_MM, STEP_MM = period(Sense, "handle_position_mm"), period(State, "left_position_mm") / 2**16
+HANDLE_SPAN_MM: Final = period(Sense, "handle_position_mm")
+STEP_MM, HANDLE_STEP_MM = period(State, "left_position_mm") / 2**16, HANDLE_SPAN_MM / 2**16
 TURN_MM, TURNED_S, LEAP_MM = 40.0 * math.pi, 20.0, 1.0
 "A handle at 0.3 m/s moves a third of LEAP_MM in 1 ms; one of swapped bytes leaps by 2 mm a step."
 SUCCESSIVE_S, APART_S = 3e-3, 0.1
@@ -65,8 +66,9 @@ def columns(host: Host, first: int = 0) -> dict[str, Array]:
     rows = np.array(host.rows[first:]).reshape(-1, len(COLUMNS))
     unless(len(rows) < 2, "no Sense")
     table = dict(zip(COLUMNS, rows.T, strict=True))
-    gaps = np.diff(table["arrived_s"], prepend=table["arrived_s"][:1]) > APART_S
-    table["device_s"] = np.unwrap(table["device_time_s"], period=TIME_SPAN_S) + np.cumsum(gaps)
+    table["device_s"] = np.unwrap(table["device_time_s"], period=TIME_SPAN_S) + np.cumsum(
+        np.diff(table["arrived_s"], prepend=table["arrived_s"][:1]) > APART_S
+    )
     table["handle_mm"] = np.unwrap(table["handle_mm"], period=HANDLE_SPAN_MM)
     table["handle_mm_s"] = np.gradient(table["handle_mm"], table["device_s"] + 1e-9 * np.arange(len(rows)))
     return table
@@ -280,12 +282,12 @@ def handle_runs_on(host: Host) -> str:
     ):
         host.pass_time(0.5, DriveMode.OFF)
     rows = columns(host)
-    near = np.diff(rows["device_s"]) < SUCCESSIVE_S
-    most_mm = float(np.max(np.abs(np.diff(rows["handle_mm"]))[near], initial=0.0))
+    steps_mm = np.diff(rows["handle_mm"])[np.diff(rows["device_s"]) < SUCCESSIVE_S]
+    most_mm, coarse = np.abs(steps_mm).max(initial=0.0), np.gcd.reduce(np.rint(steps_mm / HANDLE_STEP_MM).astype(int))
     way_mm = float(np.ptp(rows["handle_mm"]))
     along_N = _along_N(rows)
-    seen = f"turned by {way_mm:.0f} mm, {most_mm:.3f} mm a step at most, {along_N} N against it"
-    unless(most_mm > LEAP_MM or min(along_N, default=0.0) < 0.0, seen)
+    seen = f"turned by {way_mm:.0f} mm, {most_mm:.3f} mm a time at most, in steps of {coarse}, {along_N} N against it"
+    unless(most_mm > LEAP_MM or coarse > 1 or min(along_N, default=0.0) < 0.0, seen)
     if way_mm < TURN_MM or len(along_N) < 2:
         raise Untested(f"{seen}; turn the handle by over a turn and back meanwhile, --only handle_runs_on")
     return seen
