@@ -134,7 +134,7 @@ class Host:
         self.send(self.said)
 
     def send_beside(self, message: Message) -> None:
-        """Send a message, and the Drive before it again, which it may not make a new one."""
+        """Send a message, and the Drive before it again."""
         self.send(message)
         self.send(self.said)
 
@@ -276,6 +276,9 @@ class Host:
         """Keep a message, and count the resets and contradictions that a Status shows."""
         message = heard.message
         if isinstance(message, State):
+            self.contradictions["a State's counter not one more"] += (
+                State in self.newest and (message.counter - self.last(State).counter) % 256 != 1
+            )
             self.states += 1
             self._unpaired.append(message)
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it

@@ -50,7 +50,7 @@ NEAR, PAST = 0.85, 1.15
 gets there does not watch."""
 MIDDLE_MM, PULSE_S, SETTLED_S = 10.0, 0.08, 0.04
 PARTS: Final = (slice(6, 16), slice(40, None))
-"States of a pulse: where the motor still starts, a current that is smoothed is not of its duty and speed."
+"States of a pulse; its start shows a current that is smoothed."
 PAIRED: Final = (
     *((0.02 * step, 0.12 - 0.02 * step) for step in range(1, 6)),
     *((0.4, 0.53), (0.55, 0.46), (0.62, 0.71), (0.75, 0.66), (0.79, 0.88), (0.93, 0.83), (0.97, 1.0), (1.0, 0.86)),
@@ -263,7 +263,6 @@ def let_go_after_all(host: Host) -> str:
             keeps_still(host, "before a Drive OFF")
             host.beat(DriveMode.OFF)
         host.pass_time(SEEN_S, DriveMode.RUN, duty=DUTY)
-        # a Drive RUN counts whatever its duties are
         seen.append(host.shows(DeviceMode.RUN, DriveMode.RUN, besides=lets_go.name, wrong=_has_left(host)))
     return "; ".join(seen)
 

@@ -67,7 +67,6 @@ TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 100
 "A Drive and a Status on their way put a Status behind by more than the beats in TWO_STATUS_S."
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
 ENDS_IN: Final = {False: DeviceMode.IDLE, True: DeviceMode.LATCHED}
-"Where an opening ends, without a fault and with one."
 COMMANDS: Final[dict[str, type[Retract | Home | Clear]]] = {"Retract": Retract, "Home": Home, "Clear": Clear}
 FITS, MISFITS, OFF = "Hello that fits", "Hello that does not", "Drive OFF"
 SILENT: Final = "silence"

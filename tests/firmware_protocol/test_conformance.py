@@ -486,12 +486,11 @@ def sensed(change: Callable[[Sense], Sense]) -> Callable[..., Measured]:
     return lambda _device, _time_s, measured: (measured[0], change(measured[1]))
 
 
-HANDLE_STEP_MM = 40.0 * math.pi / 16384.0
-
-
 def big_endian(sense: Sense) -> Sense:
-    steps = round(sense.handle_position_mm / HANDLE_STEP_MM) % 65536
-    return sense.replaced(handle_position_mm=int.from_bytes(steps.to_bytes(2, "little"), "big") * HANDLE_STEP_MM)
+    steps = round(sense.handle_position_mm / telling.HANDLE_STEP_MM) % 65536
+    return sense.replaced(
+        handle_position_mm=int.from_bytes(steps.to_bytes(2, "little"), "big") * telling.HANDLE_STEP_MM
+    )
 
 
 def one_old(device: Rogue, _time_s: float, measured: Measured) -> Measured:
@@ -795,12 +794,14 @@ PLANTED = (
     wire("late", "every_drive_answered", of=Late),
     rogue(
         "State's counter stuck",
-        "clock_runs_on",
+        "status_consistent",
+        "every_drive_answered",
         measures=lambda _, time_s, measured: (measured[0].replaced(counter=5), measured[1]),
     ),
     rogue(
         "State's counter repeated",
-        "clock_runs_on",
+        "status_consistent",
+        "every_drive_answered",
         measures=lambda _, time_s, measured: (measured[0].replaced(counter=measured[0].counter // 2), measured[1]),
     ),
     fault("clock=+2%", "clock_runs_on"),
