@@ -2,9 +2,11 @@ import resource
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from firmware_protocol.build import COST, REMEDY, Build
+from tormagd.commission.force_findings import sensor_at_rest
 from tormagd.config import Config, Device, RealTime
 from tormagd.ctl import doctor as checks, headroom
 from tormagd.ctl.doctor import Severity, judged
@@ -336,3 +338,15 @@ def test_what_others_took_is_the_difference_of_two_looks(good, machine):
     assert headroom.shares(before, after, 5.0) == (pytest.approx(0.05), pytest.approx(0.1))
     (good / "proc/pressure/cpu").unlink()
     assert headroom.shares(before, Machine(good).taken(), 5.0)[1] is None
+
+
+@pytest.mark.parametrize(
+    ("noise_N", "read_hz", "bad"),
+    [(0.005, 500, []), (0.1, 500, ["sensor's noise"]), (0.005, 12, ["sensor's readings apart"])],
+)
+def test_a_sensor_at_rest_is_judged(good, noise_N, read_hz, bad):
+    random, times_s = np.random.default_rng(1), np.arange(3000) * 1e-3
+    readings_N = 0.002 * np.round(random.normal(0.9, noise_N, 1 + 3 * read_hz) / 0.002)
+    sensed = sensor_at_rest({"monotonic_s": times_s, "device_force_N": readings_N[(times_s * read_hz).astype(int)]})
+    checked = judged(REALTIME, Machine(good), sensed=sensed).result["checks"]
+    assert [each["name"] for each in checked if each["verdict"] != "ok"] == bad
