@@ -49,14 +49,14 @@ NEAR, PAST = 0.85, 1.15
 """Shares of the stroke: that is travelled at a brisk speed; and further than any scale is off, so that a device that
 gets there does not watch."""
 MIDDLE_MM, PULSE_S, SETTLED_S = 10.0, 0.08, 0.04
-PARTS: Final = (slice(6, 16), slice(40, None))
+PARTS: Final = (slice(4, 24), slice(40, None))
 "States of a pulse; its start shows a current that is smoothed."
 PAIRED: Final = (
     *((0.02 * step, 0.12 - 0.02 * step) for step in range(1, 6)),
     *((0.4, 0.53), (0.55, 0.46), (0.62, 0.71), (0.75, 0.66), (0.79, 0.88), (0.93, 0.83), (0.97, 1.0), (1.0, 0.86)),
 )
 "Left and right duties; the smallest leave a motor at rest."
-MAX_OFF, STARTED_S, STARTED_MM, STALL_A = 0.015, 0.02, 0.015, (0.7, 30.0)
+MAX_OFF, STARTED_S, STARTED_MM, STALL_A = 0.01, 0.02, 0.015, (0.7, 30.0)
 """By MAX_OFF of duty a current may differ from what duty and speed make; a whole duty makes STALL_A in a motor at rest,
 outside the unit is wrong."""
 SHORT_S, LONG_S, BORNE_S, NOTICED_S = 0.047, 0.053, 0.0495, 0.0515
@@ -192,8 +192,10 @@ def duties_make_currents(host: Host) -> str:
         unless(host.status.mode is not DeviceMode.RUN, f"{left:+.2f} and {right:+.2f}: {shown(host.status)}")
         rows = columns(host, -round(PULSE_S / PERIOD_S) * len(COLUMNS))
         for part, (side, name, duty) in product(PARTS, ((0, "left", left), (1, "right", right))):
-            mm_s = float(np.polyfit(rows["device_s"][part] - rows["device_s"][0], rows[f"{name}_mm"][part], 1)[0])
-            pulses[side].append((duty, mm_s, float(rows[f"{name}_A"][part].mean())))
+            at_s, at_mm, at_A = (rows[each][part] for each in ("device_s", f"{name}_mm", f"{name}_A"))
+            # means over time, whatever Drives a late host left out
+            mean_A = float(np.sum((at_A[1:] + at_A[:-1]) * np.diff(at_s))) / 2.0 / (at_s[-1] - at_s[0])
+            pulses[side].append((duty, (at_mm[-1] - at_mm[0]) / (at_s[-1] - at_s[0]), mean_A))
     host.bring(-MIDDLE_MM, -MIDDLE_MM)
     host.pass_time(SETTLED_S, DriveMode.RUN)
     start_mm = places(host.last(State))
