@@ -175,6 +175,16 @@ class Measured(Value):
 
 
 @final
+class GapSpeeds(Value):
+    """The gap's greatest speeds, and the closing that is counted on."""
+
+    def __init__(self, closing_mm_s: float, opening_mm_s: float, sure_mm_s: float) -> None:
+        self.closing_mm_s: Final = closing_mm_s
+        self.opening_mm_s: Final = opening_mm_s
+        self.sure_mm_s: Final = sure_mm_s
+
+
+@final
 class Belief(Value):
     """What is believed of the device at a plan: at the handle's rate (`device`), at speed, and, until it is known from
     today, as any device may be (`unseen`).

@@ -13,7 +13,7 @@ from tormagd.control.ask.forecast import HORIZON_S, Forecast
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, _wanted_N
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.records import Ask, TimedSetpoint, Travel
+from tormagd.control.records import Ask, GapSpeeds, TimedSetpoint, Travel
 from tormagd.control.safety.codes import Limit
 from tormagd.element.physics.errors import DomainError
 from tormagd.ground.plain_values import plain, restore
@@ -39,7 +39,7 @@ def governor(
     gap_speed_mm_s: float = GAP_SPEED_MM_S,
     terms: Terms = EVERY_TERM,
 ) -> Governor:
-    begun = Governor(now_s, portrait, scene, gap_speed_mm_s, terms)
+    begun = Governor(now_s, portrait, scene, GapSpeeds(*[gap_speed_mm_s] * 3), terms)
     begun.asked_N, begun.above_N = asked_N, asked_N - portrait.min_N
     return begun
 

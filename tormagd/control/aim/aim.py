@@ -16,12 +16,13 @@ from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, lawful_m
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.strength import DeviceFit, device_bounds
+from tormagd.control.move.motor import gap_speeds
 from tormagd.control.nominal import FieldOfGap, Nominal
 from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Limit
 from tormagd.element.inverse.solution import Answer, FieldSolution, FieldSolver, Question, Reach
 from tormagd.element.model.features import FEATURES
-from tormagd.element.model.force_curve import ForceCurve
+from tormagd.element.model.force_curve import ForceCurve, within
 from tormagd.element.model.memory import Memory
 from tormagd.element.physics.errors import DomainError
 from tormagd.scenes.scene import Scene
@@ -72,7 +73,7 @@ class Aim:
         self._open_mm: Final = scene.insert.gap_open_mm
         self._ceiling_N: Final = CEILING * scene.force.most_N
         self._bounds: Final = device_bounds(config.trim)
-        self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
+        self._speeds: Final = gap_speeds(config)
         self._max_mm_s2: Final = config.position.gap_acceleration_mm_s2
         self._low_confidence: Final = config.limits.low_confidence
 
@@ -92,7 +93,9 @@ class Aim:
         belief: Belief,
         memory: ElementMemory,
         measured: Measured | None,
+        before: Plan | None = None,
     ) -> Plan:
+        """Return the next plan, which the gap reaches from the plan `before`."""
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
@@ -103,12 +106,25 @@ class Aim:
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
+        if before is not None:
+            wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
         min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
         self.number += 1
         self.element_mT = field_mT - memory.lag_mT
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
         gap_mm, confidence = max(wanted_mm, min_mm), solution.confidence
         return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
+
+    def _reached_mm(self, wanted_mm: float, before: Plan, now_s: float, ask: Ask, device: DeviceFit) -> float:
+        """Return how far the gap gets since the plan `before`. It leaps no further than the force that is asked for."""
+        passed_s, leap_mm = max(now_s - before.time_s, 0.0), 0.0
+        if ask.asked_N is not None and before.setpoint_N is not None:
+            asked_mm, before_mm = (
+                self._portrait.gap_mm_at(device.model_N(each_N)) for each_N in (ask.asked_N, before.setpoint_N)
+            )
+            leap_mm = abs(asked_mm - before_mm)
+        closed_mm = before.gap_mm - self._speeds.closing_mm_s * passed_s - leap_mm
+        return within(wanted_mm, (closed_mm, before.gap_mm + self._speeds.opening_mm_s * passed_s + leap_mm))
 
     def answer_to(self, question: Question) -> Answer:
         """Answer `question` in the search that runs beside the plans."""
@@ -192,5 +208,5 @@ class Aim:
             away_mm = self._portrait.gap_mm_at(device.model_N(force_N)) - start_mm
             speed += _TO_SPEED[place] * away_mm
             acceleration += _TO_ACCELERATION[place] * away_mm
-        top, hardest = self._top_speed_mm_s, self._max_mm_s2
-        return min(max(speed, -top), top), min(max(acceleration, -hardest), hardest)
+        most, hardest = self._speeds, self._max_mm_s2
+        return within(speed, (-most.closing_mm_s, most.opening_mm_s)), within(acceleration, (-hardest, hardest))

@@ -19,7 +19,7 @@ from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
 from tormagd.control.ask.path import PATH_S, SPEEDING_UP_S, TIMES_S, Path
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.interpolation import low_pass
-from tormagd.control.records import AT_REST, Ask, TimedSetpoint, Travel, Wall
+from tormagd.control.records import AT_REST, Ask, GapSpeeds, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.features import LARGEST, require_number
 from tormagd.element.model.force_curve import within
@@ -77,12 +77,12 @@ class Governor:
     was_pushing: bool
 
     def __init__(
-        self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
+        self, now_s: float, portrait: Portrait, force: Force, speeds: GapSpeeds, terms: Terms = EVERY_TERM
     ) -> None:
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
-        self._path: Final = Path(portrait, gap_speed_mm_s)
-        self._gap_speed_mm_s: Final = gap_speed_mm_s
+        self._path: Final = Path(portrait, speeds)
+        self._speeds: Final = speeds
         self._least_N: Final = force.least_N
         self._allowed: Final = (force.waiting_N, force.most_N)
         self._release_N_s: Final = force.release_N_s
@@ -172,8 +172,9 @@ class Governor:
         elif spacing_s > MAX_STEP_S or not self._has_forecast or setpoint.wall is not None:
             self.slope_N_s = 0.0
         elif spacing_s > 0.0:
-            rate_N_s = device.scale * self._portrait.force_rate_N_s(device.model_N(force_N), self._gap_speed_mm_s)
-            slope_N_s = min(max((allowed_N - self.last_N) / spacing_s, -rate_N_s), rate_N_s)
+            slope_N_mm = device.scale * self._portrait.slope_at_N_mm(device.model_N(force_N))
+            most_N_s = (-self._speeds.opening_mm_s * slope_N_mm, self._speeds.sure_mm_s * slope_N_mm)
+            slope_N_s = within((allowed_N - self.last_N) / spacing_s, most_N_s)
             self.slope_N_s = low_pass(self.slope_N_s, slope_N_s, spacing_s, SLOPE_FILTER_S)
         self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
 
