@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-from msgspec import UNSET, Meta, UnsetType
+from msgspec import Meta
 
 from tormagd.ground.toml_file import checked as checked, convert, convert_as, placed, table_in as table_in
 from tormagd_client.endpoints import ConfigError, Endpoints, Strict, require_usable
@@ -161,9 +161,9 @@ class Position(Strict, frozen=True):
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
     "Gain on the skew between the carriages, as a multiple of `proportional_per_mm`."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
-    "Greatest speed of the gap, both carriages together. Alone in a file it bounds closing, too."
-    closing_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] | UnsetType = UNSET
-    "Greatest speed of closing; by default what the motors can."
+    "Greatest speed of the gap, both carriages together."
+    closing_mm_s: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
+    "The same of closing; 0: the motors' own. A file that states `gap_speed_mm_s` alone sets both."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
     """Greatest acceleration of the gap from rest; it falls with speed, and rises up to twofold for carriages that
     show more."""
@@ -325,7 +325,6 @@ def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
 
 
 def _both_ways(position: object) -> None:
-    """Let a gap speed that is stated alone bound closing, too."""
     if isinstance(position, dict) and "gap_speed_mm_s" in position:
         position.setdefault("closing_mm_s", position["gap_speed_mm_s"])
 

@@ -258,8 +258,7 @@ class Bound:
         wanted_mm = self._gaps_for(wall.friction_N + wall.stiffness_N_mm * np.maximum(depths_mm, 0.0), strength)
         slopes = np.interp(wanted_mm, self._gap_mm[1:], np.diff(self._fresh_N) / GRID_MM)
         weights = np.maximum(slopes * slopes, FLATTEST_N_MM**2) * np.gradient(TIMES_S)
-        speed_mm_s = max(abs(self._speed_mm_s), self._core.gap_speed_mm_s)
-        speeds = GapSpeeds(speed_mm_s, speed_mm_s, speed_mm_s)
+        speeds = GapSpeeds(*[max(abs(self._speed_mm_s), self._core.gap_speeds.sure_mm_s)] * 3)
         path = nearest_path_mm(truth.gap_mm, PERIOD_S, TIMES_S, wanted_mm.tolist(), weights.tolist(), speeds, 1)
         open_N = self._scale * float(self._fresh_N[-1]) * strength + self._offset_N
         waiting_N = max(self._core.scene.force.waiting_N, open_N)

@@ -29,7 +29,6 @@ from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
-from tormagd.element.inverse.solution import Answer, Question
 from tormagd.element.model.features import require_number
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.measurement import Measurement
@@ -90,13 +89,6 @@ class Planner:
 
     def foresee(self) -> bool:
         return self.governor.foresee()
-
-    @property
-    def question(self) -> Question | None:
-        return self.aim.question
-
-    def answered(self, answer: Answer) -> None:
-        self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
         self.believe.teach(learned)

@@ -59,7 +59,7 @@ class IdealCarriages(Actuator):
         if plan is not None and not is_over:
             floor_mm = max(self._closed_mm, plan.min_gap_mm)
             wanted_mm = target_of(plan, now_s, 0.0, floor_mm, self._open_mm).gap_mm
-        closed_mm, opened_mm = self._speeds.closing_mm_s * dt_s, self._speeds.opening_mm_s * dt_s
+        closed_mm, opened_mm = self._speeds.reach_mm(dt_s)
         gap_mm = min(max(wanted_mm, before_mm - closed_mm), before_mm + opened_mm)
         put_gap(self._plant, gap_mm)
         self.reference = Reference(gap_mm, (gap_mm - before_mm) / dt_s)

@@ -63,12 +63,8 @@ class Aim:
     answer: Answer
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
-        self._nominal: Final = element.nominal
-        self._field: Final = element.field
+        self._element: Final = element
         self._portrait: Final = element.portrait
-        self._search: Final = element.search
-        self._is_beside: Final = element.is_beside
-        self._law: Final = element.law
         self._closed_mm: Final = scene.insert.gap_closed_mm
         self._open_mm: Final = scene.insert.gap_open_mm
         self._ceiling_N: Final = CEILING * scene.force.most_N
@@ -79,7 +75,7 @@ class Aim:
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open and no setpoint."""
-        field_mT = self._field.field_mT(self._open_mm)
+        field_mT = self._element.field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
         self.answer = Answer(now_s, FieldSolution(self.element_mT, min_N, 1.0, 0, _INSIDE))
@@ -97,43 +93,41 @@ class Aim:
     ) -> Plan:
         """Return the next plan, which the gap reaches from the plan `before`."""
         device = belief.device
-        curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
+        curve, outside = self._element.nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
         solution = self._solution(now_s, curve, wanted_N)
-        element_mT = lawful_mT(self._law, wanted_N, solution.field_mT)
+        element_mT = lawful_mT(self._element.law, wanted_N, solution.field_mT)
         if element_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
-        wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
+        wanted_mm = min(max(self._element.field.gap_mm(field_mT), self._closed_mm), self._open_mm)
         if before is not None:
             wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
         min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
         self.number += 1
         self.element_mT = field_mT - memory.lag_mT
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
-        gap_mm, confidence = max(wanted_mm, min_mm), solution.confidence
-        return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
+        gaps_mm = max(wanted_mm, min_mm), min_mm
+        return self._plan(now_s, setpoint, ask, belief, field_mT, gaps_mm, solution.confidence, limits, outside)
 
     def _reached_mm(self, wanted_mm: float, before: Plan, now_s: float, ask: Ask, device: DeviceFit) -> float:
-        """Return how far the gap gets since the plan `before`. It leaps no further than the force that is asked for."""
-        passed_s, leap_mm = max(now_s - before.time_s, 0.0), 0.0
-        if ask.asked_N is not None and before.setpoint_N is not None:
-            asked_mm, before_mm = (
-                self._portrait.gap_mm_at(device.model_N(each_N)) for each_N in (ask.asked_N, before.setpoint_N)
-            )
-            leap_mm = abs(asked_mm - before_mm)
-        closed_mm = before.gap_mm - self._speeds.closing_mm_s * passed_s - leap_mm
-        return within(wanted_mm, (closed_mm, before.gap_mm + self._speeds.opening_mm_s * passed_s + leap_mm))
+        """Return how far the gap gets from the plan `before`, besides what the setpoint leaps."""
+        if before.setpoint_N is None or ask.asked_N is None:
+            return wanted_mm
+        asked_mm = self._portrait.gap_mm_at(device.model_N(ask.asked_N))
+        leap_mm = abs(asked_mm - self._portrait.gap_mm_at(device.model_N(before.setpoint_N)))
+        closed_mm, opened_mm = self._speeds.reach_mm(max(now_s - before.time_s, 0.0))
+        return within(wanted_mm, (before.gap_mm - closed_mm - leap_mm, before.gap_mm + opened_mm + leap_mm))
 
     def answer_to(self, question: Question) -> Answer:
         """Answer `question` in the search that runs beside the plans."""
-        curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
-        return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
+        curve = self._element.nominal.curve(question.displacement_mm, question.rate_mm_s)
+        return Answer(question.time_s, self._element.search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        if not self._is_beside:
-            return self._search.solve(curve, wanted_N, self.element_mT)
+        if not self._element.is_beside:
+            return self._element.search.solve(curve, wanted_N, self.element_mT)
         self.question = Question(now_s, curve.displacement_mm, curve.rate_mm_s, wanted_N, self.element_mT)
         age_s = now_s - self.answer.time_s
         if age_s > OLDEST_ANSWER_S:
@@ -147,8 +141,7 @@ class Aim:
         ask: Ask,
         belief: Belief,
         field_mT: float,
-        gap_mm: float,
-        min_mm: float,
+        gaps_mm: tuple[float, float],
         confidence: float,
         limits: tuple[Limit, ...],
         outside: tuple[Outside, ...],
@@ -163,18 +156,18 @@ class Aim:
             governed_N=ask.force_N,
             predicted_N=belief.predicted_N,
             field_mT=field_mT,
-            gap_mm=gap_mm,
+            gap_mm=gaps_mm[0],
             gap_speed_mm_s=speed_mm_s,
             confidence=confidence,
             limits=limits,
             gap_acceleration_mm_s2=acceleration_mm_s2,
             foresight=ask.foresight,
-            min_gap_mm=min_mm,
+            min_gap_mm=gaps_mm[1],
             outside=outside,
             sensor_doubted_s=belief.sensor_doubted_s,
             trim=ask.force_N / model_N if model_N > 0.0 else belief.at_speed.scale,
             stamp_s=setpoint.stamp_s if setpoint is not None and ask.is_meant else -math.inf,
-            search_age_s=now_s - self.answer.time_s if self._is_beside else 0.0,
+            search_age_s=now_s - self.answer.time_s if self._element.is_beside else 0.0,
         )
 
     def _limits(

@@ -66,21 +66,18 @@ class Path:
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
         require_number("sent_mm", sent_mm)
-        wanted_mm: list[float] = []
-        weights: list[float] = []
-        for place, force_N in enumerate(wanted_N):
-            gap_mm, slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
-            slope_N_mm = max(slope_N_mm, FLATTEST_N_MM)
-            if place and most_N is None:
-                wanted_mm[place - 1] += late_s * CHANGES_PER_S[place - 1] * (gap_mm - wanted_mm[place - 1])
-            wanted_mm.append(gap_mm)
-            weights.append(LASTS_S[place] * slope_N_mm * slope_N_mm)
+        there = [portrait.gap_and_slope_at(device.model_N(force_N)) for force_N in wanted_N]
+        weights = [lasts_s * max(slope, FLATTEST_N_MM) ** 2 for (_, slope), lasts_s in zip(there, LASTS_S)]  # noqa: B905
+        wanted_mm = [gap_mm for gap_mm, _ in there]
+        if most_N is None:
+            for place in range(len(wanted_mm) - 1):
+                wanted_mm[place] += late_s * CHANGES_PER_S[place] * (wanted_mm[place + 1] - wanted_mm[place])
         path_mm = nearest_path_mm(sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._speeds, len(PATH_S))
         if most_N is not None:
             lead_mm = late_s * self._speeds.sure_mm_s
             for place, (now_N, then_N) in enumerate(most_N):
-                least_mm = self.gap_mm(now_N, device) - lead_mm
-                path_mm[place] = max(path_mm[place], least_mm, self.gap_mm(then_N, device))
+                least_mm = max(self.gap_mm(now_N, device) - lead_mm, self.gap_mm(then_N, device))
+                path_mm[place] = max(path_mm[place], least_mm)
         gap_mm, forces_N = from_mm, []
         left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for to_mm in path_mm:
@@ -105,8 +102,8 @@ def nearest_path_mm(
     path_mm: list[float] = []
     gap_mm, before_s = start_mm, times_s[0] - elapsed_s
     for place in range(count):
-        passed_s = times_s[place] - before_s
-        gap_mm = min(max(best_mm[place], gap_mm - speeds.closing_mm_s * passed_s), gap_mm + speeds.opening_mm_s * passed_s)
+        closed_mm, opened_mm = speeds.reach_mm(times_s[place] - before_s)
+        gap_mm = within(best_mm[place], (gap_mm - closed_mm, gap_mm + opened_mm))
         path_mm.append(gap_mm)
         before_s = times_s[place]
     return path_mm

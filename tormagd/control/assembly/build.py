@@ -75,10 +75,6 @@ class Core(NamedTuple):
     "What the gap's speed alone leaves of the scene's signal."
 
     @property
-    def gap_speed_mm_s(self) -> float:
-        return self.config.position.gap_speed_mm_s
-
-    @property
     def gap_speeds(self) -> GapSpeeds:
         return gap_speeds(self.config)
 
@@ -259,7 +255,7 @@ def at_rates_of(scene: Scene, config: Config) -> Config:
 
 def _slowed(config: Config, scene: Scene) -> Config:
     """Return the configuration with a gap no faster than the scene lets it move. Raises ConfigError."""
-    position, most, asked_mm_s = config.position, gap_speeds(config), scene.insert.gap_speed_mm_s
+    most, asked_mm_s = gap_speeds(config), scene.insert.gap_speed_mm_s
     can_mm_s = max(most_closing_mm_s(config), most.opening_mm_s)
     if most.closing_mm_s > can_mm_s:
         raise ConfigError(
@@ -267,9 +263,8 @@ def _slowed(config: Config, scene: Scene) -> Config:
         )
     if asked_mm_s is UNSET:
         return config
-    opening_mm_s, closing_mm_s = min(most.opening_mm_s, asked_mm_s), min(most.closing_mm_s, asked_mm_s)
-    slowed = msgspec.structs.replace(position, gap_speed_mm_s=opening_mm_s, closing_mm_s=closing_mm_s)
-    return msgspec.structs.replace(config, position=slowed)
+    slowed = {"gap_speed_mm_s": min(most.opening_mm_s, asked_mm_s), "closing_mm_s": min(most.closing_mm_s, asked_mm_s)}
+    return msgspec.structs.replace(config, position=msgspec.structs.replace(config.position, **slowed))
 
 
 def approaches_s(core: Core) -> list[tuple[float, float]]:
@@ -279,7 +274,7 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
     reach, force = core.portrait, core.scene.force
     waits_N = [max(force.waiting_N, reach.min_N), *(reach.min_N + share * STANDBY_N for share in (1 / 3, 2 / 3, 1.0))]
     middle_mm = reach.gap_mm_at((waits_N[0] + force.most_N) / 2.0)
-    return [(wait_N, (reach.gap_mm_at(wait_N) - middle_mm) / core.gap_speed_mm_s) for wait_N in waits_N]
+    return [(wait_N, (reach.gap_mm_at(wait_N) - middle_mm) / core.gap_speeds.sure_mm_s) for wait_N in waits_N]
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:

@@ -10,8 +10,6 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from msgspec import UNSET
-
 from tormagd.config import Config, Motor, Position
 from tormagd.control.records import GapSpeeds
 
@@ -26,7 +24,7 @@ PULL_DEPTH_MM: Final = 32.0
 
 
 LIVELY: Final = 1.1
-"The plant card's motors turn up to 9% faster than their figures; a gap that is late may ask for that."
+"The plant card's motors turn up to 9% faster than their figures; a late gap may ask for that."
 
 
 class TransferFunction(NamedTuple):
@@ -53,11 +51,9 @@ def most_closing_mm_s(config: Config) -> float:
 
 
 def gap_speeds(config: Config) -> GapSpeeds:
-    """Return how fast the gap closes at most, by what the motors can, and how fast it opens, by what a task may lose.
-    Counted on is what the motors do against their dry friction.
-    """
+    """Return the gap's speeds. Counted on is what the motors do against dry friction."""
     position, motor = config.position, config.motor
-    closing_mm_s = most_closing_mm_s(config) if position.closing_mm_s is UNSET else position.closing_mm_s
+    closing_mm_s = position.closing_mm_s or most_closing_mm_s(config)
     sure_mm_s = 2.0 * full_speed_mm_s(motor) * (position.duty_limit - motor.coulomb_V / motor.supply_V)
     sure_mm_s = min(closing_mm_s, max(sure_mm_s, position.gap_speed_mm_s))
     return GapSpeeds(closing_mm_s, position.gap_speed_mm_s, sure_mm_s)
