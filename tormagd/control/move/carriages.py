@@ -157,7 +157,7 @@ class Carriages(Actuator):
         opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         most = self._gap_speeds
         return Speeds(
-            motors_mm_s, min(motors_mm_s, most.opening_mm_s, opening_mm_s), min(motors_mm_s, most.closing_mm_s)
+            motors_mm_s, min(motors_mm_s, most.opening_mm_s, opening_mm_s), min(motors_mm_s, most.sure_mm_s)
         )
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
