@@ -162,6 +162,8 @@ class Position(Strict, frozen=True):
     "Gain on the skew between the carriages, as a multiple of `proportional_per_mm`."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
     "Greatest speed of the gap, both carriages together."
+    closing_mm_s: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
+    "The same of closing; 0: the motors' own. A file that states `gap_speed_mm_s` alone sets both."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
     """Greatest acceleration of the gap from rest; it falls with speed, and rises up to twofold for carriages that
     show more."""
@@ -318,9 +320,15 @@ def load_calibration(path: Path, config: Config, serial_number: int) -> Config:
             found.serial_number == serial_number, "serial_number", found.serial_number, f"{serial_number}, the device's"
         )
         own = msgspec.to_builtins(config)
+        _both_ways(stated["position"])
         return checked(own | {key: own[key] | stated[key] for key in stated if key in own}, Config)
     except ValueError as error:
         raise ConfigError(placed(path, str(error))) from error
+
+
+def _both_ways(position: object) -> None:
+    if isinstance(position, dict) and "gap_speed_mm_s" in position:
+        position.setdefault("closing_mm_s", position["gap_speed_mm_s"])
 
 
 def load_config(path: Path | None) -> Config:
@@ -330,6 +338,7 @@ def load_config(path: Path | None) -> Config:
     def kind_of(tables: dict[str, Any]) -> type[Config]:
         rates = tables.get("rates")
         stated.update(rates if isinstance(rates, dict) else ())
+        _both_ways(tables.get("position"))
         return Config
 
     config = Config() if path is None else convert_as(path, kind_of)

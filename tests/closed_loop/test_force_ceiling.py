@@ -166,7 +166,7 @@ def ask_for_six_newtons(core: Core) -> Governor:
     """A governor that has gone mad, and asks for 6 N whatever the scene wants."""
     giant = Portrait([95.0, 45.0], [0.0, 100.0], [2.0, 2.0])
     force = msgspec.structs.replace(core.scene.force, least_N=6.0, most_N=6.0)
-    return Governor(0.0, giant, force, CONFIG.position.gap_speed_mm_s)
+    return Governor(0.0, giant, force, core.gap_speeds)
 
 
 @pytest.mark.parametrize("sample", WEAKEST_AND_STRONGEST)

@@ -12,6 +12,8 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import MIN_INFERENCE_HZ, Config, Rates, load_calibration, load_config
+from tormagd.control.assembly.build import build_core
+from tormagd.control.move.motor import gap_speeds
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
 from tormagd_client.endpoints import ConfigError
@@ -332,6 +334,28 @@ def test_the_sample_files_are_accepted(example: Path) -> None:
     config = load_config(example)
     assert config.scene == "coronary"
     choose(config.device, config.rates)
+
+
+@pytest.mark.parametrize(
+    ("stated", "closing_mm_s", "opening_mm_s"),
+    [
+        ("", 43.7, 38.0),
+        ("gap_speed_mm_s = 30.0", 30.0, 30.0),
+        ("closing_mm_s = 40.0", 40.0, 38.0),
+        ("gap_speed_mm_s = 30.0\nclosing_mm_s = 40.0", 40.0, 30.0),
+    ],
+)
+def test_a_gap_speed_alone_is_of_both_ways(write, stated: str, closing_mm_s: float, opening_mm_s: float) -> None:
+    table = f"[position]\n{stated}"
+    calibrated = load_calibration(write(f"serial_number = 7\n{table}"), load_config(None), 7)
+    for config in (load_config(write(table)), calibrated):
+        closing, opening = gap_speeds(config).reach_mm(1.0)
+        assert (closing, opening) == (pytest.approx(closing_mm_s, abs=0.1), opening_mm_s)
+
+
+def test_closing_faster_than_the_motors_can_is_refused(write) -> None:
+    with pytest.raises(ConfigError, match=r"closing_mm_s = 60: allowed is at most 43\.7, what the motors can"):
+        build_core(load_config(write("[position]\nclosing_mm_s = 60.0")))
 
 
 def test_a_calibration_goes_before_the_configurations_own_keys(write) -> None:

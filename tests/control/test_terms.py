@@ -125,6 +125,7 @@ def test_without_the_motor_late_carriages_stay_late(moving, planned, names: tupl
     core = core_without(*names)
     planner = core.planner()
     planner.governor.asked_N = 1.0
+    planner.governor.from_mm = planner.governor.sent_mm = core.portrait.gap_mm_at(1.0)
     for number in range(1, 101):
         force_N = 1.0 + 0.5 * PERIOD_S * number
         late = moving(core.portrait.gap_mm_at(force_N) + 0.3, 1.0, left_mm_s=-7.0, right_mm_s=-7.0, sensed_s=-math.inf)

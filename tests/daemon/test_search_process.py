@@ -46,12 +46,12 @@ def test_a_plan_uses_the_newest_answer_asks_anew_and_says_how_old_it_is(core: Co
     first = planner.plan(1.01, setpoint(1.5, 1.01), None)
     assert first.gap_mm >= core.portrait.gap_mm_at(first.governed_N)  # nothing has been found yet
     for step in range(1, 100):
-        question = planner.question
+        question = planner.aim.question
         assert question is not None
-        planner.answered(planner.aim.answer_to(question))
+        planner.aim.answer = planner.aim.answer_to(question)
         plan = planner.plan(1.01 + 0.02 * step, setpoint(1.5, 1.01), None)
         assert plan.search_age_s == pytest.approx(0.02)
-        assert planner.question != question
+        assert planner.aim.question != question
     assert plan.governed_N == pytest.approx(1.5)
     assert plan.gap_mm == pytest.approx(core.portrait.gap_mm_at(1.5), abs=2.0)  # of another handle
 

@@ -150,7 +150,11 @@ class Flight:
         self.command("enable")
 
     def write(self, path: Path, **changes: str) -> Path:
-        write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.ring.parts())
+        write_black_box(
+            path,
+            {**header(self.config, self.core), "reason": "TEST", **changes},
+            [each.entries for each in self.ring.parts()],
+        )
         return path
 
 

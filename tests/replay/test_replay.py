@@ -24,7 +24,6 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.record.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.record.journal import ANSWER, CONFIRM, FORMAT
-from tormagd.record.keeper import Part
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd.record.replay.rebuild import ReplayError, differences, rebuilt, recorded
 from tormagd.record.replay.rerun import rerun, ticks_of
@@ -38,7 +37,7 @@ FORMER = (
     f"format = '4', written by tormagd {__version__!r}: allowed is {FORMAT}, which tormagd {__version__} writes; "
     "replay it with the version that wrote it"
 )
-NO_TICKS = [Part(0.0, msgspec.msgpack.encode(["step"]))]
+NO_TICKS = [msgspec.msgpack.encode(["step"])]
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +234,7 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
                 yield edited
 
     monkeypatch.setattr(Derived, "of", other)
-    write_black_box(tmp_path / "edited.mcap", box.header, [Part(0.0, msgspec.msgpack.encode(head))])
+    write_black_box(tmp_path / "edited.mcap", box.header, [msgspec.msgpack.encode(head)])
     monkeypatch.undo()
     assert read_black_box(tmp_path / "edited.mcap").odd.startswith(said)
 

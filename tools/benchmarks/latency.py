@@ -23,9 +23,9 @@ from machines.processes import received
 from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
 from tormag_lab.arrays import Array
 from tormagd.config import Config, RealTime
+from tormagd.ctl.record import listening
 from tormagd.daemon.endpoint import context
 from tormagd.daemon.realtime import prepare, priority_of_threads
-from tormagd.record.ticks import listening
 from tormagd_client.messages import VERSION, Setpoint, encode
 
 MIN_N, GRAIN_N = 1.0, 1e-4

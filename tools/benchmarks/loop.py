@@ -38,12 +38,13 @@ from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compil
 from tormag_lab.arrays import Array
 from tormag_lab.pages import subplots
 from tormagd.config import Config, RealTime, load_config
+from tormagd.ctl.record import listening
 from tormagd.ctl.scene_check import as_toml
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.headroom.bare_timer import beat
-from tormagd.record.ticks import encode_ticks, listening
+from tormagd.record.ticks import encode_ticks
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request

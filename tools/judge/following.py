@@ -202,8 +202,8 @@ Rehearsals = dict[Case, Followed]
 
 def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array, boot: FirmwareKind = Firmware) -> Followed:
     if case.gap_speed_mm_s is not None:
-        slow = msgspec.structs.replace(config.position, gap_speed_mm_s=case.gap_speed_mm_s)
-        config = msgspec.structs.replace(config, position=slow)
+        both = {"gap_speed_mm_s": case.gap_speed_mm_s, "closing_mm_s": case.gap_speed_mm_s}
+        config = msgspec.structs.replace(config, position=msgspec.structs.replace(config.position, **both))
     # what is played is not the scene's own signal, which the daemon refuses if the gap is too slow for it
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
     loop = armed(build_core(config, scene), device_of(case.plant), parse_hand(case.hand), boot=boot)

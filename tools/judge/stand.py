@@ -19,7 +19,7 @@ from machines.wire import carried
 
 from tormag_lab.arrays import Array
 from tormagd.config import load_config
-from tormagd.record.ticks import listening
+from tormagd.ctl.record import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.keys import SECRET, SERVER, generate
 

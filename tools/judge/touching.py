@@ -22,7 +22,7 @@ from tormag_lab.ideal_carriage import Brake, Drive, brake_of, drive_of
 from tormagd.config import Config, Rates
 from tormagd.control.ask.path import FLATTEST_N_MM, SPEEDING_UP_S, TIMES_S, nearest_path_mm
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.control.records import TimedSetpoint, Travel, Wall
+from tormagd.control.records import GapSpeeds, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import FeltHand, Impedance
@@ -258,8 +258,8 @@ class Bound:
         wanted_mm = self._gaps_for(wall.friction_N + wall.stiffness_N_mm * np.maximum(depths_mm, 0.0), strength)
         slopes = np.interp(wanted_mm, self._gap_mm[1:], np.diff(self._fresh_N) / GRID_MM)
         weights = np.maximum(slopes * slopes, FLATTEST_N_MM**2) * np.gradient(TIMES_S)
-        speed_mm_s = max(abs(self._speed_mm_s), self._core.gap_speed_mm_s)
-        path = nearest_path_mm(truth.gap_mm, PERIOD_S, TIMES_S, wanted_mm.tolist(), weights.tolist(), speed_mm_s, 1)
+        speeds = GapSpeeds(*[max(abs(self._speed_mm_s), self._core.gap_speeds.sure_mm_s)] * 3)
+        path = nearest_path_mm(truth.gap_mm, PERIOD_S, TIMES_S, wanted_mm.tolist(), weights.tolist(), speeds, 1)
         open_N = self._scale * float(self._fresh_N[-1]) * strength + self._offset_N
         waiting_N = max(self._core.scene.force.waiting_N, open_N)
         waiting_mm, early_mm = self._gaps_for(np.array([waiting_N, waiting_N + EARLY_N]), strength).tolist()

@@ -23,13 +23,12 @@ from tormagd.control.measure import Measure
 from tormagd.control.move.actuator import Actuator
 from tormagd.control.move.carriages import Carriages
 from tormagd.control.move.homing import Homing
-from tormagd.control.move.motor import full_speed_mm_s
+from tormagd.control.move.motor import full_speed_mm_s, gap_speeds
 from tormagd.control.move.opening import Opening
 from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
-from tormagd.element.inverse.solution import Answer, Question
 from tormagd.element.model.features import require_number
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.measurement import Measurement
@@ -51,10 +50,9 @@ class Planner:
         gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
         self.believe = Believe(config, scene, element.nominal, followed)
-        gap_speed_mm_s = config.position.gap_speed_mm_s
         self._portrait: Final = element.portrait
         self.way = Way(config.handle.push_sign)
-        self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
+        self.governor = Governor(now_s, element.portrait, scene.force, gap_speeds(config), terms)
         self.aim = Aim(config, scene, element)
         self.planned = self.aim.begin(now_s, 0, 0.0)
 
@@ -71,7 +69,8 @@ class Planner:
         # at the open gap the element's field lags and gives more than the portrait says
         device = belief.device.relaxed(self._portrait.min_N - self.believe.memory.open_N())
         ask = self.governor.update(now_s, setpoint, device, belief.lag_s, travel, held_N)
-        plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
+        before = self.planned if is_followed else None
+        plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured, before)
         # what is learned of the carriages' delay acts on the next plan
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan
@@ -90,13 +89,6 @@ class Planner:
 
     def foresee(self) -> bool:
         return self.governor.foresee()
-
-    @property
-    def question(self) -> Question | None:
-        return self.aim.question
-
-    def answered(self, answer: Answer) -> None:
-        self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
         self.believe.teach(learned)

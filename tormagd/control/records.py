@@ -11,7 +11,12 @@ from firmware_protocol.value import Value
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import MOVING_MM_S, Turn
+from tormagd.element.model.features import LARGEST, require_number
+from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.measurement import DeviceRequest
+
+# compiled, a constant of this module is a plain float
+_LARGEST: Final[float] = LARGEST
 
 
 @final
@@ -81,6 +86,31 @@ class TimedSetpoint(Value):
         if self.wall is None:
             return self.force_N
         return self.wall.force_N(travel.place_mm) if travel.is_pushing else self.wall.friction_N
+
+    def lets_go(self, travel: "Travel") -> bool:
+        """Tell whether a hand that draws back has a force of its own."""
+        return not travel.is_pushing and (self.wall is not None or self.withdraw_N is not None)
+
+    def require_numbers(self) -> None:
+        """Raise DomainError, naming the field, unless all numbers are finite and within LARGEST."""
+        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N"):
+            require_number(name, getattr(self, name) or 0.0)
+        if self.wall is not None:
+            for name in self.wall.__match_args__:
+                require_number(name, getattr(self.wall, name))
+        if not self.preview_N:
+            return
+        if not 0.0 < self.preview_dt_s <= _LARGEST:
+            raise DomainError("preview_dt_s", self.preview_dt_s, "above 0 s")
+        # one sum finds NaN and infinity anywhere
+        if not -_LARGEST <= sum(self.preview_N) <= _LARGEST:
+            for force_N in self.preview_N:
+                require_number("preview_N", force_N)
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the publisher says what comes."""
+        return self.wall is not None or self.preview_N != ()
 
     @property
     def preview_s(self) -> float:
@@ -172,6 +202,20 @@ class Measured(Value):
     @property
     def skew_mm(self) -> float:
         return self.left_mm - self.right_mm
+
+
+@final
+class GapSpeeds(Value):
+    """The gap's greatest speeds, and the closing that is counted on."""
+
+    def __init__(self, closing_mm_s: float, opening_mm_s: float, sure_mm_s: float) -> None:
+        self.closing_mm_s: Final = closing_mm_s
+        self.opening_mm_s: Final = opening_mm_s
+        self.sure_mm_s: Final = sure_mm_s
+
+    def reach_mm(self, passed_s: float) -> tuple[float, float]:
+        """Return how far the gap closes and opens."""
+        return self.closing_mm_s * passed_s, self.opening_mm_s * passed_s
 
 
 @final

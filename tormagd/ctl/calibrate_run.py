@@ -30,9 +30,10 @@ from tormagd.config import Config
 from tormagd.control.safety.codes import FAULTS
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
+from tormagd.ctl.record import listening
 from tormagd.ctl.waveform import Waveform
 from tormagd.ground.terminal import interrupted_by
-from tormagd.record.ticks import decode_ticks, listening
+from tormagd.record.ticks import decode_ticks
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable

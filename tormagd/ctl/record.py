@@ -14,15 +14,17 @@ from tormagd.config import Config, Recordings
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.record.folder import Budget, RecordingFolder
-from tormagd.record.ticks import decode_ticks, listening
+from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import TELEMETRY_TOPIC, MessageError, Telemetry, decode
 from tormagd_client.printable import printable
-from tormagd_client.wire import keys_of
+from tormagd_client.wire import Keys, connect, keys_of
 
+QUEUE = 10_000
+"Over three minutes for a slow listener."
 POLL_MS = 100
 LONGEST_END_S = 60.0
 SILENT_S = 1.0
@@ -38,6 +40,18 @@ def budget_of(settings: Recordings) -> Budget:
         most_s=settings.most_days * 86_400.0,
         free_bytes=round(settings.free_MB * 1e6),
     )
+
+
+def listening(
+    context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
+) -> "zmq.Socket[bytes]":
+    """Connect a new SUB socket for telemetry or ticks."""
+    socket = context.socket(zmq.SUB)
+    socket.setsockopt(zmq.RCVHWM, QUEUE)
+    socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
+    socket.subscribe(topic)
+    connect(socket, address, keys)
+    return socket
 
 
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:

@@ -83,7 +83,7 @@ class Answers:
     def _describe(self) -> Description:
         core, link = self._telemetry.core, self._commands.connection.report()
         portrait, device = core.portrait, self._inference.planner.believe.device
-        scaled_mm_s = device.scale * core.gap_speed_mm_s
+        scaled_mm_s = device.scale * core.gap_speeds.opening_mm_s
         return Description(
             version=__version__,
             build=str(settle()),

@@ -56,14 +56,14 @@ class InferenceLoop:
         answer = None if beside is None else beside.answer()
         if answer is not None:
             self._journal.note(ANSWER, answer)
-            self.planner.answered(answer)
+            self.planner.aim.answer = answer
         self._journal.note(PLAN, now_s, setpoint)
         try:
             self.planner.plan(now_s, setpoint, measured, is_followed)
         except PLAN_ERRORS as error:
             self._begin_afresh(now_s, error)
         if beside is not None:
-            beside.ask(self.planner.question)
+            beside.ask(self.planner.aim.question)
         self.timing.record(beat.due_ns, start_ns, self._clock_ns())
         # missed plans are not made up for
         is_regular = not is_asked and beat.due_ns - self._due_ns < period_ns

@@ -81,7 +81,7 @@ class Topics:
             measured.gap_mm if measured is not None and measured.is_homed else None,
             core.portrait,
             believe.device,
-            gap_speed_mm_s=core.gap_speed_mm_s,
+            gap_speed_mm_s=core.gap_speeds.opening_mm_s,
             lag_s=believe.carriages.lag_s,
             tolerance_N=force.tolerance_rms_N,
             release_N_s=force.release_N_s,

@@ -5,7 +5,7 @@ runs such a file, and compares what people see, `/ticks` and `/frames`, with wha
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import msgspec
 from mcap.records import Message
 
 from tormagd.ground.files import in_place_of
-from tormagd.record.keeper import Part
 from tormagd.record.reader import Contents, RecordingError, damage_in, opened, scan
 from tormagd.record.ticks import MISSING, TOLD
 from tormagd.record.writer import CORE_TOPIC, FRAMES_TOPIC, TICKS_TOPIC, Derived, RecordingWriter
@@ -35,15 +34,15 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
     """The first message of `/ticks` or `/frames` that `/core` does not give, or why an entry of `/core` gives none."""
 
 
-def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -> None:
-    """Write a new black box of these parts, whole or not at all."""
+def write_black_box(path: Path, header: dict[str, str], parts: Iterable[bytes]) -> None:
+    """Write a new black box of these entries, whole or not at all."""
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
     columns = msgspec.json.decode(header["columns"], type=tuple[str, ...])
     with in_place_of(path) as beside, RecordingWriter(beside, header) as writer:
         for part in parts:
-            entries = msgspec.msgpack.decode(part.entries, type=list[Any])
-            writer.entries(columns, entries, part.entries)
+            entries = msgspec.msgpack.decode(part, type=list[Any])
+            writer.entries(columns, entries, part)
             for told in (each for each in entries if isinstance(each, list) and each[:1] == [TOLD]):
                 writer.telemetry(msgspec.convert(told[1], Telemetry))
 

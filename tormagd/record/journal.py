@@ -32,11 +32,11 @@ from tormagd.record.telemetry import TickRecord
 from tormagd.record.ticks import MISSING, READ, WROTE
 from tormagd.scenes.scene import Scene
 
-FORMAT = 19
+FORMAT = 20
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
-    *(Measured, Handle, Travel, Turn, Wall, Leap, Reference, Plan, Outside),
+    *(Measured, Handle, Travel, Turn, TimedSetpoint, Wall, Leap, Reference, Plan, Outside),
     *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
 )
 "All types that `plain_values` reads back."

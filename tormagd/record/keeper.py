@@ -248,7 +248,7 @@ class Keeper:
                 raise OSError(0, "nothing is kept yet")
             folder.mkdir(mode=0o750, parents=True, exist_ok=True)
             details = {**begun.header, **write.details, "reason": write.reason}
-            write_black_box(folder / write.name, details, parts)
+            write_black_box(folder / write.name, details, [part.entries for part in parts])
             # a name is a clock's word: what this daemon has written is newer than the rest
             self._written.append(write.name)
             known = sorted(folder.glob("*Z-*.mcap"), key=lambda each: (each.name in self._written, each.name))

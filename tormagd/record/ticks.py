@@ -4,18 +4,14 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import msgspec
-import zmq
 
 from tormagd.record.telemetry import COLUMNS, TIME_COLUMN
 from tormagd_client.messages import VERSION, MessageError
 from tormagd_client.printable import require
-from tormagd_client.wire import Keys, connect
 
 MAX_BATCH_BYTES = 4_000_000  # 20 ticks with a snapshot of the core are under 0.1 MB
 MAX_COLUMNS = 256
 MAX_TIME_NS = 2**63
-QUEUE = 10_000
-"Over three minutes for a slow listener."
 READ, WROTE, TOLD, MISSING = "read", "wrote", "told", "missing"
 """Entries of `core` that are no inputs of the core: what passed between daemon and device, as `[READ, time_s, raw]`, a
 snapshot as published, and that others were lost."""
@@ -74,18 +70,6 @@ class Axis:
         """Place a snapshot, which may know of a step before the ticks do."""
         at_ns = t_ns - self.ahead_ns
         return at_ns if self._offset_ns is None or abs(at_ns - self._newest_ns) < 1_000_000_000 else self._newest_ns
-
-
-def listening(
-    context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
-) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket for telemetry or ticks."""
-    socket = context.socket(zmq.SUB)
-    socket.setsockopt(zmq.RCVHWM, QUEUE)
-    socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
-    socket.subscribe(topic)
-    connect(socket, address, keys)
-    return socket
 
 
 _ENCODER, _DECODER = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(TickBatch)

@@ -231,14 +231,14 @@ class ClosedLoop:
             self._answer_question(planner, now_s)
             planner.plan(now_s, setpoint, self.stepper.measured, self.stepper.is_followed)
             planner.foresee()
-            self._asked = self._asked or planner.question
+            self._asked = self._asked or planner.aim.question
         return planner.planned
 
     def _answer_question(self, planner: Planner, now_s: float) -> None:
         """Answer the pending question once SEARCH_S is over."""
         asked = self._asked
         if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
-            planner.answered(planner.aim.answer_to(asked))
+            planner.aim.answer = planner.aim.answer_to(asked)
             self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:

@@ -35,7 +35,7 @@ class IdealCarriages(Actuator):
         insert = core.scene.insert
         self._closed_mm: Final = insert.gap_closed_mm
         self._open_mm: Final = insert.gap_open_mm
-        self._top_speed_mm_s: Final = core.gap_speed_mm_s
+        self._speeds: Final = core.gap_speeds
         self._plant: Final = plant
 
     def begin(self, gap_mm: float) -> None:
@@ -59,8 +59,8 @@ class IdealCarriages(Actuator):
         if plan is not None and not is_over:
             floor_mm = max(self._closed_mm, plan.min_gap_mm)
             wanted_mm = target_of(plan, now_s, 0.0, floor_mm, self._open_mm).gap_mm
-        reach_mm = self._top_speed_mm_s * dt_s
-        gap_mm = min(max(wanted_mm, before_mm - reach_mm), before_mm + reach_mm)
+        closed_mm, opened_mm = self._speeds.reach_mm(dt_s)
+        gap_mm = min(max(wanted_mm, before_mm - closed_mm), before_mm + opened_mm)
         put_gap(self._plant, gap_mm)
         self.reference = Reference(gap_mm, (gap_mm - before_mm) / dt_s)
         return Drive(0.0, 0.0, 0.0, 0.0, [] if gap_mm == wanted_mm else [Limit.RATE])

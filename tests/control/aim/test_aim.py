@@ -114,12 +114,20 @@ def test_the_gap_moves_ahead_along_the_setpoints_slope(core, planner, planned, m
     assert plan.gap_speed_mm_s == pytest.approx(-0.5 / core.portrait.slope_at_N_mm(plan.governed_N), rel=0.1)
 
 
+def test_a_plan_is_reached_from_the_one_before_though_its_preview_comes_and_goes(core, planner, planned) -> None:
+    tells = {"preview_N": (1.2,) * 20 + (1.9,) * 180, "preview_dt_s": 0.002}
+    gaps_mm = [planned(planner, 1.2, **tells if number % 20 < 10 else {}).gap_mm for number in range(100)]
+    assert np.abs(np.diff(gaps_mm)).max() <= core.gap_speeds.closing_mm_s * PERIOD_S + 1e-9
+    assert gaps_mm[0] - min(gaps_mm) > 0.5
+
+
 def test_a_preview_gives_the_gaps_speed_and_acceleration(core, planner, first, moving) -> None:
 
     def force_N(time_s: float) -> float:
         return 1.5 + 0.1 * math.cos(2.0 * math.pi * 3.0 * (time_s - 0.2))
 
     planner.governor.asked_N = force_N(0.0)
+    planner.governor.from_mm = planner.governor.sent_mm = core.portrait.gap_mm_at(force_N(0.0))
     for tick in range(1, 101):
         now_s = 2e-3 * tick
         ahead_N = tuple(force_N(now_s + 2e-3 * step) for step in range(1, 40))
@@ -237,7 +245,7 @@ def test_nan_never_travels(core, moving, history: list[tuple[float, TimedSetpoin
         told += [plan.confidence, plan.trim, plan.min_gap_mm]
         told += [getattr(device, name) for name in DeviceFit.__match_args__]
         assert all(map(math.isfinite, told))
-        assert abs(plan.gap_speed_mm_s) <= CONFIG.position.gap_speed_mm_s
+        assert -core.gap_speeds.closing_mm_s <= plan.gap_speed_mm_s <= CONFIG.position.gap_speed_mm_s
         assert max(45.0, plan.min_gap_mm) <= plan.gap_mm <= 95.0
         assert CONFIG.trim.least <= device.scale <= CONFIG.trim.most
         assert plan.governed_N <= max(core.scene.force.most_N, device.force_N(core.portrait.min_N))

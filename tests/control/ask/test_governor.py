@@ -10,10 +10,10 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, Forecast
-from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, _wanted_N
+from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, previewed_N
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.records import Ask, TimedSetpoint, Travel
+from tormagd.control.records import Ask, GapSpeeds, TimedSetpoint, Travel
 from tormagd.control.safety.codes import Limit
 from tormagd.element.physics.errors import DomainError
 from tormagd.ground.plain_values import plain, restore
@@ -39,8 +39,9 @@ def governor(
     gap_speed_mm_s: float = GAP_SPEED_MM_S,
     terms: Terms = EVERY_TERM,
 ) -> Governor:
-    begun = Governor(now_s, portrait, scene, gap_speed_mm_s, terms)
-    begun.asked_N, begun.above_N = asked_N, asked_N - portrait.min_N
+    begun = Governor(now_s, portrait, scene, GapSpeeds(*[gap_speed_mm_s] * 3), terms)
+    begun.asked_N = asked_N
+    begun.from_mm = begun.sent_mm = portrait.gap_mm_at(asked_N)
     return begun
 
 
@@ -453,7 +454,7 @@ def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> No
             following.foresee()
             decide(following, now_s, setpoint)
             if now_s > 6.0:
-                wanted_N = _wanted_N(setpoint, 0.0, (0.0, 10.0), following.forecast)
+                wanted_N = previewed_N(setpoint, 0.0, following.forecast)
                 known_s = 0.04 + HORIZON_S * is_foreseen
                 assert len(wanted_N) == max(MIN_TIMES, sum(after_s < known_s for after_s in TIMES_S))
                 found.append(wanted_N[MIN_TIMES - 1] - beats_N(now_s + TIMES_S[MIN_TIMES - 1]))

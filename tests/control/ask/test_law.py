@@ -10,7 +10,7 @@ from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import DECAY, EARLY_N, Governor
 from tormagd.control.ask.way import SLID_MM, Way
 from tormagd.control.believe.strength import UNSEEN, DeviceFit
-from tormagd.control.records import Ask, Handle, Measured, TimedSetpoint, Travel, Wall
+from tormagd.control.records import Ask, GapSpeeds, Handle, Measured, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import TURN_MM, Turn
 from tormagd.scenes.scene import Force
@@ -27,7 +27,7 @@ PASSES = 10
 
 class Following:
     def __init__(self, scene: Force = SCENE) -> None:
-        self.governor = Governor(0.0, PORTRAIT, scene, 38.0)
+        self.governor = Governor(0.0, PORTRAIT, scene, GapSpeeds(38.0, 38.0, 38.0))
         self.now_s = 0.0
 
     def ask(self, travel: Travel, force_N: float = 0.0, device: DeviceFit = UNSEEN, **law: object) -> Ask:

@@ -9,15 +9,17 @@ from hypothesis import given, settings, strategies as st
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.path import NEAR_S, Path, nearest_path_mm
 from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.records import GapSpeeds
 
 STEP_S = 0.01
 SPEED_MM_S = 40.0
+SPEEDS = GapSpeeds(*[SPEED_MM_S] * 3)
 MAX_MM = SPEED_MM_S * STEP_S
 
 
 def path_mm(start_mm: float, wanted_mm: list[float], weights: list[float], elapsed_s: float = STEP_S) -> list[float]:
     times_s = [STEP_S * place for place in range(len(wanted_mm))]
-    return nearest_path_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEED_MM_S, len(wanted_mm))
+    return nearest_path_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEEDS, len(wanted_mm))
 
 
 def cost(path: list[float], wanted_mm: list[float], weights: list[float]) -> float:
@@ -50,12 +52,12 @@ def test_the_first_gap_is_within_reach_of_the_last() -> None:
 
 def test_no_more_of_it_is_told_than_is_asked_for() -> None:
     times_s = [STEP_S * place for place in range(12)]
-    assert len(nearest_path_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
+    assert len(nearest_path_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEEDS, 3)) == 3
 
 
 @pytest.mark.parametrize(("from_mm", "wanted_N"), [(89.9, (1.01, 1.0)), (50.1, (1.99, 2.0))])
 def test_no_carriages_are_sent_past_the_ends(from_mm: float, wanted_N: tuple[float, float]) -> None:
-    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEED_MM_S)
+    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEEDS)
     _, sent_mm = path.pursue(from_mm, from_mm, 1.0, [wanted_N[0]] + [wanted_N[1]] * 14, DeviceFit(), 0.0)
     assert sent_mm == (90.0 if from_mm > 70.0 else 50.0)
 
@@ -64,9 +66,18 @@ def test_no_carriages_are_sent_past_the_ends(from_mm: float, wanted_N: tuple[flo
 @pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: float, is_near: bool, way: float) -> None:
-    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEED_MM_S)
+    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEEDS)
     to_N = 1.5 + way * share * NEAR_S * SPEED_MM_S / 40.0
     assert path.is_near(70.0, device.force_N(to_N), device) is is_near
+
+
+@pytest.mark.parametrize(("to_mm", "speed_mm_s"), [(40.0, -50.0), (80.0, 20.0)])
+def test_a_late_gap_closes_by_what_the_motors_can_and_opens_by_what_a_task_may_lose(
+    to_mm: float, speed_mm_s: float
+) -> None:
+    times_s = [STEP_S * place for place in range(10)]
+    path = nearest_path_mm(60.0, STEP_S, times_s, [to_mm] * 10, [1.0] * 10, GapSpeeds(50.0, 20.0, 40.0), 3)
+    assert path == pytest.approx([60.0 + speed_mm_s * STEP_S * place for place in (1, 2, 3)])
 
 
 GRID = 4
@@ -77,21 +88,23 @@ GRID = 4
 @given(
     st.lists(st.tuples(st.floats(-2.0, 2.0), st.floats(0.01, 1.0), st.integers(1, 3)), min_size=1, max_size=12),
     st.integers(-10, 10),
+    st.sampled_from([1, 2, GRID]),
 )
-def test_no_path_within_the_speed_misses_less(points: list[tuple[float, float, int]], start: int) -> None:
+def test_no_path_within_the_speeds_misses_less(points: list[tuple[float, float, int]], start: int, opens: int) -> None:
     wanted, weights = [60.0 + at for at, _, _ in points], [weight for _, weight, _ in points]
     steps = [step for _, _, step in points]
     grid_mm = MAX_MM / GRID
     start_mm = 60.0 + start * grid_mm
     times_s = [STEP_S * (passed - steps[0]) for passed in itertools.accumulate(steps)]
-    path = nearest_path_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, SPEED_MM_S, len(wanted))
+    speeds = GapSpeeds(SPEED_MM_S, SPEED_MM_S * opens / GRID, SPEED_MM_S)
+    path = nearest_path_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, speeds, len(wanted))
     for (before, after), step in zip(itertools.pairwise([start_mm, *path]), steps, strict=True):
-        assert abs(after - before) <= step * MAX_MM + 1e-9
+        assert -step * MAX_MM - 1e-9 <= after - before <= step * MAX_MM * opens / GRID + 1e-9
     reached = {start: 0.0}
     for want, weight, step in zip(wanted, weights, steps, strict=True):
         following: dict[int, float] = {}
         for place, spent in reached.items():
-            for there in range(place - step * GRID, place + step * GRID + 1):
+            for there in range(place - step * GRID, place + step * opens + 1):
                 total = spent + weight * (60.0 + there * grid_mm - want) ** 2
                 following[there] = min(total, following.get(there, math.inf))
         reached = following

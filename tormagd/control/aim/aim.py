@@ -16,12 +16,13 @@ from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, lawful_m
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.strength import DeviceFit, device_bounds
+from tormagd.control.move.motor import gap_speeds
 from tormagd.control.nominal import FieldOfGap, Nominal
 from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Limit
 from tormagd.element.inverse.solution import Answer, FieldSolution, FieldSolver, Question, Reach
 from tormagd.element.model.features import FEATURES
-from tormagd.element.model.force_curve import ForceCurve
+from tormagd.element.model.force_curve import ForceCurve, within
 from tormagd.element.model.memory import Memory
 from tormagd.element.physics.errors import DomainError
 from tormagd.scenes.scene import Scene
@@ -62,23 +63,19 @@ class Aim:
     answer: Answer
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
-        self._nominal: Final = element.nominal
-        self._field: Final = element.field
+        self._element: Final = element
         self._portrait: Final = element.portrait
-        self._search: Final = element.search
-        self._is_beside: Final = element.is_beside
-        self._law: Final = element.law
         self._closed_mm: Final = scene.insert.gap_closed_mm
         self._open_mm: Final = scene.insert.gap_open_mm
         self._ceiling_N: Final = CEILING * scene.force.most_N
         self._bounds: Final = device_bounds(config.trim)
-        self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
+        self._speeds: Final = gap_speeds(config)
         self._max_mm_s2: Final = config.position.gap_acceleration_mm_s2
         self._low_confidence: Final = config.limits.low_confidence
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open and no setpoint."""
-        field_mT = self._field.field_mT(self._open_mm)
+        field_mT = self._element.field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
         self.answer = Answer(now_s, FieldSolution(self.element_mT, min_N, 1.0, 0, _INSIDE))
@@ -92,32 +89,45 @@ class Aim:
         belief: Belief,
         memory: ElementMemory,
         measured: Measured | None,
+        before: Plan | None = None,
     ) -> Plan:
+        """Return the next plan, which the gap reaches from the plan `before`."""
         device = belief.device
-        curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
+        curve, outside = self._element.nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
         solution = self._solution(now_s, curve, wanted_N)
-        element_mT = lawful_mT(self._law, wanted_N, solution.field_mT)
+        element_mT = lawful_mT(self._element.law, wanted_N, solution.field_mT)
         if element_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
-        wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
+        wanted_mm = min(max(self._element.field.gap_mm(field_mT), self._closed_mm), self._open_mm)
+        if before is not None:
+            wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
         min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
         self.number += 1
         self.element_mT = field_mT - memory.lag_mT
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
-        gap_mm, confidence = max(wanted_mm, min_mm), solution.confidence
-        return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
+        gaps_mm = max(wanted_mm, min_mm), min_mm
+        return self._plan(now_s, setpoint, ask, belief, field_mT, gaps_mm, solution.confidence, limits, outside)
+
+    def _reached_mm(self, wanted_mm: float, before: Plan, now_s: float, ask: Ask, device: DeviceFit) -> float:
+        """Return how far the gap gets from the plan `before`, besides what the setpoint leaps."""
+        if before.setpoint_N is None or ask.asked_N is None:
+            return wanted_mm
+        asked_mm = self._portrait.gap_mm_at(device.model_N(ask.asked_N))
+        leap_mm = abs(asked_mm - self._portrait.gap_mm_at(device.model_N(before.setpoint_N)))
+        closed_mm, opened_mm = self._speeds.reach_mm(max(now_s - before.time_s, 0.0))
+        return within(wanted_mm, (before.gap_mm - closed_mm - leap_mm, before.gap_mm + opened_mm + leap_mm))
 
     def answer_to(self, question: Question) -> Answer:
         """Answer `question` in the search that runs beside the plans."""
-        curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
-        return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
+        curve = self._element.nominal.curve(question.displacement_mm, question.rate_mm_s)
+        return Answer(question.time_s, self._element.search.solve(curve, question.force_N, question.last_field_mT))
 
     def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
-        if not self._is_beside:
-            return self._search.solve(curve, wanted_N, self.element_mT)
+        if not self._element.is_beside:
+            return self._element.search.solve(curve, wanted_N, self.element_mT)
         self.question = Question(now_s, curve.displacement_mm, curve.rate_mm_s, wanted_N, self.element_mT)
         age_s = now_s - self.answer.time_s
         if age_s > OLDEST_ANSWER_S:
@@ -131,8 +141,7 @@ class Aim:
         ask: Ask,
         belief: Belief,
         field_mT: float,
-        gap_mm: float,
-        min_mm: float,
+        gaps_mm: tuple[float, float],
         confidence: float,
         limits: tuple[Limit, ...],
         outside: tuple[Outside, ...],
@@ -147,18 +156,18 @@ class Aim:
             governed_N=ask.force_N,
             predicted_N=belief.predicted_N,
             field_mT=field_mT,
-            gap_mm=gap_mm,
+            gap_mm=gaps_mm[0],
             gap_speed_mm_s=speed_mm_s,
             confidence=confidence,
             limits=limits,
             gap_acceleration_mm_s2=acceleration_mm_s2,
             foresight=ask.foresight,
-            min_gap_mm=min_mm,
+            min_gap_mm=gaps_mm[1],
             outside=outside,
             sensor_doubted_s=belief.sensor_doubted_s,
             trim=ask.force_N / model_N if model_N > 0.0 else belief.at_speed.scale,
             stamp_s=setpoint.stamp_s if setpoint is not None and ask.is_meant else -math.inf,
-            search_age_s=now_s - self.answer.time_s if self._is_beside else 0.0,
+            search_age_s=now_s - self.answer.time_s if self._element.is_beside else 0.0,
         )
 
     def _limits(
@@ -192,5 +201,5 @@ class Aim:
             away_mm = self._portrait.gap_mm_at(device.model_N(force_N)) - start_mm
             speed += _TO_SPEED[place] * away_mm
             acceleration += _TO_ACCELERATION[place] * away_mm
-        top, hardest = self._top_speed_mm_s, self._max_mm_s2
-        return min(max(speed, -top), top), min(max(acceleration, -hardest), hardest)
+        most, hardest = self._speeds, self._max_mm_s2
+        return within(speed, (-most.closing_mm_s, most.opening_mm_s)), within(acceleration, (-hardest, hardest))

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from firmware_protocol.value import Value
 from tormagd.control.interpolation import at_step
+from tormagd.element.model.force_curve import within
 
 DOUBT_N: Final = 0.02
 "Before an error is judged, the two guesses count as this far apart and equally good."
@@ -34,17 +35,15 @@ class Skill(Value):
 
     def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
         """Return the skill after both guesses' newest errors, weighted by `share`."""
-        gained = other_error_N * other_error_N - error_N * error_N
-        difference_N = other_error_N - error_N
-        apart = difference_N * difference_N
-        return Skill(self.gained + share * (gained - self.gained), self.apart + share * (apart - self.apart))
+        apart_N = other_error_N - error_N
+        gained = apart_N * (other_error_N + error_N)
+        return Skill(
+            self.gained + share * (gained - self.gained), self.apart + share * (apart_N * apart_N - self.apart)
+        )
 
     @property
     def score(self) -> float:
         return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
-
-
-UNJUDGED: Final = Skill(0.0, DOUBT_N * DOUBT_N)
 
 
 Array = npt.NDArray[np.float64]
@@ -83,15 +82,14 @@ SHORT_S: Final = 0.2
 "Skill is earned over the long time, a few beats, and lost over the short one."
 _LONG_SHARE: Final = EVERY * GRID_S / (LONG_S + EVERY * GRID_S)
 _SHORT_SHARE: Final = EVERY * GRID_S / (SHORT_S + EVERY * GRID_S)
-_MIN_BYTES: Final = MIN_HISTORY * array("d").itemsize
-_MAX_BYTES: Final = HISTORY * array("d").itemsize
-_LONGEST: Final = BEAT_DELAYS[-1]
+_BYTES: Final = 8
+"Of each point of the history."
 
 
 def embedding(delays: tuple[int, ...]) -> Array:
     """Return the places of all stretches in a full history, as indices from its end."""
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
-    ends = np.arange(-1 - HORIZON, _LONGEST - HISTORY - 1, -STRIDE)
+    ends = np.arange(-1 - HORIZON, BEAT_DELAYS[-1] - HISTORY - 1, -STRIDE)
     return np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
 
 
@@ -111,7 +109,6 @@ class Guess(Value):
 
 
 NOTHING_SAID: Final[tuple[Guess | None, ...]] = (None,) * JUDGED
-UNJUDGED_SHORT: Final = Skill(0.0, 0.0)
 LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
 "Where no stretch is like the newest one, the next forecast has to earn trust again."
 
@@ -139,18 +136,21 @@ class Forecast:
     beat_missed: float
 
     def __init__(self) -> None:
-        self._begin(-math.inf, 0.0, -math.inf, b"")
+        self.forget()
 
     @property
     def trust(self) -> float:
         """Return how far the forecast takes the place of the slope, 0..1."""
         if not self.changes_N:
             return 0.0
-        earned, lost = self.long.score, -self.short.score
-        return min(max(earned, 0.0), 1.0) * min(max(1.0 - lost, 0.0), 1.0)
+        return within(self.long.score, (0.0, 1.0)) * within(1.0 + self.short.score, (0.0, 1.0))
 
-    def forget(self) -> None:
-        self._begin(-math.inf, 0.0, -math.inf, b"")
+    def forget(self, stamp_s: float = -math.inf, force_N: float = 0.0, history: bytes = b"") -> None:
+        """Begin with one setpoint, or with none."""
+        self.stamp_s, self.force_N, self.time_s, self.history = stamp_s, force_N, stamp_s, history
+        self.from_s, self.changes_N, self.awaited = -math.inf, [], NOTHING_SAID
+        self.long, self.short = Skill(0.0, DOUBT_N * DOUBT_N), Skill(0.0, 0.0)
+        self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
 
     def update(self, stamp_s: float, force_N: float) -> None:
         """Take one setpoint: judge what was forecast for its time, and remember it."""
@@ -158,7 +158,7 @@ class Forecast:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
         spacing_s = stamp_s - self.stamp_s
         if not 0.0 <= spacing_s <= MAX_STEP_S:
-            self._begin(stamp_s, force_N, stamp_s, array("d", [force_N]).tobytes())
+            self.forget(stamp_s, force_N, array("d", [force_N]).tobytes())
             return
         count = int((stamp_s - self.time_s) / GRID_S)
         if count > 0 and spacing_s > 0.0:
@@ -167,7 +167,7 @@ class Forecast:
 
     def foresee(self, slope_N_s: float) -> bool:
         """Make a forecast from the newest point of the grid, and return whether one was due."""
-        if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < _MIN_BYTES:
+        if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < MIN_HISTORY * _BYTES:
             return False
         (rise, rise_unlike), (beat, beat_unlike) = _search(np.frombuffer(self.history))
         changes: list[float] = []
@@ -178,7 +178,9 @@ class Forecast:
             rise_weight = (self.rise_missed + rise_unlike) ** -2
             share = rise_weight / (rise_weight + (self.beat_missed + beat_unlike) ** -2)
             changes = [beat[place] + share * (rise[place] - beat[place]) for place in range(len(rise))]
-            said = self._guess(rise, beat, changes, slope_N_s)
+            since = (self.stamp_s - self.time_s) / GRID_S
+            ahead_N = [self.force_N + each[JUDGED] - each[1] * since for each in (rise, beat, changes)]
+            said = Guess(ahead_N[0], ahead_N[1], ahead_N[2], self.force_N + slope_N_s * GRID_S * (JUDGED - since))
         else:
             self.short = LOST
         self.from_s, self.changes_N = self.time_s, changes
@@ -193,19 +195,13 @@ class Forecast:
         base_N = self.force_N - at_step(since_s / GRID_S, changes)
         return [base_N + at_step((since_s + begins_after_s + later_s) / GRID_S, changes) for later_s in after_s]
 
-    def _begin(self, stamp_s: float, force_N: float, time_s: float, history: bytes) -> None:
-        self.stamp_s, self.force_N, self.time_s, self.history = stamp_s, force_N, time_s, history
-        self.from_s, self.changes_N, self.awaited = -math.inf, [], NOTHING_SAID
-        self.long, self.short = UNJUDGED, UNJUDGED_SHORT
-        self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
-
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
         """Add `count` points to the grid, and judge the guesses for them."""
         spacing_s = stamp_s - self.stamp_s
         times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]
-        shares = [(time_s - self.stamp_s) / spacing_s for time_s in times_s]
-        came_N = [self.force_N + share * (force_N - self.force_N) for share in shares]
-        self.history = (self.history + array("d", came_N).tobytes())[-_MAX_BYTES:]
+        per_s = (force_N - self.force_N) / spacing_s
+        came_N = [self.force_N + per_s * (time_s - self.stamp_s) for time_s in times_s]
+        self.history = (self.history + array("d", came_N).tobytes())[-HISTORY * _BYTES :]
         self.time_s = times_s[-1]
         for came, guess in zip(came_N, self.awaited):  # noqa: B905 as below
             if guess is not None:
@@ -223,24 +219,11 @@ class Forecast:
         self.rise_missed += _LONG_SHARE * (rise_error_N * rise_error_N - self.rise_missed)
         self.beat_missed += _LONG_SHARE * (beat_error_N * beat_error_N - self.beat_missed)
 
-    def _guess(self, rise: list[float], beat: list[float], changes: list[float], slope_N_s: float) -> Guess:
-        since_s = self.stamp_s - self.time_s
-        return Guess(
-            _ahead_N(self.force_N, rise, since_s),
-            _ahead_N(self.force_N, beat, since_s),
-            _ahead_N(self.force_N, changes, since_s),
-            self.force_N + slope_N_s * (JUDGED * GRID_S - since_s),
-        )
-
-
-def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
-    return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
-
 
 def _search(history: Array) -> list[tuple[list[float], float]]:
     """Forecast with each embedding: return the changes of force, N, and the distance, N², of each."""
     # both at once: most of the time goes into the calls, not into their numbers
-    changes = history[EMBEDDINGS[:, :, : (len(history) - _LONGEST - 1 - HORIZON) // STRIDE + 2]]
+    changes = history[EMBEDDINGS[:, :, : (len(history) - BEAT_DELAYS[-1] - 1 - HORIZON) // STRIDE + 2]]
     changes -= changes[:, TAPS : TAPS + 1]
     before = changes[:, :TAPS]
     before -= before[:, :, :1].copy()
@@ -249,28 +232,18 @@ def _search(history: Array) -> list[tuple[list[float], float]]:
     unlike: list[float] = (apart.min(axis=1) / TAPS).tolist()
     weight = 1.0 / (apart * apart)
     changes[:, TAPS] = 1.0
-    sums = ((changes[:, : TAPS + 1] * weight[:, None]) @ changes.transpose(0, 2, 1)).tolist()
+    sums = (changes[:, : TAPS + 1] * weight[:, None]) @ changes.transpose(0, 2, 1)
     return [
         ([] if each > UNLIKE_N * UNLIKE_N else _constants(rows), each) for rows, each in zip(sums, unlike, strict=True)
     ]
 
 
-def _constants(rows: list[list[float]]) -> list[float]:
-    """Return the regressions' constants, by elimination."""
-    total = rows[TAPS][TAPS]
-    variance = 0.0
-    for place in range(TAPS):
-        variance += rows[place][place]
-    ridge = RIDGE / TAPS * variance + SAME_N**2 * total
-    for _ in range(TAPS):
-        pivot = rows[0]
-        left: list[list[float]] = []
-        for row in rows[1:]:
-            share = row[0] / (pivot[0] + ridge)
-            # rows are equally long, and only an unchecked zip is compiled to a plain loop
-            left.append([value - share * above for value, above in zip(row[1:], pivot[1:])])  # noqa: B905
-        rows = left
-    constant = rows[0]
-    if total > MAX_LEVERAGE * constant[0]:
-        return []
-    return [0.0, *[each / constant[0] for each in constant[1:]]]
+def _constants(sums: Array) -> list[float]:
+    """Return the ridge regression's constants, from its sums of products."""
+    total = sums[TAPS, TAPS]
+    ridge = RIDGE / TAPS * np.trace(sums[:TAPS, :TAPS]) + SAME_N**2 * total
+    sums[range(TAPS), range(TAPS)] += ridge
+    # the last column of the inverse gives the constants' variance
+    followed = np.column_stack([sums[:, TAPS + 1 :], np.eye(TAPS + 1)[:, TAPS]])
+    *constants, variance = np.linalg.solve(sums[:, : TAPS + 1], followed)[TAPS].tolist()
+    return [] if total * variance > MAX_LEVERAGE else [0.0, *constants]

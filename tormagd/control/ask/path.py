@@ -1,6 +1,6 @@
-"""The path of a gap that misses least of a force known ahead, at the gap's speed.
+"""The path of a gap that misses least of a force known ahead, at the gap's speeds of closing and opening.
 
-    least sum of weight (path - wanted)^2    with    |path'| <= speed
+    least sum of weight (path - wanted)^2    with    -sure <= path' <= opening
 
 The sum is over TIMES_S. A weight is a point's share of the time, times the square of |dF/dgap|, so newtons are missed
 least. A dynamic programme solves this exactly, backwards over the points (Johnson, J. Comput. Graph. Stat. 22, 2013,
@@ -13,6 +13,7 @@ from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.records import GapSpeeds
 from tormagd.element.model.features import require_number
 from tormagd.element.model.force_curve import within
 
@@ -37,18 +38,19 @@ FLATTEST_N_MM: Final = 1e-3
 
 @final
 class Path:
-    """Finds the gap's best path, for one portrait and one top speed of the gap."""
+    """Finds the gap's best path, for one portrait and the gap's top speeds."""
 
-    def __init__(self, portrait: Portrait, gap_speed_mm_s: float) -> None:
+    def __init__(self, portrait: Portrait, speeds: GapSpeeds) -> None:
         self._portrait: Final = portrait
-        self._gap_speed_mm_s: Final = gap_speed_mm_s
+        self._speeds: Final = speeds
 
     def gap_mm(self, force_N: float, device: DeviceFit) -> float:
         return self._portrait.gap_mm_at(device.model_N(force_N))
 
     def is_near(self, from_mm: float, to_N: float, device: DeviceFit) -> bool:
         """Tell whether the gap gets from `from_mm` to the force `to_N` within NEAR_S."""
-        return abs(from_mm - self.gap_mm(to_N, device)) < NEAR_S * self._gap_speed_mm_s
+        closing_mm, most = from_mm - self.gap_mm(to_N, device), self._speeds
+        return -NEAR_S * most.opening_mm_s < closing_mm < NEAR_S * most.sure_mm_s
 
     def pursue(
         self,
@@ -64,21 +66,18 @@ class Path:
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
         require_number("sent_mm", sent_mm)
-        wanted_mm: list[float] = []
-        weights: list[float] = []
-        for place, force_N in enumerate(wanted_N):
-            gap_mm, slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
-            slope_N_mm = max(slope_N_mm, FLATTEST_N_MM)
-            if place and most_N is None:
-                wanted_mm[place - 1] += late_s * CHANGES_PER_S[place - 1] * (gap_mm - wanted_mm[place - 1])
-            wanted_mm.append(gap_mm)
-            weights.append(LASTS_S[place] * slope_N_mm * slope_N_mm)
-        path_mm = nearest_path_mm(sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
+        there = [portrait.gap_and_slope_at(device.model_N(force_N)) for force_N in wanted_N]
+        weights = [lasts_s * max(slope, FLATTEST_N_MM) ** 2 for (_, slope), lasts_s in zip(there, LASTS_S)]  # noqa: B905
+        wanted_mm = [gap_mm for gap_mm, _ in there]
+        if most_N is None:
+            for place in range(len(wanted_mm) - 1):
+                wanted_mm[place] += late_s * CHANGES_PER_S[place] * (wanted_mm[place + 1] - wanted_mm[place])
+        path_mm = nearest_path_mm(sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._speeds, len(PATH_S))
         if most_N is not None:
-            lead_mm = late_s * self._gap_speed_mm_s
+            lead_mm = late_s * self._speeds.sure_mm_s
             for place, (now_N, then_N) in enumerate(most_N):
-                least_mm = self.gap_mm(now_N, device) - lead_mm
-                path_mm[place] = max(path_mm[place], least_mm, self.gap_mm(then_N, device))
+                least_mm = max(self.gap_mm(now_N, device) - lead_mm, self.gap_mm(then_N, device))
+                path_mm[place] = max(path_mm[place], least_mm)
         gap_mm, forces_N = from_mm, []
         left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for to_mm in path_mm:
@@ -95,22 +94,22 @@ def nearest_path_mm(
     times_s: list[float],
     wanted_mm: list[float],
     weights: list[float],
-    speed_mm_s: float,
+    speeds: GapSpeeds,
     count: int,
 ) -> list[float]:
     """Return the first `count` gaps of the path that misses `wanted_mm` least."""
-    best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
+    best_mm = _best_mm(times_s, wanted_mm, weights, speeds)
     path_mm: list[float] = []
     gap_mm, before_s = start_mm, times_s[0] - elapsed_s
     for place in range(count):
-        moved_mm = speed_mm_s * (times_s[place] - before_s)
-        gap_mm = min(max(best_mm[place], gap_mm - moved_mm), gap_mm + moved_mm)
+        closed_mm, opened_mm = speeds.reach_mm(times_s[place] - before_s)
+        gap_mm = within(best_mm[place], (gap_mm - closed_mm, gap_mm + opened_mm))
         path_mm.append(gap_mm)
         before_s = times_s[place]
     return path_mm
 
 
-def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
+def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speeds: GapSpeeds) -> list[float]:
     """Return for each point the gap from which it and all later ones are missed least."""
     best_mm = wanted_mm[:]
     # The least cost of what comes is convex in the gap, with a piecewise linear derivative. One point further back in
@@ -123,26 +122,26 @@ def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float],
     place = len(wanted_mm)
     while place:
         place -= 1
-        shift_mm = speed_mm_s * times_s[place]
+        opened_mm, closed_mm = speeds.opening_mm_s * times_s[place], speeds.sure_mm_s * times_s[place]
         least_mm, slope = wanted_mm[place], weights[place]
         offset = -slope * least_mm
-        while above and least_mm > above_mm[-1] - shift_mm:
-            kink_mm, change = above_mm.pop() - shift_mm, above.pop()
+        while above and least_mm > above_mm[-1] - closed_mm:
+            kink_mm, change = above_mm.pop() - closed_mm, above.pop()
             slope += change
             offset -= change * kink_mm
-            below_mm.append(kink_mm - shift_mm)
+            below_mm.append(kink_mm - opened_mm)
             below.append(-change)
             least_mm = -offset / slope
-        while below and least_mm < below_mm[-1] + shift_mm:
-            kink_mm, change = below_mm.pop() + shift_mm, below.pop()
+        while below and least_mm < below_mm[-1] + opened_mm:
+            kink_mm, change = below_mm.pop() + opened_mm, below.pop()
             slope += change
             offset -= change * kink_mm
-            above_mm.append(kink_mm + shift_mm)
+            above_mm.append(kink_mm + closed_mm)
             above.append(-change)
             least_mm = -offset / slope
         best_mm[place] = least_mm
-        below_mm.append(least_mm - shift_mm)
+        below_mm.append(least_mm - opened_mm)
         below.append(slope)
-        above_mm.append(least_mm + shift_mm)
+        above_mm.append(least_mm + closed_mm)
         above.append(slope)
     return best_mm

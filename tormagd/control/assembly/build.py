@@ -19,8 +19,9 @@ from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, Portrait
 from tormagd.control.assembly.renderable import Missed, missed
 from tormagd.control.contact import PRESSED, ElementContact, Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
-from tormagd.control.move.motor import Margins, margins, pull_V
+from tormagd.control.move.motor import Margins, gap_speeds, margins, most_closing_mm_s, pull_V
 from tormagd.control.nominal import FieldOfGap, Nominal
+from tormagd.control.records import GapSpeeds
 from tormagd.element.inverse.choice import BESIDE_PLANS, Choice, build, mean_error_N, named
 from tormagd.element.model.features import FEATURES
 from tormagd.element.model.memory import NO_MEMORY
@@ -74,8 +75,8 @@ class Core(NamedTuple):
     "What the gap's speed alone leaves of the scene's signal."
 
     @property
-    def gap_speed_mm_s(self) -> float:
-        return self.config.position.gap_speed_mm_s
+    def gap_speeds(self) -> GapSpeeds:
+        return gap_speeds(self.config)
 
     @property
     def portrait(self) -> Portrait:
@@ -253,10 +254,17 @@ def at_rates_of(scene: Scene, config: Config) -> Config:
 
 
 def _slowed(config: Config, scene: Scene) -> Config:
-    position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
-    if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
+    """Return the configuration with a gap no faster than the scene lets it move. Raises ConfigError."""
+    most, asked_mm_s = gap_speeds(config), scene.insert.gap_speed_mm_s
+    can_mm_s = max(most_closing_mm_s(config), most.opening_mm_s)
+    if most.closing_mm_s > can_mm_s:
+        raise ConfigError(
+            f"position.closing_mm_s = {most.closing_mm_s:g}: allowed is at most {can_mm_s:.3g}, what the motors can"
+        )
+    if asked_mm_s is UNSET:
         return config
-    return msgspec.structs.replace(config, position=msgspec.structs.replace(position, gap_speed_mm_s=asked_mm_s))
+    slowed = {"gap_speed_mm_s": min(most.opening_mm_s, asked_mm_s), "closing_mm_s": min(most.closing_mm_s, asked_mm_s)}
+    return msgspec.structs.replace(config, position=msgspec.structs.replace(config.position, **slowed))
 
 
 def approaches_s(core: Core) -> list[tuple[float, float]]:
@@ -266,7 +274,7 @@ def approaches_s(core: Core) -> list[tuple[float, float]]:
     reach, force = core.portrait, core.scene.force
     waits_N = [max(force.waiting_N, reach.min_N), *(reach.min_N + share * STANDBY_N for share in (1 / 3, 2 / 3, 1.0))]
     middle_mm = reach.gap_mm_at((waits_N[0] + force.most_N) / 2.0)
-    return [(wait_N, (reach.gap_mm_at(wait_N) - middle_mm) / core.gap_speed_mm_s) for wait_N in waits_N]
+    return [(wait_N, (reach.gap_mm_at(wait_N) - middle_mm) / core.gap_speeds.sure_mm_s) for wait_N in waits_N]
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:

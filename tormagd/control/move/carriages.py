@@ -11,7 +11,7 @@ from typing import Final, final
 
 from tormagd.config import Config
 from tormagd.control.move.actuator import Actuator, Drive
-from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
+from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, gap_speeds, mechanical_time_s, pull_V
 from tormagd.control.move.pid import Pid
 from tormagd.control.move.reference import Expected, Reference, Speeds, follow, target_of
 from tormagd.control.records import Measured, Plan
@@ -47,7 +47,7 @@ class Carriages(Actuator):
         self._derivative_filter_s: Final = position.derivative_filter_s
         self._synchronisation: Final = position.synchronisation
         self._gap_acceleration_mm_s2: Final = position.gap_acceleration_mm_s2
-        self._gap_speed_mm_s: Final = position.gap_speed_mm_s
+        self._gap_speeds: Final = gap_speeds(config)
         self._closed_mm: Final = scene.insert.gap_closed_mm
         self._open_mm: Final = scene.insert.gap_open_mm
         self._pull_V: Final = motor.pull_V
@@ -153,10 +153,10 @@ class Carriages(Actuator):
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
-        closing_mm_s = min(motors_mm_s, self._gap_speed_mm_s)
         # the pull helps to close, but a reserve of duty is worth more there than a little speed
         opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
-        return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
+        most = self._gap_speeds
+        return Speeds(motors_mm_s, min(motors_mm_s, most.opening_mm_s, opening_mm_s), min(motors_mm_s, most.sure_mm_s))
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:

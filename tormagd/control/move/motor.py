@@ -10,7 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.config import Motor, Position
+from tormagd.config import Config, Motor, Position
+from tormagd.control.records import GapSpeeds
 
 Array = npt.NDArray[np.float64]
 
@@ -20,6 +21,10 @@ MAX_MARGIN_DB: Final = 200.0
 "No gain makes such a loop swing or, negative, every gain does."
 PULL_DEPTH_MM: Final = 32.0
 "Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
+
+
+LIVELY: Final = 1.1
+"The plant card's motors turn up to 9% faster than their figures; a late gap may ask for that."
 
 
 class TransferFunction(NamedTuple):
@@ -39,6 +44,19 @@ class Margins(NamedTuple):
 def full_speed_mm_s(motor: Motor) -> float:
     """Return the speed of one carriage at full duty without load."""
     return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
+
+
+def most_closing_mm_s(config: Config) -> float:
+    return LIVELY * config.position.duty_limit * 2.0 * full_speed_mm_s(config.motor)
+
+
+def gap_speeds(config: Config) -> GapSpeeds:
+    """Return the gap's speeds. Counted on is what the motors do against dry friction."""
+    position, motor = config.position, config.motor
+    closing_mm_s = position.closing_mm_s or most_closing_mm_s(config)
+    sure_mm_s = 2.0 * full_speed_mm_s(motor) * (position.duty_limit - motor.coulomb_V / motor.supply_V)
+    sure_mm_s = min(closing_mm_s, max(sure_mm_s, position.gap_speed_mm_s))
+    return GapSpeeds(closing_mm_s, position.gap_speed_mm_s, sure_mm_s)
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:

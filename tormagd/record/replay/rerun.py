@@ -182,7 +182,7 @@ class _Running:
                     case Learned() as learned:
                         self._planner.teach(learned)
                     case Answer() as answer:
-                        self._planner.answered(answer)
+                        self._planner.aim.answer = answer
                     case other:
                         raise ValueError(f"{other!r}: allowed is what is learned of a device, or what a search found")
             case journal.CONFIRM:
