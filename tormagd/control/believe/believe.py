@@ -96,8 +96,9 @@ class Believe:
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
-        self.zero.way = self._way = trim.way
         self._leash: Final = trim.leash
+        self._way: Final = trim.way
+        self.zero.way = trim.way
         self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
         self.ripple = Ripple()
         self._radius_mm: Final = scene.insert.roller_radius_mm
