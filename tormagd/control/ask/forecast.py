@@ -232,18 +232,28 @@ def _search(history: Array) -> list[tuple[list[float], float]]:
     unlike: list[float] = (apart.min(axis=1) / TAPS).tolist()
     weight = 1.0 / (apart * apart)
     changes[:, TAPS] = 1.0
-    sums = (changes[:, : TAPS + 1] * weight[:, None]) @ changes.transpose(0, 2, 1)
+    sums = ((changes[:, : TAPS + 1] * weight[:, None]) @ changes.transpose(0, 2, 1)).tolist()
     return [
         ([] if each > UNLIKE_N * UNLIKE_N else _constants(rows), each) for rows, each in zip(sums, unlike, strict=True)
     ]
 
 
-def _constants(sums: Array) -> list[float]:
-    """Return the ridge regression's constants, from its sums of products."""
-    total = sums[TAPS, TAPS]
-    ridge = RIDGE / TAPS * np.trace(sums[:TAPS, :TAPS]) + SAME_N**2 * total
-    sums[range(TAPS), range(TAPS)] += ridge
-    # the last column of the inverse gives the constants' variance
-    followed = np.column_stack([sums[:, TAPS + 1 :], np.eye(TAPS + 1)[:, TAPS]])
-    *constants, variance = np.linalg.solve(sums[:, : TAPS + 1], followed)[TAPS].tolist()
-    return [] if total * variance > MAX_LEVERAGE else [0.0, *constants]
+def _constants(rows: list[list[float]]) -> list[float]:
+    """Return the regressions' constants, by elimination."""
+    total = rows[TAPS][TAPS]
+    variance = 0.0
+    for place in range(TAPS):
+        variance += rows[place][place]
+    ridge = RIDGE / TAPS * variance + SAME_N**2 * total
+    for _ in range(TAPS):
+        pivot = rows[0]
+        left: list[list[float]] = []
+        for row in rows[1:]:
+            share = row[0] / (pivot[0] + ridge)
+            # rows are equally long, and only an unchecked zip is compiled to a plain loop
+            left.append([value - share * above for value, above in zip(row[1:], pivot[1:])])  # noqa: B905
+        rows = left
+    constant = rows[0]
+    if total > MAX_LEVERAGE * constant[0]:
+        return []
+    return [0.0, *[each / constant[0] for each in constant[1:]]]
