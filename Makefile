@@ -174,7 +174,7 @@ deb: $(VENV)/.man
 	$(PIP_TO) build/library --no-compile --no-deps ./client . ./lab
 	$(PIP_TO) build/library --no-compile --no-deps --only-binary :all: --require-hashes --requirement systemd/bundled.txt
 	rm -rf build/library/bin
-	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library' systemd/deb.sh build/library build
+	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library:/usr/lib/python3/dist-packages' systemd/deb.sh build/library build
 
 clean:
 	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage*
