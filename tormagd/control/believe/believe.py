@@ -95,10 +95,9 @@ class Believe:
         self.memory, self.handle = memory, HandleWatch()
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
-        self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self._leash: Final = trim.leash
         self._way: Final = trim.way
-        self.zero.way = trim.way
+        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(trim.way)
         self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
         self.ripple = Ripple()
         self._radius_mm: Final = scene.insert.roller_radius_mm
@@ -134,10 +133,9 @@ class Believe:
     def teach(self, learned: Learned) -> None:
         """Replace all that is known of the device by `learned`, and begin its estimators anew."""
         self.strength.forget(learned.device)
-        self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
+        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(self._way)
         self.sensor, self.carriages = SensorTrust(self._bounds, self._leash, learned.device), CarriageLag()
         self.ripple = Ripple()
-        self.zero.way = self._way
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()

@@ -47,7 +47,7 @@ class Ripple:
     last: int = -1
     "The place before."
     mean: float = 0.0
-    "Their mean there."
+    "The mean of the readings there."
     force_N: float = math.inf
     "The anchor's force as the handle left it."
     rate_mm_s: float = 0.0

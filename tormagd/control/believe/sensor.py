@@ -40,7 +40,7 @@ INSIDE_S: Final = 0.2
 WRONG_S: Final = 0.05
 "Evidence for so long shows that the sensor is wrong."
 LEAPT: Final = 0.25
-"A reading below the anchor by a greater share is no device's: no friction falls so far without a word."
+"A reading that is below the anchor by a greater share teaches nothing."
 WEAKENED: Final = 0.12
 "Any device may be weaker or stronger than its bounds by this share and SLACK_N: relaxed, or warm."
 

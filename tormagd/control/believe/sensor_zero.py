@@ -73,7 +73,7 @@ class SensorZero:
     "What the sensor reads without a force."
     variance_N2: float = TARED_VARIANCE_N2
     "Variance of the zero at `told_s`."
-    way: float = 0.0
+    way: float
     "By which share friction is greater one way, and less the other."
     way_variance: float = WAY_VARIANCE
     told_s: float = math.inf
@@ -84,6 +84,9 @@ class SensorZero:
     "Level of the present way; None before the first reading."
     before: Level | None = None
     "Level of the way before, until the two have been compared; None without one."
+
+    def __init__(self, way: float = 0.0) -> None:
+        self.way = way
 
     def sd_N(self, now_s: float) -> float:
         """Return the zero's standard deviation at `now_s`, N, at most MAX_SD_N."""
