@@ -3,6 +3,7 @@
 import contextlib
 import socket
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock, patch
@@ -92,6 +93,19 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
     assert [each for part in parts for each in names(part)].count("tick") == 3_010
     rig.box.begin_scene({"format": "2"}, rig.stepper, rig.planner)
     assert rig.heard()[-1] == Begin("/boxes", {"format": "2"})
+
+
+def test_nothing_stays_of_what_was_handed_over(rig: Rig) -> None:
+    for _ in range(10):
+        rig.tick(PART_TICKS)
+        rig.heard()
+    tracemalloc.start()
+    for _ in range(100):
+        rig.tick(PART_TICKS)
+        rig.heard()
+    stays, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert stays < 100_000
 
 
 def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) -> None:
@@ -195,7 +209,7 @@ def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(
 
 def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) -> None:
     rig.box.journal._entries.append((TEACH, object()))
-    rig.tick()
+    rig.tick(PART_TICKS)
     assert "cannot be written" in rig.box.report().refusal
     rig.tick(100)
 

@@ -20,7 +20,7 @@ from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd.record.black_box import write_black_box
-from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal, Packer, core_hash
+from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal, core_hash, packed
 from tormagd.record.keeper import Part, Ring
 from tormagd.record.replay.rerun import Rerun, rerun
 from tormagd.record.telemetry import COLUMNS, tick_of
@@ -119,9 +119,7 @@ class Flight:
         self.loop.stepper.latch(Fault.PLAN_FAILED)
 
     def _packed(self) -> bytes:
-        packer = Packer()
-        packer.add(self._journal.take())
-        return packer.take()[0]
+        return packed(self._journal.take())
 
     def command(self, name: str) -> None:
         conditions, is_refused = self.loop.conditions(), False

@@ -1,7 +1,7 @@
 """The stream: all inputs of the core, and all traffic with the device, for the black box's process and for recorders.
 
-The control thread writes references into a journal, and encodes them once, behind each tick. The entries of 20 ticks go
-to recorders by ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not
+The control thread writes references into a journal, and encodes those of 20 ticks at once. They go to recorders by
+ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not
 take is lost and counted. That process writes the files, and outlives the daemon, however the daemon ends.
 """
 
@@ -27,9 +27,9 @@ from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
-from tormagd.record.journal import FORMAT, Journal, Packer, core_hash
+from tormagd.record.journal import FORMAT, Journal, core_hash, packed
 from tormagd.record.keeper import REQUEST, Begin, End, Part, Said, Write, Written
-from tormagd.record.telemetry import COLUMNS
+from tormagd.record.telemetry import COLUMNS, TickRecord
 from tormagd.record.ticks import MISSING
 from tormagd_client.messages import BlackBoxReport
 
@@ -90,7 +90,7 @@ class BlackBox:
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
         self._due_s, self.is_heard = math.inf, False
-        self.journal, self._packer = Journal(is_kept=False), Packer()
+        self.journal = Journal(is_kept=False)
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
@@ -112,37 +112,37 @@ class BlackBox:
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
         """Begin anew with the core of another scene, from a snapshot of these states."""
-        self._forget()
+        self.journal.take()
         self.begun = Begin(str(self._folder), header)
         self._send(self.begun)
         self._snapshot(stepper, planner)
 
-    def ticked(self, record: Any, stepper: Stepper, planner: Planner) -> tuple[bytes, bytes] | None:
-        """Add a tick to the journal, and encode all entries since the last; return a whole part, and its rows."""
+    def ticked(self, record: Any, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
+        """Add a tick to the journal; return all entries, encoded, and the ticks when there are PART_TICKS."""
         was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
         if not (was_kept and self.journal.is_kept):  # from the end of this period
-            self._forget()
+            self.journal.take()
             self._ticks = 0
             self.journal.note(MISSING)
             self._snapshot(stepper, planner)
             return None
         self.journal.add(record)
-        try:
-            self._packer.add(self.journal.take())
-        except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
-            self._stop(f"an entry that cannot be written: {error}")
-            return None
         self._ticks += 1
         if self._ticks % PART_TICKS:
             return None
-        part, rows = self._packer.take()
+        entries = self.journal.take()
+        try:
+            part = packed(entries)
+        except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
+            self._stop(f"an entry that cannot be written: {error}")
+            return None
         is_taken = self._beside is None or self._send(Part(record.monotonic_s, part))
         if not is_taken:
             self._dropped += 1
             self.journal.note(MISSING)
         if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
             self._snapshot(stepper, planner)
-        return part, rows
+        return part, [entry for entry in entries if isinstance(entry, TickRecord)]
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
@@ -248,8 +248,4 @@ class BlackBox:
             self._beside.close()
         self._beside = None
         self.journal.is_kept = False
-        self._forget()
-
-    def _forget(self) -> None:
         self.journal.take()
-        self._packer.take()

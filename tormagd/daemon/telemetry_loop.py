@@ -4,8 +4,6 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import msgspec
-
 from tormagd.config import Config
 from tormagd.control.assembly.belief import beliefs
 from tormagd.control.assembly.build import Core
@@ -79,7 +77,7 @@ class TelemetryLoop:
         )
         part = self._box.ticked(self._tick, control.stepper, self._inference.planner)
         if part is not None and self._box.is_heard:
-            self._endpoint.publish_ticks(encode_ticks(msgspec.Raw(part[1]), core=part[0]))
+            self._endpoint.publish_ticks(encode_ticks(part[1], core=part[0]))
 
     def publish(self, beat: Beat) -> bool:
         if self._left > 0 or self._tick is None:

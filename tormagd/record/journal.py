@@ -5,7 +5,6 @@ results stand in the journal for comparison only.
 """
 
 import hashlib
-import struct
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,7 +27,6 @@ from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.telemetry import TickRecord
 from tormagd.record.ticks import MISSING, READ, WROTE
 from tormagd.scenes.scene import Scene
 
@@ -53,10 +51,6 @@ CONNECTED = "connected"
 STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."
-
-_LENGTH = struct.Struct(">I")
-_NONE = b"\xdd" + _LENGTH.pack(0)
-"An empty array whose length has four bytes."
 
 Entry = Any
 
@@ -103,29 +97,8 @@ class Journal:
         self._entries.append(entry)
 
 
-class Packer:
-    """Writes entries as one growing msgpack array, and the ticks among them as another."""
-
-    def __init__(self) -> None:
-        self._bytes, self._count = bytearray(_NONE), 0
-        self._rows, self._row_count = bytearray(_NONE), 0
-
-    def add(self, entries: Sequence[Entry]) -> None:
-        for entry in entries:
-            at = len(self._bytes)
-            _ENCODER.encode_into(entry, self._bytes, -1)
-            self._count += 1
-            if isinstance(entry, TickRecord):
-                self._rows += self._bytes[at:]
-                self._row_count += 1
-
-    def take(self) -> tuple[bytes, bytes]:
-        """Return all entries, and the ticks' rows, and forget both."""
-        _LENGTH.pack_into(self._bytes, 1, self._count)
-        _LENGTH.pack_into(self._rows, 1, self._row_count)
-        packed = bytes(self._bytes), bytes(self._rows)
-        self.__init__()  # type: ignore[misc]
-        return packed
+def packed(entries: Sequence[Entry]) -> bytes:
+    return _ENCODER.encode(entries)
 
 
 def _of_value(thing: Any) -> Any:

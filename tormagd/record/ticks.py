@@ -75,8 +75,8 @@ class Axis:
 _ENCODER, _DECODER = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(TickBatch)
 
 
-def encode_ticks(rows: Sequence[object] | msgspec.Raw, columns: tuple[str, ...] = COLUMNS, core: bytes = b"") -> bytes:
-    """Return the recording endpoint's message; `rows` may have been encoded before."""
+def encode_ticks(rows: Sequence[object], columns: tuple[str, ...] = COLUMNS, core: bytes = b"") -> bytes:
+    """Return the recording endpoint's message."""
     return _ENCODER.encode({"v": VERSION, "columns": columns, "rows": rows, "core": core})
 
 
