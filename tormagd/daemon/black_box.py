@@ -1,8 +1,8 @@
 """The stream: all inputs of the core, and all traffic with the device, for the black box's process and for recorders.
 
 The control thread writes references into a journal, and encodes those of 20 ticks at once. They go to recorders by
-ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not
-take is lost and counted. That process writes the files, and outlives the daemon, however the daemon ends.
+ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not take is lost
+and counted. That process writes the files, and outlives the daemon, however the daemon ends.
 """
 
 import contextlib
@@ -128,21 +128,7 @@ class BlackBox:
             return None
         self.journal.add(record)
         self._ticks += 1
-        if self._ticks % PART_TICKS:
-            return None
-        entries = self.journal.take()
-        try:
-            part = packed(entries)
-        except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
-            self._stop(f"an entry that cannot be written: {error}")
-            return None
-        is_taken = self._beside is None or self._send(Part(record.monotonic_s, part))
-        if not is_taken:
-            self._dropped += 1
-            self.journal.note(MISSING)
-        if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
-            self._snapshot(stepper, planner)
-        return part, [entry for entry in entries if isinstance(entry, TickRecord)]
+        return None if self._ticks % PART_TICKS else self._hand_over(record.monotonic_s, stepper, planner)
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
@@ -209,6 +195,21 @@ class BlackBox:
             beside.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
+
+    def _hand_over(self, time_s: float, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
+        entries = self.journal.take()
+        try:
+            part = packed(entries)
+        except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
+            self._stop(f"an entry that cannot be written: {error}")
+            return None
+        is_taken = self._beside is None or self._send(Part(time_s, part))
+        if not is_taken:
+            self._dropped += 1
+            self.journal.note(MISSING)
+        if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
+            self._snapshot(stepper, planner)
+        return part, [entry for entry in entries if isinstance(entry, TickRecord)]
 
     def _send_requests(self) -> None:
         while self._asked and self._send(self._asked[0]):
