@@ -56,6 +56,7 @@ COMPILED = {
     "tormagd/daemon": (
         *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay", "topics"),
         *("control_loop", "inference_loop", "black_box", "commands", "telemetry_loop", "answers"),
+        *("endpoint", "listeners", "daemon"),
     ),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]

@@ -24,7 +24,7 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
 from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
-from tormagd.record.telemetry import COLUMNS as OF_TICK, tick_of
+from tormagd.record.telemetry import COLUMNS as OF_TICK, Moment
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd.simulation.closed_loop import ClosedLoop
@@ -231,7 +231,7 @@ def record(path: Path, plant: PlantParameters) -> None:
             at_s = number * 1e-3
             force_N = LEVELS_N[int(at_s / 2.0) % len(LEVELS_N)] + 0.1 * math.sin(math.tau * 1.2 * at_s)
             sample = loop.tick(TimedSetpoint(force_N, loop.now_s, 0.25))
-            made = tick_of(loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, number)
+            made = Moment(loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, number).row()
             rows.append(msgspec.structs.replace(made, t_ns=round(sample.time_s * 1e9), monotonic_s=sample.time_s))
             if len(rows) == 20:
                 batch = {"v": VERSION, "columns": OF_TICK, "rows": rows}

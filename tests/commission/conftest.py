@@ -15,7 +15,7 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.record.telemetry import COLUMNS as OF_TICK, tick_of
+from tormagd.record.telemetry import COLUMNS as OF_TICK, Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
@@ -86,7 +86,7 @@ class Bench:
             for _ in range(self._stall_ticks if number == 0 else 0):
                 self.loop.skip()
             sample = self.loop.tick(setpoint)
-            record = tick_of(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
+            record = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0).row()
             row = msgspec.to_builtins(record)
             row[OF_TICK.index("monotonic_s")] = sample.time_s
             rows.append([row[place] for place in PLACES])

@@ -23,7 +23,7 @@ from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.record.journal import MAX_ENTRIES, PLAN, STEP, TEACH, Journal
 from tormagd.record.keeper import Begin, End, Part, Said, Write, Written
-from tormagd.record.telemetry import tick_of
+from tormagd.record.telemetry import Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
@@ -57,7 +57,7 @@ class Rig:
         for _ in range(times):
             self.box.journal.note(STEP)
             self.box.ticked(
-                tick_of(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
+                Moment(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
             )
 
     def heard(self) -> list[Said]:

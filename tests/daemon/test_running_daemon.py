@@ -8,13 +8,13 @@ import os
 import signal
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
 import pytest
+import zmq
 from failing_search import FailingSearch
 
 from firmware_protocol.build import settle
@@ -22,6 +22,7 @@ from firmware_protocol.codec import Message
 from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, load_calibration
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.ctl.record import listening
 from tormagd.daemon import daemon as daemon_module, service
 from tormagd.daemon.beat import KERNEL, Beat, Delay
 from tormagd.daemon.daemon import Daemon
@@ -271,23 +272,18 @@ def test_requests_are_answered_with_the_newest_snapshot_however_few_ticks_it_sta
     assert numbers == sorted(set(numbers))  # one answer in a period
 
 
-def test_however_seldom_telemetry_is_told_every_tick_is_recorded(
-    running: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_however_seldom_telemetry_is_told_every_tick_is_recorded(running: Running) -> None:
     running.start(Rates(telemetry_hz=5))
-    endpoint, numbers = running.daemon._endpoint, list[int]()
-    at = COLUMNS.index("tick")
-
-    def note(data: bytes) -> None:
-        batch = decode_ticks(data)
-        told = [row[at] for row in batch.rows]
-        assert told == [entry[at] for entry in msgspec.msgpack.decode(batch.core) if is_tick(entry)]
-        numbers.extend(told)
-
-    monkeypatch.setattr(endpoint, "publish_ticks", note)
-    monkeypatch.setattr(endpoint.admission, "connections", lambda: Counter(recording=1))
-    running.tick(450)
-    assert numbers == [*range(numbers[0], numbers[0] + 440)]
+    at, numbers = COLUMNS.index("tick"), list[int]()
+    with zmq.Context() as context, listening(context, in_folder(running.folder).recording, None) as recorder:
+        running.until(lambda _: bool(recorder.poll(1)), "ticks come")
+        running.tick(450)
+        while recorder.poll(100):
+            batch = decode_ticks(recorder.recv())
+            told = [row[at] for row in batch.rows]
+            assert told == [entry[at] for entry in msgspec.msgpack.decode(batch.core) if is_tick(entry)]
+            numbers.extend(told)
+    assert numbers == [*range(numbers[0], numbers[0] + max(len(numbers), 440))]
 
 
 def test_a_daemon_describes_what_it_runs(alone: Running) -> None:

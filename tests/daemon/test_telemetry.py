@@ -19,7 +19,7 @@ from tormagd.daemon.verdict import ARRIVES, CANNOT, RENDERED, Judged, judged
 from tormagd.element.model.features import FEATURES
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
-from tormagd.record.telemetry import limits_held, snapshot, tick_of
+from tormagd.record.telemetry import Moment, limits_held, snapshot
 from tormagd.record.ticks import encode_ticks
 from tormagd.scenes.scene import Budget, load_scene
 from tormagd_client.messages import BeliefReport, Telemetry, decode, encode
@@ -60,7 +60,7 @@ def telemetry(
 ) -> Telemetry:
     stepper = stepped(safety, measurement)
     stepper.move.reference = reference
-    tick = tick_of(stepper, OUTPUT, PLAN, measurement, 20.0, 150.0)
+    tick = Moment(stepper, OUTPUT, PLAN, measurement, 20.0, 150.0).row()
     is_homed = stepper.measured is not None and stepper.measured.is_homed
     return decode(encode(snapshot(tick, 3, is_homed, is_busy, 0.012, BELIEF)), Telemetry)
 
@@ -142,7 +142,7 @@ def test_a_tick_is_recorded_whole() -> None:
     stepper = stepped(safety, measurement, 1.5)
     stepper.move.reference = Reference(64.2)
     output = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
-    tick = tick_of(stepper, output, plan, measurement, 20.0, 150.0, 9)
+    tick = Moment(stepper, output, plan, measurement, 20.0, 150.0, 9).row()
     sent = msgspec.msgpack.decode(encode_ticks([tick]))
     row = dict(zip(sent["columns"], sent["rows"][0], strict=True))
     assert abs(row.pop("t_ns") - time.time_ns()) < 60_000_000_000

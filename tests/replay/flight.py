@@ -23,7 +23,7 @@ from tormagd.record.black_box import write_black_box
 from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal, core_hash, packed
 from tormagd.record.keeper import Part, Ring
 from tormagd.record.replay.rerun import Rerun, rerun
-from tormagd.record.telemetry import COLUMNS, tick_of
+from tormagd.record.telemetry import COLUMNS, Moment
 from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
@@ -69,7 +69,7 @@ class Flight:
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
         self._inference.foresee(beat)
-        record = tick_of(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
+        record = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0).row()
         self._journal.add(record)
         self._ticks += 1
         if self._ticks % PART_TICKS == 0:

@@ -29,7 +29,7 @@ from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
 from tormagd.record.journal import FORMAT, Journal, core_hash, packed
 from tormagd.record.keeper import REQUEST, Begin, End, Part, Said, Write, Written
-from tormagd.record.telemetry import COLUMNS, TickRecord
+from tormagd.record.telemetry import COLUMNS, Moment, TickRecord
 from tormagd.record.ticks import MISSING
 from tormagd_client.messages import BlackBoxReport
 
@@ -117,7 +117,7 @@ class BlackBox:
         self._send(self.begun)
         self._snapshot(stepper, planner)
 
-    def ticked(self, record: Any, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
+    def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
         """Add a tick to the journal; return all entries, encoded, and the ticks when there are PART_TICKS."""
         was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
         if not (was_kept and self.journal.is_kept):  # from the end of this period
@@ -126,9 +126,9 @@ class BlackBox:
             self.journal.note(MISSING)
             self._snapshot(stepper, planner)
             return None
-        self.journal.add(record)
+        self.journal.add(moment)
         self._ticks += 1
-        return None if self._ticks % PART_TICKS else self._hand_over(record.monotonic_s, stepper, planner)
+        return None if self._ticks % PART_TICKS else self._hand_over(moment.time_s, stepper, planner)
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
@@ -197,7 +197,7 @@ class BlackBox:
                 beside.process.wait(LEAVING_S)
 
     def _hand_over(self, time_s: float, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
-        entries = self.journal.take()
+        entries = [each.row() if isinstance(each, Moment) else each for each in self.journal.take()]
         try:
             part = packed(entries)
         except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
@@ -209,7 +209,7 @@ class BlackBox:
             self.journal.note(MISSING)
         if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
             self._snapshot(stepper, planner)
-        return part, [entry for entry in entries if isinstance(entry, TickRecord)]
+        return part, [each for each in entries if isinstance(each, TickRecord)]
 
     def _send_requests(self) -> None:
         while self._asked and self._send(self._asked[0]):

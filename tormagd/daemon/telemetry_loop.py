@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from typing import Any
 
 from tormagd.config import Config
 from tormagd.control.assembly.belief import beliefs
@@ -18,7 +17,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.topics import Topics
 from tormagd.record.force_following import Following
-from tormagd.record.telemetry import snapshot, tick_of
+from tormagd.record.telemetry import Moment, snapshot
 from tormagd.record.ticks import TOLD, encode_ticks
 from tormagd_client.messages import Telemetry
 
@@ -47,7 +46,7 @@ class TelemetryLoop:
         if inference.beside is not None:
             self.groups.append(inference.beside.timing)
         self.newest: Telemetry
-        self._tick: Any = None
+        self._moment: Moment | None = None
         self.way = ForceDelay()
         self.topics = Topics(config, core, control, inference, endpoint)
         self._left, self._beats_per_snapshot = 0, config.rates.control_hz // self._hz
@@ -66,7 +65,7 @@ class TelemetryLoop:
         self._left -= 1
         self.way.ticked(control.stepper.time_s, control.used, self._endpoint.inbox.sources.playout_ms * 1e-3)
         timing = control.timing
-        self._tick = tick_of(
+        self._moment = Moment(
             control.stepper,
             control.output,
             control.used,
@@ -75,17 +74,17 @@ class TelemetryLoop:
             timing.exec_us,
             timing.runs,
         )
-        part = self._box.ticked(self._tick, control.stepper, self._inference.planner)
+        part = self._box.ticked(self._moment, control.stepper, self._inference.planner)
         if part is not None and self._box.is_heard:
             self._endpoint.publish_ticks(encode_ticks(part[1], core=part[0]))
 
     def publish(self, beat: Beat) -> bool:
-        if self._left > 0 or self._tick is None:
+        if self._left > 0 or self._moment is None:
             return False
         self._left = max(self._left + self._beats_per_snapshot, 1)
         start_ns = time.monotonic_ns()
         endpoint, connections = self._endpoint, self._endpoint.admission.connections()
-        tick, box = self._tick, self._box
+        tick, box = self._moment.row(), self._box
         box.is_heard = connections["recording"] > 0
         self.following.look(
             tick.operating_state,

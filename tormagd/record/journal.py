@@ -5,7 +5,6 @@ results stand in the journal for comparison only.
 """
 
 import hashlib
-from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -97,14 +96,10 @@ class Journal:
         self._entries.append(entry)
 
 
-def packed(entries: Sequence[Entry]) -> bytes:
-    return _ENCODER.encode(entries)
-
-
 def _of_value(thing: Any) -> Any:
     if type(thing) is TimedSetpoint:
         return [getattr(thing, name) for name in thing.__match_args__]
     return plain(thing)
 
 
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=_of_value)
+packed = msgspec.msgpack.Encoder(enc_hook=_of_value).encode

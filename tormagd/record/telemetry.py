@@ -10,11 +10,11 @@ import time
 from collections.abc import Mapping
 from functools import lru_cache
 from operator import attrgetter
-from typing import Any
+from typing import Any, Final, final
 
 import msgspec
 
-from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
+from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from firmware_protocol.value import Value
 from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
@@ -70,41 +70,46 @@ TickRecord: Any = msgspec.defstruct(
 "A row whose values have their columns' names."
 
 
-def tick_of(
-    stepper: Stepper,
-    output: Duty,
-    plan: Plan,
-    measurement: Measurement | None,
-    lateness_us: float,
-    exec_us: float,
-    number: int = 0,
-) -> Any:
-    measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
-    is_placed = measured is not None and measured.is_homed
-    return TickRecord(
-        *(time.time_ns(), stepper.time_s),
-        *_of_plan(plan),
-        plan.governed_N if safety.is_driven else None,
-        None if reference is None else reference.gap_mm,
-        None if measured is None else measured.force_N,
-        measured.left_mm if measured is not None and is_placed else None,
-        measured.right_mm if measured is not None and is_placed else None,
-        None if measured is None else measured.handle_mm,
-        None if measured is None else measured.handle.rate_mm_s,
-        *(safety.operating_state, safety.faults, limits_held(safety, output, plan)),
-        tuple([f"{each.quantity} {each.asked!r} {each.used!r}" for each in plan.outside]) if plan.outside else (),
-        _DRIVE_MODES[output.mode],
-        None if measurement is None else _MODES[measurement.mode],
-        () if measurement is None else _names(measurement.switches),
-        () if measurement is None else _names(measurement.faults),
-        *(number, lateness_us, exec_us),
-        *_of_duty(output),
-        *(_UNKNOWN if measurement is None else _of_measurement(measurement) + _of_link(measurement.link)),
-    )
+@final
+class Moment:
+    """A tick by reference, until its row is read."""
 
+    def __init__(
+        self,
+        stepper: Stepper,
+        output: Duty,
+        plan: Plan,
+        measurement: Measurement | None,
+        lateness_us: float,
+        exec_us: float,
+        number: int = 0,
+    ) -> None:
+        self.time_s: Final = stepper.time_s
+        self._of_core: Final = stepper.measured, stepper.safety, stepper.move.reference, output, plan, measurement
+        self._of_tick: Final = time.time_ns(), (number, lateness_us, exec_us)
 
-_MODES = {mode: mode.name for mode in DeviceMode}
-_DRIVE_MODES = {mode: mode.name for mode in DriveMode}
+    def row(self) -> Any:
+        (measured, safety, reference, output, plan, measurement), (time_ns, timing) = self._of_core, self._of_tick
+        return TickRecord(
+            *(time_ns, self.time_s),
+            *_of_plan(plan),
+            plan.governed_N if safety.is_driven else None,
+            None if reference is None else reference.gap_mm,
+            None if measured is None else measured.force_N,
+            measured.left_mm if measured is not None and measured.is_homed else None,
+            measured.right_mm if measured is not None and measured.is_homed else None,
+            None if measured is None else measured.handle_mm,
+            None if measured is None else measured.handle.rate_mm_s,
+            *(safety.operating_state, safety.faults, limits_held(safety, output, plan)),
+            tuple([f"{each.quantity} {each.asked!r} {each.used!r}" for each in plan.outside]) if plan.outside else (),
+            output.mode.name,
+            None if measurement is None else measurement.mode.name,
+            () if measurement is None else _names(measurement.switches),
+            () if measurement is None else _names(measurement.faults),
+            *timing,
+            *_of_duty(output),
+            *(_UNKNOWN if measurement is None else _of_measurement(measurement) + _of_link(measurement.link)),
+        )
 
 
 # typed: a switch and a fault of the same bits are equal
@@ -131,7 +136,7 @@ def measurement_of(tick: Any) -> Measurement | None:
 
 
 def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...]:
-    """Return the limits that hold the force back; none while the device is not driven."""
+    """Return the limits in force; none while the device is not driven."""
     return tuple(dict.fromkeys((*plan.limits, *output.limits))) if safety.is_driven else ()
 
 
@@ -150,7 +155,7 @@ def snapshot(
     mark: Mark | None = None,
     beside: tuple[str, ...] = (),
 ) -> Telemetry:
-    """Return the telemetry message of a tick, with its columns of the same names."""
+    """Return the telemetry message of a tick."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
     fields: dict[str, Any] = {name: getattr(tick, name) for name in _SHARED}

@@ -555,13 +555,13 @@ def decode(data: bytes, message_type: type[M]) -> M:
 
 
 def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    names = [name for name, _ in pairs]
-    for name in names:
-        if not isinstance(name, str):
+    for name, _ in pairs:
+        if type(name) is not str:
             raise MessageError(f"key {in_short(name)} is bin: allowed is str; pack names as str, numbers as numbers")
-        if names.count(name) > 1:
-            raise MessageError(f"{in_short(name)} stands twice: allowed is once")
-    return dict(pairs)
+    if len(unpacked := dict(pairs)) < len(pairs):
+        twice = next(name for name, _ in pairs if [each for each, _ in pairs].count(name) > 1)
+        raise MessageError(f"{in_short(twice)} stands twice: allowed is once")
+    return unpacked
 
 
 def _in_words(text: str) -> str:

@@ -19,7 +19,7 @@ from tormagd.record import journal, ticks
 from tormagd.record.journal import KNOWN, core_hash
 from tormagd.record.replay.conversation import Conversation, Found, differing
 from tormagd.record.replay.rebuild import ReplayError
-from tormagd.record.telemetry import COLUMNS, TickRecord, measurement_of, tick_of
+from tormagd.record.telemetry import COLUMNS, Moment, TickRecord, measurement_of
 from tormagd.record.writer import frames_in, is_tick
 
 UNTAKEN = (
@@ -212,7 +212,7 @@ class _Running:
         timing = record.lateness_us, record.exec_us, record.tick
         if self._failure is not None:
             return Found("plan", "made", f"failed: {self._failure}")
-        given = tick_of(self._stepper, self._output, self._used, self._measurement, *timing)
+        given = Moment(self._stepper, self._output, self._used, self._measurement, *timing).row()
         left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
         if packed(left) == packed(right):
             return self._of_frames
