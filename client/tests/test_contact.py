@@ -1,5 +1,6 @@
 """The wall that a tip touches, from a noisy place and force."""
 
+import math
 import random
 
 import pytest
@@ -15,7 +16,7 @@ SPEED_MM_S = 8.0
 class Tip:
     def __init__(self, wall_mm: float, stiffness_N_mm: float, friction_N: float = 0.1, seed: int = 0) -> None:
         self.wall_mm, self.stiffness_N_mm, self.friction_N = wall_mm, stiffness_N_mm, friction_N
-        self.found, self.place_mm = ContactEstimator(), 0.0
+        self.found, self.place_mm, self.speed_mm_s = ContactEstimator(), 0.0, SPEED_MM_S
         self._draw = random.Random(seed)
 
     def go(self, *places_mm: float) -> None:
@@ -24,7 +25,7 @@ class Tip:
 
     def _go(self, to_mm: float) -> None:
         """Move at the tip's speed, or rest for a second if it is there."""
-        step_mm = SPEED_MM_S / HZ
+        step_mm = self.speed_mm_s / HZ
         steps = round(abs(to_mm - self.place_mm) / step_mm)
         onward_mm = (to_mm - self.place_mm) / steps if steps else 0.0
         for _ in range(steps or HZ):
@@ -53,6 +54,20 @@ def test_a_wall_is_known_once_it_was_touched_and_stays_known(stiffness_N_mm: flo
     for to_mm in (14.0, 14.0, 14.0, 2.0, 2.0, 11.0, 14.0):
         tip.go(to_mm)
         tip.expect()
+
+
+@pytest.mark.parametrize("speed_mm_s", [8.0, 20.0, 60.0])
+@pytest.mark.parametrize("stiffness_N_mm", [0.1, 0.3])
+def test_a_wall_is_as_sure_as_it_says(stiffness_N_mm: float, speed_mm_s: float) -> None:
+    squares = 0.0
+    for seed in range(20, 40):
+        tip = Tip(12.0, stiffness_N_mm, seed=seed)
+        tip.speed_mm_s = speed_mm_s
+        tip.go(12.0 + 1.8 / stiffness_N_mm)
+        contact = tip.found.contact
+        assert contact is not None
+        squares += ((contact.handle_mm - 12.0) / contact.place_sd_mm) ** 2
+    assert math.sqrt(squares / 20.0) < 2.0
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -2,15 +2,16 @@
 
     F = f + k max(x - x0, 0)     x tip's place on the handle's way, mm; F force, N; f friction, k stiffness, x0 the wall
 
-A line is fitted to the points of the way in by recursive least squares with forgetting; variances are the residuals'.
+A line is fitted to the points of the way in by recursive least squares with forgetting; variances are the residuals',
+and friction's is that of its points.
 """
 
 import math
 
 from tormagd_client.messages import MAX_PLACE_MM, MAX_STIFFNESS_N_MM, Contact
 
-SETTLES = 20
-"Samples in the running mean of a point, which averages out the noise."
+SETTLES, FREE = 8, 20
+"Samples in the running mean of a point, which averages out the noise; points in the running mean of friction."
 STEP_MM = 0.2
 "Distance from point to point: a tip at rest adds nothing and forgets nothing."
 KEPT, LEAST = 0.98, 6
@@ -28,8 +29,8 @@ class ContactEstimator:
     def __init__(self) -> None:
         self._mean_mm = self._mean_N = 0.0
         self._samples = self._strikes = self._free = 0
-        self._point_mm = math.inf
-        self.friction_N = 0.0
+        self._point_mm, self._is_free = math.inf, True
+        self.friction_N = self._friction_N2 = 0.0
         self._begin()
 
     @property
@@ -55,7 +56,7 @@ class ContactEstimator:
             if not math.isfinite(value):
                 raise ValueError(f"{name} = {value}: allowed are finite numbers")
         if way <= 0.0:
-            self._samples, self._point_mm = 0, math.inf
+            self._samples, self._point_mm, self._is_free = 0, math.inf, True
             return
         self._samples = min(self._samples + 1, SETTLES)
         self._mean_mm += (tip_mm - self._mean_mm) / self._samples
@@ -72,8 +73,13 @@ class ContactEstimator:
         if self._is_off(place_mm, force_N):
             return
         if self._free < LEAST or force_N - self.friction_N < TOUCHES_N:
-            self._free += 1
-            self.friction_N += (force_N - self.friction_N) / min(self._free, SETTLES)
+            self._free, self._is_free = self._free + 1, True
+            share, off_N = 1.0 / min(self._free, FREE), force_N - self.friction_N
+            self.friction_N += share * off_N
+            self._friction_N2 += share * ((1.0 - share) * off_N * off_N - self._friction_N2)
+            return
+        if self._is_free:  # the mean begins anew behind the wall
+            self._samples, self._point_mm, self._is_free = 0, math.inf, False
             return
         for name in ("_weight", "_mm2", "_mm_N", "_N2"):
             setattr(self, name, KEPT * getattr(self, name))
@@ -107,5 +113,6 @@ class ContactEstimator:
         slope_N_mm = self._mm_N / self._mm2
         sd_N = math.sqrt(max(self._N2 - slope_N_mm * self._mm_N, 0.0) / (self._weight - 2.0))
         before_mm = (self._at_N - self.friction_N) / slope_N_mm
-        place_sd_mm = sd_N / slope_N_mm * math.sqrt(1.0 / self._weight + before_mm * before_mm / self._mm2)
+        of_line_N2 = sd_N * sd_N * (1.0 / self._weight + before_mm * before_mm / self._mm2)
+        place_sd_mm = math.sqrt(of_line_N2 + self._friction_N2) / slope_N_mm
         return slope_N_mm, self._at_mm - before_mm, sd_N / math.sqrt(self._mm2), place_sd_mm, sd_N
