@@ -22,6 +22,7 @@ from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
 from tormagd.record.telemetry import COLUMNS
 from tormagd.scenes.measured import measured
+from tormagd.scenes.scene import load_scene, scene_path, shipped_scenes
 from tormagd.simulation import __main__ as simulation
 
 ROOT = Path(__file__).parents[2]
@@ -202,8 +203,8 @@ DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 
 
 def drawn():
-    yield "images/scenes.png", measured().scenes
-    yield "images/scenes_trade.png", measured()
+    shipped = (measured(load_scene(name).fingerprint, scene_path(name).parent) for name in shipped_scenes())
+    yield "images/scenes.png", list(shipped)
     for path in sorted(DOCS.glob("evidence/*.json")):
         evidence = json.loads(path.read_text(encoding="utf-8"))
         for picture in DRAWN.findall(evidence["command"]):

@@ -26,7 +26,7 @@ from tormagd.element.model.force_curve import ForceCurve, Known, Network
 from tormagd.element.model.model_file import ForceModel, ModelMetadata
 from tormagd.element.physics.errors import DomainError
 from tormagd.scenes.measured import measured
-from tormagd.scenes.scene import Solver, load_scene, shipped_scenes
+from tormagd.scenes.scene import Solver, load_scene, scene_path, shipped_scenes
 
 torch.set_num_threads(1)  # a second thread costs more than it saves at this size
 
@@ -477,17 +477,12 @@ def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name
     assert build_core(Config(scene=name)).solver.solver == wanted
 
 
-def test_no_other_search_without_torch_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
-    file = measured()
-    for scene in file.scenes:
-        way = scene.chosen
-        ways = [msgspec.structs.replace(way, search=search) for search in ("newton", "nearest")]
-        newton, nearest = (scene.of(each) for each in ways)
-        newtons, nearests = (file.share(each) for each in ways)
-        assert newtons is not None
-        assert nearests is not None
-        assert newtons.daemon < nearests.daemon
-        assert newton.worst_N < nearest.worst_N + 0.01 * scene.tolerance_N
+def test_no_other_search_without_torch_is_cheaper_in_any_measured_scene() -> None:
+    for name in shipped_scenes():
+        found = measured(load_scene(name).fingerprint, scene_path(name).parent)
+        assert found is not None
+        shares = {each.way.search: each.share for each in found.served if each.way.inference_hz == 500}
+        assert shares["newton"] == min(shares.values())
 
 
 def test_a_scene_may_name_its_search() -> None:
