@@ -6,8 +6,9 @@ from pathlib import Path
 from tormag_lab.pages import stamp, subplots, table
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
-from tormagd.scenes.measured import MeasuredScene, measured
-from tormagd.scenes.scene import load_scene, scene_path, shipped_scenes
+from tormagd.ctl.scene_check import measured_as
+from tormagd.scenes.measured import MeasuredScene
+from tormagd.scenes.scene import load_scene, shipped_scenes
 
 DOCS = Path(__file__).parents[1] / "docs"
 PICTURE = Path("images") / "scenes.png"
@@ -16,16 +17,10 @@ FRONT = 1.5
 
 
 def main() -> int:
-    found = {name: found_of(name) for name in shipped_scenes()}
+    found = {name: measured_as(name, load_scene(name)) for name in shipped_scenes()}
     (DOCS / "scenes.md").write_text(page(found), encoding="utf-8")
     draw(DOCS / PICTURE, found)
     return 0
-
-
-def found_of(name: str) -> MeasuredScene:
-    found = measured(load_scene(name).fingerprint, scene_path(name).parent)
-    assert found is not None, f"tormagctl scene measure {name}"
-    return found
 
 
 def front(found: MeasuredScene) -> float:
@@ -101,16 +96,15 @@ def _row(name: str, found: MeasuredScene) -> list[str]:
     force, reach = load_scene(name).force, build_core(Config(scene=name), load_scene(name)).portrait
     low_N, high_N = max(force.least_N, reach.min_N), min(force.most_N, reach.max_N)
     share = (high_N - low_N) / (force.most_N - force.least_N)
-    chosen = found.chosen
-    errors = [chosen.rms_N.get(each) for each in ("signal", "seldom", "steps", "contact")]
+    errors = [found.chosen.rms_N.get(each) for each in ("signal", "seldom", "steps", "contact")]
     return [
         f"`{name}`",
         f"{force.least_N:g} to {force.most_N:g}",
         f"{low_N:.2f} to {high_N:.2f} ({share:.0%})",
         f"{1e3 * force.tolerance_rms_N:g}",
-        str(chosen.way),
+        str(found.chosen.way),
         *("-" if each is None else _shown(each, force.tolerance_rms_N) for each in errors),
-        f"{chosen.share:.0%}",
+        f"{found.chosen.share:.0%}",
     ]
 
 

@@ -12,7 +12,7 @@ import pytest
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import firmware_text, status_text
-from tormagd.scenes.measured import MeasuredScene, OperatingPoint, Served, measured_beside
+from tormagd.scenes.measured import ENDING, MeasuredScene, OperatingPoint, Served
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd_client.messages import LinkReport, Status
 
@@ -192,8 +192,8 @@ def test_a_scene_is_checked_as_the_daemon_does(ctl):
 WAYS = {"usual": (1000, 500, "newton"), "cheap": (500, 83, "newton"), "dear": (1000, 500, "nearest")}
 
 
-def run_of(way: str, share: float, contact_N: float, steps_N: float = 0.01) -> Served:
-    return Served(OperatingPoint(*WAYS[way]), "sample_2", {"steps": steps_N, "contact": contact_N}, share, 50.0)
+def run_of(way: str, share: float, contact_N: float) -> Served:
+    return Served(OperatingPoint(*WAYS[way]), "sample_2", {"signal": 0.01, "contact": contact_N}, share, 50.0)
 
 
 @pytest.fixture
@@ -206,7 +206,7 @@ def fast(tmp_path: Path) -> Path:
     scene = load_scene(str(path))
     assert scene.force.most_N == 1.9
     found = MeasuredScene(scene.fingerprint, 0.05, 1e3, (usual, cheap, dear), (cheap, usual))
-    measured_beside(path).write_bytes(msgspec.json.encode(found))
+    path.with_suffix(ENDING).write_bytes(msgspec.json.encode(found))
     return path
 
 

@@ -16,6 +16,7 @@ from tormagd.element.model.features import FEATURES
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
 from tormagd.scenes.measured import (
+    ENDING,
     TOLERATED,
     WORSE,
     MeasuredScene,
@@ -23,7 +24,6 @@ from tormagd.scenes.measured import (
     Served,
     allowed_N,
     measured,
-    measured_beside,
     served_like,
 )
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Signal, Terms, load_scene, scene_path, shipped_scenes
@@ -321,7 +321,7 @@ def test_every_shipped_scene_is_measured_and_its_choice_follows_from_its_figures
     assert found is not None
     assert found.tolerance_N == scene.force.tolerance_rms_N
     fits = served_like(found.served, found.tolerance_N, scene.bandwidth)
-    cheapest = min(fits, key=lambda each: each.share)
+    cheapest = min(fits, key=lambda each: each.way.sum_hz)
     assert found.chosen == (cheapest if found.judged[0].way == cheapest.way else found.usual)
     assert {each.device for each in found.served}.isdisjoint(each.device for each in found.judged)
 
@@ -330,10 +330,10 @@ def test_a_daemon_runs_at_the_rates_that_measuring_chose_if_they_are_higher(writ
     path = Path(write(bandwidth__control_hz="500", bandwidth__inference_hz="83"))
     own, scene = Config(scene=str(path), rates=Rates(of_scene=True)), load_scene(str(path))
     found = MeasuredScene(scene.fingerprint, 0.05, 100.0, (USUAL, BOTH), (BOTH, USUAL))
-    measured_beside(path).write_bytes(msgspec.json.encode(found))
+    path.with_suffix(ENDING).write_bytes(msgspec.json.encode(found))
     rates = at_rates_of(scene, own).rates
     assert (rates.control_hz, rates.inference_hz) == (500, 500)
-    measured_beside(path).write_bytes(b"{}")
+    path.with_suffix(ENDING).write_bytes(b"{}")
     assert at_rates_of(scene, own).rates.inference_hz == 83
 
 

@@ -1,11 +1,7 @@
-"""`tormagctl scene measure`: a scene served live, in each way, beside a simulated device, with error and price.
+"""`tormagctl scene measure`: a scene served live beside simulated devices, in each way: error and price of one run.
 
-In each run a daemon of its own serves a new simulated device (processes of their own) and this one publishes: the
-scene's signal, the same from a slow publisher, steps, and a wall that the handle meets. The error is of the plant's
-true force; the price, of the same seconds, is processor time of the daemon and its children.
-
-What the gap's speed alone decides is not counted, because no way changes it: a step counts from COMES_S on, and the
-wall's force takes CONTACT_S to rise.
+This process publishes to a daemon of its own: the scene's signal, the same seldom, steps, a wall that the handle meets.
+Nothing counts that the gap's speed alone decides: a step does from COMES_S on, a wall's force rises in CONTACT_S.
 """
 
 import contextlib
@@ -30,40 +26,36 @@ from tormagd.ctl.scene_served import write_scene
 from tormagd.ground.files import in_place_of
 from tormagd.ground.machine_loop import machine_us
 from tormagd.ground.terminal import write_line
-from tormagd.scenes.measured import MeasuredScene, OperatingPoint, Served, measured_beside, served_like
+from tormagd.scenes.measured import ENDING, MeasuredScene, OperatingPoint, Served, served_like
 from tormagd.scenes.scene import MIN_CONTROL_HZ, Scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ENDPOINTS
 from tormagd_client.messages import Contact
 
-Array = npt.NDArray[np.float64]
 RATES_HZ = (1_000, 500), (500, 500), (500, 83)
-"Of control and of plans: the usual ones first."
-NEAREST_HZ = (1_000, 500), (500, 83)
-"The other search competes at these."
+"Of control and plans; the usual first."
 CHOOSES, JUDGES = 2, 3
-"Of the simulated samples; models learned from the first."
+"Samples; models learned from the first."
 DENSE_HZ, PREVIEW_S, PREVIEW_STEP_S = 1_000, 0.4, 0.02
 SELDOM_HZ = 20.0
-STEP_S, COMES_S, STEPS = 1.5, 1.0, (0.8, 0.2)
-"Up and down to shares of the range; they count when the gap has come."
+STEP_S, COMES_S, STEPS = 2.0, 1.5, (0.8, 0.2)
+"Shares of the range."
 CONTACT_S = 2.0
-"A wall's force rises in this time, so that the gap can follow."
-LASTS_S = {"approach": 2.0, "signal": 5.0, "seldom": 2.0, "steps": len(STEPS) * STEP_S, "contact": CONTACT_S + 0.2}
-LEARN_S = 2.0
-"In the approach, and so long in the signal, the device is learned."
+LASTS_S = {"approach": 2.0, "signal": 7.0, "seldom": 2.0, "steps": len(STEPS) * STEP_S, "contact": CONTACT_S + 0.2}
+LEARN_S = 4.0
+"In the approach, and so long in the signal, it learns."
 PRICED, LOOKS_HZ = ("signal", "steps"), 2.0
-"Where setpoints come as often as the way plans; the machine itself is looked at so often meanwhile."
+"Where setpoints come as often as plans; meanwhile the machine is looked at."
 OPEN_MM = 0.1
-"This near its open end a gap is open: too much force is then the device's."
+"A gap so near its end is open: excess force is the device's."
 VALID_FOR_MS = 200.0
 STARTS_S, LOOK_S, ENDS_S = 30.0, 0.05, 10.0
 FIFO = 50
 
 
 class Part(NamedTuple):
-    """A stretch of a run, s: its situation, and how often setpoints come."""
+    """One situation of a run."""
 
     name: str
     begins_s: float
@@ -73,36 +65,27 @@ class Part(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What is asked in a run: forces at DENSE_HZ, and its parts, of which the first is not counted."""
+    """Forces at DENSE_HZ; the first part does not count."""
 
-    time_s: Array
-    force_N: Array
+    time_s: npt.NDArray[np.float64]
+    force_N: npt.NDArray[np.float64]
     parts: tuple[Part, ...]
 
-    def force_at(self, time_s: float) -> float:
-        return float(np.interp(time_s, self.time_s, self.force_N))
 
+class Heard(NamedTuple):
+    """The plant's true state over a run, the daemon's last status; when it began, and met the wall, CLOCK_REALTIME."""
 
-class Played(NamedTuple):
-    """When a run began and the handle met the wall, CLOCK_REALTIME; the daemon's share, and `machine_us` meanwhile."""
-
+    truth: Any
+    status: dict[str, Any]
     start_ns: int
     met_ns: int
     share: float
     machine_us: float
 
 
-class Heard(NamedTuple):
-    """What the plant truly did in a run, and what the daemon said at its end."""
-
-    truth: Any
-    status: dict[str, Any]
-    played: Played
-
-
 def measure_scene(name: str) -> Outcome:
     """Measure the scene live, and keep what was found beside it."""
-    scene, derived, out = loaded(name), derived_of(name, None), measured_beside(scene_path(name))
+    scene, derived, out = loaded(name), derived_of(name, None), scene_path(name).with_suffix(ENDING)
     if scene.signal is None:
         raise usage_error(
             f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for",
@@ -122,7 +105,7 @@ def measure_scene(name: str) -> Outcome:
 
     write_line(f"{scene.name}: up to {len(ways) + 2} live runs of about {sum(LASTS_S.values()) + 4:.0f} s", sys.stderr)
     tried = [run(way, CHOOSES) for way in ways]
-    cheapest = min(served_like(tried, tolerance_N, least), key=lambda each: each.share)
+    cheapest = min(served_like(tried, tolerance_N, least), key=lambda each: each.way.sum_hz)
     judged = [run(way, JUDGES) for way in dict.fromkeys((cheapest.way, ways[0]))]
     if judged[0] not in served_like(judged[::-1], tolerance_N, least):
         judged.reverse()
@@ -130,24 +113,26 @@ def measure_scene(name: str) -> Outcome:
     found = MeasuredScene(scene.fingerprint, tolerance_N, machine, tuple(tried), tuple(judged))
     with as_usage_error(OSError, hint="copy the scene to a folder that you may write to"), in_place_of(out) as beside:
         beside.write_bytes(msgspec.json.format(msgspec.json.encode(found), indent=1) + b"\n")
-    text = f"{out} is written; chosen: {found.chosen.way}. tormagctl scene explain {name} shows all"
-    return Outcome(msgspec.to_builtins(found) | {"file": str(out)}, text)
+    return Outcome(
+        msgspec.to_builtins(found) | {"file": str(out)},
+        f"{out} is written; chosen: {found.chosen.way}. tormagctl scene explain {name} shows all",
+    )
 
 
 def ways_of(scene: Scene, runs: str) -> list[OperatingPoint]:
-    """Return the ways to try, the usual one first; the search that `runs` competes too."""
-    # where newton is refused, the search that runs stands alone
+    """Return the ways to try, the usual one first."""
+    # newton is refused where none but nearest is chosen
     first, *others = [runs] if runs == "nearest" != scene.solver.name else dict.fromkeys(["newton", "nearest", runs])
     stated_hz = max(scene.bandwidth.control_hz, MIN_CONTROL_HZ), scene.bandwidth.inference_hz
     usual_hz = max(stated_hz[0], RATES_HZ[0][0]), max(stated_hz[1], RATES_HZ[0][1])
     ways = [OperatingPoint(*hz, first) for hz in dict.fromkeys((usual_hz, *RATES_HZ[1:], stated_hz))]
-    return ways + [OperatingPoint(*hz, search) for search in others for hz in NEAREST_HZ]
+    return ways + [OperatingPoint(*stated_hz, search) for search in others]
 
 
 def served(
     name: str, scene: Scene, way: OperatingPoint, sample: int, range_N: tuple[float, float]
 ) -> tuple[Served, float]:
-    """Run the scene in one way on a simulated sample, and return errors and price, and `machine_us` meanwhile."""
+    """Return errors and price of one run, and `machine_us` meanwhile."""
     course = course_of(name, scene, way, range_N)
     heard = _heard(name, scene, way, sample, course)
     if heard.status["faults"]:  # a busy host causes some
@@ -157,7 +142,7 @@ def served(
     else:
         rms_N = errors_N(course, heard, scene, range_N)
     plan_us = heard.status["rates"]["inference"]["exec_us"]["p50"]
-    share, machine = round(heard.played.share, 4), heard.played.machine_us
+    share, machine = round(heard.share, 4), heard.machine_us
     return Served(way, f"{_kind(scene)}_{sample}", rms_N, share, plan_us), machine
 
 
@@ -166,7 +151,6 @@ def _kind(scene: Scene) -> str:
 
 
 def course_of(name: str, scene: Scene, way: OperatingPoint, range_N: tuple[float, float]) -> Course:
-    """Return what is asked: the first force is held, then each situation of LASTS_S follows."""
     assert scene.signal is not None, "its forces are asked for"
     low_N, high_N = range_N
     counts = {part: round(lasts_s * DENSE_HZ) for part, lasts_s in LASTS_S.items()}
@@ -191,10 +175,9 @@ def course_of(name: str, scene: Scene, way: OperatingPoint, range_N: tuple[float
 
 
 def errors_N(course: Course, heard: Heard, scene: Scene, range_N: tuple[float, float]) -> dict[str, float]:
-    """Return the RMS of the true less the asked force in each situation."""
-    truth = heard.truth
-    time_s = (truth["t_ns"] - heard.played.start_ns) * 1e-9
-    found = {}
+    """Return the RMS of true less asked force by situation."""
+    truth, found = heard.truth, dict[str, float]()
+    time_s = (truth["t_ns"] - heard.start_ns) * 1e-9
     for name, begins_s, ends_s, *_ in course.parts[1:]:
         inside = (time_s >= begins_s) & (time_s < ends_s)
         wanted_N = np.interp(time_s, course.time_s, course.force_N)
@@ -203,7 +186,7 @@ def errors_N(course: Course, heard: Heard, scene: Scene, range_N: tuple[float, f
         if name == "steps":
             inside &= (time_s - begins_s) % STEP_S >= COMES_S
         if name == "contact":
-            depth_mm = truth["handle_mm"] - np.interp(heard.played.met_ns, truth["t_ns"], truth["handle_mm"])
+            depth_mm = truth["handle_mm"] - np.interp(heard.met_ns, truth["t_ns"], truth["handle_mm"])
             wanted_N = np.clip(_stiffness_N_mm(scene) * depth_mm, *range_N)
         error_N = (truth["force_N"] - wanted_N)[inside]
         is_least = (truth["gap_mm"][inside] >= scene.insert.gap_open_mm - OPEN_MM) & (error_N > 0.0)
@@ -234,13 +217,12 @@ def _heard(name: str, scene: Scene, way: OperatingPoint, sample: int, course: Co
         _arm(client, daemon, folder)
         played = _play(client, course, scene, daemon.pid)
         status = client.request("status")
-        stack.close()  # what the device has told is written out when it ends
+        stack.close()  # the device writes the rest as it ends
         truth = np.genfromtxt(folder / "truth.csv", delimiter=",", names=True)
-    return Heard(truth, status, played)
+    return Heard(truth, status, *played)
 
 
 def _device(stack: contextlib.ExitStack, folder: Path, scene: Scene, sample: int) -> str:
-    """Start the simulated device, and return its port."""
     hand = f"steady={scene.handle.most_mm_s:g}" if scene.finger is UNSET else f"pressing={scene.finger.depth_mm:g}"
     plant = ["--plant", f"{_kind(scene)}_{sample}", "--hand", hand]
     plant += ["--insert", scene.insert.name] if scene.element == "torque" else []
@@ -270,7 +252,7 @@ def _begun(stack: contextlib.ExitStack, folder: Path, *arguments: str) -> "subpr
 
 
 def _as_another_machine(pid: int, priority: int) -> None:
-    """Have a process run before this machine's others, if the kernel grants it."""
+    """Let a process run first, if the kernel grants it."""
     with contextlib.suppress(PermissionError):
         os.sched_setscheduler(pid, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
@@ -289,7 +271,7 @@ def _arm(client: Client, daemon: "subprocess.Popen[str]", folder: Path) -> None:
     client.arm(STARTS_S)
 
 
-def _play(client: Client, course: Course, scene: Scene, pid: int) -> Played:
+def _play(client: Client, course: Course, scene: Scene, pid: int) -> tuple[int, int, float, float]:
     _as_another_machine(0, FIFO - 20)
     start_s, start_ns, met_ns = time.monotonic(), time.time_ns(), 0
     spent_s, took_s, machine = 0.0, 0.0, list[float]()
@@ -306,12 +288,13 @@ def _play(client: Client, course: Course, scene: Scene, pid: int) -> Played:
                 ahead_s = at_s + PREVIEW_STEP_S * np.arange(1, round(part.preview_s / PREVIEW_STEP_S) + 1)
                 ahead_N = np.interp(ahead_s, course.time_s, course.force_N)
                 fields = {"preview_N": tuple(ahead_N.tolist()), "preview_dt_ms": 1e3 * PREVIEW_STEP_S}
-            client.publish(course.force_at(at_s), VALID_FOR_MS, start_ns + round(at_s * 1e9), **fields)
+            force_N = float(np.interp(at_s, course.time_s, course.force_N))
+            client.publish(force_N, VALID_FOR_MS, start_ns + round(at_s * 1e9), **fields)
             if part.name in PRICED and (at_s - course.parts[1].begins_s) * LOOKS_HZ >= len(machine):
                 machine.append(machine_us(1))
         if part.name in PRICED:
             spent_s, took_s = spent_s + processor_s(pid) - before_s, took_s + time.monotonic() - begun_s
-    return Played(start_ns, met_ns, spent_s / took_s, statistics.median(machine))
+    return start_ns, met_ns, spent_s / took_s, statistics.median(machine)
 
 
 def processor_s(pid: int) -> float:

@@ -1,8 +1,6 @@
-"""What `tormagctl scene measure` found: how exactly, and at what share of a processor, each way serves a scene live.
+"""What `tormagctl scene measure` found of a scene, in a file beside it: error and price of each way, of one live run.
 
-Error and share are of the same run of a daemon beside a simulated device. An error is the RMS of the true less the
-asked force in one situation; of a way, the worst counts. The devices that choose a way do not judge it. The file stands
-beside the scene, and is true of any scene that asks for the same.
+Of a way, the worst situation counts. The devices that choose do not judge.
 """
 
 from collections.abc import Sequence
@@ -20,7 +18,6 @@ WORSE = 0.2
 "An error that exceeds the usual way's by this share of the tolerance may be chosen."
 ENDING = ".measured.json"
 LONGEST = 100_000
-"Bytes: such a file has a few thousand."
 
 
 class OperatingPoint(Struct, frozen=True):
@@ -28,12 +25,16 @@ class OperatingPoint(Struct, frozen=True):
     inference_hz: int
     search: str
 
+    @property
+    def sum_hz(self) -> int:
+        return self.control_hz + self.inference_hz
+
     def __str__(self) -> str:
         return f"{self.control_hz} / {self.inference_hz} Hz, {self.search}"
 
 
 class Served(Struct, frozen=True):
-    """One live run: errors by situation, and the share of a processor that all the daemon's processes took."""
+    """One live run: errors by situation, and the share of a processor that the daemon took."""
 
     way: OperatingPoint
     device: str
@@ -47,7 +48,7 @@ class Served(Struct, frozen=True):
 
 
 class MeasuredScene(Struct, frozen=True):
-    """The runs that choose, the usual way's first, and those that judge, the chosen way's first."""
+    """The runs that choose, the usual first, and that judge, the chosen first."""
 
     fingerprint: str
     tolerance_N: float
@@ -72,9 +73,9 @@ class MeasuredScene(Struct, frozen=True):
         return next(each for each in self.served if each.way == way)
 
     def offered(self, least: Bandwidth) -> tuple[Served, ...]:
-        """The ways that a scene of these least rates may run; what costs less than the chosen one was refused."""
+        """The ways at these rates or more that nothing refused."""
         fits = served_like(self.served, self.tolerance_N, least)
-        return tuple(each for each in fits if each.share >= self.chosen.share)
+        return tuple(each for each in fits if each.way.sum_hz >= self.chosen.way.sum_hz)
 
     def share_of(self, way: OperatingPoint, machine_us: float, plans_hz: float) -> float | None:
         """Return what the daemon takes of a processor of `machine_us`: a line through the measured rates of plans."""
@@ -88,7 +89,7 @@ class MeasuredScene(Struct, frozen=True):
 
 
 def served_like(served: Sequence[Served], tolerance_N: float, least: Bandwidth) -> list[Served]:
-    """Return the ways that do what the first, the usual one, does in every situation, at these rates or more."""
+    """Return the ways at these rates or more that do what the first, the usual one, does in every situation."""
     return [
         each
         for each in served
@@ -104,17 +105,13 @@ def allowed_N(usual_N: float, tolerance_N: float) -> float:
     return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N
 
 
-def measured_beside(scene: Path) -> Path:
-    return scene.with_name(scene.stem + ENDING)
-
-
 def measured(fingerprint: str, folder: Path) -> MeasuredScene | None:
-    """Return what was measured of a scene that asks for the same: in its folder, or with the shipped ones."""
+    """Return what was measured of a scene that asks for the same."""
     for path in (*sorted(folder.glob(f"*{ENDING}")), *sorted(Path(__file__).parent.glob(f"*{ENDING}"))):
         try:
             found = msgspec.json.decode(read_bounded(path, LONGEST), type=MeasuredScene)
         except (OSError, msgspec.DecodeError):
-            continue  # of another version, or no such file at all: not measured
+            continue  # of another version
         if found.fingerprint == fingerprint:
             return found
     return None

@@ -243,12 +243,10 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:
-    """Return the configuration at the scene's least rates, or at the higher ones of the way that measuring chose."""
     if not config.rates.of_scene:
         return config
     found = measured(scene.fingerprint, scene_path(config.scene).parent)
-    least = scene.bandwidth
-    chosen = least if found is None else found.chosen.way
+    least, chosen = scene.bandwidth, scene.bandwidth if found is None else found.chosen.way
     rates = msgspec.structs.replace(
         config.rates,
         control_hz=max(least.control_hz, chosen.control_hz, MIN_CONTROL_HZ),
