@@ -49,7 +49,7 @@ def page(found: dict[str, MeasuredScene]) -> str:
         ),
         "Errors are RMS, in mN, of the true force, live, some seconds after arming, on a simulated device that chose "
         "no model. **Bold** is over the tolerance. *Slow publisher*: the same signal, 20 setpoints a second. *Steps* "
-        "count a second after each. *Contact*: a wall whose force rises in two seconds. *Share* is what the daemon "
+        "count 1.5 s after each. *Contact*: a wall whose force rises in two seconds. *Share* is what the daemon "
         "took of one processor meanwhile. The worst of the four counts.",
         f"![worst error over the daemon's share](<{PICTURE.as_posix()}>)",
         "Each point is a way to serve a scene: to the left is cheaper, down is more exact.",
@@ -87,8 +87,8 @@ def _head() -> str:
         "| `[solver]` | the search for the field ([which](guides/scene.md)) |\n"
         "| `[terms]` | parts of the controller's model to switch off, `false` each (`tormagd/scenes/scene.py`; [why "
         "all run](decisions/0009-what-a-scene-requires.md)) |\n\n"
-        "The cheapest way is chosen that serves every situation like the usual one, on a device that chose and on one "
-        "that did not. You can [choose by price or error](guides/scene.md#the-tables) yourself."
+        "Served is the lowest rate at which signal and worst error are like the usual way's, 1000 / 500 Hz, on a "
+        "device that chose and on one that did not. You can [choose by price or error](guides/scene.md#the-tables)."
     )
 
 

@@ -275,8 +275,8 @@ def test_a_hold_of_a_day_and_a_recording_at_1_khz_are_taken(write, tmp_path: Pat
     assert of_path(write(signal__file='"fast.csv"')).missed.rms_N < 1e-3
 
 
-def run(hz: tuple[int, int], share: float, steps_N: float, contact_N: float = 0.0) -> Served:
-    return Served(OperatingPoint(*hz, "newton"), "sample_2", {"steps": steps_N, "contact": contact_N}, share, 50.0)
+def run(hz: tuple[int, int], share: float, signal_N: float, contact_N: float = 0.0) -> Served:
+    return Served(OperatingPoint(*hz, "newton"), "sample_2", {"signal": signal_N, "contact": contact_N}, share, 50.0)
 
 
 USUAL, FEW, BOTH, WRONG = (
@@ -288,7 +288,7 @@ USUAL, FEW, BOTH, WRONG = (
 ALL_HZ = Bandwidth(500, 83)
 
 
-def test_what_serves_every_situation_like_the_usual_way_at_the_least_rates_or_more_may_be_chosen() -> None:
+def test_what_serves_signal_and_worst_like_the_usual_way_at_the_least_rates_or_more_may_be_chosen() -> None:
     served = (USUAL, FEW, BOTH, WRONG)
     assert served_like(served, 0.05, ALL_HZ) == [USUAL, FEW, BOTH]
     assert served_like(served, 0.05, Bandwidth(500, 500)) == [USUAL, BOTH]

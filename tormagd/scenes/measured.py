@@ -89,13 +89,14 @@ class MeasuredScene(Struct, frozen=True):
 
 
 def served_like(served: Sequence[Served], tolerance_N: float, least: Bandwidth) -> list[Served]:
-    """Return the ways at these rates or more that do what the first, the usual one, does in every situation."""
+    """Return the ways at these rates or more that do what the first, the usual one, does with the signal and at worst."""
     return [
         each
         for each in served
         if each.way.control_hz >= least.control_hz
         and each.way.inference_hz >= least.inference_hz
-        and all(each.rms_N[name] <= allowed_N(usual_N, tolerance_N) for name, usual_N in served[0].rms_N.items())
+        and each.rms_N["signal"] <= allowed_N(served[0].rms_N["signal"], tolerance_N)
+        and each.worst_N <= allowed_N(served[0].worst_N, tolerance_N)
     ]
 
 
