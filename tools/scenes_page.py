@@ -47,10 +47,12 @@ def page(found: dict[str, MeasuredScene]) -> str:
             ],
             [_row(name, each) for name, each in found.items()],
         ),
-        "Errors are RMS, in mN, of the true force, live, some seconds after arming, on a simulated device that chose "
-        "no model. **Bold** is over the tolerance. *Slow publisher*: the same signal, 20 setpoints a second. *Steps* "
-        "count 1.5 s after each. *Contact*: a wall whose force rises in two seconds. *Share* is what the daemon "
-        "took of one processor meanwhile. The worst of the four counts.",
+        "Errors are RMS, in mN, of the true force, live, some seconds after arming, with the handle at the scene's "
+        "greatest speed, on a simulated device that no model was learned from. **Bold** is over the tolerance. *Slow*: "
+        "the same signal, 20 setpoints a second. *Steps* count 1.5 s after each. *Contact*: a wall whose force rises "
+        "in two seconds. *Share* is what the daemon took of one processor meanwhile, on a busy machine (`machine_us` "
+        f"{min(each.machine_us for each in found.values()):.0f} to "
+        f"{max(each.machine_us for each in found.values()):.0f}). The worst of the four counts.",
         f"![worst error over the daemon's share](<{PICTURE.as_posix()}>)",
         "Each point is a way to serve a scene: to the left is cheaper, down is more exact.",
         f"In {len(flat)} of {len(found)} scenes the worst way is less than {FRONT} times as far off as the most exact: "

@@ -43,6 +43,8 @@ STEP_S, COMES_S, STEPS = 2.0, 1.5, (0.8, 0.2)
 "Shares of the range."
 CONTACT_S = 2.0
 LASTS_S = {"approach": 2.0, "signal": 7.0, "seldom": 2.0, "steps": len(STEPS) * STEP_S, "contact": CONTACT_S + 0.2}
+PRESSES_S = 7.0
+"A finger comes late: the approach of a pad lasts so much longer."
 LEARN_S = 4.0
 "In the approach, and so long in the signal, it learns."
 PRICED, LOOKS_HZ = ("signal", "steps"), 2.0
@@ -153,7 +155,8 @@ def _kind(scene: Scene) -> str:
 def course_of(name: str, scene: Scene, way: OperatingPoint, range_N: tuple[float, float]) -> Course:
     assert scene.signal is not None, "its forces are asked for"
     low_N, high_N = range_N
-    counts = {part: round(lasts_s * DENSE_HZ) for part, lasts_s in LASTS_S.items()}
+    lasts = LASTS_S | {"approach": LASTS_S["approach"] + (PRESSES_S if scene.element == "tactile" else 0.0)}
+    counts = {part: round(lasts_s * DENSE_HZ) for part, lasts_s in lasts.items()}
     played = counts["signal"] + counts["seldom"]
     _, signal_N = asked(scene.signal, scene_path(name).parent, range_N, played / DENSE_HZ, DENSE_HZ)
     signal_N = np.resize(signal_N, played)
@@ -164,7 +167,7 @@ def course_of(name: str, scene: Scene, way: OperatingPoint, range_N: tuple[float
         way.inference_hz if scene.signal.setpoint_hz is UNSET else min(scene.signal.setpoint_hz, way.inference_hz)
     )
     parts, begins_s = [], 0.0
-    for part, lasts_s in LASTS_S.items():
+    for part, lasts_s in lasts.items():
         hz = min(SELDOM_HZ, usual_hz) if part == "seldom" else usual_hz
         preview_s = PREVIEW_S if scene.signal.is_known_ahead and part in ("signal", "seldom") else 0.0
         parts.append(Part(part, begins_s, begins_s + lasts_s, hz, preview_s))

@@ -57,7 +57,7 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
             Exit.REFUSED,
             "no_way",
             f"{asked} = {most:g}: allowed is at least {least:.3g} {unit}",
-            "tormagctl scene explain shows every way that was measured; not offered is one that is worse than the usual one",
+            "tormagctl scene explain shows every way; not offered is one that is worse than the usual one",
         )
     least_N = min(way.figures[1] for way in fits)
     alike = [way for way in fits if share is None or way.figures[1] <= (1.0 + ALIKE) * least_N]

@@ -89,7 +89,7 @@ class MeasuredScene(Struct, frozen=True):
 
 
 def served_like(served: Sequence[Served], tolerance_N: float, least: Bandwidth) -> list[Served]:
-    """Return the ways at these rates or more that do what the first, the usual one, does with the signal and at worst."""
+    """Return the ways at these rates or more whose signal and worst error are like the first, the usual one's."""
     return [
         each
         for each in served
