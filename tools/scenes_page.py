@@ -56,8 +56,8 @@ def page(found: dict[str, MeasuredScene]) -> str:
         f"![worst error over the daemon's share](<{PICTURE.as_posix()}>)",
         "Each point is a way to serve a scene: to the left is cheaper, down is more exact.",
         f"In {len(flat)} of {len(found)} scenes the worst way is less than {FRONT} times as far off as the most exact: "
-        f"{', '.join(f'`{name}`' for name in flat)}. There the worst situation is contact, where the gap's speed "
-        "decides and no rate or search does. `tormagctl scene explain NAME` lists every way.",
+        f"{', '.join(f'`{name}`' for name in flat)}. A brake is worst at a contact, where the gap's speed decides and "
+        "no rate or search does. `tormagctl scene explain NAME` lists every way.",
     ]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
