@@ -13,7 +13,6 @@ from tormagd.ground.machine_loop import machine_us
 
 MEASUREMENTS = {
     "inverse": "speed against accuracy of the searches for the field",
-    "scenes": "what each scene costs with all terms and with those it requires",
     "loop": "lateness of the control loop beside a bare timer",
     "latency": "from a setpoint to the first drive frame that reflects it",
     "step": "how fast and how exactly the gap follows, in virtual time",

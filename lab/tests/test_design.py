@@ -3,6 +3,8 @@
 import dataclasses
 import itertools
 import math
+import re
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
@@ -33,7 +35,7 @@ from tormag_lab.design.range_fit import (
     frictionless_range_N,
     mean_relative_error,
 )
-from tormag_lab.thesis import page, table_2_5
+from tormag_lab.thesis import page, reproduction, table_2_5
 from tormag_lab.thesis.table_2_5 import judge, rank
 from tormag_lab.thesis.values import TABLE_2_5, ForceTask
 from tormagd.element.physics.errors import DomainError
@@ -326,3 +328,20 @@ def test_of_what_the_thesis_names_one_is_not_wide_enough() -> None:
 
 def test_the_page_has_it() -> None:
     assert page.table_2_5(FOUND) in Path(__file__).parents[2].joinpath("docs/reproduction.md").read_text("utf-8")
+
+
+def test_a_reproduction_that_is_stopped_writes_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reproduction, "ProcessPoolExecutor", ThreadPoolExecutor)
+    monkeypatch.setattr(reproduction, "chapter_4", dict)
+    monkeypatch.setattr(reproduction, "step_test", Mock(side_effect=KeyboardInterrupt))
+    found = reproduction.run(Namespace(out=tmp_path, gap_speed=40.0, workers=1, seed=1))
+    assert found.exit_code == 130
+    written = (tmp_path / "reproduction.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (\w+ ?[\d.]*)", written, re.M) == [
+        "Table 2.3",
+        "Table 2.4",
+        "Table 2.5",
+        "Figure 2.5",
+        "Errata",
+    ]
+    assert "table_2_4.png" in {path.name for path in (tmp_path / "reproduction").iterdir()}

@@ -1,4 +1,3 @@
-import json
 import math
 import re
 import subprocess
@@ -13,7 +12,8 @@ import pytest
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import firmware_text, status_text
-from tormagd.scenes.scene import load_scene
+from tormagd.scenes.measured import ENDING, MeasuredScene, OperatingPoint, Served
+from tormagd.scenes.scene import load_scene, scene_path
 from tormagd_client.messages import LinkReport, Status
 
 SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply, then tormagctl arm"}
@@ -189,27 +189,74 @@ def test_a_scene_is_checked_as_the_daemon_does(ctl):
     assert list(comes_s) == sorted(comes_s, reverse=True)
 
 
-def test_every_measured_way_is_shown_with_what_it_costs(ctl, checked_here):
-    text = ctl("scene", "explain", "aorta_1").ended(0).out
-    assert all(said in text for said in ("1000 / 500 Hz, newton", "chosen, runs here", "contact", "signal, frozen"))
-    text = ctl("scene", "explain", "pulse").ended(0).out
-    assert all(said in text for said in ("fails a judged case", "1000 / 500 Hz, newton is as exact for"))
+WAYS = {"usual": (1000, 500, "newton"), "cheap": (500, 83, "newton"), "dear": (1000, 500, "nearest")}
 
 
-def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_written(tmp_path, ctl, checked_here):
-    every = ctl("--json", "scene", "explain", "pulse").ended(0).result
-    errors_N = {json.dumps(tried["way"]): max(tried["rms_N"]) for tried in every["tried"]}
-    cheap, exact = tmp_path / "cheap.toml", tmp_path / "exact.toml"
-    words = "--json", "scene", "check", "pulse"
-    newton = {"control_hz": 1000, "inference_hz": 500, "search": "newton"}
-    found = ctl(*words, "--tolerance", str(max(errors_N.values())), "--out", str(cheap)).ended(0).result
-    assert found["way"] == newton  # cheaper ways fail a judged case
-    found = ctl(*words, "--share", "1.0", "--out", str(exact)).ended(0).result
-    assert found["way"] == newton  # as exact as the chosen search, to 0.1 mN, for less
-    assert found["rms_N"] == pytest.approx(errors_N[json.dumps(newton)], abs=5e-5)
-    for path in (cheap, exact):  # what is written is the same scene, and is taken
-        assert load_scene(str(path)).fingerprint == load_scene("pulse").fingerprint
-        ctl("scene", "check", str(path)).ended(0)
+def run_of(way: str, share: float, contact_N: float) -> Served:
+    return Served(OperatingPoint(*WAYS[way]), "sample_2", {"signal": 0.01, "contact": contact_N}, share, 50.0)
+
+
+@pytest.fixture
+def fast(tmp_path: Path) -> Path:
+    """A scene with what was measured of it beside it: the cheap way is as exact as its tolerance asks, but not more."""
+    path = tmp_path / "fast.toml"
+    stated = scene_path("coronary").read_text(encoding="utf-8").replace("most_N = 2.0", "most_N = 1.9")
+    path.write_text(stated, encoding="utf-8")
+    usual, cheap, dear = run_of("usual", 0.2, 0.100), run_of("cheap", 0.1, 0.105), run_of("dear", 0.3, 0.02)
+    scene = load_scene(str(path))
+    assert scene.force.most_N == 1.9
+    found = MeasuredScene(scene.fingerprint, 0.05, 1e3, (usual, cheap, dear), (cheap, usual))
+    path.with_suffix(ENDING).write_bytes(msgspec.json.encode(found))
+    return path
+
+
+def test_every_measured_way_is_shown_with_what_it_costs(fast, ctl, checked_here):
+    rows = ctl("scene", "explain", str(fast)).ended(0).out.splitlines()
+    shown = {name: next(row for row in rows if row.startswith(str(OperatingPoint(*WAYS[name])))) for name in WAYS}
+    assert [("chosen" in row, "runs here" in row) for row in shown.values()] == [
+        (False, False),
+        (True, True),
+        (False, False),
+    ]
+    assert "10.0    105.0" in shown["cheap"]
+    words = ctl("scene", "explain", "pulse").ended(0).out
+    assert "The scene states 1000 / 500 Hz, nearest; 1000 / 500 Hz, newton serves it for" in words
+
+
+@pytest.mark.parametrize(
+    ("bound", "way"),
+    [
+        (("--tolerance", "0.11"), "cheap"),
+        (("--tolerance", "0.1"), "usual"),
+        (("--tolerance", "0.02"), "dear"),
+        (("--share", "100"), "dear"),
+    ],
+)
+def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_written(
+    bound, way, fast, ctl, checked_here, monkeypatch
+):
+    monkeypatch.setattr("tormagd.ctl.scene_served.machine_us", lambda: 2e3)
+    out = fast.with_name("mine.toml")
+    found = ctl("--json", "scene", "check", str(fast), *bound, "--out", str(out)).ended(0).result
+    assert tuple(found["way"].values()) == WAYS[way]
+    assert found["daemon_share"] == pytest.approx({"usual": 0.4, "cheap": 0.2, "dear": 0.6}[way])
+    assert load_scene(str(out)).fingerprint == load_scene(str(fast)).fingerprint
+    derived = ctl("--json", "scene", "check", str(out)).ended(0).result  # what is written is taken, and keeps its rates
+    assert (derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"]) == WAYS[way]
+
+
+def test_of_ways_that_are_alike_the_cheaper_is_taken(fast, ctl, monkeypatch):
+    monkeypatch.setattr("tormagd.ctl.scene_served.machine_us", lambda: 1e3)
+    found = ctl("--json", "scene", "check", str(fast), "--share", "0.25").ended(0).result
+    assert tuple(found["way"].values()) == WAYS["cheap"]
+    refused = ctl("--json", "scene", "check", str(fast), "--share", "0.05").ended(1).error
+    assert "--share = 0.05: allowed is at least 0.1 of a processor" in refused["message"]
+
+
+def test_a_scene_that_was_not_measured_as_it_is_now_says_how(fast, ctl):
+    fast.write_text(fast.read_text(encoding="utf-8").replace("most_N = 1.9", "most_N = 1.8"), encoding="utf-8")
+    error = ctl("--json", "scene", "explain", str(fast)).ended(1).error
+    assert (error["code"], f"tormagctl scene measure {fast}" in error["hint"]) == ("not_measured", True)
 
 
 @pytest.fixture

@@ -124,7 +124,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     (
         "tormagctl scene explain other.toml",
         1,
-        "tormagctl guide scene",
+        "tormagctl scene measure other.toml",
         {"other.toml": CORONARY.replace("most_N = 2.0", "most_N = 1.9")},
     ),
     ("tormagctl --config unfit.toml doctor --measure", 1, "nowhere", {"unfit.toml": 'scene = "nowhere"\n'}),

@@ -17,11 +17,12 @@ from tormag_lab.pages import KEY, figures_of, stamp
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
 from tormagd.ctl.commands import COMMANDS
+from tormagd.ctl.scene_check import measured_as
 from tormagd.daemon import main as daemon
 from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
 from tormagd.record.telemetry import COLUMNS
-from tormagd.scenes.measured import measured
+from tormagd.scenes.scene import load_scene, shipped_scenes
 from tormagd.simulation import __main__ as simulation
 
 ROOT = Path(__file__).parents[2]
@@ -202,8 +203,7 @@ DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 
 
 def drawn():
-    yield "images/scenes.png", measured().scenes
-    yield "images/scenes_trade.png", measured()
+    yield "images/scenes.png", [measured_as(name, load_scene(name)) for name in shipped_scenes()]
     for path in sorted(DOCS.glob("evidence/*.json")):
         evidence = json.loads(path.read_text(encoding="utf-8"))
         for picture in DRAWN.findall(evidence["command"]):

@@ -15,8 +15,18 @@ from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.features import FEATURES
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
-from tormagd.scenes.measured import OperatingPoint, measured
-from tormagd.scenes.scene import EVERY_TERM, Scene, Signal, Terms, load_scene, scene_path, shipped_scenes
+from tormagd.scenes.measured import (
+    ENDING,
+    TOLERATED,
+    WORSE,
+    MeasuredScene,
+    OperatingPoint,
+    Served,
+    allowed_N,
+    measured,
+    served_like,
+)
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Signal, Terms, load_scene, scene_path, shipped_scenes
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
@@ -265,13 +275,66 @@ def test_a_hold_of_a_day_and_a_recording_at_1_khz_are_taken(write, tmp_path: Pat
     assert of_path(write(signal__file='"fast.csv"')).missed.rms_N < 1e-3
 
 
-def test_a_share_is_scaled_to_the_machine_and_to_the_plans_that_a_publisher_causes():
-    file = measured()
-    few, many = (OperatingPoint(500, hz, "newton") for hz in (83, 500))
-    taken = [file.daemon_share(few, file.machine_us, hz) for hz in (83, 500)]
-    assert taken == pytest.approx([file.share(way).daemon for way in (few, many)])
-    assert file.daemon_share(few, 2.0 * file.machine_us) == pytest.approx(2.0 * file.share(few).daemon)
-    assert file.daemon_share(OperatingPoint(500, 83, "thesis"), file.machine_us, 500.0) is None
+def run(hz: tuple[int, int], share: float, signal_N: float, contact_N: float = 0.0) -> Served:
+    return Served(OperatingPoint(*hz, "newton"), "sample_2", {"signal": signal_N, "contact": contact_N}, share, 50.0)
+
+
+USUAL, FEW, BOTH, WRONG = (
+    run((1000, 500), 0.2, 0.01, 0.3),
+    run((500, 83), 0.1, 0.04, 0.31),
+    run((500, 500), 0.15, 0.02, 0.3),
+    run((500, 100), 0.05, 0.01, 0.32),
+)
+ALL_HZ = Bandwidth(500, 83)
+
+
+def test_what_serves_signal_and_worst_like_the_usual_way_at_the_least_rates_or_more_may_be_chosen() -> None:
+    served = (USUAL, FEW, BOTH, WRONG)
+    assert served_like(served, 0.05, ALL_HZ) == [USUAL, FEW, BOTH]
+    assert served_like(served, 0.05, Bandwidth(500, 500)) == [USUAL, BOTH]
+    assert served_like(served, 0.03, ALL_HZ) == [USUAL, BOTH]
+
+
+def test_what_the_judging_device_refuses_is_not_offered_nor_anything_cheaper() -> None:
+    chosen = MeasuredScene("", 0.05, 100.0, (USUAL, FEW, BOTH), (run((1000, 500), 0.2, 0.01),))
+    assert (chosen.chosen, chosen.offered(ALL_HZ)) == (USUAL, (USUAL,))
+
+
+def test_a_share_is_scaled_to_the_machine_and_to_the_plans_that_a_publisher_causes() -> None:
+    found = MeasuredScene("", 0.05, 100.0, (USUAL, FEW, BOTH), (FEW, USUAL))
+    few = FEW.way
+    assert [found.share_of(few, 100.0, hz) for hz in (83, 500)] == pytest.approx([0.1, 0.15])
+    assert found.share_of(few, 200.0, 83) == pytest.approx(0.2)
+    assert found.share_of(USUAL.way, 100.0, 1000.0) is None
+
+
+def test_an_error_is_allowed_within_the_tolerance_or_beside_the_usual_way() -> None:
+    assert allowed_N(0.001, 0.05) == TOLERATED * 0.05
+    assert allowed_N(0.060, 0.05) == 0.060 + WORSE * 0.05
+    assert allowed_N(0.048, 0.05) == 0.05, "what the usual way keeps is kept"
+
+
+@pytest.mark.parametrize("name", shipped_scenes())
+def test_every_shipped_scene_is_measured_and_its_choice_follows_from_its_figures(name: str) -> None:
+    scene = load_scene(name)
+    found = measured(scene.fingerprint, scene_path(name).parent)
+    assert found is not None
+    assert found.tolerance_N == scene.force.tolerance_rms_N
+    fits = served_like(found.served, found.tolerance_N, scene.bandwidth)
+    cheapest = min(fits, key=lambda each: each.way.sum_hz)
+    assert found.chosen == (cheapest if found.judged[0].way == cheapest.way else found.usual)
+    assert {each.device for each in found.served}.isdisjoint(each.device for each in found.judged)
+
+
+def test_a_daemon_runs_at_the_rates_that_measuring_chose_if_they_are_higher(write: Write) -> None:
+    path = Path(write(bandwidth__control_hz="500", bandwidth__inference_hz="83"))
+    own, scene = Config(scene=str(path), rates=Rates(of_scene=True)), load_scene(str(path))
+    found = MeasuredScene(scene.fingerprint, 0.05, 100.0, (USUAL, BOTH), (BOTH, USUAL))
+    path.with_suffix(ENDING).write_bytes(msgspec.json.encode(found))
+    rates = at_rates_of(scene, own).rates
+    assert (rates.control_hz, rates.inference_hz) == (500, 500)
+    path.with_suffix(ENDING).write_bytes(b"{}")
+    assert at_rates_of(scene, own).rates.inference_hz == 83
 
 
 # -- the signal --------------------------------------------------------------------------------------------------------

@@ -21,7 +21,6 @@ from tormag_lab.told import lines
 from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG
 from tormagd.config import Config, RealTime, load_config
 from tormagd.control.assembly.build import build_core
-from tormagd.scenes.scene import shipped_scenes
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.parameters import load_plant
 
@@ -108,22 +107,6 @@ def test_the_committed_page_is_of_the_committed_figures() -> None:
     assert inverse.PAGE.read_text(encoding="utf-8") == inverse.page(figures), (
         "python tools/evidence.py inverse writes both anew"
     )
-
-
-SCENE_KEYS = {
-    "name", "terms_in", "terms_out", "control_hz", "inference_hz", "solver", "rms_N", "rms_full_N", "tolerance_N",
-    "cost_us_per_s", "cost_full_us_per_s", "daemon_share", "daemon_share_full", "plan_us", "judged",
-}  # fmt: skip
-
-
-def test_every_scene_has_the_keys_of_the_contract_and_costs_no_more_than_the_usual_way(capsys):
-    assert benchmark.main(["scenes", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert {row["name"] for row in result["scenes"]} <= set(shipped_scenes())
-    for row in result["scenes"]:
-        assert row.keys() >= SCENE_KEYS
-        assert row["daemon_share"] <= row["daemon_share_full"]
-        assert row["cost_us_per_s"] <= row["cost_full_us_per_s"]
 
 
 @pytest.fixture(scope="module")

@@ -90,7 +90,6 @@ class Stand(NamedTuple):
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
     rates_hz: tuple[int, int] = (CONTROL_HZ, CONTROL_HZ)
-    scene: str = Config().scene
 
 
 T = TypeVar("T")
@@ -294,7 +293,6 @@ def hammer(address: str, stop: Event) -> None:
 def write_config(folder: Path, port: str, stand: Stand) -> Path:
     path, realtime, (control_hz, inference_hz) = folder / "tormagd.toml", stand.realtime, stand.rates_hz
     tables = {
-        "scene": stand.scene,
         "device": {"port": port},
         "endpoints": {name: f"ipc://{folder}/{name}" for name in ENDPOINTS},
         "rates": {"control_hz": control_hz, "inference_hz": inference_hz},

@@ -351,14 +351,15 @@ COMMANDS = {
         (option("--port", type=port, metavar="N", help="of 127.0.0.1"),),
     ),
     "scene": Command(
-        "list scenes; show, check, explain, make or use one (default: the configuration's)",
+        "list scenes; show, check, explain, measure, make or use one (default: the configuration's)",
         "scene.scene",
         ("config", "config_file", "endpoints", "wait_s"),
         (
             option(
                 "action",
-                choices=("list", "show", "check", "explain", "new", "use"),
+                choices=("list", "show", "check", "explain", "measure", "new", "use"),
                 help="check: whether daemon and device can serve it. explain: ways to serve it, with error and cost. "
+                "measure: those ways, live beside a simulated device. "
                 "new: ask for the task and write one. use: change to it while disabled",
             ),
             option("name", nargs="?", metavar="NAME|FILE"),

@@ -9,7 +9,7 @@ from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, folded, usage_error
 from tormagd.ctl.scene_check import LONGEST_S, as_toml, check_scene, derived_of, loaded, measured_as, way_of
 from tormagd.ground.machine_loop import machine_us
-from tormagd.scenes.measured import MeasuredScene, OperatingPoint, Tried, measured
+from tormagd.scenes.measured import MeasuredScene, Served
 from tormagd.scenes.scene import load_scene, shipped_scenes
 from tormagd_client.endpoints import Endpoints
 
@@ -29,7 +29,7 @@ def scene(
     wait_s: float,
     **recorded: Any,
 ) -> Outcome:
-    """Do one of list, show, check, explain, new and use; without `name`, for the configuration's scene."""
+    """Do one of list, show, check, explain, measure, new and use; without `name`, for the configuration's scene."""
     named = name or config.scene
     if action == "new":
         if name is None:
@@ -55,6 +55,10 @@ def scene(
             return check_scene(named, config_file)
         case "explain":
             return explain_scene(named, config_file)
+        case "measure":
+            from tormagd.ctl.scene_measure import measure_scene
+
+            return measure_scene(named)
     from tormagd_client.blocking import Client
 
     with Client(endpoints, wait_s) as client:
@@ -95,55 +99,37 @@ def show_scene(name: str) -> Outcome:
 
 
 def explain_scene(name: str, config: Path | None) -> Outcome:
-    """Show every measured way to serve a scene, the chosen one, and how well it served other signals."""
-    file = measured()
-    found = measured_as(loaded(name), file)
-    derived = derived_of(name, config)
-    tolerance_N = found.tolerance_N
+    """Show every measured way to serve a scene, the chosen one, and how well it does on a device that chose nothing."""
+    scene, derived = loaded(name), derived_of(name, config)
+    found = measured_as(name, scene)
     runs, machine = way_of(derived), machine_us()
-    shares = {each.way: file.daemon_share(each.way, machine) for each in found.tried}
+    scale, offered, chosen = machine / found.machine_us, found.offered(scene.bandwidth), found.chosen
     lines = [
-        f"{found.name}: tolerance {1e3 * tolerance_N:g} mN RMS",
+        f"{scene.name}: tolerance {1e3 * found.tolerance_N:g} mN RMS",
         "",
-        f"{'way':28} {'samples 1 to 3, mN':>22} {'of a processor':>15}",
-        *(_tried(each, shares[each.way], found, runs) for each in found.tried),
+        f"{'mN RMS':26} {' '.join(f'{each:>8}' for each in found.usual.rms_N)} {'share':>7}",
+        *(_row(each, scale, _marks(each, found, each.way == runs, each in offered)) for each in found.served),
         "",
-        *_cheaper(found, shares),
-        *([] if found.is_met else ["NOT MET: the usual way itself is over the tolerance", ""]),
-        f"{'chosen, judged':28} {'worst device':>14} {'chosen':>10} {'usual':>10}",
+        f"on {found.judged[0].device}, which chose nothing:",
+        *(_row(each, scale) for each in found.judged),
+        "",
+        *([] if found.is_met else ["NOT MET: the usual way itself is over the tolerance\n"]),
         *(
-            f"{item.signal + ('' if item.learning else ', frozen'):28} {item.device:>14} {1e3 * item.rms_N:7.1f} mN "
-            f"{1e3 * item.usual_N:7.1f} mN"
-            for item in found.judged
+            [f"The scene states {runs}; {chosen.way} serves it for {chosen.share * scale:.1%}.\n"]
+            if runs != chosen.way
+            else []
         ),
-        "",
-        "Shares: the daemon's processes, live on the simulated device, with as many setpoints as plans; scaled from a",
-        f"machine_us of {file.machine_us:g} to this machine's {machine:.0f}.",
+        "Live beside simulated devices: the true force's error in each situation, and what the daemon's processes take",
+        f"of a processor, scaled from a machine_us of {found.machine_us:g} to this machine's {machine:.0f}.",
     ]
-    result = msgspec.to_builtins(found) | {
-        "shares": msgspec.to_builtins(file.shares),
-        "stored_machine_us": file.machine_us,
-        "machine_us": machine,
-        "derived": derived,
-    }
-    return Outcome(result, folded("\n".join(lines)))
+    return Outcome(msgspec.to_builtins(found) | {"here_us": machine, "derived": derived}, folded("\n".join(lines)))
 
 
-def _cheaper(found: MeasuredScene, shares: dict[OperatingPoint, float | None]) -> list[str]:
-    """Return a line on each way that is as exact as the chosen one, to 0.1 mN, for less."""
-    most_N, most = round(found.of(found.chosen).worst_N, 4), shares[found.chosen] or 0.0
-    cheaper = (
-        (each.way, share)
-        for each in found.offered
-        if round(each.worst_N, 4) <= most_N and (share := shares[each.way]) and share < most
-    )
-    return [f"The scene states its search; {way} is as exact for {share:.1%}.\n" for way, share in cheaper]
+def _row(each: Served, scale: float, marks: str = "") -> str:
+    errors = " ".join(f"{1e3 * error_N:8.1f}" for error_N in each.rms_N.values())
+    return f"{each.way!s:26} {errors} {each.share * scale:7.1%}  {marks}".rstrip()
 
 
-def _tried(tried: Tried, share: float | None, found: MeasuredScene, runs: OperatingPoint) -> str:
-    """Return one way's row: errors on three samples, share of a processor, whether chosen."""
-    marks = [word for way, word in ((found.chosen, "chosen"), (runs, "runs here")) if way == tried.way]
-    marks += [] if tried in found.offered else ["fails a judged case"]
-    errors = " ".join(f"{1e3 * error_N:6.1f}" for error_N in tried.rms_N)
-    taken = "not measured" if share is None else f"{share:.1%}"
-    return f"{tried.way!s:28} {errors:>22} {taken:>15}  {', '.join(marks)}".rstrip()
+def _marks(each: Served, found: MeasuredScene, runs_here: bool, is_offered: bool) -> str:
+    marks = {"chosen": each == found.chosen, "runs here": runs_here, "not offered": not is_offered}
+    return ", ".join(word for word, holds in marks.items() if holds)

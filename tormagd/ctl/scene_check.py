@@ -8,8 +8,8 @@ from msgspec import UNSET
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, answer_of, as_usage_error, folded
 from tormagd.ground.machine_loop import machine_us
-from tormagd.scenes.measured import MeasuredScene, Measurements, OperatingPoint, measured
-from tormagd.scenes.scene import Force, Scene, load_scene
+from tormagd.scenes.measured import MeasuredScene, OperatingPoint, measured
+from tormagd.scenes.scene import Force, Scene, load_scene, scene_path
 from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 30.0
@@ -21,7 +21,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     scene = loaded(name)
     derived = derived_of(name, config)
     sent_hz = UNSET if scene.signal is None else scene.signal.setpoint_hz
-    share, plans_hz = _price(derived, 0.0 if sent_hz is UNSET else sent_hz)
+    share, plans_hz = _price(name, scene, derived, 0.0 if sent_hz is UNSET else sent_hz)
     if share is not None and share > scene.budget.core_share:
         raise CommandError(
             Exit.REFUSED,
@@ -61,11 +61,12 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     return Outcome(result, folded("\n".join(lines)))
 
 
-def _price(derived: dict[str, Any], sent_hz: float) -> tuple[float | None, float]:
+def _price(name: str, scene: Scene, derived: dict[str, Any], sent_hz: float) -> tuple[float | None, float]:
     """Return the share of this machine's processor, if it was measured, and the plans a second that it is for."""
     way = way_of(derived)
     plans_hz = max(way.inference_hz, sent_hz if derived["plan_every_setpoint"] else 0.0)
-    return None if derived["terms_out"] else measured().daemon_share(way, machine_us(), plans_hz), plans_hz
+    found = None if derived["terms_out"] else measured(scene.fingerprint, scene_path(name).parent)
+    return None if found is None else found.share_of(way, machine_us(), plans_hz), plans_hz
 
 
 def torque_range(scene: Scene) -> str:
@@ -113,15 +114,15 @@ def way_of(derived: dict[str, Any]) -> OperatingPoint:
     return OperatingPoint(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
 
 
-def measured_as(scene: Scene, file: Measurements) -> MeasuredScene:
+def measured_as(name: str, scene: Scene) -> MeasuredScene:
     """Return what was measured of a scene that asks for the same, under whatever name."""
-    found = file.scene(scene.fingerprint)
+    found = measured(scene.fingerprint, scene_path(name).parent)
     if found is None:
         raise CommandError(
             Exit.REFUSED,
             "not_measured",
             f"scene {scene.name} was not measured as it is now",
-            "tormagctl guide scene says how that is done, in some minutes",
+            f"tormagctl scene measure {name}: about two minutes",
         )
     return found
 

@@ -1,9 +1,23 @@
-"""Figures from `tools/benchmark.py scenes`: how exactly and at what cost each scene is served, and what was chosen."""
+"""What `tormagctl scene measure` found of a scene, in a file beside it: error and price of each way, of one live run.
 
-from importlib import resources
+Of a way, the worst situation counts. The devices that choose do not judge.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
 from msgspec import Struct
+
+from tormagd.ground.files import read_bounded
+from tormagd.scenes.scene import Bandwidth
+
+TOLERATED = 0.8
+"An error within this share of the tolerance may be chosen."
+WORSE = 0.2
+"An error that exceeds the usual way's by this share of the tolerance may be chosen."
+ENDING = ".measured.json"
+LONGEST = 100_000
 
 
 class OperatingPoint(Struct, frozen=True):
@@ -13,112 +27,92 @@ class OperatingPoint(Struct, frozen=True):
 
     @property
     def sum_hz(self) -> int:
-        """Order in which ways are judged: the first that serves every case is chosen."""
         return self.control_hz + self.inference_hz
 
     def __str__(self) -> str:
         return f"{self.control_hz} / {self.inference_hz} Hz, {self.search}"
 
 
-class Share(Struct, frozen=True):
-    """The processor time of a daemon that serves a scene in one way on the simulated device."""
+class Served(Struct, frozen=True):
+    """One live run: errors by situation, and the share of a processor that the daemon took."""
 
     way: OperatingPoint
-    daemon: float
-    tick_us: float
+    device: str
+    rms_N: dict[str, float]
+    share: float
     plan_us: float
 
     @property
-    def ticks_us_s(self) -> float:
-        return self.way.control_hz * self.tick_us
-
-
-class Tried(Struct, frozen=True):
-    way: OperatingPoint
-    rms_N: tuple[float, ...]
-
-    @property
     def worst_N(self) -> float:
-        return max(self.rms_N)
-
-
-class WorstDevice(Struct, frozen=True):
-    group: str
-    device: str
-    signal: str
-    learning: bool
-    rms_N: float
-    usual_N: float
+        return max(self.rms_N.values())
 
 
 class MeasuredScene(Struct, frozen=True):
-    name: str
+    """The runs that choose, the usual first, and that judge, the chosen first."""
+
     fingerprint: str
     tolerance_N: float
-    chosen: OperatingPoint
-    tried: tuple[Tried, ...]
-    judged: tuple[WorstDevice, ...]
+    machine_us: float
+    "See `tormagd.ground.machine_loop`."
+    served: tuple[Served, ...]
+    judged: tuple[Served, ...]
 
     @property
-    def usual(self) -> Tried:
-        return self.tried[0]
+    def usual(self) -> Served:
+        return self.served[0]
+
+    @property
+    def chosen(self) -> Served:
+        return self.of(self.judged[0].way)
 
     @property
     def is_met(self) -> bool:
-        return self.usual.worst_N <= self.tolerance_N
+        return self.usual.rms_N["signal"] <= self.tolerance_N
 
-    def of(self, way: OperatingPoint) -> Tried:
-        return next(each for each in self.tried if each.way == way)
+    def of(self, way: OperatingPoint) -> Served:
+        return next(each for each in self.served if each.way == way)
 
-    @property
-    def offered(self) -> tuple[Tried, ...]:
-        """Those with no lower rates than the chosen way's: a lower one failed a case that the chosen way passes."""
-        return tuple(each for each in self.tried if each.way.sum_hz >= self.chosen.sum_hz)
+    def offered(self, least: Bandwidth) -> tuple[Served, ...]:
+        """The ways at these rates or more that nothing refused."""
+        fits = served_like(self.served, self.tolerance_N, least)
+        return tuple(each for each in fits if each.way.sum_hz >= self.chosen.way.sum_hz)
 
-
-class Measurements(Struct, frozen=True):
-    """The file of measurements: how it was made, what each way costs, and every scene."""
-
-    command: str
-    machine_us: float
-    "See `tormagd.ground.machine_loop`."
-    pairs: int
-    "Runs of each way that a share is the median of."
-    draws: int
-    "Devices from the plant card that decided; twice as many judged."
-    shares: tuple[Share, ...]
-    scenes: tuple[MeasuredScene, ...]
-
-    def share(self, way: OperatingPoint) -> Share | None:
-        return next((each for each in self.shares if each.way == way), None)
-
-    def daemon_share(self, way: OperatingPoint, machine_us: float, plans_hz: float | None = None) -> float | None:
+    def share_of(self, way: OperatingPoint, machine_us: float, plans_hz: float) -> float | None:
         """Return what the daemon takes of a processor of `machine_us`: a line through the measured rates of plans."""
-        plans_hz = way.inference_hz if plans_hz is None else plans_hz
-        alike = [each for each in self.shares if (each.way.control_hz, each.way.search) == (way.control_hz, way.search)]
-        found = sorted((each.way.inference_hz, each.daemon) for each in alike)
-        if not found or (len(found) == 1 and plans_hz > way.inference_hz):
+        alike = [each for each in self.served if (each.way.control_hz, each.way.search) == (way.control_hz, way.search)]
+        found = sorted((each.way.inference_hz, each.share) for each in alike)
+        if not found or (len(found) == 1 and plans_hz > found[0][0]):
             return None
         (low_hz, low), (high_hz, high) = found[0], found[-1]
         slope = (high - low) / (high_hz - low_hz) if len(found) > 1 else 0.0
         return (low + slope * (plans_hz - low_hz)) * machine_us / self.machine_us
 
-    def scene(self, fingerprint: str) -> MeasuredScene | None:
-        return next((each for each in self.scenes if each.fingerprint == fingerprint), None)
 
-
-FILE = "measured.json"
-TOLERATED = 0.8
-"An error within this share of the tolerance may be chosen."
-WORSE = 0.2
-"An error that exceeds the usual way's by this share of the tolerance may be chosen."
-
-
-def measured() -> Measurements:
-    return msgspec.json.decode((resources.files(__package__) / FILE).read_bytes(), type=Measurements)
+def served_like(served: Sequence[Served], tolerance_N: float, least: Bandwidth) -> list[Served]:
+    """Return the ways at these rates or more whose signal and worst error are like the first, the usual one's."""
+    return [
+        each
+        for each in served
+        if each.way.control_hz >= least.control_hz
+        and each.way.inference_hz >= least.inference_hz
+        and each.rms_N["signal"] <= allowed_N(served[0].rms_N["signal"], tolerance_N)
+        and each.worst_N <= allowed_N(served[0].worst_N, tolerance_N)
+    ]
 
 
 def allowed_N(usual_N: float, tolerance_N: float) -> float:
     """Return the greatest error of a way that may replace the usual one."""
     most_N = max(TOLERATED * tolerance_N, usual_N + WORSE * tolerance_N)
     return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N
+
+
+def measured(fingerprint: str, folder: Path) -> MeasuredScene | None:
+    """Return what was measured of a scene that asks for the same."""
+    for path in (*sorted(folder.glob(f"*{ENDING}")), *sorted(Path(__file__).parent.glob(f"*{ENDING}"))):
+        try:
+            found = msgspec.json.decode(read_bounded(path, LONGEST), type=MeasuredScene)
+        except (OSError, msgspec.DecodeError):
+            continue  # of another version
+        if found.fingerprint == fingerprint:
+            return found
+    return None

@@ -26,7 +26,7 @@ from tormagd.simulation.emulated_firmware import EmulatedFirmware, EmulationErro
 from tormagd.simulation.faults import FORMS as KNOWN_FAULTS, FaultError, parse_fault
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
-from tormagd.simulation.parameters import PlantError, load_plant, plant_names
+from tormagd.simulation.parameters import PLANTS_INSERT, PlantError, load_plant, plant_names, with_insert
 from tormagd.simulation.pty_port import PtyPort
 from tormagd.simulation.real_time import Door, PacedDevice, serve
 from tormagd.simulation.slcan_port import SlcanPort
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
     """Build the device that the options ask for, and open its door."""
     boot = FIRMWARES[options.firmware]
-    plant = load_plant(options.plant)
+    plant = with_insert(load_plant(options.plant), options.insert)
     hand = parse_hand(options.hand or ("steady" if plant.pad is None else "pressing"))
     faults = [parse_fault(spec) for spec in options.fault]
     door: Door
@@ -100,6 +100,7 @@ def parser() -> argparse.ArgumentParser:
         help="CAN bus for python-can's interface tormagsim; prints its channel",
     )
     made.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
+    made.add_argument("--insert", default=PLANTS_INSERT, metavar="NAME", help=f"default {PLANTS_INSERT}; of a brake")
     made.add_argument("--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing")
     made.add_argument(
         "--fault",

@@ -30,6 +30,7 @@ from tormagd.element.physics.errors import DomainError, require
 from tormagd.element.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
 from tormagd.element.physics.force import Geometry
 from tormagd.element.physics.inserts import insert
+from tormagd.scenes.measured import measured
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Finger, Scene, load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
@@ -244,9 +245,13 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
 def at_rates_of(scene: Scene, config: Config) -> Config:
     if not config.rates.of_scene:
         return config
-    needed = scene.bandwidth
-    control_hz = max(needed.control_hz, MIN_CONTROL_HZ)
-    rates = msgspec.structs.replace(config.rates, control_hz=control_hz, inference_hz=needed.inference_hz)
+    found = measured(scene.fingerprint, scene_path(config.scene).parent)
+    least, chosen = scene.bandwidth, scene.bandwidth if found is None else found.chosen.way
+    rates = msgspec.structs.replace(
+        config.rates,
+        control_hz=max(least.control_hz, chosen.control_hz, MIN_CONTROL_HZ),
+        inference_hz=max(least.inference_hz, chosen.inference_hz),
+    )
     try:
         return msgspec.structs.replace(config, rates=rates)
     except ValueError as error:

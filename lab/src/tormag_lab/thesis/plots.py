@@ -1,5 +1,7 @@
 """The pictures of docs/reproduction.md."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +19,14 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
-    return {
-        "table_2_4": _table_2_4(result["table_2_4"]),
-        "figure_2_5": _figure_2_5(result["figure_2_5"]),
-        "figure_2_7": _figure_2_7(result["figure_2_7"], tests),
-        "figure_3_2": _figure_3_2(result["table_3_2"]),
-        "figure_3_4": _figure_3_4(result["table_3_2"]),
+    drawn: dict[str, tuple[str, Callable[[Json], Figure]]] = {
+        "table_2_4": ("table_2_4", _table_2_4),
+        "figure_2_5": ("figure_2_5", _figure_2_5),
+        "figure_2_7": ("figure_2_7", partial(_figure_2_7, tests=tests)),
+        "figure_3_2": ("table_3_2", _figure_3_2),
+        "figure_3_4": ("table_3_2", _figure_3_4),
     }
+    return {name: draw(result[part]) for name, (part, draw) in drawn.items() if part in result}
 
 
 def _table_2_4(table: Json) -> Figure:

@@ -1,0 +1,308 @@
+"""`tormagctl scene measure`: a scene served live beside simulated devices, in each way: error and price of one run.
+
+This process publishes to a daemon of its own: the scene's signal, the same seldom, steps, a wall that the handle meets.
+Nothing counts that the gap's speed alone decides: a step does from COMES_S on, a wall's force rises in CONTACT_S.
+"""
+
+import contextlib
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import UNSET
+
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
+from tormagd.ctl.scene_check import as_toml, derived_of, loaded
+from tormagd.ctl.scene_served import write_scene
+from tormagd.ground.files import in_place_of
+from tormagd.ground.machine_loop import machine_us
+from tormagd.ground.terminal import write_line
+from tormagd.scenes.measured import ENDING, MeasuredScene, OperatingPoint, Served, served_like
+from tormagd.scenes.scene import MIN_CONTROL_HZ, Scene, scene_path
+from tormagd.scenes.signal import asked
+from tormagd_client.blocking import Client
+from tormagd_client.endpoints import ENDPOINTS
+from tormagd_client.messages import Contact
+
+RATES_HZ = (1_000, 500), (500, 500), (500, 83)
+"Of control and plans; the usual first."
+CHOOSES, JUDGES = 2, 3
+"Samples; models learned from the first."
+DENSE_HZ, PREVIEW_S, PREVIEW_STEP_S = 1_000, 0.4, 0.02
+SELDOM_HZ = 20.0
+STEP_S, COMES_S, STEPS = 2.0, 1.5, (0.8, 0.2)
+"Shares of the range."
+CONTACT_S = 2.0
+LASTS_S = {"approach": 2.0, "signal": 7.0, "seldom": 2.0, "steps": len(STEPS) * STEP_S, "contact": CONTACT_S + 0.2}
+PRESSES_S = 7.0
+"A finger comes late: the approach of a pad lasts so much longer."
+LEARN_S = 4.0
+"In the approach, and so long in the signal, it learns."
+PRICED, LOOKS_HZ = ("signal", "steps"), 2.0
+"Where setpoints come as often as plans; meanwhile the machine is looked at."
+OPEN_MM = 0.1
+"A gap so near its end is open: excess force is the device's."
+VALID_FOR_MS = 200.0
+STARTS_S, LOOK_S, ENDS_S = 30.0, 0.05, 10.0
+FIFO = 50
+
+
+class Part(NamedTuple):
+    """One situation of a run."""
+
+    name: str
+    begins_s: float
+    ends_s: float
+    sent_hz: float
+    preview_s: float = 0.0
+
+
+class Course(NamedTuple):
+    """Forces at DENSE_HZ; the first part does not count."""
+
+    time_s: npt.NDArray[np.float64]
+    force_N: npt.NDArray[np.float64]
+    parts: tuple[Part, ...]
+
+
+class Heard(NamedTuple):
+    """The plant's true state over a run, the daemon's last status; when it began, and met the wall, CLOCK_REALTIME."""
+
+    truth: Any
+    status: dict[str, Any]
+    start_ns: int
+    met_ns: int
+    share: float
+    machine_us: float
+
+
+def measure_scene(name: str) -> Outcome:
+    """Measure the scene live, and keep what was found beside it."""
+    scene, derived, out = loaded(name), derived_of(name, None), scene_path(name).with_suffix(ENDING)
+    if scene.signal is None:
+        raise usage_error(
+            f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for",
+            "tormagctl guide scene says how one is stated",
+        )
+    range_N = max(scene.force.least_N, derived["least_N"]), min(scene.force.most_N, derived["most_N"])
+    ways, least, tolerance_N = ways_of(scene, derived["solver"]["solver"]), scene.bandwidth, scene.force.tolerance_rms_N
+    machines = list[float]()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what was begun is ended
+
+    def run(way: OperatingPoint, sample: int) -> Served:
+        found, machine = served(name, scene, way, sample, range_N)
+        machines.append(machine)
+        errors = ", ".join(f"{situation} {1e3 * error_N:.1f}" for situation, error_N in found.rms_N.items())
+        write_line(f"{way} on {found.device}: {errors} mN, {found.share:.1%} of a processor", sys.stderr)
+        return found
+
+    write_line(f"{scene.name}: up to {len(ways) + 2} live runs of about {sum(LASTS_S.values()) + 4:.0f} s", sys.stderr)
+    tried = [run(way, CHOOSES) for way in ways]
+    cheapest = min(served_like(tried, tolerance_N, least), key=lambda each: each.way.sum_hz)
+    judged = [run(way, JUDGES) for way in dict.fromkeys((cheapest.way, ways[0]))]
+    if judged[0] not in served_like(judged[::-1], tolerance_N, least):
+        judged.reverse()
+    machine = round(statistics.median(machines), 1)
+    found = MeasuredScene(scene.fingerprint, tolerance_N, machine, tuple(tried), tuple(judged))
+    with as_usage_error(OSError, hint="copy the scene to a folder that you may write to"), in_place_of(out) as beside:
+        beside.write_bytes(msgspec.json.format(msgspec.json.encode(found), indent=1) + b"\n")
+    return Outcome(
+        msgspec.to_builtins(found) | {"file": str(out)},
+        f"{out} is written; chosen: {found.chosen.way}. tormagctl scene explain {name} shows all",
+    )
+
+
+def ways_of(scene: Scene, runs: str) -> list[OperatingPoint]:
+    """Return the ways to try, the usual one first."""
+    # newton is refused where none but nearest is chosen
+    first, *others = [runs] if runs == "nearest" != scene.solver.name else dict.fromkeys(["newton", "nearest", runs])
+    stated_hz = max(scene.bandwidth.control_hz, MIN_CONTROL_HZ), scene.bandwidth.inference_hz
+    usual_hz = max(stated_hz[0], RATES_HZ[0][0]), max(stated_hz[1], RATES_HZ[0][1])
+    ways = [OperatingPoint(*hz, first) for hz in dict.fromkeys((usual_hz, *RATES_HZ[1:], stated_hz))]
+    return ways + [OperatingPoint(*stated_hz, search) for search in others]
+
+
+def served(
+    name: str, scene: Scene, way: OperatingPoint, sample: int, range_N: tuple[float, float]
+) -> tuple[Served, float]:
+    """Return errors and price of one run, and `machine_us` meanwhile."""
+    course = course_of(name, scene, way, range_N)
+    heard = _heard(name, scene, way, sample, course)
+    if heard.status["faults"]:  # a busy host causes some
+        heard = _heard(name, scene, way, sample, course)
+    if heard.status["faults"]:  # no force at all
+        rms_N = {part.name: range_N[1] for part in course.parts[1:]}
+    else:
+        rms_N = errors_N(course, heard, scene, range_N)
+    plan_us = heard.status["rates"]["inference"]["exec_us"]["p50"]
+    share, machine = round(heard.share, 4), heard.machine_us
+    return Served(way, f"{_kind(scene)}_{sample}", rms_N, share, plan_us), machine
+
+
+def _kind(scene: Scene) -> str:
+    return "pad" if scene.element == "tactile" else "sample"
+
+
+def course_of(name: str, scene: Scene, way: OperatingPoint, range_N: tuple[float, float]) -> Course:
+    assert scene.signal is not None, "its forces are asked for"
+    low_N, high_N = range_N
+    lasts = LASTS_S | {"approach": LASTS_S["approach"] + (PRESSES_S if scene.element == "tactile" else 0.0)}
+    counts = {part: round(lasts_s * DENSE_HZ) for part, lasts_s in lasts.items()}
+    played = counts["signal"] + counts["seldom"]
+    _, signal_N = asked(scene.signal, scene_path(name).parent, range_N, played / DENSE_HZ, DENSE_HZ)
+    signal_N = np.resize(signal_N, played)
+    step_N = low_N + (high_N - low_N) * np.repeat(STEPS, counts["steps"] // len(STEPS))
+    approach_N, contact_N = np.full(counts["approach"], signal_N[0]), np.full(counts["contact"], low_N)
+    force_N = np.concatenate([approach_N, signal_N, step_N, contact_N])
+    usual_hz = (
+        way.inference_hz if scene.signal.setpoint_hz is UNSET else min(scene.signal.setpoint_hz, way.inference_hz)
+    )
+    parts, begins_s = [], 0.0
+    for part, lasts_s in lasts.items():
+        hz = min(SELDOM_HZ, usual_hz) if part == "seldom" else usual_hz
+        preview_s = PREVIEW_S if scene.signal.is_known_ahead and part in ("signal", "seldom") else 0.0
+        parts.append(Part(part, begins_s, begins_s + lasts_s, hz, preview_s))
+        begins_s += lasts_s
+    if scene.element == "tactile":  # a finger in a pad meets no wall
+        parts.pop()
+    return Course(np.arange(len(force_N)) / DENSE_HZ, force_N, tuple(parts))
+
+
+def errors_N(course: Course, heard: Heard, scene: Scene, range_N: tuple[float, float]) -> dict[str, float]:
+    """Return the RMS of true less asked force by situation."""
+    truth, found = heard.truth, dict[str, float]()
+    time_s = (truth["t_ns"] - heard.start_ns) * 1e-9
+    for name, begins_s, ends_s, *_ in course.parts[1:]:
+        inside = (time_s >= begins_s) & (time_s < ends_s)
+        wanted_N = np.interp(time_s, course.time_s, course.force_N)
+        if name == "signal":
+            inside &= time_s >= begins_s + LEARN_S
+        if name == "steps":
+            inside &= (time_s - begins_s) % STEP_S >= COMES_S
+        if name == "contact":
+            depth_mm = truth["handle_mm"] - np.interp(heard.met_ns, truth["t_ns"], truth["handle_mm"])
+            wanted_N = np.clip(_stiffness_N_mm(scene) * depth_mm, *range_N)
+        error_N = (truth["force_N"] - wanted_N)[inside]
+        is_least = (truth["gap_mm"][inside] >= scene.insert.gap_open_mm - OPEN_MM) & (error_N > 0.0)
+        found[name] = round(float(np.sqrt(np.mean(np.where(is_least, 0.0, error_N) ** 2))), 5)
+    return found
+
+
+def _stiffness_N_mm(scene: Scene) -> float:
+    return scene.force.most_N / (CONTACT_S * scene.handle.most_mm_s)
+
+
+def _heard(name: str, scene: Scene, way: OperatingPoint, sample: int, course: Course) -> Heard:
+    with tempfile.TemporaryDirectory(prefix="tormag-") as made, contextlib.ExitStack() as stack:
+        folder = Path(made)
+        port = _device(stack, folder, scene, sample)
+        write_scene(name, way, folder / "scene.toml")
+        tables = {
+            "scene": str(folder / "scene.toml"),
+            "device": {"backend": "can", "port": port},
+            "device.options": {"interface": "tormagsim"},
+            "endpoints": {each: f"ipc://{folder}/{each}" for each in ENDPOINTS},
+            "rates": {"control_hz": way.control_hz, "inference_hz": way.inference_hz},
+            "realtime": {"fifo_priority": FIFO, "lock_memory": True},
+        }
+        (folder / "tormagd.toml").write_text(as_toml(tables), encoding="utf-8")
+        daemon = _begun(stack, folder, "tormagd.daemon.main", "--config", str(folder / "tormagd.toml"))
+        client = stack.enter_context(contextlib.closing(Client.local(str(folder), STARTS_S, "measure")))
+        _arm(client, daemon, folder)
+        played = _play(client, course, scene, daemon.pid)
+        status = client.request("status")
+        stack.close()  # the device writes the rest as it ends
+        truth = np.genfromtxt(folder / "truth.csv", delimiter=",", names=True)
+    return Heard(truth, status, *played)
+
+
+def _device(stack: contextlib.ExitStack, folder: Path, scene: Scene, sample: int) -> str:
+    hand = f"steady={scene.handle.most_mm_s:g}" if scene.finger is UNSET else f"pressing={scene.finger.depth_mm:g}"
+    plant = ["--plant", f"{_kind(scene)}_{sample}", "--hand", hand]
+    plant += ["--insert", scene.insert.name] if scene.element == "torque" else []
+    device = _begun(stack, folder, "tormagd.simulation", "--can", "--truth", str(folder / "truth.csv"), *plant)
+    assert device.stdout is not None, "it is read"
+    _as_another_machine(device.pid, FIFO - 10)
+    if not (port := device.stdout.readline().strip()):
+        raise _ended("the simulated device", folder)
+    return port
+
+
+def _begun(stack: contextlib.ExitStack, folder: Path, *arguments: str) -> "subprocess.Popen[str]":
+    with (folder / "log").open("a", encoding="utf-8") as log:
+        command = [sys.executable, "-P", "-m", *arguments]
+        child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+
+    def end() -> None:
+        child.terminate()
+        try:
+            child.wait(ENDS_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+    stack.callback(end)
+    return child
+
+
+def _as_another_machine(pid: int, priority: int) -> None:
+    """Let a process run first, if the kernel grants it."""
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(pid, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+
+
+def _ended(what: str, folder: Path) -> CommandError:
+    said = (folder / "log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return CommandError(Exit.REFUSED, "not_measured", f"{what} ended: {said[-1] if said else ''}", "try it again")
+
+
+def _arm(client: Client, daemon: "subprocess.Popen[str]", folder: Path) -> None:
+    until_s = time.monotonic() + STARTS_S
+    while client.status().link.state != "RUNNING":
+        if daemon.poll() is not None or time.monotonic() > until_s:
+            raise _ended("the daemon", folder)
+        time.sleep(LOOK_S)
+    client.arm(STARTS_S)
+
+
+def _play(client: Client, course: Course, scene: Scene, pid: int) -> tuple[int, int, float, float]:
+    _as_another_machine(0, FIFO - 20)
+    start_s, start_ns, met_ns = time.monotonic(), time.time_ns(), 0
+    spent_s, took_s, machine = 0.0, 0.0, list[float]()
+    for part in course.parts:
+        fields: dict[str, Any] = {}
+        if part.name == "contact":
+            met = client.status()
+            met_ns = met.t_ns
+            fields = {"contact": Contact(handle_mm=met.handle_mm or 0.0, stiffness_N_mm=_stiffness_N_mm(scene))}
+        begun_s, before_s = time.monotonic(), processor_s(pid)
+        for at_s in np.arange(part.begins_s, part.ends_s, 1.0 / part.sent_hz):
+            time.sleep(max(start_s + at_s - time.monotonic(), 0.0))
+            if part.preview_s:
+                ahead_s = at_s + PREVIEW_STEP_S * np.arange(1, round(part.preview_s / PREVIEW_STEP_S) + 1)
+                ahead_N = np.interp(ahead_s, course.time_s, course.force_N)
+                fields = {"preview_N": tuple(ahead_N.tolist()), "preview_dt_ms": 1e3 * PREVIEW_STEP_S}
+            force_N = float(np.interp(at_s, course.time_s, course.force_N))
+            client.publish(force_N, VALID_FOR_MS, start_ns + round(at_s * 1e9), **fields)
+            if part.name in PRICED and (at_s - course.parts[1].begins_s) * LOOKS_HZ >= len(machine):
+                machine.append(machine_us(1))
+        if part.name in PRICED:
+            spent_s, took_s = spent_s + processor_s(pid) - before_s, took_s + time.monotonic() - begun_s
+    return start_ns, met_ns, spent_s / took_s, statistics.median(machine)
+
+
+def processor_s(pid: int) -> float:
+    """Return the processor time of a process and its children, s (proc_pid_stat(5))."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+    children = (Path(f"/proc/{pid}/task") / str(pid) / "children").read_text(encoding="ascii").split()
+    ticks = sum(int(field) for field in fields[11:15]) / os.sysconf("SC_CLK_TCK")
+    return ticks + sum(processor_s(int(child)) for child in children)
