@@ -8,6 +8,7 @@ import pytest
 
 from tormag_lab.main import main
 from tormag_lab.training.dataset import read_csv
+from tormagd.ground.table import QUANTITIES, Wanted, read_table
 
 
 def measured() -> dict[str, np.ndarray]:
@@ -179,3 +180,17 @@ def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: floa
     assert code == 0
     assert json.loads(capsys.readouterr().out)["left_out"] == {"missing": 0, "duplicate": 0, "outlier": 0}
     assert read_csv(out).force_N == pytest.approx(1.0 + 0.001 * step, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("heading", "unit", "quantity", "worth"),
+    [
+        *(("F", unit, "force_N", worth) for unit, worth in (("mN", 1e-3), ("kN", 1e3), ("lbf", 4.4482216), ("N", 1.0))),
+        *(("B", unit, "field_mT", worth) for unit, worth in (("mT", 1.0), ("T", 1e3), ("G", 0.1))),
+        *(("x", unit, "displacement_mm", worth) for unit, worth in (("mm", 1.0), ("\u00b5m", 1e-3), ("m", 1e3))),
+    ],
+)
+def test_a_unit_is_worth_what_it_is(tmp_path: Path, heading: str, unit: str, quantity: str, worth: float) -> None:
+    (tmp_path / "f.csv").write_text(f"t_s,{heading} [{unit}]\n0,1\n1,2\n", encoding="utf-8")
+    wanted = Wanted({name: QUANTITIES[name] for name in ("time_s", quantity)})
+    assert read_table(tmp_path / "f.csv", wanted, 1_000).values[quantity] == pytest.approx([worth, 2.0 * worth])

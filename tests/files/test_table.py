@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tormagd.ground.force_file import read_column, read_forces
-from tormagd.ground.table import QUANTITIES, TableError, Wanted, read_table
+from tormagd.ground.table import TableError
 
 ROWS = [(0.01 * row, 1.5 + 0.3 * math.sin(row)) for row in range(100)]
 
@@ -81,17 +81,3 @@ def test_a_heading_of_any_length_is_read_at_once(tmp_path: Path, name: str) -> N
     (tmp_path / "f.csv").write_text(f"t_s,{name}\n0,1\n1,1\n")
     with pytest.raises(TableError, match=r"no column is force_N \(force, load"):
         read_forces(tmp_path / "f.csv")
-
-
-@pytest.mark.parametrize(
-    ("heading", "unit", "quantity", "worth"),
-    [
-        *(("F", unit, "force_N", worth) for unit, worth in (("mN", 1e-3), ("kN", 1e3), ("lbf", 4.4482216), ("N", 1.0))),
-        *(("B", unit, "field_mT", worth) for unit, worth in (("mT", 1.0), ("T", 1e3), ("G", 0.1))),
-        *(("x", unit, "displacement_mm", worth) for unit, worth in (("mm", 1.0), ("\u00b5m", 1e-3), ("m", 1e3))),
-    ],
-)
-def test_a_unit_is_worth_what_it_is(tmp_path: Path, heading: str, unit: str, quantity: str, worth: float) -> None:
-    (tmp_path / "f.csv").write_text(f"t_s,{heading} [{unit}]\n0,1\n1,2\n", encoding="utf-8")
-    wanted = Wanted({name: QUANTITIES[name] for name in ("time_s", quantity)})
-    assert read_table(tmp_path / "f.csv", wanted, 1_000).values[quantity] == pytest.approx([worth, 2.0 * worth])

@@ -11,7 +11,6 @@ from firmware_protocol.generate import main
 from firmware_protocol.python_source import python_files
 
 ROOM = Path(__file__).parents[2] / "firmware_protocol"
-"The checkout's: a wheel has no README."
 
 
 @pytest.fixture

@@ -167,8 +167,6 @@ def published_sum_N(gap_mm: float, magnet: CuboidMagnet) -> Any:
     return mp.mpf(magnet.remanence_T) ** 2 / (16 * mp.pi**2 * mp.mpf(10) ** -7) * total
 
 
-
-
 def test_agrees_with_the_published_sum_for_any_block_out_to_the_last_gap() -> None:
     rng = np.random.default_rng(1)
     for edges_m in 10 ** rng.uniform(-3.0, 0.0, (60, 3)):
