@@ -156,7 +156,7 @@ wheels: | $(BIN)/python
 parts: $(addprefix part-,client tormagd lab)
 part-client: WHEELS = $$(echo build/wheels/tormagd_client-*.whl)
 part-client: TESTS = client/tests
-part-tormagd: WHEELS = $$(echo build/wheels/tormagd_client-*.whl build/wheels/tormagd-*.whl)[test]
+part-tormagd: WHEELS = $$(echo build/wheels/tormagd_client-*.whl build/wheels/tormagd-*.whl)[man,test]
 part-tormagd: TESTS = tests --ignore tests/tools --ignore tests/docs
 part-lab: WHEELS = $$(echo build/wheels/tormagd*.whl build/wheels/tormag_lab-*.whl)[all]
 part-lab: TESTS = lab/tests

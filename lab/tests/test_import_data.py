@@ -8,6 +8,7 @@ import pytest
 
 from tormag_lab.main import main
 from tormag_lab.training.dataset import read_csv
+from tormagd.ground.table import QUANTITIES, Wanted, read_table
 
 
 def measured() -> dict[str, np.ndarray]:
@@ -181,31 +182,15 @@ def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: floa
     assert read_csv(out).force_N == pytest.approx(1.0 + 0.001 * step, rel=1e-4)
 
 
-FORCES = (("N", 1.0), ("mN", 1e3), ("kN", 1e-3), ("lbf", 1.0 / 4.4482216152605), ("", 1.0), ("oz", 3.6))
-FIELDS = (("mT", 1.0), ("T", 1e-3), ("G", 10.0), ("", 1e-3))
-PLACES = (("mm", 1.0), ("\u00b5m", 1e3), ("m", 1e-3), ("", 1.0))
-LANGUAGES = (("Time", "Force", "Field", "Position"), ("Zeit", "Kraft", "Feld", "Weg"), ("Temps", "Force", "Champ", "x"))
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_a_mutated_file_is_read_as_meant_or_refused(seed: int, tmp_path: Path, capsys) -> None:
-    draw = np.random.default_rng(seed).integers
-    units = [("s", 1.0), FORCES[draw(6)], FIELDS[draw(4)], PLACES[draw(4)]]
-    names, pace, sign, each = LANGUAGES[draw(3)], (0.2, 1.0, 3.0)[draw(3)], (-1.0, 1.0)[draw(2)], int(draw(1, 5))
-    signed = SIGNED if draw(2) else measured()
-    known = (signed["time"] / pace, sign * signed["force"], signed["field"], signed["x"])
-    columns = {
-        f"{name} [{unit}]".removesuffix(" []"): factor * values[::each]
-        for name, (unit, factor), values in zip(names, units, known, strict=True)
-    }
-    comma, encoding = ((".", "utf-8"), (",", "cp1252"), (",", "utf-16"))[draw(3)]
-    code, out = imported(tmp_path, text(columns, ";", comma).encode(encoding))
-    given = [unit for unit, _ in units]
-    if code == 2:
-        assert "state --column" in capsys.readouterr().err
-        assert "" in given or "oz" in given or "Temps" in names
-    else:
-        rows = read_csv(out)
-        assert np.allclose(rows.force_N, 0.002 * rows.features[:, 2] + 0.3, rtol=1e-3)
-        assert 100.0 <= rows.features[:, 2].min() <= rows.features[:, 2].max() <= 700.0
-        assert rows.features[:, 1].max() <= 301.0 * pace
+@pytest.mark.parametrize(
+    ("heading", "unit", "quantity", "worth"),
+    [
+        *(("F", unit, "force_N", worth) for unit, worth in (("mN", 1e-3), ("kN", 1e3), ("lbf", 4.4482216), ("N", 1.0))),
+        *(("B", unit, "field_mT", worth) for unit, worth in (("mT", 1.0), ("T", 1e3), ("G", 0.1))),
+        *(("x", unit, "displacement_mm", worth) for unit, worth in (("mm", 1.0), ("\u00b5m", 1e-3), ("m", 1e3))),
+    ],
+)
+def test_a_unit_is_worth_what_it_is(tmp_path: Path, heading: str, unit: str, quantity: str, worth: float) -> None:
+    (tmp_path / "f.csv").write_text(f"t_s,{heading} [{unit}]\n0,1\n1,2\n", encoding="utf-8")
+    wanted = Wanted({name: QUANTITIES[name] for name in ("time_s", quantity)})
+    assert read_table(tmp_path / "f.csv", wanted, 1_000).values[quantity] == pytest.approx([worth, 2.0 * worth])

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
 
-import firmware_protocol
 from firmware_protocol import codec
 from firmware_protocol.codec import (
     FUNCTION,
@@ -260,7 +259,7 @@ def test_numbers_of_numpy_s_are_numbers() -> None:
 # -- the golden vectors in Python and in C, also under sanitizers, and what the README shows ---------------------------
 
 
-ROOM = Path(firmware_protocol.__file__).parent
+ROOM = Path(__file__).parents[2] / "firmware_protocol"
 MESSAGES: dict[str, Any] = json.loads((ROOM / "vectors" / "messages.json").read_text(encoding="utf-8"))
 PAGE = (ROOM / "README.md").read_text(encoding="utf-8")
 FRAMES: dict[str, Any] = json.loads((ROOM / "vectors" / "frames.json").read_text(encoding="utf-8"))

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import pytest
 
-import firmware_protocol
 from firmware_protocol.codec import (
     FUNCTION,
     SCHEMA_HASH,
@@ -61,7 +60,7 @@ from tormagd.simulation.firmware import Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-PAGE = Path(firmware_protocol.__file__).parent / "README.md"
+PAGE = Path(__file__).parents[2] / "firmware_protocol" / "README.md"
 Measured = tuple[State, Sense]
 SAMPLE = load_plant("sample_1")
 NEAR_HOME = msgspec.structs.replace(

@@ -3,7 +3,6 @@
 import contextlib
 import pickle
 import random
-from binascii import crc_hqx
 from itertools import pairwise
 
 import pytest
@@ -12,8 +11,6 @@ from hypothesis import assume, given, settings, strategies as st
 
 from firmware_protocol.codec import EncodeError
 from firmware_protocol.framing import (
-    CRC_INITIAL,
-    CRC_RESIDUE,
     MAX_ENCODED,
     Frame,
     FrameDecoder,
@@ -52,11 +49,6 @@ def test_cobs_refuses_what_the_reference_refuses(data: bytes) -> None:
 def test_crc_is_genibus_in_big_endian() -> None:
     assert bitwise_crc16(b"123456789") == 0xD64E
     assert cobs.decode(encode_frame(0x31, 0x32, b"3456789")[:-1]) == b"123456789\xd6\x4e"
-
-
-@given(st.binary(max_size=20))
-def test_a_crc_carried_on_over_itself_leaves_the_residue(data: bytes) -> None:
-    assert crc_hqx(data + bitwise_crc16(data).to_bytes(2, "big"), CRC_INITIAL) == CRC_RESIDUE
 
 
 @given(frames)

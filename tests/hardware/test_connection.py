@@ -7,8 +7,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, settings, strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from firmware_protocol.codec import (
     SCHEMA_HASH,
@@ -120,7 +118,6 @@ class Bench:
         self.is_held = self.is_mute = self.is_bus_off = self.is_babbling = False
         self.request, self.number = DeviceRequest.NONE, 0
         self.asked_of: int | None = None
-        self.accepted_before = 0
         self.seen = [LinkState.CLOSED]
         self.host = ""
         self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose, lambda _now_s: self.host)
@@ -152,7 +149,6 @@ class Bench:
     def ask(self, request: DeviceRequest) -> None:
         self.request, self.number = request, self.number + 1
         self.asked_of = self.losses if self.connection.state is LinkState.RUNNING else None
-        self.accepted_before = len(self.firmware.accepted)
 
     def pass_ms(self, ms: int, is_stalled: bool = False) -> None:
         """Let time pass; a stalled host does not notice it."""
@@ -174,6 +170,9 @@ class Bench:
         self.look()
 
     def look(self) -> None:
+        connection, still_open = self.connection, [port for port in self.ports if not port.is_closed]
+        assert len(still_open) == (connection.state not in (LinkState.CLOSED, LinkState.BACK_OFF, LinkState.LOST))
+        assert bool(connection.cause) == (connection.measurement is None)
         if (state := self.connection.state) is not self.seen[-1]:
             self.seen.append(state)
 
@@ -336,92 +335,3 @@ def test_what_is_not_known_is_reported_as_such(bench: Bench) -> None:
     assert (after.firmware, after.serial_number, after.daemon_schema) == ("1.0", 7, f"{SCHEMA_HASH:08x}")
     assert after.round_trip_us.p50 == pytest.approx(1_000.0)
     assert (after.clock.offset_s, after.clock.drift_ppm) == pytest.approx((1_000.0005, 0.0), abs=1e-4)
-
-
-IDENTITIES = st.builds(
-    Identity, st.sampled_from([SCHEMA_HASH, SCHEMA_HASH, 0xBAD]), st.just(1), st.just(0), st.integers(7, 8)
-)
-CHANGES = st.one_of(
-    st.just(("is_there", True)),  # somebody puts the plug in
-    st.tuples(st.just("identity"), IDENTITIES),  # another device takes the place
-    *(
-        st.tuples(st.just(name), st.booleans())
-        for name in ("is_held", "is_mute", "is_babbling", "is_bus_off", "is_armed")
-    ),
-)
-
-
-class Cables(RuleBasedStateMachine):
-    """Anything that can happen to a connection, in any order."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.bench = Bench()
-        self.bench.connection.open(self.bench.now_s)
-        self.bench.look()
-
-    @rule(ms=st.integers(1, 150))
-    def time_passes(self, ms: int) -> None:
-        self.bench.pass_ms(ms)
-
-    @rule(ms=st.integers(1, 400))
-    def the_host_is_not_run(self, ms: int) -> None:
-        self.bench.pass_ms(ms, is_stalled=True)
-
-    @rule()
-    def somebody_pulls_the_plug(self) -> None:
-        self.bench.unplug()
-
-    @rule(changes=st.lists(CHANGES, min_size=1, max_size=3))
-    def the_device_the_line_or_the_core_changes(self, changes: list[tuple[str, object]]) -> None:
-        for change in changes:
-            setattr(self.bench, *change)
-
-    @rule()
-    def the_device_is_reset(self) -> None:
-        self.bench.firmware.reset()
-
-    @rule(request=st.sampled_from([DeviceRequest.HOME, DeviceRequest.RETRACT, DeviceRequest.CLEAR]))
-    def the_core_asks(self, request: DeviceRequest) -> None:
-        if request is DeviceRequest.RETRACT or self.bench.connection.state is LinkState.RUNNING:
-            self.bench.ask(request)
-
-    @invariant()
-    def a_state_says_why_and_what_to_do(self) -> None:
-        connection = self.bench.connection
-        state = connection.state
-        assert bool(connection.cause) == (connection.measurement is None)
-        assert bool(connection.remedy) == (bool(connection.cause) and state is not LinkState.IDENTIFYING)
-        assert state is LinkState.RUNNING or connection.measurement is None
-
-    @invariant()
-    def one_port_is_open_at_most(self) -> None:
-        still_open = [port for port in self.bench.ports if not port.is_closed]
-        assert len(still_open) <= 1
-        assert (self.bench.connection.state in (LinkState.BACK_OFF, LinkState.LOST)) == (not still_open)
-
-    @invariant()
-    def ports_are_not_opened_in_a_hurry(self) -> None:
-        assert all(
-            after - before >= FIRST_BACK_OFF_S - 1e-9 for before, after in itertools.pairwise(self.bench.attempts_s)
-        )
-
-    @invariant()
-    def each_loss_is_told_once(self) -> None:
-        assert self.bench.losses == self.bench.connection.losses
-        assert self.bench.losses >= self.bench.seen[1:].count(LinkState.RUNNING) - 1
-
-    def teardown(self) -> None:
-        heal(self.bench)
-        self.bench.pass_ms(2_300)
-        assert self.bench.connection.state is LinkState.RUNNING
-        if self.bench.request is DeviceRequest.RETRACT:
-            assert Retract in self.bench.firmware.accepted[self.bench.accepted_before :]
-        self.bench.connection.close()
-        assert all(port.is_closed for port in self.bench.ports)
-
-
-Cables.TestCase.settings = settings(
-    max_examples=40, stateful_step_count=30, deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
-TestCables = Cables.TestCase

@@ -230,17 +230,6 @@ def test_every_request_has_a_new_number_and_none_is_zero_or_a_hellos(link: Devic
         link.receive(turn * 0.1, status(nonce))
 
 
-def test_a_newer_request_replaces_an_unfinished_one(link: DeviceLink) -> None:
-    link.request(0.01, DeviceRequest.HOME)
-    (home,) = link.due(0.01)
-    link.request(0.02, DeviceRequest.RETRACT)
-    (retract,) = link.due(0.02)
-    assert (type(home), type(retract)) == (Home, Retract)
-    assert home.nonce != retract.nonce
-    link.receive(0.03, status(home.nonce))
-    assert any(isinstance(message, Retract) for _, message in due(link, 0.03, 0.1))
-
-
 @pytest.mark.parametrize("left_by_another_host", [0, 1, 2, 254, 255])
 @pytest.mark.parametrize("is_early", [False, True], ids=["after the first Status", "before it"])
 def test_a_number_that_another_host_used_last_is_no_acknowledgement(
@@ -398,10 +387,6 @@ def test_what_is_missing_for_a_measurement_is_said(heard, refused, missing: str,
     assert not unmet.missing(refused), "it does not run yet"
     told(unmet, 0.01, US, *heard)
     assert (unmet.missing(refused), unmet.measurement) == (missing, None)
-
-
-def test_nothing_is_missing_where_there_is_a_measurement() -> None:
-    assert running().missing({"Status": "range"}) == ""
 
 
 def test_the_quality_goes_with_the_measurement(link: DeviceLink) -> None:

@@ -18,7 +18,6 @@ from firmware_protocol.codec import (
     Hello,
     Home,
     Message,
-    Retract,
     State,
     Status,
     Switches,
@@ -38,37 +37,6 @@ STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(pack) -> None:
     with pytest.raises(EncodeError, match="left_duty"):
         pack(Drive(float("nan"), 0.0, DriveMode.RUN, 0))
-
-
-drives = st.builds(
-    Drive,
-    left_duty=st.integers(-10_000, 10_000).map(lambda steps: steps * 1e-4),
-    right_duty=st.just(0.5),
-    mode=st.sampled_from(DriveMode),
-    counter=st.integers(0, 255),
-)
-messages = st.lists(
-    st.builds(Home, st.integers(0, 255)) | st.builds(Retract, st.integers(0, 255)) | drives, max_size=20
-)
-
-
-@given(sent=messages, cuts=st.lists(st.integers(1, 9), min_size=1, max_size=50))
-def test_what_is_packed_comes_out_however_it_is_cut(sent: list[Message], cuts: list[int]) -> None:
-    sender, receiver = FrameStream(), FrameStream()
-    line = b"".join(sender.pack(message) for message in sent)
-    received: list[Message] = []
-    for cut in cuts:
-        received += receiver.unpack(line[:cut])
-        line = line[cut:]
-    assert received + receiver.unpack(line) == sent
-    assert (receiver.statistics.frames, receiver.statistics.corrupt, receiver.statistics.lost) == (len(sent), 0, 0)
-
-
-@given(noise=st.binary(max_size=300))
-def test_noise_never_raises_and_does_not_outlive_a_delimiter(noise: bytes) -> None:
-    stream = FrameStream()
-    stream.unpack(noise + b"\x00")
-    assert stream.unpack(FrameStream().pack(Home(3))) == [Home(3)]
 
 
 def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:

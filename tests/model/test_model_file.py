@@ -247,13 +247,6 @@ def test_what_is_no_model_file_is_refused(tmp_path: Path, model: ForceModel) -> 
     refused(pickled, "at most 1048576 bytes; this has 1048577")
 
 
-@given(st.binary(max_size=600))
-def test_noise_is_refused(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
-    path = tmp_path_factory.mktemp("noise") / "model.safetensors"
-    path.write_bytes(data)
-    refused(path)
-
-
 @pytest.mark.parametrize(
     ("changes", "name"),
     [

@@ -1,7 +1,6 @@
 """What friction and an elastomer's memory do to the force: closed forms, passivity, superposition."""
 
 import math
-from itertools import pairwise
 
 import pytest
 from hypothesis import given, strategies as st
@@ -80,19 +79,6 @@ def test_passive_under_any_motion_and_any_field(friction: Friction, steps: list[
         assert work_mJ >= stored_mJ - 1e-9 * (1.0 + work_mJ)
 
 
-@given(frictions, st.floats(0.1, 10.0), st.floats(0.01, 20.0), st.floats(0.1, 5.0), st.integers(8, 100))
-def test_a_closed_cycle_costs_the_hand_work(
-    friction: Friction, kinetic_N: float, amplitude_mm: float, frequency_Hz: float, steps: int
-) -> None:
-    dt_s = 1.0 / (frequency_Hz * steps)
-    positions = [amplitude_mm * math.sin(2.0 * math.pi * index / steps) for index in range(2 * steps + 1)]
-    deflection_mm, works_mJ = 0.0, []
-    for before, after in pairwise(positions):
-        force_N, deflection_mm = friction.advance(deflection_mm, (after - before) / dt_s, kinetic_N, dt_s)
-        works_mJ.append(force_N * (after - before))
-    assert sum(works_mJ[steps:]) > 0.0
-
-
 SERIES = PronySeries(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0))
 forces = st.floats(-10.0, 10.0)
 
@@ -129,19 +115,6 @@ def test_splitting_a_step_changes_nothing(start_N: float, end_N: float, dt_s: fl
     for index in range(1, parts + 1):
         force_N, state = update.advance(state, start_N + (end_N - start_N) * index / parts)
     assert (force_N, *state) == pytest.approx((whole_N, *whole), abs=1e-12)
-
-
-@given(st.lists(st.tuples(forces, forces), min_size=1, max_size=50), st.floats(1e-6, 10.0))
-def test_superposition_and_the_bound_of_the_response(pairs: list[tuple[float, float]], dt_s: float) -> None:
-    update = SERIES.discretise(dt_s)
-    one, two, both = SERIES.relaxed(0.0), SERIES.relaxed(0.0), SERIES.relaxed(0.0)
-    max_N = max(abs(first) for first, _ in pairs)
-    for first, second in pairs:
-        force_one, one = update.advance(one, first)
-        force_two, two = update.advance(two, second)
-        force_both, both = update.advance(both, first + second)
-        assert force_both == pytest.approx(force_one + force_two, abs=1e-12)
-        assert abs(force_one) <= (1.0 + sum(SERIES.fractions)) * max_N + 1e-12
 
 
 def test_a_rested_element_carries_the_equilibrium_share_and_may_undershoot() -> None:

@@ -86,18 +86,6 @@ def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "s
     return host
 
 
-def test_drive_run_is_refused_without_a_hello() -> None:
-    host = Bench()
-    host.command(Home)
-    host.pass_time(3.0, DriveMode.OFF)
-    assert Switches.HOMED in host.status.switches
-    host.run_until(host.now_s + 0.1, -1.0)
-    assert host.status.mode is DeviceMode.IDLE
-    host.hello()
-    host.run_until(host.now_s + 0.1, -0.5)
-    assert host.status.mode is DeviceMode.RUN
-
-
 @pytest.mark.parametrize("name", SAMPLES)
 def test_homing_zeroes_the_encoders_at_the_open_switches_repeatably(name: str) -> None:
     host = Bench(plant=load_plant(name))
@@ -260,19 +248,6 @@ def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int
     while DeviceFault.RETRACT_FAILED not in host.status.faults:
         host.pass_time(0.01)
         assert host.now_s - started_s < within_s
-
-
-def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap() -> None:
-    host = running(["reset@3.5"], gap_mm=60.0)
-    host.run_until(3.6, -0.2)
-    assert host.status.mode is DeviceMode.IDLE
-    assert Switches.HOMED not in host.status.switches
-    stood_mm = host.device.truth.gap_mm
-    host.pass_time(0.5, DriveMode.OFF)
-    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=1e-6)
-    assert host.last(State).left_position_mm == pytest.approx(0.0, abs=0.3)
-    host.homed()
-    host.go_to(60.0)
 
 
 def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open() -> None:

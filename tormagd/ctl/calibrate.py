@@ -49,8 +49,8 @@ def calibrate_insert(
         with armed(endpoints, client, forces.least_N) as run:
             sweeps = [_sweep(run, forces, number, rates_N_s) for number in range(len(rates_N_s))]
     rows = write_sweeps(out, sweeps)
-    fitting = f"--insert {insert_name} --inner-radius-mm {scene.insert.inner_radius_mm:g} --out MODEL.safetensors"
-    text = f"{out}: {rows} rows of {len(sweeps)} sweeps. next: tormag-lab calibrate {out} {fitting}"
+    fitting = f"tormag-lab calibrate {out} --insert {insert_name} --out MODEL.safetensors"
+    text = f"{out}: {rows} rows of {len(sweeps)} sweeps. next: {fitting}"
     return Outcome({"file": str(out), "insert": insert_name, "rows": rows}, text)
 
 

@@ -117,18 +117,6 @@ def test_both_directions_are_alike(error: float, speed: float, integral: float) 
     assert (updated(mirrored, -error, -speed), mirrored.integral) == (-updated(stage, error, speed), -stage.integral)
 
 
-@pytest.mark.long
-@settings(max_examples=5, deadline=None)
-@given(position=positions, error=st.floats(0.5, 50.0), dt_s=st.sampled_from([0.01, 0.05, 0.1]))
-def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float, dt_s: float) -> None:
-    stage = Pid(position)
-    for _ in range(round(3_600.0 / dt_s)):
-        stage.update(error, 0.0, 0.0, dt_s, False)
-        assert abs(stage.integral) <= position.duty_limit
-    most = 2.0 * position.duty_limit / position.proportional_per_mm
-    assert updated(stage, -most) <= -position.duty_limit * (1.0 - 1e-9)
-
-
 @given(integral=st.floats(-1.0, 1.0), error_mm=st.floats(-0.01, 0.01))
 def test_a_carriage_at_rest_on_target_forgets_within_its_integral_time(integral: float, error_mm: float) -> None:
     stage = begun(integral=integral)
