@@ -291,7 +291,7 @@ def previewed_N(setpoint: TimedSetpoint, begins_s: float, forecast: Forecast) ->
             break
         force_N = at_step(at_s / setpoint.preview_dt_s, forces_N)
         if past_s >= 0.0:
-            force_N += setpoint.preview_slope_N_s * min(past_s, AHEAD_S, setpoint.preview_s)
+            force_N += setpoint.preview_slope_N_s * min(min(past_s, AHEAD_S), setpoint.preview_s)
             if trust > 0.0:
                 force_N += trust * (forecast.forces_N(past_s, [0.0])[0] - force_N)
         require_number("preview_N", force_N)

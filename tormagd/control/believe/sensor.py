@@ -154,7 +154,7 @@ class SensorTrust:
         # what is lost in the slack is given way, too: readings at its end would teach only their noise
         self.low_s = self.low_s + dt_s if self.measured_N < self.share * force_N else 0.0
         falls = FALLS_1_S * dt_s if self.low_s > LEARNS_S else 0.0
-        self.share = min(max(self.share - falls, believed, 1.0 - self._leash), 1.0)
+        self.share = min(max(max(self.share - falls, believed), 1.0 - self._leash), 1.0)
 
     def _doubt(self, is_strange: bool, dt_s: float) -> None:
         """Count how long the readings have been such as no device gives, and how long the device has slid."""

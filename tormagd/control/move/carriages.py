@@ -156,7 +156,9 @@ class Carriages(Actuator):
         # the pull helps to close, but a reserve of duty is worth more there than a little speed
         opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         most = self._gap_speeds
-        return Speeds(motors_mm_s, min(motors_mm_s, most.opening_mm_s, opening_mm_s), min(motors_mm_s, most.sure_mm_s))
+        # compiled, only the least of two is a comparison
+        opening_mm_s = min(min(motors_mm_s, most.opening_mm_s), opening_mm_s)
+        return Speeds(motors_mm_s, opening_mm_s, min(motors_mm_s, most.sure_mm_s))
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
