@@ -134,17 +134,14 @@ class Governor:
         )
         if self.blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N:
             limits = (*limits, Limit.RATE)
-        if is_free and force_N < self.asked_N and setpoint.lets_go(travel):
-            self.is_passing = False
         step_N = self._release_N_s * dt_s if is_free else 0.0
-        self.is_passing = self.is_passing and abs(path_N[0] - self.asked_N) > step_N
-        expected_N = path_N[0] if sent_mm is None else self.expected_N
+        is_let_go = is_free and force_N < self.asked_N and setpoint.lets_go(travel)
+        self.is_passing = self.is_passing and not is_let_go and abs(path_N[0] - self.asked_N) > step_N
         if self.is_passing:
-            governed_N = expected_N = self.asked_N + math.copysign(step_N, path_N[0] - self.asked_N)
+            governed_N = self.asked_N + math.copysign(step_N, path_N[0] - self.asked_N)
             path_N, sent_mm = [governed_N] * len(PATH_S), None
             limits, foresight = (*limits, Limit.TAKEOVER), 0.0
         self._stand_at(path_N[0], device, sent_mm)
-        self.expected_N = expected_N
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def _target(
@@ -268,9 +265,10 @@ class Governor:
         return [(wall.most_N(each_mm) + over_N, wall.most_N(each_mm + on_mm) + over_N) for each_mm in places_mm]
 
     def _stand_at(self, force_N: float, device: DeviceFit, sent_mm: float | None = None) -> None:
-        self.asked_N = self.expected_N = force_N
-        self.from_mm = self._portrait.gap_mm_at(device.model_N(force_N))
-        self.sent_mm = self.from_mm if sent_mm is None else sent_mm
+        self.asked_N, self.from_mm = force_N, self._portrait.gap_mm_at(device.model_N(force_N))
+        if sent_mm is None:
+            self.expected_N, sent_mm = force_N, self.from_mm
+        self.sent_mm = sent_mm
 
     def _forget(self) -> None:
         self.last, self.slope_N_s, self.is_passing = None, 0.0, True
