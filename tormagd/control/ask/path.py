@@ -13,8 +13,8 @@ from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.interpolation import require_finite
 from tormagd.control.records import GapSpeeds
-from tormagd.element.model.features import require_number
 from tormagd.element.model.force_curve import within
 
 PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
@@ -64,10 +64,12 @@ class Path:
         """Find the best path for `wanted_N` at TIMES_S; return its forces at PATH_S and a gap to send."""
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
-        require_number("sent_mm", sent_mm)
-        there = [portrait.gap_and_slope_at(device.model_N(force_N)) for force_N in wanted_N]
-        weights = [lasts_s * max(slope, FLATTEST_N_MM) ** 2 for (_, slope), lasts_s in zip(there, LASTS_S)]  # noqa: B905
-        wanted_mm = [gap_mm for gap_mm, _ in there]
+        require_finite("sent_mm", sent_mm)
+        # compiled, pairs and ** make objects
+        wanted_mm, weights = wanted_N[:], LASTS_S[: len(wanted_N)]
+        for place, force_N in enumerate(wanted_N):
+            wanted_mm[place], slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
+            weights[place] *= math.pow(max(slope_N_mm, FLATTEST_N_MM), 2.0)
         if most_N is None:
             for place in range(len(wanted_mm) - 1):
                 wanted_mm[place] += late_s * CHANGES_PER_S[place] * (wanted_mm[place + 1] - wanted_mm[place])

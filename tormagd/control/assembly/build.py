@@ -37,8 +37,7 @@ from tormagd_client.endpoints import ConfigError
 
 MIN_PHASE_MARGIN_DEG = 30.0
 MIN_GAIN_MARGIN_DB = 4.0
-SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
-SOURCES += ("tormagd/hardware", "tormagd/control", "tormagd/control/assembly")
+SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("element", "scenes", "hardware", "control")))
 SENSED_N = 0.001
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "Friction holds the gap to within four counts of the encoders."
@@ -315,7 +314,7 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
 
 
 def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> Iterator[str]:
-    """Yield by how much ideal carriages miss the signal where that is more than its tolerance."""
+    """Yield by how much ideal carriages miss the signal, if beyond its tolerance."""
     if miss is not None and miss.rms_N > scene.force.tolerance_rms_N:
         worst = ", ".join(
             f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
@@ -329,7 +328,7 @@ def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> Iterator[str
 
 
 def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> Iterator[str]:
-    """Yield how fast an opening gap releases the force where that is faster than the scene allows."""
+    """Yield how fast an opening gap releases the force, where the scene forbids that."""
     # the weakest believable device makes a force at the least gap, where the gap's speed changes it most
     opening_mm_s, key = max(
         (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),

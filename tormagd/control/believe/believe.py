@@ -95,15 +95,14 @@ class Believe:
         self.memory, self.handle = memory, HandleWatch()
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
-        self._leash: Final = trim.leash
-        self._way: Final = trim.way
+        self._trim: Final = trim
         self._radius_mm: Final = scene.insert.roller_radius_mm
         self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self.learns: Final = terms.learning
+        self.learns = terms.learning
         self._has_lag: Final = terms.motor
         self._slides: Final = nominal.contact.slides
         self._has_creep: Final = terms.creep and nominal.contact.slides
@@ -130,8 +129,8 @@ class Believe:
     def teach(self, learned: Learned) -> None:
         """Replace all that is known of the device by `learned`, and begin its estimators anew."""
         self.strength.forget(learned.device)
-        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(self._way)
-        self.sensor, self.carriages = SensorTrust(self._bounds, self._leash, learned.device), CarriageLag()
+        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(self._trim.way)
+        self.sensor, self.carriages = SensorTrust(self._bounds, self._trim.leash, learned.device), CarriageLag()
         self.ripple = Ripple()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
@@ -169,7 +168,6 @@ class Believe:
             self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
-        """Return the belief, and change nothing."""
         at_speed = self.device
         ripple, predicted_N, has_slid = 1.0, None, self.sensor.has_slid
         if measured is not None:
@@ -187,7 +185,7 @@ class Believe:
         return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, doubted_s, anchor_N)
 
     def _anchor_N(self, factor: float) -> float:
-        """Return the model's force, N, with which the device as it first showed itself gives the most allowed."""
+        """Return the model's force, N, of the ceiling on the anchor."""
         anchor, most_N = self.sensor.anchor, self._surely_N
         most_N += SURE * max(anchor.deviation_N(most_N) - 2.0 * KNOWN_N, 0.0)
         return anchor.model_N(most_N / factor) + self.memory.relaxed_N
@@ -253,7 +251,8 @@ class Believe:
                 fit.scale_sd,
                 is_disputed=sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
             )
-        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
+        learns = self.learns and zero_sd_N <= UNKNOWN_SD_N
+        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns)
         unknown_N = self._unknown_N(zero_sd_N)
         least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
         if taught_N is None or (unknown_N > 0.0 and reading_N < least_N):
@@ -297,7 +296,7 @@ class Believe:
             return
         fit = self.strength.fit
         if wrong == "device":
-            self.sensor = SensorTrust(self._bounds, self._leash)
+            self.sensor = SensorTrust(self._bounds, self._trim.leash)
         else:
             fit = fit.shifted(self.sensor.anchor.force_N(MIDDLE_N) - fit.force_N(MIDDLE_N))
             self.sensor.is_doubted = True

@@ -58,9 +58,7 @@ class ElementMemory:
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`."""
         change_mT = field_mT - self.field_mT
-        if self.time_s == -math.inf:
-            return 0.0
-        if change_mT == 0.0:
+        if change_mT == 0.0 or self.time_s == -math.inf:
             return self.lag_mT
         side_mT = math.copysign(self._width_mT, change_mT)
         return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)

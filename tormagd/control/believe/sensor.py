@@ -117,8 +117,7 @@ class SensorTrust:
             return None
         taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
-        is_known = zero_sd_N <= UNKNOWN_SD_N and beyond_N <= 0.0
-        self._learn(model_N, force_N, deviation_N, rate_mm_s, taught_N, believed, dt_s, learns and is_known)
+        self._learn(model_N, force_N, deviation_N, rate_mm_s, taught_N, believed, dt_s, learns and beyond_N <= 0.0)
         if self.has_slid:
             self._give_way(believed, force_N, dt_s)
         return taught_N
@@ -159,8 +158,7 @@ class SensorTrust:
             self.known_s = min(self.known_s + dt_s, LEARNS_S)
 
     def _judge(self, is_strange: bool, is_inside: bool, dt_s: float) -> bool:
-        """Count how long the readings have been outside or inside the leash, and return whether they teach. A doubted
-        sensor may be believed again."""
+        """Count how long the readings have been outside or inside the leash, and return whether they teach."""
         self.inside_s = self.inside_s + dt_s if is_inside and not is_strange else 0.0
         if self.has_slid and not is_inside:
             self.outside_s += dt_s

@@ -213,7 +213,7 @@ class Strength:
         """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`."""
         error_N = reading_N - self.fit.force_N(model_N)
         self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)
-        adapts_in_s = self._adapts_in_s / (1.0 + (self.surprise_N / SURPRISE_N) ** 2)
+        adapts_in_s = self._adapts_in_s / (1.0 + math.pow(self.surprise_N / SURPRISE_N, 2.0))
         self.fit, self.is_held = observe(
             self.fit,
             model_N,
@@ -229,10 +229,8 @@ class Strength:
             self.fit, self.is_held = self.fit.shifted(offset_N - self.fit.offset_N), True
 
     def settle(self) -> None:
-        """Set `surprise_N` to 0 and `is_held` to False, while no reading teaches."""
         self.surprise_N, self.is_held = 0.0, False
 
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
-        """Replace the fit by `fit`, and forget the surprise."""
         self.fit = fit
         self.settle()

@@ -177,7 +177,6 @@ class Watch:
         return list(device_faults(measurement.faults, is_host_stall=is_ours))
 
     def _is_misplaced(self, measurement: Measurement, measured: Measured, sight: Sight) -> bool:
-        """Tell whether a carriage is beyond the stroke, or a switch contradicts its place."""
         # switches come with Status: with an older Status or State they are of another place
         is_told = not sight.is_blind and measurement.reported_s >= measurement.received_s
         closed_mm, open_mm = self._range_mm
