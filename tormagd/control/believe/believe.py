@@ -96,18 +96,20 @@ class Believe:
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
         self._trim: Final = trim
+        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(trim.way)
+        self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
+        self.ripple = Ripple()
         self._radius_mm: Final = scene.insert.roller_radius_mm
         self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self.learns = terms.learning
+        self.read_s, self.learns = -math.inf, terms.learning
         self._has_lag: Final = terms.motor
         self._slides: Final = nominal.contact.slides
         self._has_creep: Final = terms.creep and nominal.contact.slides
-        self._fits: Final = terms.learning and (terms.scale or terms.offset)
-        self.teach(NOTHING_LEARNED)
+        self._fits: Final = terms.scale or terms.offset
 
     @property
     def device(self) -> DeviceFit:
@@ -276,7 +278,7 @@ class Believe:
 
     def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing."""
-        if not self._fits:
+        if not (self.learns and self._fits):
             return
         before_N = self.strength.fit.force_N(model_N)
         if self.is_prior and not self.sensor.has_slid and abs(reading_N - before_N) > CONTRADICTED_N:
