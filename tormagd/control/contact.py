@@ -63,12 +63,10 @@ class Pressing:
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
         if measured is not None and self.is_known(measured):
             depth_mm, rate_mm_s = self.motion_now(measured)
-        if setpoint is not None:
-            if setpoint.displacement_mm is not None:
-                depth_mm = setpoint.displacement_mm
-            if setpoint.rate_mm_s is not None:
-                rate_mm_s = setpoint.rate_mm_s
-        return depth_mm, rate_mm_s
+        if setpoint is None:
+            return depth_mm, rate_mm_s
+        told_mm, told_mm_s = setpoint.displacement_mm, setpoint.rate_mm_s
+        return depth_mm if told_mm is None else told_mm, rate_mm_s if told_mm_s is None else told_mm_s
 
     def motion_now(self, measured: Measured) -> tuple[float, float]:
         return measured.handle.displacement_mm, measured.handle.rate_mm_s

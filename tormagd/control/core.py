@@ -46,13 +46,12 @@ class Planner:
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begin at `now_s` with the gap open and nothing known of the device."""
-        terms, insert = scene.terms, scene.insert
-        gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
-        followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
-        self.believe = Believe(config, scene, element.nominal, followed)
+        gap_range_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
+        memory = ElementMemory(element.memory, element.nominal, element.field, gap_range_mm)
+        self.believe = Believe(config, scene, element.nominal, memory)
         self._portrait: Final = element.portrait
         self.way = Way(config.handle.push_sign)
-        self.governor = Governor(now_s, element.portrait, scene.force, gap_speeds(config), terms)
+        self.governor = Governor(now_s, element.portrait, scene.force, gap_speeds(config), scene.terms)
         self.aim = Aim(config, scene, element)
         self.planned = self.aim.begin(now_s, 0, 0.0)
 
@@ -82,9 +81,8 @@ class Planner:
         if measured is None or not measured.is_homed:
             return device.force_N(portrait.min_N)
         # the rest of the plan's gap is the element's memory and the handle's rate
-        beside_mm = planned.gap_mm - portrait.gap_mm_at(device.model_N(planned.governed_N))
-        if Limit.CEILING in planned.limits:
-            beside_mm = 0.0
+        is_held = Limit.CEILING in planned.limits
+        beside_mm = 0.0 if is_held else planned.gap_mm - portrait.gap_mm_at(device.model_N(planned.governed_N))
         return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
 
     def foresee(self) -> bool:
@@ -153,10 +151,9 @@ class Stepper:
             return self._hold(now_s)
         if sight.was_blind:
             self.move.resume(measured)
-        dt_s = now_s - last_s
-        if not 0.0 < dt_s < 10.0 * self._period_s:
-            dt_s = self._period_s  # a clock that stood still gives no period
-        return self._drive(now_s, dt_s, measurement, measured, plan)
+        # a clock that stood still gives no period
+        is_period = 0.0 < now_s - last_s < 10.0 * self._period_s
+        return self._drive(now_s, now_s - last_s if is_period else self._period_s, measurement, measured, plan)
 
     def command(self, name: str, now_s: float, conditions: Conditions) -> None:
         """Carry out an operator's command, one of `operating_state.COMMANDS`."""
@@ -199,9 +196,8 @@ class Stepper:
 
     def _hold(self, now_s: float) -> Duty:
         """Return zero duties in mode RUN: the device keeps answering, and friction holds the gap."""
-        limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
-        if self.measure.leap is not None:
-            limit = Limit.ENCODER
+        seen = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
+        limit = seen if self.measure.leap is None else Limit.ENCODER
         self.watch.rest()
         return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
 

@@ -54,7 +54,6 @@ class Measure:
         return measured
 
     def without_position(self, measured: Measured) -> Measured:
-        """Mark the newest record as not homed, and return it."""
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
 

@@ -89,7 +89,6 @@ def _is_contradicted(
     at_mm: float, speed_mm_s: float, is_open: bool, is_closed: bool, inner_mm: float, home_mm: float
 ) -> bool:
     moved_mm = TOLD_S * abs(speed_mm_s)
-    if is_closed and at_mm > inner_mm + moved_mm:
-        return True
     near_mm = OPEN_SWITCH_MM + moved_mm
-    return at_mm < home_mm - near_mm if is_open else at_mm > home_mm + near_mm
+    is_elsewhere = at_mm < home_mm - near_mm if is_open else at_mm > home_mm + near_mm
+    return is_elsewhere or (is_closed and at_mm > inner_mm + moved_mm)

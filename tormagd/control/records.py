@@ -39,6 +39,13 @@ class Wall(Value):
         self.place_sd_mm: Final = place_sd_mm
         self.stiffness_share: Final = stiffness_share
 
+    def require_numbers(self) -> None:
+        # one sum finds NaN and infinity anywhere
+        size = abs(self.place_mm) + abs(self.stiffness_N_mm) + abs(self.friction_N)
+        if not size + abs(self.place_sd_mm) + abs(self.stiffness_share) <= _LARGEST:
+            for name in self.__match_args__:
+                require_number(name, getattr(self, name))
+
     def force_N(self, handle_mm: float) -> float:
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
 
@@ -93,16 +100,19 @@ class TimedSetpoint(Value):
 
     def require_numbers(self) -> None:
         """Raise DomainError, naming the field, unless all numbers are finite and within LARGEST."""
-        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N"):
-            require_number(name, getattr(self, name) or 0.0)
+        size = abs(self.force_N) + abs(self.stamp_s) + abs(self.valid_for_s)
+        size += abs(self.displacement_mm or 0.0) + abs(self.rate_mm_s or 0.0) + abs(self.withdraw_N or 0.0)
+        if not size <= _LARGEST:
+            for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N"):
+                require_number(name, getattr(self, name) or 0.0)
         if self.wall is not None:
-            for name in self.wall.__match_args__:
-                require_number(name, getattr(self.wall, name))
-        if not self.preview_N:
-            return
+            self.wall.require_numbers()
+        if self.preview_N:
+            self._require_preview()
+
+    def _require_preview(self) -> None:
         if not 0.0 < self.preview_dt_s <= _LARGEST:
             raise DomainError("preview_dt_s", self.preview_dt_s, "above 0 s")
-        # one sum finds NaN and infinity anywhere
         if not -_LARGEST <= sum(self.preview_N) <= _LARGEST:
             for force_N in self.preview_N:
                 require_number("preview_N", force_N)

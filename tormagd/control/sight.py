@@ -43,7 +43,6 @@ class Sight:
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 
     def update(self, last_s: float, now_s: float, is_new: bool) -> None:
-        """Take a step at `now_s`, the step before being at `last_s`."""
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:
             before_s = self.stall_s if self.has_stalled(now_s) else 0.0

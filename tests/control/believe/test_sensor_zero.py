@@ -12,7 +12,7 @@ from tormagd.control.believe.sensor_zero import (
     LONGEST_TURN_S,
     MAX_SD_N,
     MAX_ZERO_N,
-    TARED_SD_N,
+    TARED_VARIANCE_N2,
     UNKNOWN_SD_N,
     Level,
     SensorZero,
@@ -58,7 +58,7 @@ def strokes(
     ("off_N", "turns", "within_N", "most_sd_N"),
     [
         *(
-            (off_N, {"number": 20, "scale": scale}, 0.015 + 0.1 * abs(off_N), TARED_SD_N)
+            (off_N, {"number": 20, "scale": scale}, 0.015 + 0.1 * abs(off_N), math.sqrt(TARED_VARIANCE_N2))
             for off_N in (0.0, 0.05, -0.1, 0.3)
             for scale in (0.7, 1.0, 1.4)
         ),
@@ -102,7 +102,7 @@ def test_a_sensor_that_drifts_one_way_stays_within_what_is_believed(minutes: int
 
 
 def test_before_anything_is_heard_no_time_counts() -> None:
-    assert SensorZero().sd_N(1e9) == TARED_SD_N
+    assert SensorZero().sd_N(1e9) == math.sqrt(TARED_VARIANCE_N2)
 
 
 @pytest.mark.parametrize(

@@ -148,21 +148,21 @@ def test_what_is_known_is_forgotten_in_its_time() -> None:
     assert 0.0 < relaxed.covariance_N < left**0.5 * known.covariance_N
 
 
-@pytest.mark.parametrize(("learns_scale", "learns_offset"), [(True, False), (False, True)])
-def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns_scale: bool, learns_offset: bool) -> None:
+@pytest.mark.parametrize("learns", [(True, False), (False, True)])
+def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns: tuple[bool, bool]) -> None:
     fit, terms = DeviceFit(1.1, 0.02, 0.02, 0.001, 0.008), {"adapts_in_s": 0.5, "bounds": BOUNDS}
-    found, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=learns_scale, learns_offset=learns_offset, **terms)
-    aged, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=False, learns_offset=False, **terms)
+    found, _ = observe(fit, 1.5, 1.7, 0.01, learns=learns, **terms)
+    aged, _ = observe(fit, 1.5, 1.7, 0.01, learns=(False, False), **terms)
     before = np.array([[aged.scale_variance, aged.covariance_N], [aged.covariance_N, aged.offset_variance_N2]])
     seen = np.array([1.5, 1.0])
     noise_N2 = ERROR_N2_S / 0.01
-    gains = before @ seen / (seen @ before @ seen + noise_N2) * [learns_scale, learns_offset]
+    gains = before @ seen / (seen @ before @ seen + noise_N2) * learns
     kept = np.eye(2) - np.outer(gains, seen)
     joseph = kept @ before @ kept.T + noise_N2 * np.outer(gains, gains)
     assert (found.scale_variance, found.covariance_N, found.offset_variance_N2) == pytest.approx(
         (*joseph[0], joseph[1, 1])
     )
-    assert (found.scale != fit.scale, found.offset_N != fit.offset_N) == (learns_scale, learns_offset)
+    assert (found.scale != fit.scale, found.offset_N != fit.offset_N) == learns
 
 
 KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)

@@ -65,8 +65,7 @@ class Aim:
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
         self._element: Final = element
         self._portrait: Final = element.portrait
-        self._closed_mm: Final = scene.insert.gap_closed_mm
-        self._open_mm: Final = scene.insert.gap_open_mm
+        self._range_mm: Final = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
         self._ceiling_N: Final = CEILING * scene.force.most_N
         self._bounds: Final = device_bounds(config.trim)
         self._speeds: Final = gap_speeds(config)
@@ -75,11 +74,11 @@ class Aim:
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open and no setpoint."""
-        field_mT = self._element.field.field_mT(self._open_mm)
+        field_mT = self._element.field.field_mT(self._range_mm[1])
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
         self.answer = Answer(now_s, FieldSolution(self.element_mT, min_N, 1.0, 0, _INSIDE))
-        return Plan(number, now_s, None, None, min_N, None, field_mT, self._open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
+        return Plan(number, now_s, None, None, min_N, None, field_mT, self._range_mm[1], 0.0, 1.0, (Limit.NO_SETPOINT,))
 
     def update(
         self,
@@ -101,7 +100,7 @@ class Aim:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
-        wanted_mm = min(max(self._element.field.gap_mm(field_mT), self._closed_mm), self._open_mm)
+        wanted_mm = within(self._element.field.gap_mm(field_mT), self._range_mm)
         if before is not None:
             wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
         min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
@@ -178,19 +177,18 @@ class Aim:
         is_held: bool,
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
-        limits = (*ask.limits, *believed)
-        if outside:
-            limits = (*limits, Limit.MODEL_RANGE)
-        if is_held:
-            limits = (*limits, Limit.CEILING)
-        if solution.confidence < self._low_confidence:
-            limits = (*limits, Limit.LOW_CONFIDENCE)
-        if solution.reach is not _INSIDE:
-            reached = Limit.F_MIN if solution.reach is Reach.BELOW else Limit.F_MAX
-            # where nobody asks for a force, none is held back for being too low
-            if reached not in limits and (ask.is_meant or reached is Limit.F_MAX):
-                limits = (*limits, reached)
-        return limits
+        limits = (
+            *ask.limits,
+            *believed,
+            *((Limit.MODEL_RANGE,) if outside else ()),
+            *((Limit.CEILING,) if is_held else ()),
+            *((Limit.LOW_CONFIDENCE,) if solution.confidence < self._low_confidence else ()),
+        )
+        # where nobody asks for a force, none is held back for being too low
+        if solution.reach is _INSIDE or not (ask.is_meant or solution.reach is Reach.ABOVE):
+            return limits
+        reached = Limit.F_MIN if solution.reach is Reach.BELOW else Limit.F_MAX
+        return limits if reached in limits else (*limits, reached)
 
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
         """Return the gap's speed and acceleration at the start of a path of forces, by a fitted parabola."""

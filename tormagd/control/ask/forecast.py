@@ -141,9 +141,8 @@ class Forecast:
     @property
     def trust(self) -> float:
         """Return how far the forecast takes the place of the slope, 0..1."""
-        if not self.changes_N:
-            return 0.0
-        return within(self.long.score, (0.0, 1.0)) * within(1.0 + self.short.score, (0.0, 1.0))
+        unit = 0.0, 1.0
+        return within(self.long.score, unit) * within(1.0 + self.short.score, unit) if self.changes_N else 0.0
 
     def forget(self, stamp_s: float = -math.inf, force_N: float = 0.0, history: bytes = b"") -> None:
         """Begin with one setpoint, or with none."""

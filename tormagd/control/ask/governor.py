@@ -18,10 +18,9 @@ from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
 from tormagd.control.ask.path import PATH_S, SPEEDING_UP_S, TIMES_S, Path
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.interpolation import at_step, low_pass
+from tormagd.control.interpolation import at_step, low_pass, require_finite
 from tormagd.control.records import AT_REST, Ask, GapSpeeds, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
-from tormagd.element.model.features import require_number
 from tormagd.element.model.force_curve import within
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
@@ -36,6 +35,9 @@ EARLY_N: Final = 0.08
 "The gap closes before a wall by this much more than is felt there: 0.1 N with what is not known of a device."
 DECAY: Final = 0.25
 "A force that gives way falls more slowly than a gap opens, so that the hand can stop."
+
+ENDLESS: Final[float] = math.inf
+"Compiled, a plain float."
 
 Bounds = tuple[float, float]
 
@@ -72,7 +74,7 @@ class Governor:
         self._least_N: Final = force.least_N
         self._allowed: Final = (force.waiting_N, force.most_N)
         self._release_N_s: Final = force.release_N_s
-        self._decay_N_s: Final = DECAY * force.release_N_s if force.breakthrough == "decay" else math.inf
+        self._decay_N_s: Final = DECAY * force.release_N_s if force.breakthrough == "decay" else ENDLESS
         self.forecast = Forecast()
         self.begin(now_s)
 
@@ -105,7 +107,7 @@ class Governor:
         if setpoint is not None:
             age_s = now_s - setpoint.stamp_s
             setpoint.require_numbers()
-            require_number("age_s", age_s)
+            require_finite("age_s", age_s)
             if age_s <= setpoint.valid_for_s:
                 return self._followed(setpoint, age_s, device, lag_s, travel, dt_s, given, held_N is None)
             limits = [Limit.STALE, *setpoint.limits]
@@ -134,17 +136,14 @@ class Governor:
         )
         if self.blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N:
             limits = (*limits, Limit.RATE)
-        if is_free and force_N < self.asked_N and setpoint.lets_go(travel):
-            self.is_passing = False
         step_N = self._release_N_s * dt_s if is_free else 0.0
-        self.is_passing = self.is_passing and abs(path_N[0] - self.asked_N) > step_N
-        expected_N = path_N[0] if sent_mm is None else self.expected_N
+        is_let_go = is_free and force_N < self.asked_N and setpoint.lets_go(travel)
+        self.is_passing = self.is_passing and not is_let_go and abs(path_N[0] - self.asked_N) > step_N
         if self.is_passing:
-            governed_N = expected_N = self.asked_N + math.copysign(step_N, path_N[0] - self.asked_N)
+            governed_N = self.asked_N + math.copysign(step_N, path_N[0] - self.asked_N)
             path_N, sent_mm = [governed_N] * len(PATH_S), None
             limits, foresight = (*limits, Limit.TAKEOVER), 0.0
         self._stand_at(path_N[0], device, sent_mm)
-        self.expected_N = expected_N
         return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
 
     def _target(
@@ -156,30 +155,29 @@ class Governor:
         self.blend_N = lawful_N - allowed_N
         self.target_N, self.target_mm = lawful_N if travel.is_pushing else None, travel.place_mm
         waiting_N, most_N = self._allowed
-        held = (
-            (Limit.RANGE, not self._least_N <= asked_N <= most_N),
-            (Limit.STANDBY, self._least_N < waiting_N > asked_N),
-            (Limit.F_MIN, lawful_N < given[0]),
-            (Limit.F_MAX, lawful_N > given[1]),
+        return within(lawful_N, given), (
+            *((Limit.RANGE,) if not self._least_N <= asked_N <= most_N else ()),
+            *((Limit.STANDBY,) if self._least_N < waiting_N > asked_N else ()),
+            *((Limit.F_MIN,) if lawful_N < given[0] else ()),
+            *((Limit.F_MAX,) if lawful_N > given[1] else ()),
+            *setpoint.limits,
         )
-        return within(lawful_N, given), (*[limit for limit, acts in held if acts], *setpoint.limits)
 
     def _law(self, setpoint: TimedSetpoint, travel: Travel, dt_s: float) -> Bounds:
         """Return what a law's ramp leaves of the corridor."""
         before_N, last, wall = self.target_N, self.last, setpoint.wall
         # a new holder has a ramp of its own
         if last is None or before_N is None or not travel.is_pushing or setpoint.holder != last.holder:
-            return -math.inf, math.inf
+            return -ENDLESS, ENDLESS
         if wall is not None:
             most_N = self._release_N_s * dt_s + wall.stiffness_N_mm * abs(travel.place_mm - self.target_mm)
-        elif self._decay_N_s < math.inf:
-            return before_N - self._decay_N_s * dt_s, math.inf
+        elif self._decay_N_s < ENDLESS:
+            return before_N - self._decay_N_s * dt_s, ENDLESS
         else:
-            most_N = math.inf if last.wall is None and self.blend_N == 0.0 else self._release_N_s * dt_s
+            most_N = ENDLESS if last.wall is None and self.blend_N == 0.0 else self._release_N_s * dt_s
         return before_N - most_N, before_N + most_N
 
     def _learn(self, setpoint: TimedSetpoint, travel: Travel, force_N: float, device: DeviceFit) -> None:
-        """Learn the stream's slope and what it repeats."""
         last, self.last = self.last or setpoint, setpoint
         spacing_s = setpoint.stamp_s - last.stamp_s
         if setpoint.holder != last.holder:  # another publisher's forces say nothing about this one's
@@ -268,9 +266,10 @@ class Governor:
         return [(wall.most_N(each_mm) + over_N, wall.most_N(each_mm + on_mm) + over_N) for each_mm in places_mm]
 
     def _stand_at(self, force_N: float, device: DeviceFit, sent_mm: float | None = None) -> None:
-        self.asked_N = self.expected_N = force_N
-        self.from_mm = self._portrait.gap_mm_at(device.model_N(force_N))
-        self.sent_mm = self.from_mm if sent_mm is None else sent_mm
+        self.asked_N, self.from_mm = force_N, self._portrait.gap_mm_at(device.model_N(force_N))
+        if sent_mm is None:
+            self.expected_N, sent_mm = force_N, self.from_mm
+        self.sent_mm = sent_mm
 
     def _forget(self) -> None:
         self.last, self.slope_N_s, self.is_passing = None, 0.0, True
@@ -291,9 +290,9 @@ def previewed_N(setpoint: TimedSetpoint, begins_s: float, forecast: Forecast) ->
             break
         force_N = at_step(at_s / setpoint.preview_dt_s, forces_N)
         if past_s >= 0.0:
-            force_N += setpoint.preview_slope_N_s * min(past_s, AHEAD_S, setpoint.preview_s)
+            force_N += setpoint.preview_slope_N_s * min(min(past_s, AHEAD_S), setpoint.preview_s)
             if trust > 0.0:
                 force_N += trust * (forecast.forces_N(past_s, [0.0])[0] - force_N)
-        require_number("preview_N", force_N)
+        require_finite("preview_N", force_N)
         ahead_N.append(force_N)
     return ahead_N

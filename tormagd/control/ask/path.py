@@ -13,13 +13,12 @@ from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.interpolation import require_finite
 from tormagd.control.records import GapSpeeds
-from tormagd.element.model.features import require_number
 from tormagd.element.model.force_curve import within
 
 PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
 "When, after the moment planned for, a plan looks at the force to come."
-PATH_STEP_S: Final = 0.005
 TIMES_S: Final = [*PATH_S, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25, 0.33, 0.4]
 "When what is known ahead is looked at. By the last the gap crosses a third of its stroke."
 LASTS_S: Final = [
@@ -65,10 +64,12 @@ class Path:
         """Find the best path for `wanted_N` at TIMES_S; return its forces at PATH_S and a gap to send."""
         portrait = self._portrait
         late_s = SPEEDING_UP_S + lag_s
-        require_number("sent_mm", sent_mm)
-        there = [portrait.gap_and_slope_at(device.model_N(force_N)) for force_N in wanted_N]
-        weights = [lasts_s * max(slope, FLATTEST_N_MM) ** 2 for (_, slope), lasts_s in zip(there, LASTS_S)]  # noqa: B905
-        wanted_mm = [gap_mm for gap_mm, _ in there]
+        require_finite("sent_mm", sent_mm)
+        # compiled, pairs and ** make objects
+        wanted_mm, weights = wanted_N[:], LASTS_S[: len(wanted_N)]
+        for place, force_N in enumerate(wanted_N):
+            wanted_mm[place], slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
+            weights[place] *= math.pow(max(slope_N_mm, FLATTEST_N_MM), 2.0)
         if most_N is None:
             for place in range(len(wanted_mm) - 1):
                 wanted_mm[place] += late_s * CHANGES_PER_S[place] * (wanted_mm[place + 1] - wanted_mm[place])
@@ -79,7 +80,7 @@ class Path:
                 least_mm = max(self.gap_mm(now_N, device) - lead_mm, self.gap_mm(then_N, device))
                 path_mm[place] = max(path_mm[place], least_mm)
         gap_mm, forces_N = from_mm, []
-        left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_STEP_S / late_s)
+        left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_S[1] / late_s)
         for to_mm in path_mm:
             gap_mm = to_mm + (gap_mm - to_mm) * left
             forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
@@ -119,9 +120,7 @@ def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float],
     below: list[float] = []
     above_mm: list[float] = []
     above: list[float] = []
-    place = len(wanted_mm)
-    while place:
-        place -= 1
+    for place in range(len(wanted_mm) - 1, -1, -1):
         opened_mm, closed_mm = speeds.opening_mm_s * times_s[place], speeds.sure_mm_s * times_s[place]
         least_mm, slope = wanted_mm[place], weights[place]
         offset = -slope * least_mm

@@ -6,6 +6,7 @@ The daemon, the virtual-time simulation and the tests build the core here, so th
 import hashlib
 import math
 import platform
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,8 +38,7 @@ from tormagd_client.endpoints import ConfigError
 
 MIN_PHASE_MARGIN_DEG = 30.0
 MIN_GAIN_MARGIN_DB = 4.0
-SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
-SOURCES += ("tormagd/hardware", "tormagd/control", "tormagd/control/assembly")
+SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("element", "scenes", "hardware", "control")))
 SENSED_N = 0.001
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "Friction holds the gap to within four counts of the encoders."
@@ -224,22 +224,20 @@ def _refuse_too_weak(config: Config, scene: Scene) -> None:
         )
 
 
-def _out_of_reach(scene: Scene, reach: Portrait) -> list[str]:
-    """Return which of the scene's greatest and standby forces the gaps do not reach."""
+def _out_of_reach(scene: Scene, reach: Portrait) -> Iterator[str]:
+    """Yield which of the scene's greatest and standby forces the gaps do not reach."""
     # a lower least force is no error: no passive brake gives 0, and the limit F_MIN says so
-    unmet = []
     if not reach.min_N < scene.force.most_N <= reach.max_N:
-        unmet.append(
+        yield (
             f"force.most_N = {scene.force.most_N:g}: allowed is {reach.min_N:.2f}..{reach.max_N:.2f}, what model "
             f"{scene.insert.model} gives in these gaps"
         )
     standby_N, most_N = scene.force.standby_N, min(reach.min_N + STANDBY_N, scene.force.most_N)
     if standby_N is not UNSET and not reach.min_N < standby_N <= most_N:
-        unmet.append(
+        yield (
             f"force.standby_N = {standby_N:g}: allowed is above {reach.min_N:.3g}, what the open gap gives, to "
             f"{most_N:.3g}"
         )
-    return unmet
 
 
 def at_rates_of(scene: Scene, config: Config) -> Config:
@@ -286,14 +284,13 @@ def least_resolution_N(reach: Portrait, most_N: float) -> float:
     return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
 
 
-def _too_fine(scene: Scene, reach: Portrait) -> list[str]:
+def _too_fine(scene: Scene, reach: Portrait) -> Iterator[str]:
     least_N = least_resolution_N(reach, scene.force.most_N)
-    if scene.force.resolution_N >= least_N:
-        return []
-    return [
-        f"force.resolution_N = {scene.force.resolution_N:g}: allowed is at least {least_N:.2g}: the force sensor has "
-        f"steps of {SENSED_N:g} N, and the gap settles to {1e3 * SETTLES_MM:.0f} um"
-    ]
+    if scene.force.resolution_N < least_N:
+        yield (
+            f"force.resolution_N = {scene.force.resolution_N:g}: allowed is at least {least_N:.2g}: the force sensor "
+            f"has steps of {SENSED_N:g} N, and the gap settles to {1e3 * SETTLES_MM:.0f} um"
+        )
 
 
 def _unknown_hand(scene: Scene, model: ForceModel) -> list[str]:
@@ -321,23 +318,22 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
     return missed(reach, times_s.tolist(), forces_N.tolist(), config.position.gap_speed_mm_s)
 
 
-def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> list[str]:
-    """Return whether ideal carriages miss the signal by more than its tolerance, as text."""
-    if miss is None or miss.rms_N <= scene.force.tolerance_rms_N:
-        return []
-    worst = ", ".join(
-        f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
-        for point in miss.worst
-    )
-    return [
-        f"force.tolerance_rms_N = {scene.force.tolerance_rms_N:g}: allowed for its signal is at least "
-        f"{ROUNDED_UP * miss.rms_N:.3g}: gaps of {config.position.gap_speed_mm_s:g} mm/s miss it by that, "
-        f"{miss.share:.0%} of the time it is faster: {worst}"
-    ]
+def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> Iterator[str]:
+    """Yield by how much ideal carriages miss the signal, if beyond its tolerance."""
+    if miss is not None and miss.rms_N > scene.force.tolerance_rms_N:
+        worst = ", ".join(
+            f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
+            for point in miss.worst
+        )
+        yield (
+            f"force.tolerance_rms_N = {scene.force.tolerance_rms_N:g}: allowed for its signal is at least "
+            f"{ROUNDED_UP * miss.rms_N:.3g}: gaps of {config.position.gap_speed_mm_s:g} mm/s miss it by that, "
+            f"{miss.share:.0%} of the time it is faster: {worst}"
+        )
 
 
-def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
-    """Return whether an opening gap releases the force faster than the scene allows, as text."""
+def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> Iterator[str]:
+    """Yield how fast an opening gap releases the force, where the scene forbids that."""
     # the weakest believable device makes a force at the least gap, where the gap's speed changes it most
     opening_mm_s, key = max(
         (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
@@ -346,12 +342,11 @@ def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> list[str]:
     weakest = config.trim.least
     model_N = min(CEILING * scene.force.most_N / weakest, reach.max_N)
     lost_N_s = weakest * reach.force_rate_N_s(model_N, opening_mm_s)
-    if lost_N_s <= scene.force.most_release_N_s:
-        return []
-    return [
-        f"force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least {lost_N_s:.2f}: {key} opens "
-        f"the gap by {opening_mm_s:g} mm/s, which at {weakest * model_N:.2g} N loses so much"
-    ]
+    if lost_N_s > scene.force.most_release_N_s:
+        yield (
+            f"force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least {lost_N_s:.2f}: {key} "
+            f"opens the gap by {opening_mm_s:g} mm/s, which at {weakest * model_N:.2g} N loses so much"
+        )
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:

@@ -27,8 +27,8 @@ class Missed(NamedTuple):
 def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_speed_mm_s: float) -> Missed:
     """Return what ideal carriages without preview miss of forces at rising times."""
     tenth_N = max(max(forces_N) - min(forces_N), 1e-9) / 10.0
-    furthest: dict[int, Point] = {}
-    at_N, squares, outside = forces_N[0], 0.0, 0
+    outside: list[Point] = []
+    at_N, squares = forces_N[0], 0.0
     for index in range(1, len(forces_N)):
         step_s, force_N = times_s[index] - times_s[index - 1], forces_N[index]
         most_N = shown.force_rate_N_s(at_N, gap_speed_mm_s) * step_s
@@ -37,11 +37,9 @@ def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_spe
         asked_N_s = abs(force_N - forces_N[index - 1]) / step_s
         given_N_s = shown.force_rate_N_s(force_N, gap_speed_mm_s)
         if asked_N_s > given_N_s:
-            outside += 1
-            tenth = int(force_N / tenth_N)
-            known = furthest.get(tenth)
-            if known is None or asked_N_s / given_N_s > known.asked_N_s / known.given_N_s:
-                furthest[tenth] = Point(force_N, asked_N_s, given_N_s)
-    worst = sorted(furthest.values(), key=lambda point: point.given_N_s / point.asked_N_s)
+            outside.append(Point(force_N, asked_N_s, given_N_s))
+    outside.sort(key=lambda point: point.given_N_s / point.asked_N_s)
+    furthest = {int(point.force_N / tenth_N): point for point in reversed(outside)}
+    worst = sorted(furthest.values(), key=outside.index)
     count = len(forces_N) - 1
-    return Missed(math.sqrt(squares / count), outside / count, tuple(worst[:SHOWN]))
+    return Missed(math.sqrt(squares / count), len(outside) / count, tuple(worst[:SHOWN]))

@@ -65,7 +65,7 @@ class Anchor:
 
 
 def _terms(model_N: float) -> list[float]:
-    return [model_N, 1.0, (model_N - MIDDLE_N) ** 2, max(LEAST_N - model_N, 0.0) ** 2]
+    return [model_N, 1.0, math.pow(model_N - MIDDLE_N, 2.0), math.pow(max(LEAST_N - model_N, 0.0), 2.0)]
 
 
 def _dot(left: list[float], right: list[float]) -> float:

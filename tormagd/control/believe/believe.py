@@ -95,8 +95,7 @@ class Believe:
         self.memory, self.handle = memory, HandleWatch()
         self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
-        self._leash: Final = trim.leash
-        self._way: Final = trim.way
+        self._trim: Final = trim
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero(trim.way)
         self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
         self.ripple = Ripple()
@@ -106,10 +105,9 @@ class Believe:
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self.read_s = -math.inf
-        self.learns = terms.learning
-        """Whether anything is learned."""
+        self.read_s, self.learns = -math.inf, terms.learning
         self._has_lag: Final = terms.motor
+        self._slides: Final = nominal.contact.slides
         self._has_creep: Final = terms.creep and nominal.contact.slides
         self._fits: Final = terms.scale or terms.offset
 
@@ -133,8 +131,8 @@ class Believe:
     def teach(self, learned: Learned) -> None:
         """Replace all that is known of the device by `learned`, and begin its estimators anew."""
         self.strength.forget(learned.device)
-        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(self._way)
-        self.sensor, self.carriages = SensorTrust(self._bounds, self._leash, learned.device), CarriageLag()
+        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(self._trim.way)
+        self.sensor, self.carriages = SensorTrust(self._bounds, self._trim.leash, learned.device), CarriageLag()
         self.ripple = Ripple()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
@@ -151,12 +149,13 @@ class Believe:
         slid_N: float | None = None
         if measured is not None:
             self.memory.update(now_s, measured)
-            if self._has_creep:
-                self.slow.slide(now_s, measured.handle.sliding_mm_s)
+            self.slow.slide(now_s, measured.handle.sliding_mm_s)
             if measured.is_homed:
                 model_N = self.memory.force_N(self._nominal.now(measured))
-                slides = self._nominal.contact.slides
-                slid_N = self.slow.follow(model_N, measured.handle_mm) if slides else model_N
+                slid_N = model_N
+                if self._slides:
+                    slid_N = self.slow.follow(model_N, measured.handle_mm)
+                    self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
                 self._hear(now_s, measured, model_N, slid_N)
         return self._belief(measured, slid_N)
 
@@ -171,26 +170,27 @@ class Believe:
             self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
-        """Return the belief, and change nothing."""
         at_speed = self.device
-        ripple = self._ripple(measured) if measured is not None else 1.0
-        predicted_N: float | None = None
-        if measured is not None and slid_N is not None and self._nominal.contact.is_known(measured):
-            now_slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-            predicted_N = self.strength.fit.force_N(slid_N) * now_slow * ripple
-        is_unseen = self.is_prior and not self.sensor.has_slid
-        unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
+        ripple, predicted_N, has_slid = 1.0, None, self.sensor.has_slid
+        if measured is not None:
+            ripple = self._ripple(measured)
+            if slid_N is not None and self._nominal.contact.is_known(measured):
+                now_slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
+                predicted_N = self.strength.fit.force_N(slid_N) * now_slow * ripple
+        unseen = UNSEEN.relaxed(self.memory.relaxed_N) if self.is_prior and not has_slid else None
         slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
-        anchor_N: float | None = None
-        if self.sensor.has_slid:
-            anchor, most_N = self.sensor.anchor, self._surely_N
-            most_N += SURE * max(anchor.deviation_N(most_N) - 2.0 * KNOWN_N, 0.0)
-            anchor_N = anchor.model_N(most_N / (slow * max(ripple, 1.0))) + self.memory.relaxed_N
+        anchor_N = self._anchor_N(slow * max(ripple, 1.0)) if has_slid else None
         device = at_speed.times(slow * ripple)
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
         doubted_s = self.sensor.doubted_s
         return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, doubted_s, anchor_N)
+
+    def _anchor_N(self, factor: float) -> float:
+        """Return the model's force, N, of the ceiling on the anchor."""
+        anchor, most_N = self.sensor.anchor, self._surely_N
+        most_N += SURE * max(anchor.deviation_N(most_N) - 2.0 * KNOWN_N, 0.0)
+        return anchor.model_N(most_N / factor) + self.memory.relaxed_N
 
     def _ripple(self, measured: Measured) -> float:
         """Return the friction at the handle's place and way, over its mean."""
@@ -200,13 +200,9 @@ class Believe:
 
     def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
         """Learn from the newest reading, with the model's force `model_N` at the measured gap."""
-        slides = self._nominal.contact.slides
-        if slides:
-            self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
-        if measured.number == self.read or now_s - self.read_s < MIN_DT_S:
+        is_new = measured.number != self.read and now_s - self.read_s >= MIN_DT_S
+        if not is_new or now_s - measured.sensed_s > self._unsensed_s:
             return
-        if now_s - measured.sensed_s > self._unsensed_s:
-            return  # the force was sensed too long ago
         dt_s = min(now_s - self.read_s, MAX_DT_S)
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
@@ -216,7 +212,7 @@ class Believe:
         is_low = reading_N < self.strength.fit.force_N(model_N) - STUCK_N
         is_stuck = is_low and abs(measured.handle.quick_mm_s) < STOPPING_MM_S
         if is_mobilised and not (
-            slides and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
+            self._slides and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
         ):
             self._hear_at_speed(now_s, measured, reading_N, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
         else:
@@ -227,12 +223,10 @@ class Believe:
     ) -> None:
         """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise."""
         self.strength.settle()
-        if not (self._has_creep and self.learns) or self.sensor.is_disputed:
-            return
-        handle = measured.handle
-        rate_mm_s = abs(handle.rate_mm_s)
-        is_creep = handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
-        if not is_creep or not SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S:
+        rate_mm_s = abs(measured.handle.rate_mm_s)
+        is_creep = measured.handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
+        is_creep = is_creep and SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S
+        if not (self._has_creep and self.learns and is_creep) or self.sensor.is_disputed:
             return
         expected_N = self.strength.fit.force_N(self.slow.followed_N)
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
@@ -259,13 +253,14 @@ class Believe:
                 fit.scale_sd,
                 is_disputed=sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
             )
-        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=self.learns)
+        learns = self.learns and zero_sd_N <= UNKNOWN_SD_N
+        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns)
         unknown_N = self._unknown_N(zero_sd_N)
         least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
         if taught_N is None or (unknown_N > 0.0 and reading_N < least_N):
             self.strength.settle()
             return
-        if self._nominal.contact.slides and not self.strength.is_held:
+        if self._slides and not self.strength.is_held:
             anchor_N = max(sensor.anchor.force_N(model_N), MIN_EXPECTED_N)
             self.ripple.update(angle, measured.handle.rate_mm_s, anchor_N, reading_N)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
@@ -303,7 +298,7 @@ class Believe:
             return
         fit = self.strength.fit
         if wrong == "device":
-            self.sensor = SensorTrust(self._bounds, self._leash)
+            self.sensor = SensorTrust(self._bounds, self._trim.leash)
         else:
             fit = fit.shifted(self.sensor.anchor.force_N(MIDDLE_N) - fit.force_N(MIDDLE_N))
             self.sensor.is_doubted = True

@@ -10,6 +10,8 @@ T is learned only from plans that know what comes, and not while the carriages a
 
 from typing import Final, final
 
+from tormagd.control.interpolation import low_pass
+
 MAX_LAG_S: Final = 0.06
 "The plant card's carriages are 50 ms late at most."
 FORGETTING_S: Final = 3.0
@@ -46,11 +48,9 @@ class CarriageLag:
             return
         dt_s = min(max(dt_s, 0.0), MAX_DT_S)
         speed_mm_s = min(max(speed_mm_s, -top_speed_mm_s), top_speed_mm_s)  # a new filter may overstate it
-        expected_mm = self.expected_mm
-        if expected_mm is None:
-            expected_mm = planned_mm
-        elif dt_s > 0.0:
-            expected_mm += dt_s / (self.lag_s + dt_s) * (planned_mm - expected_mm)
+        expected_mm = planned_mm if self.expected_mm is None else self.expected_mm
+        if dt_s > 0.0:
+            expected_mm = low_pass(expected_mm, planned_mm, dt_s, self.lag_s)
         self.expected_mm = expected_mm
         error_mm = expected_mm - gap_mm - speed_mm_s * AGE_S
         self.is_settling = abs(error_mm) > (SETTLED_MM if self.is_settling else MAX_LAG_S * top_speed_mm_s)

@@ -58,12 +58,9 @@ class Freshness:
     @property
     def is_frozen(self) -> bool:
         """Tell whether the sensor is broken: it should have shown another value by now."""
-        if self.still_s <= FROZEN_S:
-            return False
         is_resolved = self.alternates > ALTERNATES and self.run_s < RESOLVED * self.min_run_s
-        if self.runs == HEARD and is_resolved and self.still_s > FROZEN_RUNS * self.run_s:
-            return True
-        return self.changed_N > FROZEN_N + self._steps_N
+        is_long = self.runs == HEARD and is_resolved and self.still_s > FROZEN_RUNS * self.run_s
+        return self.still_s > FROZEN_S and (is_long or self.changed_N > FROZEN_N + self._steps_N)
 
     @property
     def _steps_N(self) -> float:

@@ -50,56 +50,55 @@ class ElementMemory:
         self._relaxes: Final = len(memory.fractions) > 0
         self._nominal: Final = nominal
         self._field: Final = field
-        self._closed_mm: Final = gap_range_mm[0]
+        self._least_mm: Final = gap_range_mm[0] - BEYOND_MM
         self._open_mm: Final = gap_range_mm[1]
-        self._only_free_N: Final = self._free_N(nominal.only)
+        self._only_free_N: Final = self._force_N(nominal.only, 0.0)
         self._open_mT: Final = field.field_mT(gap_range_mm[1])
 
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`."""
         change_mT = field_mT - self.field_mT
-        if self.time_s == -math.inf:
-            return 0.0
-        if change_mT == 0.0:
+        if change_mT == 0.0 or self.time_s == -math.inf:
             return self.lag_mT
         side_mT = math.copysign(self._width_mT, change_mT)
         return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
     def open_N(self) -> float:
         """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed."""
-        field_mT = self._open_mT - self.lag_at_mT(self._open_mT)
-        return self._nominal.only.force_N(within(field_mT, self._nominal.fields_mT))
+        return self._force_N(self._nominal.only, self._open_mT - self.lag_at_mT(self._open_mT))
 
     def force_N(self, curve: ForceCurve) -> float:
         """Return the model's force now, N, with memory; `curve` is its force over the field without."""
-        return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
+        return self._force_N(curve, self.field_mT - self.lag_mT) - self.relaxed_N
 
     def update(self, now_s: float, measured: Measured) -> None:
         """Follow lag and relaxation to `now_s`, along a straight change to the `measured` gap."""
         slides = self._nominal.contact.slides
-        is_empty = self.time_s == -math.inf
         if slides and not measured.is_homed:
             # before homing, positions count from where the carriages were at switching on, as if that were the open gap
-            if is_empty:
+            if self.time_s == -math.inf:
                 self.opened_mm = max(measured.gap_mm - self._open_mm, self.opened_mm)
             return
-        gap_mm = max(measured.gap_mm, self._closed_mm - BEYOND_MM) if measured.is_homed else self._open_mm
+        gap_mm = max(measured.gap_mm, self._least_mm) if measured.is_homed else self._open_mm
         field_mT = self._field.field_mT(gap_mm)
         curve = self._nominal.only if slides else self._nominal.now(measured)
-        free_N = self._only_free_N if slides else self._free_N(curve)
-        if is_empty and slides:
-            found_mm = gap_mm - self.opened_mm
-            is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
-            rested_mT = self._field.field_mT(found_mm if is_known else gap_mm)
-            self._begin(rested_mT, free_N, self._added_N(curve, rested_mT, free_N), now_s)
-            self._follow(curve, free_N, rested_mT, now_s)
-        elif is_empty:
-            self._begin(field_mT, 0.0, 0.0, now_s)
+        free_N = self._only_free_N if slides else self._force_N(curve, 0.0)
+        if self.time_s == -math.inf:
+            self._begin(curve, gap_mm, free_N, now_s)
         self._follow(curve, free_N, field_mT, now_s)
 
-    def _begin(self, field_mT: float, free_N: float, added_N: float, now_s: float) -> None:
-        self.field_mT, self.lag_mT, self.relaxed_N, self.opened_mm, self.time_s = field_mT, 0.0, 0.0, 0.0, now_s
-        self.free, self.added = self._free.relaxed(free_N), self._added.relaxed(added_N)
+    def _begin(self, curve: ForceCurve, gap_mm: float, free_N: float, now_s: float) -> None:
+        """Begin relaxed at the gap at which a brake was switched on, and with nothing relaxed on a pad."""
+        slides = self._nominal.contact.slides
+        found_mm = gap_mm - self.opened_mm if slides else gap_mm
+        is_known = self._least_mm <= found_mm <= self._open_mm + BEYOND_MM
+        self.field_mT = self._field.field_mT(found_mm if is_known else gap_mm)
+        self.lag_mT, self.relaxed_N, self.opened_mm, self.time_s = 0.0, 0.0, 0.0, now_s
+        self.free, self.added = self._free.relaxed(0.0), self._added.relaxed(0.0)
+        if slides:
+            added_N = self._force_N(curve, self.field_mT) - free_N
+            self.free, self.added = self._free.relaxed(free_N), self._added.relaxed(added_N)
+            self._follow(curve, free_N, self.field_mT, now_s)
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
         """Follow a straight change of the gap's field to `field_mT` at `now_s`."""
@@ -108,14 +107,11 @@ class ElementMemory:
         self.field_mT, self.time_s = field_mT, now_s
         if not self._relaxes:
             return
-        added_N = self._added_N(curve, field_mT - self.lag_mT, free_N)
+        added_N = self._force_N(curve, field_mT - self.lag_mT) - free_N
         step = self._free.discretise(dt_s)
         left_N, self.free = step.advance(self.free, free_N)
         left_of_added_N, self.added = step.of(self._added.fractions).advance(self.added, added_N)
         self.relaxed_N = free_N + added_N - left_N - left_of_added_N
 
-    def _free_N(self, curve: ForceCurve) -> float:
-        return curve.force_N(within(0.0, self._nominal.fields_mT))
-
-    def _added_N(self, curve: ForceCurve, field_mT: float, free_N: float) -> float:
-        return curve.force_N(within(field_mT, self._nominal.fields_mT)) - free_N
+    def _force_N(self, curve: ForceCurve, field_mT: float) -> float:
+        return curve.force_N(within(field_mT, self._nominal.fields_mT))

@@ -13,6 +13,8 @@ import math
 from itertools import accumulate
 from typing import Final, final
 
+TURN: Final[float] = math.tau
+"Compiled, a plain float."
 QUIET: Final = 0.015
 "A ripple that nowhere exceeds this is none: noise and relaxing leave as much."
 PLACES: Final = 36
@@ -65,14 +67,14 @@ class Ripple:
 
     def share(self, angle: float) -> float:
         """Return by which share the friction at the handle's `angle` is greater than its mean over a turn."""
-        corner = angle * PLACES / math.tau - 0.5
+        corner = angle * PLACES / TURN - 0.5
         at = math.floor(corner)
         here, there = self.shares[at % PLACES], self.shares[(at + 1) % PLACES]
         return self.trust * (here + (corner - at) * (there - here))
 
     def update(self, angle: float, rate_mm_s: float, force_N: float, reading_N: float) -> None:
         """Take a reading at the handle's `angle`, the known ripple taken off, beside the anchor's `force_N` > 0."""
-        place = math.floor(angle * PLACES / math.tau)
+        place = math.floor(angle * PLACES / TURN)
         if place != self.place:
             if self.readings > 0:
                 self._pass(rate_mm_s, force_N)

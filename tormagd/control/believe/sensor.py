@@ -111,22 +111,16 @@ class SensorTrust:
         unsure_N += VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
         beyond_N = abs(self.measured_N - force_N) - self._leash * force_N - unsure_N - KNOWN_N - surely_N
         self._doubt(is_strange, dt_s)
-        self._judge(is_strange, beyond_N <= 0.0, dt_s)
-        if self.has_slid:
-            least_N = max(least_N, (1.0 - LEAPT) * force_N - unsure_N - surely_N)
-        if not (self._teaches and least_N <= reading_N <= most_N):
+        teaches = self._judge(is_strange, beyond_N <= 0.0, dt_s)
+        leapt_N = (1.0 - LEAPT) * force_N - unsure_N - surely_N if self.has_slid else least_N
+        if not (teaches and max(least_N, leapt_N) <= reading_N <= most_N):
             return None
         taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
-        is_known = zero_sd_N <= UNKNOWN_SD_N and beyond_N <= 0.0 and learns
-        self._learn(model_N, force_N, deviation_N, rate_mm_s, taught_N, believed, dt_s, is_known=is_known)
+        self._learn(model_N, force_N, deviation_N, rate_mm_s, taught_N, believed, dt_s, learns and beyond_N <= 0.0)
         if self.has_slid:
             self._give_way(believed, force_N, dt_s)
         return taught_N
-
-    @property
-    def _teaches(self) -> bool:
-        return self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale
 
     def _learn(
         self,
@@ -137,7 +131,6 @@ class SensorTrust:
         taught_N: float,
         believed: float,
         dt_s: float,
-        *,
         is_known: bool,
     ) -> None:
         """Teach the anchor a force at which it is not known."""
@@ -154,7 +147,7 @@ class SensorTrust:
         # what is lost in the slack is given way, too: readings at its end would teach only their noise
         self.low_s = self.low_s + dt_s if self.measured_N < self.share * force_N else 0.0
         falls = FALLS_1_S * dt_s if self.low_s > LEARNS_S else 0.0
-        self.share = min(max(self.share - falls, believed, 1.0 - self._leash), 1.0)
+        self.share = min(max(max(self.share - falls, believed), 1.0 - self._leash), 1.0)
 
     def _doubt(self, is_strange: bool, dt_s: float) -> None:
         """Count how long the readings have been such as no device gives, and how long the device has slid."""
@@ -164,8 +157,8 @@ class SensorTrust:
         if not is_strange and not self.is_doubted:
             self.known_s = min(self.known_s + dt_s, LEARNS_S)
 
-    def _judge(self, is_strange: bool, is_inside: bool, dt_s: float) -> None:
-        """Count how long the readings have been outside or inside the leash; a doubted sensor may be believed again."""
+    def _judge(self, is_strange: bool, is_inside: bool, dt_s: float) -> bool:
+        """Count how long the readings have been outside or inside the leash, and return whether they teach."""
         self.inside_s = self.inside_s + dt_s if is_inside and not is_strange else 0.0
         if self.has_slid and not is_inside:
             self.outside_s += dt_s
@@ -173,3 +166,4 @@ class SensorTrust:
             self.outside_s = 0.0
         if self.is_doubted and self.inside_s > 5.0 * INSIDE_S:
             self.is_doubted, self.doubted_s, self.wrong_s = False, 0.0, 0.0
+        return self.wrong_s == 0.0 and not self.is_doubted and not self.freshness.is_stale

@@ -14,9 +14,8 @@ from typing import Final, final
 from firmware_protocol.value import Value
 from tormagd.control.believe.strength import SURE
 
-TARED_SD_N: Final = 0.02
-TARED_VARIANCE_N2: Final = TARED_SD_N * TARED_SD_N
-"Deviation and variance of a sensor that begins: it is taken for tared."
+TARED_VARIANCE_N2: Final = 0.02 * 0.02
+"Variance of a sensor that begins: it is taken for tared."
 WANDERS_S: Final = 600.0
 DRIFT_N2_S: Final = 0.05**2 / WANDERS_S
 "5 mN a minute (plant card). For WANDERS_S the zero may wander to and fro; in an hour it may have gone one way."

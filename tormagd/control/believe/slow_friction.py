@@ -13,6 +13,7 @@ from typing import Final, final
 
 from tormagd.control.believe.strength import MAX_RELAXED, DeviceBounds, DeviceFit
 from tormagd.control.interpolation import low_pass
+from tormagd.element.model.force_curve import within
 
 STRIBECK_MM_S: Final = 5.0
 "At this speed most of static friction is gone (plant card)."
@@ -57,13 +58,11 @@ class SlowFriction:
 
     def __init__(self, bounds: DeviceBounds) -> None:
         self._bounds: Final = bounds
-        least, most = factor_bounds(bounds)
-        self._least: Final = least
-        self._most: Final = most
+        self._factors: Final = factor_bounds(bounds)
 
     def factor_at(self, rate_mm_s: float) -> float:
         """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
-        return 1.0 + _slowness(rate_mm_s) * (min(max(self.factor, self._least), self._most) - 1.0)
+        return 1.0 + _slowness(rate_mm_s) * (within(self.factor, self._factors) - 1.0)
 
     def slide(self, now_s: float, sliding_mm_s: float) -> None:
         """Update `creep_mm_s` with the level of rate that friction has, `sliding_mm_s` >= 0, at `now_s`."""
@@ -86,7 +85,7 @@ class SlowFriction:
         if before_N > 0.0 and after_N > 0.0:
             kept = self.learned * max(1.0 - _slowness(rate_mm_s) / self.slowness, 0.0)
             at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
-            self.factor = 1.0 + (min(max(at_creep, self._least), self._most) - 1.0) / self.slowness
+            self.factor = 1.0 + (within(at_creep, self._factors) - 1.0) / self.slowness
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within
@@ -96,8 +95,8 @@ class SlowFriction:
         slowness = _slowness(rate_mm_s)
         share = slowness * dt_s / (LEARNED_S + dt_s)
         shown = 1.0 + (reading_N / fit.force_N(self.followed_N) - 1.0) / slowness
-        least, most = believable(fit, self.followed_N, self._bounds)
-        self.factor = min(max(self.factor + share * (shown - self.factor), least), most)
+        believed = believable(fit, self.followed_N, self._bounds)
+        self.factor = within(self.factor + share * (shown - self.factor), believed)
         self.learned += share * (1.0 - self.learned)
         self.slowness += share * (slowness - self.slowness)
 

@@ -162,8 +162,7 @@ def observe(
     *,
     adapts_in_s: float,
     bounds: DeviceBounds,
-    learns_scale: bool = True,
-    learns_offset: bool = True,
+    learns: tuple[bool, bool] = (True, True),
 ) -> tuple[DeviceFit, bool]:
     """Return the fit after one reading, and whether one of the `bounds` held its scale."""
     if dt_s <= 0.0:
@@ -173,13 +172,13 @@ def observe(
     by_scale = model_N * prior.scale_variance + prior.covariance_N
     by_offset = model_N * prior.covariance_N + prior.offset_variance_N2
     innovation_variance = model_N * by_scale + by_offset + noise_N2
-    gain_scale = by_scale / innovation_variance if learns_scale else 0.0
-    gain_offset = by_offset / innovation_variance if learns_offset else 0.0
+    gain_scale = by_scale / innovation_variance if learns[0] else 0.0
+    gain_offset = by_offset / innovation_variance if learns[1] else 0.0
     error_N = measured_N - fit.force_N(model_N)
     wanted = fit.scale + gain_scale * error_N
     scale = min(max(wanted, bounds.min_scale), bounds.max_scale)
     offset_N = fit.offset_N + gain_offset * error_N
-    if scale != wanted and learns_offset:
+    if scale != wanted and learns[1]:
         # a scale that is held is known: what is left of the error is the offset's alone
         by_itself = prior.offset_variance_N2 / (prior.offset_variance_N2 + noise_N2)
         offset_N = fit.offset_N + by_itself * (measured_N - scale * model_N - fit.offset_N)
@@ -187,7 +186,7 @@ def observe(
         scale,
         offset_N,
         prior.scale_variance - gain_scale * by_scale,
-        prior.covariance_N - (gain_scale * by_offset if learns_scale else gain_offset * by_scale),
+        prior.covariance_N - (gain_scale * by_offset if learns[0] else gain_offset * by_scale),
         prior.offset_variance_N2 - gain_offset * by_offset,
     )
     return learned, scale != wanted
@@ -214,7 +213,7 @@ class Strength:
         """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`."""
         error_N = reading_N - self.fit.force_N(model_N)
         self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)
-        adapts_in_s = self._adapts_in_s / (1.0 + (self.surprise_N / SURPRISE_N) ** 2)
+        adapts_in_s = self._adapts_in_s / (1.0 + math.pow(self.surprise_N / SURPRISE_N, 2.0))
         self.fit, self.is_held = observe(
             self.fit,
             model_N,
@@ -222,8 +221,7 @@ class Strength:
             dt_s,
             adapts_in_s=max(adapts_in_s, MIN_ADAPTS_IN_S),
             bounds=self._bounds,
-            learns_scale=self._learns[0],
-            learns_offset=self._learns[1],
+            learns=self._learns,
         )
         bounds = self._bounds
         offset_N = min(max(self.fit.offset_N, bounds.min_offset_N), bounds.max_offset_N)
@@ -231,10 +229,8 @@ class Strength:
             self.fit, self.is_held = self.fit.shifted(offset_N - self.fit.offset_N), True
 
     def settle(self) -> None:
-        """Set `surprise_N` to 0 and `is_held` to False, while no reading teaches."""
         self.surprise_N, self.is_held = 0.0, False
 
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
-        """Replace the fit by `fit`, and forget the surprise."""
         self.fit = fit
         self.settle()

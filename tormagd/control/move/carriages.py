@@ -88,9 +88,8 @@ class Carriages(Actuator):
         assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
         # a homed carriage may be found beyond the closed end
-        pull = 0.0
-        if self._has_motor:
-            pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._closed_mm)) / self._supply_V
+        nearest_mm = max(self.reference.gap_mm, self._closed_mm)
+        pull = pull_V(self._pull_V, nearest_mm) / self._supply_V if self._has_motor else 0.0
         limits: list[Limit] = []
         reference, is_slewed = self._follow(
             self.reference, now_s, dt_s, plan, self._speeds(pull, measured), measured, is_over, limits
@@ -156,7 +155,9 @@ class Carriages(Actuator):
         # the pull helps to close, but a reserve of duty is worth more there than a little speed
         opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         most = self._gap_speeds
-        return Speeds(motors_mm_s, min(motors_mm_s, most.opening_mm_s, opening_mm_s), min(motors_mm_s, most.sure_mm_s))
+        # compiled, min() of three makes objects
+        opening_mm_s = min(min(motors_mm_s, most.opening_mm_s), opening_mm_s)
+        return Speeds(motors_mm_s, opening_mm_s, min(motors_mm_s, most.sure_mm_s))
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:

@@ -90,18 +90,14 @@ class Opening:
             self.is_watching = False
             return
         if not self.is_watching:
-            self._begin(measurement)
+            self.is_watching, self.reported_s = True, measurement.reported_s
+            self.left_late_s = self.right_late_s = self.waits_s = 0.0
+            self._place(measurement)
         if not is_placed or is_blind:
             is_asked = safety.request is _RETRACT and number > self.unheard_request
             self._judge_by_word(measurement, is_asked, is_placed)
         else:
             self._judge_by_places(measurement)
-
-    def _begin(self, measurement: Measurement) -> None:
-        self.is_watching = True
-        self.left_late_s = self.right_late_s = self.waits_s = 0.0
-        self.reported_s = measurement.reported_s
-        self._place(measurement)
 
     def _place(self, measurement: Measurement) -> None:
         self.device_s = measurement.device_time_s

@@ -10,10 +10,8 @@ position.
 from typing import Final, final
 
 from tormagd.config import Position
-from tormagd.element.model.features import LARGEST, require_number
+from tormagd.control.interpolation import require_finite
 
-# compiled, a constant of this module is a plain float
-_LARGEST: Final[float] = LARGEST
 ON_TARGET_MM: Final = 0.001
 "Just over half an encoder count: a carriage cannot be told to stand nearer."
 
@@ -45,8 +43,7 @@ class Pid:
         proportional = self._proportional_per_mm * error_mm
         derivative = self._proportional_per_mm * self._derivative_time_s * error_mm_s
         asked = proportional + self.integral + derivative + feed_forward
-        if not -_LARGEST <= asked <= _LARGEST:
-            require_number("duty", asked)
+        require_finite("duty", asked)
         within = min(max(asked, -self._limit), self._limit)
         duty = min(within, 0.0) if is_blocked else within
         growth = proportional / self._integral_time_s + (duty - asked) / self._back_calculation_s

@@ -63,9 +63,8 @@ def follow(
     wanted = max(wanted, -_stopping_mm_s(max(reference.gap_mm - floor_mm, 0.0), acceleration_mm_s2, dt_s))
     bounded = min(max(wanted, -speeds.closing_mm_s), speeds.opening_mm_s)
     share = min(abs(reference.speed_mm_s) / speeds.no_load_mm_s, 1.0)
-    speeding_up, braking = acceleration_mm_s2 * (1.0 - share), acceleration_mm_s2
-    if reference.speed_mm_s * distance < 0.0:
-        braking *= 1.0 + share
+    speeding_up = acceleration_mm_s2 * (1.0 - share)
+    braking = acceleration_mm_s2 * (1.0 + share if reference.speed_mm_s * distance < 0.0 else 1.0)
     up, down = (speeding_up, braking) if reference.speed_mm_s > 0.0 else (braking, speeding_up)
     asked = (bounded - reference.speed_mm_s) / dt_s
     chosen = min(max(asked, -down), up)

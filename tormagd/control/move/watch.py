@@ -87,11 +87,12 @@ class Watch:
         self._no_motion_time_s: Final = limits.no_motion_time_s
         self._measurement_timeout_s: Final = device.measurement_timeout_ms * 1e-3
         self._longest_own_stall_s: Final = STALL_SHARE * device.command_timeout_ms * 1e-3
-        self._closed_mm: Final = scene.insert.gap_closed_mm
-        self._open_mm: Final = scene.insert.gap_open_mm
+        self._range_mm: Final = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
         self._slides: Final = scene.element == "torque"
         # devices not yet seen differ by SCALE_SD: a scene that tolerates that does without the sensor
-        self._needs_sensor: Final = scene.force.tolerance_rms_N < SCALE_SD * scene.force.most_N
+        needs_sensor = scene.force.tolerance_rms_N < SCALE_SD * scene.force.most_N
+        self._sense_fault_s: Final = SENSE_FAULT_S if needs_sensor else math.inf
+        self._sensor_fault_s: Final = SENSOR_FAULT_S if needs_sensor else math.inf
         self._ceiling_N: Final = ceiling_N(scene)
 
     def command_conditions(self, conditions: Conditions, measured: Measured | None) -> Conditions:
@@ -124,14 +125,8 @@ class Watch:
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
                 faults.append(Fault.ENCODER)
-        elif measured.is_homed and not safety.needs_homing:
-            # switches come with Status: with an older Status or State they are of another place
-            is_told = not sight.is_blind and measurement.reported_s >= measurement.received_s
-            switches: int = measurement.switches
-            if is_outside(measured, self._closed_mm, self._open_mm) or (
-                is_told and is_contradicted(measured, switches, self._closed_mm, self._open_mm)
-            ):
-                faults.append(Fault.OUT_OF_STROKE)
+        elif not safety.needs_homing and self._is_misplaced(measurement, measured, sight):
+            faults.append(Fault.OUT_OF_STROKE)
         if safety.is_driven:
             faults += self._of_link(now_s, measurement, sight)
             if leap is None:  # after a leap positions say nothing about the motion
@@ -181,6 +176,14 @@ class Watch:
         )
         return list(device_faults(measurement.faults, is_host_stall=is_ours))
 
+    def _is_misplaced(self, measurement: Measurement, measured: Measured, sight: Sight) -> bool:
+        # switches come with Status: with an older Status or State they are of another place
+        is_told = not sight.is_blind and measurement.reported_s >= measurement.received_s
+        closed_mm, open_mm = self._range_mm
+        switches: int = measurement.switches
+        is_elsewhere = is_told and is_contradicted(measured, switches, closed_mm, open_mm)
+        return measured.is_homed and (is_elsewhere or is_outside(measured, closed_mm, open_mm))
+
     def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
         faults: list[Fault] = []
         # the next tick could be a period late
@@ -189,7 +192,7 @@ class Watch:
             # a State that has just come over a slow line is old too, and a loop around such a delay would swing
             if at_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s:
                 faults.append(Fault.MEASUREMENT_STALE)
-            if self._needs_sensor and at_s - measurement.sensed_s > SENSE_FAULT_S:
+            if at_s - measurement.sensed_s > self._sense_fault_s:
                 faults.append(Fault.SENSE_STALE)
             if at_s - measurement.reported_s > STATUS_FAULT_S:
                 faults.append(Fault.STATUS_STALE)
@@ -211,7 +214,7 @@ class Watch:
             faults.append(Fault.FOLLOWING_ERROR)
         if self.over_s > OVER_FAULT_S and self._slides:  # on a pad the finger itself may press this hard
             faults.append(Fault.OVER_FORCE)
-        if self._needs_sensor and sensor_doubted_s > SENSOR_FAULT_S:
+        if sensor_doubted_s > self._sensor_fault_s:
             faults.append(Fault.SENSOR)
         if is_still:
             faults.append(Fault.NO_MOTION)
@@ -220,20 +223,15 @@ class Watch:
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
         """Tell whether a carriage stands still although it is driven the same way as a step before."""
         # a duty that reverses before the carriage could move drives it nowhere
-        is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
-        is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
-        is_left_still = is_left_driven and abs(measured.left_mm_s) < STILL_MM_S
-        is_right_still = is_right_driven and abs(measured.right_mm_s) < STILL_MM_S
-        return is_left_still or is_right_still
+        left, right = left_duty * math.copysign(1.0, self.left_duty), right_duty * math.copysign(1.0, self.right_duty)
+        is_left_still = left > self._no_motion_duty and abs(measured.left_mm_s) < STILL_MM_S
+        return is_left_still or (right > self._no_motion_duty and abs(measured.right_mm_s) < STILL_MM_S)
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        left_mm_s = right_mm_s = 0.0
-        is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
-        if is_left_driven:
-            left_mm_s = measured.left_mm_s * math.copysign(1.0, left_duty)
-        if is_right_driven:
-            right_mm_s = measured.right_mm_s * math.copysign(1.0, right_duty)
-        if left_mm_s < -STILL_MM_S or right_mm_s < -STILL_MM_S:
+        least = self._no_motion_duty
+        left_mm_s = measured.left_mm_s * math.copysign(1.0, left_duty) if abs(left_duty) > least else 0.0
+        right_mm_s = measured.right_mm_s * math.copysign(1.0, right_duty) if abs(right_duty) > least else 0.0
+        if min(left_mm_s, right_mm_s) < -STILL_MM_S:
             self.opposed_s += dt_s
-        elif left_mm_s > STILL_MM_S or right_mm_s > STILL_MM_S or not (is_left_driven or is_right_driven):
+        elif max(left_mm_s, right_mm_s) > STILL_MM_S or max(abs(left_duty), abs(right_duty)) <= least:
             self.opposed_s = 0.0
