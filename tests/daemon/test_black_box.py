@@ -89,8 +89,8 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
         parts += rig.heard()
     assert (first, {type(part) for part in parts}) == (Begin("/boxes", {"format": "1"}), {Part})
     assert (names(parts[0])[:3], names(parts[0])[-3:]) == (["state", "step", "tick"], ["plan", "step", "tick"])
-    assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 50, 100, 150]
-    assert [each for part in parts for each in names(part)].count("tick") == 3_010
+    assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 100, 200, 300]
+    assert [each for part in parts for each in names(part)].count("tick") == 3_015
     rig.box.begin_scene({"format": "2"}, rig.stepper, rig.planner)
     assert rig.heard()[-1] == Begin("/boxes", {"format": "2"})
 

@@ -1,6 +1,6 @@
 """The stream: all inputs of the core, and all traffic with the device, for the black box's process and for recorders.
 
-The control thread writes references into a journal, and encodes those of 20 ticks at once. They go to recorders by
+The control thread writes references into a journal, and encodes those of PART_TICKS at once. They go to recorders by
 ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not take is lost
 and counted. That process writes the files, and outlives the daemon, however the daemon ends.
 """
@@ -29,13 +29,13 @@ from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
 from tormagd.record.journal import FORMAT, Journal, core_hash, packed
 from tormagd.record.keeper import REQUEST, Begin, End, Part, Said, Write, Written
-from tormagd.record.telemetry import COLUMNS, Moment, TickRecord
+from tormagd.record.telemetry import COLUMNS, Moment
 from tormagd.record.ticks import MISSING
 from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
 "The keeper's main module, with its socket's descriptor as the argument."
-PART_TICKS = 20
+PART_TICKS = 10
 "Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
 OF_CORE = (
     "format",
@@ -118,7 +118,7 @@ class BlackBox:
         self._snapshot(stepper, planner)
 
     def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
-        """Add a tick to the journal; return all entries, encoded, and the ticks when there are PART_TICKS."""
+        """Add a tick to the journal; when there are PART_TICKS, return all entries and the ticks, encoded."""
         was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
         if not (was_kept and self.journal.is_kept):  # from the end of this period
             self.journal.take()
@@ -197,8 +197,10 @@ class BlackBox:
                 beside.process.wait(LEAVING_S)
 
     def _hand_over(self, time_s: float, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
-        entries = [each.row() if isinstance(each, Moment) else each for each in self.journal.take()]
         try:
+            entries = [
+                msgspec.Raw(packed(each.row())) if isinstance(each, Moment) else each for each in self.journal.take()
+            ]
             part = packed(entries)
         except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
             self._stop(f"an entry that cannot be written: {error}")
@@ -209,7 +211,7 @@ class BlackBox:
             self.journal.note(MISSING)
         if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
             self._snapshot(stepper, planner)
-        return part, [each for each in entries if isinstance(each, TickRecord)]
+        return part, [each for each in entries if isinstance(each, msgspec.Raw)]
 
     def _send_requests(self) -> None:
         while self._asked and self._send(self._asked[0]):

@@ -9,7 +9,7 @@ from tormagd.record.telemetry import COLUMNS, TIME_COLUMN
 from tormagd_client.messages import VERSION, MessageError
 from tormagd_client.printable import require
 
-MAX_BATCH_BYTES = 4_000_000  # 20 ticks with a snapshot of the core are under 0.1 MB
+MAX_BATCH_BYTES = 4_000_000  # 10 ticks with a snapshot of the core are under 0.1 MB
 MAX_COLUMNS = 256
 MAX_TIME_NS = 2**63
 READ, WROTE, TOLD, MISSING = "read", "wrote", "told", "missing"
