@@ -18,7 +18,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import zmq
-from machines.processes import received
+from machines.stream import received
 
 from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
 from tormag_lab.arrays import Array

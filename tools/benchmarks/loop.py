@@ -30,14 +30,14 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import uvloop
 import zmq
-from machines.host import processor_s
 from machines.own import own_machine
-from machines.processes import begun, first_line, is_linked, received
+from machines.stream import received
 
 from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compiler
 from tormag_lab.arrays import Array
 from tormag_lab.pages import subplots
 from tormagd.config import Config, RealTime, load_config
+from tormagd.ctl.processes import begun, first_line, is_linked, processor_s
 from tormagd.ctl.record import listening
 from tormagd.ctl.scene_check import as_toml
 from tormagd.daemon.endpoint import Endpoint

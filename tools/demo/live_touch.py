@@ -22,7 +22,6 @@ from judge.following import armed
 from judge.touching import MASS_KG, Bound, Touch, reached_ms
 from machines.host import HostWatch
 from machines.own import own_machine
-from machines.processes import first_line
 
 from demo.show import (
     PUBLISHER_FIFO,
@@ -44,6 +43,7 @@ from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.ctl.operate import open_gap
+from tormagd.ctl.processes import first_line
 from tormagd.ctl.scene import use_scene
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import PRESSES_AT_S, parse_hand

@@ -20,13 +20,13 @@ from typing import Any, NamedTuple, TypedDict, TypeVar
 import numpy as np
 from judge.following import RATE_HZ, Tracking, tracking
 from judge.signals import with_approach
-from machines.host import Host, HostWatch, processor_s
+from machines.host import Host, HostWatch
 from machines.own import own_machine
-from machines.processes import begun, end, first_line, is_linked
 
 from tormag_lab.arrays import Array
 from tormag_lab.human_pulse import pulse_profile
 from tormagd.control.safety.codes import FAULTS, Fault
+from tormagd.ctl.processes import begun, end, first_line, is_linked, processor_s
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd_client import Client, ClientError, UnreachableError
 from tormagd_client.messages import MessageError, Telemetry

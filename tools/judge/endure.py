@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 from machines.host import HOST_SHARE, HostWatch
-from machines.processes import end
 from mcap.reader import make_reader
 from tqdm import tqdm
 
 from judge import fuzz, siege
 from judge.stand import FIFO_PRIORITY, PATIENCE_S, Figures, Stand, is_at_rest, used
 from tormag_lab.main import whole
+from tormagd.ctl.processes import end
 from tormagd.record.writer import TICKS_TOPIC
 from tormagd_client import Client
 

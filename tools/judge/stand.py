@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import zmq
 from machines.own import own_machine
-from machines.processes import begun, end, first_line, received
+from machines.stream import received
 from machines.wire import carried
 
 from tormag_lab.arrays import Array
 from tormagd.config import load_config
+from tormagd.ctl.processes import begun, end, first_line
 from tormagd.ctl.record import listening
 from tormagd_client import Client, ClientError
 from tormagd_client.keys import SECRET, SERVER, generate

@@ -8,7 +8,6 @@ import contextlib
 import os
 import signal
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from msgspec import UNSET
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
+from tormagd.ctl.processes import begun, first_line, is_linked, processor_s
 from tormagd.ctl.scene_check import as_toml, derived_of, loaded
 from tormagd.ctl.scene_served import write_scene
 from tormagd.ground.files import in_place_of
@@ -52,8 +52,8 @@ PRICED, LOOKS_HZ = ("signal", "steps"), 2.0
 OPEN_MM = 0.1
 "A gap so near its end is open: excess force is the device's."
 VALID_FOR_MS = 200.0
-STARTS_S, LOOK_S, ENDS_S = 30.0, 0.05, 10.0
-FIFO = 50
+STARTS_S, FIFO = 30.0, 50
+LOG = "log"
 
 
 class Part(NamedTuple):
@@ -215,9 +215,12 @@ def _heard(name: str, scene: Scene, way: OperatingPoint, sample: int, course: Co
             "realtime": {"fifo_priority": FIFO, "lock_memory": True},
         }
         (folder / "tormagd.toml").write_text(as_toml(tables), encoding="utf-8")
-        daemon = _begun(stack, folder, "tormagd.daemon.main", "--config", str(folder / "tormagd.toml"))
+        module = "-P", "-m", "tormagd.daemon.main"
+        daemon = begun(stack, folder / LOG, *module, "--config", str(folder / "tormagd.toml"))
         client = stack.enter_context(contextlib.closing(Client.local(str(folder), STARTS_S, "measure")))
-        _arm(client, daemon, folder)
+        if not is_linked(client, daemon, STARTS_S):
+            raise _ended("the daemon", folder)
+        client.arm(STARTS_S)
         played = _play(client, course, scene, daemon.pid)
         status = client.request("status")
         stack.close()  # the device writes the rest as it ends
@@ -229,29 +232,12 @@ def _device(stack: contextlib.ExitStack, folder: Path, scene: Scene, sample: int
     hand = f"steady={scene.handle.most_mm_s:g}" if scene.finger is UNSET else f"pressing={scene.finger.depth_mm:g}"
     plant = ["--plant", f"{_kind(scene)}_{sample}", "--hand", hand]
     plant += ["--insert", scene.insert.name] if scene.element == "torque" else []
-    device = _begun(stack, folder, "tormagd.simulation", "--can", "--truth", str(folder / "truth.csv"), *plant)
-    assert device.stdout is not None, "it is read"
+    module = "-P", "-m", "tormagd.simulation"
+    device = begun(stack, folder / LOG, *module, "--can", "--truth", str(folder / "truth.csv"), *plant)
     _as_another_machine(device.pid, FIFO - 10)
-    if not (port := device.stdout.readline().strip()):
+    if not (port := first_line(device)):
         raise _ended("the simulated device", folder)
     return port
-
-
-def _begun(stack: contextlib.ExitStack, folder: Path, *arguments: str) -> "subprocess.Popen[str]":
-    with (folder / "log").open("a", encoding="utf-8") as log:
-        command = [sys.executable, "-P", "-m", *arguments]
-        child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
-
-    def end() -> None:
-        child.terminate()
-        try:
-            child.wait(ENDS_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-
-    stack.callback(end)
-    return child
 
 
 def _as_another_machine(pid: int, priority: int) -> None:
@@ -261,17 +247,8 @@ def _as_another_machine(pid: int, priority: int) -> None:
 
 
 def _ended(what: str, folder: Path) -> CommandError:
-    said = (folder / "log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    said = (folder / LOG).read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return CommandError(Exit.REFUSED, "not_measured", f"{what} ended: {said[-1] if said else ''}", "try it again")
-
-
-def _arm(client: Client, daemon: "subprocess.Popen[str]", folder: Path) -> None:
-    until_s = time.monotonic() + STARTS_S
-    while client.status().link.state != "RUNNING":
-        if daemon.poll() is not None or time.monotonic() > until_s:
-            raise _ended("the daemon", folder)
-        time.sleep(LOOK_S)
-    client.arm(STARTS_S)
 
 
 def _play(client: Client, course: Course, scene: Scene, pid: int) -> tuple[int, int, float, float]:
@@ -298,11 +275,3 @@ def _play(client: Client, course: Course, scene: Scene, pid: int) -> tuple[int, 
         if part.name in PRICED:
             spent_s, took_s = spent_s + processor_s(pid) - before_s, took_s + time.monotonic() - begun_s
     return start_ns, met_ns, spent_s / took_s, statistics.median(machine)
-
-
-def processor_s(pid: int) -> float:
-    """Return the processor time of a process and its children, s (proc_pid_stat(5))."""
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
-    children = (Path(f"/proc/{pid}/task") / str(pid) / "children").read_text(encoding="ascii").split()
-    ticks = sum(int(field) for field in fields[11:15]) / os.sysconf("SC_CLK_TCK")
-    return ticks + sum(processor_s(int(child)) for child in children)

@@ -173,26 +173,6 @@ def kept(stalls: list[Stall], start_s: float, end_s: float) -> float:
     return 1.0 - min(missed * period_s / max(end_s - start_s, period_s), 1.0)
 
 
-def processor_s(pid: int) -> float:
-    """Return the processor time of a process and all its children, s; ended ones count if they were waited for."""
-    ticks = 0
-    waiting = [pid]
-    while waiting:
-        member = waiting.pop()
-        try:
-            stat = Path(f"/proc/{member}/stat").read_text(encoding="ascii", errors="replace")
-        except OSError:
-            if member == pid:
-                raise
-            continue  # it ended while we looked
-        with contextlib.suppress(OSError):  # so may a thread
-            for thread in Path(f"/proc/{member}/task").iterdir():
-                waiting.extend(int(child) for child in (thread / "children").read_text(encoding="ascii").split())
-        # a name may hold spaces and parentheses, so the fields are counted from the last one (proc_pid_stat(5))
-        ticks += sum(int(field) for field in stat.rpartition(")")[2].split()[11:15])
-    return ticks / os.sysconf("SC_CLK_TCK")
-
-
 def counters(pids: dict[str, int]) -> Counters:
     fields = [int(field) for field in Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
     waited_s = {}

@@ -1,6 +1,7 @@
-"""Processes of ours: begun with a log, waited for, heard, and ended."""
+"""Processes of ours: begun with a log, waited for, and ended; and what they take."""
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -8,9 +9,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import zmq
-
-from tormagd.record.ticks import decode_ticks
 from tormagd_client import Client, ClientError
 
 PATIENCE_S, LOOK_S = 20.0, 0.05
@@ -47,11 +45,6 @@ def is_linked(client: Client, daemon: "subprocess.Popen[str]", patience_s: float
     return False
 
 
-def received(socket: "zmq.Socket[bytes]") -> list[dict[str, Any]]:
-    batch = decode_ticks(socket.recv())
-    return [dict(zip(batch.columns, row, strict=True)) for row in batch.rows]
-
-
 def end(child: "subprocess.Popen[Any]", number: signal.Signals = signal.SIGTERM) -> int:
     """Ask a process to end, and kill it if it does not; return its exit code."""
     child.send_signal(number)
@@ -60,3 +53,23 @@ def end(child: "subprocess.Popen[Any]", number: signal.Signals = signal.SIGTERM)
     except subprocess.TimeoutExpired:
         child.kill()
         return child.wait()
+
+
+def processor_s(pid: int) -> float:
+    """Return the processor time of a process and all its children, s; ended ones count if they were waited for."""
+    ticks = 0
+    waiting = [pid]
+    while waiting:
+        member = waiting.pop()
+        try:
+            stat = Path(f"/proc/{member}/stat").read_text(encoding="ascii", errors="replace")
+        except OSError:
+            if member == pid:
+                raise
+            continue  # it ended while we looked
+        with contextlib.suppress(OSError):  # so may a thread
+            for thread in Path(f"/proc/{member}/task").iterdir():
+                waiting.extend(int(child) for child in (thread / "children").read_text(encoding="ascii").split())
+        # a name may hold spaces and parentheses, so the fields are counted from the last one (proc_pid_stat(5))
+        ticks += sum(int(field) for field in stat.rpartition(")")[2].split()[11:15])
+    return ticks / os.sysconf("SC_CLK_TCK")
