@@ -15,7 +15,7 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.beat import Beat
-from tormagd.daemon.black_box import header
+from tormagd.daemon.black_box import PART_TICKS, header
 from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
@@ -28,7 +28,7 @@ from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
 
-PART_TICKS, SNAPSHOT_TICKS = 20, 500
+SNAPSHOT_TICKS = 500
 NS = 1_000_000_000
 
 

@@ -317,7 +317,7 @@ def test_an_error_is_allowed_within_the_tolerance_or_beside_the_usual_way() -> N
 @pytest.mark.parametrize("name", shipped_scenes())
 def test_every_shipped_scene_is_measured_and_its_choice_follows_from_its_figures(name: str) -> None:
     scene = load_scene(name)
-    found = measured(scene.fingerprint, scene_path(name).parent)
+    found = measured(scene, name)
     assert found is not None
     assert found.tolerance_N == scene.force.tolerance_rms_N
     fits = served_like(found.served, found.tolerance_N, scene.bandwidth)

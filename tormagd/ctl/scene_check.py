@@ -9,7 +9,7 @@ from msgspec import UNSET
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, answer_of, as_usage_error, folded
 from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import MeasuredScene, OperatingPoint, measured
-from tormagd.scenes.scene import Force, Scene, load_scene, scene_path
+from tormagd.scenes.scene import Force, Scene, load_scene
 from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 30.0
@@ -65,7 +65,7 @@ def _price(name: str, scene: Scene, derived: dict[str, Any], sent_hz: float) -> 
     """Return the share of this machine's processor, if it was measured, and the plans a second that it is for."""
     way = way_of(derived)
     plans_hz = max(way.inference_hz, sent_hz if derived["plan_every_setpoint"] else 0.0)
-    found = None if derived["terms_out"] else measured(scene.fingerprint, scene_path(name).parent)
+    found = None if derived["terms_out"] else measured(scene, name)
     return None if found is None else found.share_of(way, machine_us(), plans_hz), plans_hz
 
 
@@ -116,7 +116,7 @@ def way_of(derived: dict[str, Any]) -> OperatingPoint:
 
 def measured_as(name: str, scene: Scene) -> MeasuredScene:
     """Return what was measured of a scene that asks for the same, under whatever name."""
-    found = measured(scene.fingerprint, scene_path(name).parent)
+    found = measured(scene, name)
     if found is None:
         raise CommandError(
             Exit.REFUSED,

@@ -36,7 +36,7 @@ from tormagd_client.messages import BlackBoxReport
 KEEPER = "tormagd.record.keeper"
 "The keeper's main module, with its socket's descriptor as the argument."
 PART_TICKS = 10
-"Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
+"Control periods that are handed over at once; at 1000 and 50 Hz between two telemetry messages."
 OF_CORE = (
     "format",
     "sources_sha256",

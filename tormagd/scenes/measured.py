@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from tormagd.ground.files import read_bounded
-from tormagd.scenes.scene import Bandwidth
+from tormagd.scenes.scene import Bandwidth, Scene, scene_path
 
 TOLERATED = 0.8
 "An error within this share of the tolerance may be chosen."
@@ -106,13 +106,14 @@ def allowed_N(usual_N: float, tolerance_N: float) -> float:
     return min(most_N, tolerance_N) if usual_N <= tolerance_N else most_N
 
 
-def measured(fingerprint: str, folder: Path) -> MeasuredScene | None:
+def measured(scene: Scene, name: str) -> MeasuredScene | None:
     """Return what was measured of a scene that asks for the same."""
-    for path in (*sorted(folder.glob(f"*{ENDING}")), *sorted(Path(__file__).parent.glob(f"*{ENDING}"))):
+    folders = scene_path(name).parent, Path(__file__).parent
+    for path in (path for folder in dict.fromkeys(folders) for path in sorted(folder.glob(f"*{ENDING}"))):
         try:
             found = msgspec.json.decode(read_bounded(path, LONGEST), type=MeasuredScene)
         except (OSError, msgspec.DecodeError):
             continue  # of another version
-        if found.fingerprint == fingerprint:
+        if found.fingerprint == scene.fingerprint:
             return found
     return None

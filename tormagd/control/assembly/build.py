@@ -243,7 +243,7 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> Iterator[str]:
 def at_rates_of(scene: Scene, config: Config) -> Config:
     if not config.rates.of_scene:
         return config
-    found = measured(scene.fingerprint, scene_path(config.scene).parent)
+    found = measured(scene, config.scene)
     least, chosen = scene.bandwidth, scene.bandwidth if found is None else found.chosen.way
     rates = msgspec.structs.replace(
         config.rates,

@@ -38,8 +38,8 @@ def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_spe
         given_N_s = shown.force_rate_N_s(force_N, gap_speed_mm_s)
         if asked_N_s > given_N_s:
             outside.append(Point(force_N, asked_N_s, given_N_s))
-    outside.sort(key=lambda point: point.given_N_s / point.asked_N_s)
-    furthest = {int(point.force_N / tenth_N): point for point in reversed(outside)}
-    worst = sorted(furthest.values(), key=outside.index)
+    furthest: dict[int, Point] = {}
+    for point in sorted(outside, key=lambda point: point.given_N_s / point.asked_N_s):
+        furthest.setdefault(int(point.force_N / tenth_N), point)
     count = len(forces_N) - 1
-    return Missed(math.sqrt(squares / count), len(outside) / count, tuple(worst[:SHOWN]))
+    return Missed(math.sqrt(squares / count), len(outside) / count, tuple(furthest.values())[:SHOWN])
