@@ -337,6 +337,20 @@ def test_a_daemon_runs_at_the_rates_that_measuring_chose_if_they_are_higher(writ
     assert at_rates_of(scene, own).rates.inference_hz == 83
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [{"machine_us": 0.0}, {"judged": []}, {"served": []}, {"served": [msgspec.to_builtins(USUAL) | {"rms_N": {}}]}],
+    ids=str,
+)
+def test_damaged_figures_are_as_none(write: Write, damage: dict[str, object]) -> None:
+    path = Path(write())
+    scene = load_scene(str(path))
+    found = msgspec.to_builtins(MeasuredScene(scene.fingerprint, 0.05, 100.0, (USUAL, BOTH), (USUAL,)))
+    for figures in (found, found | damage):
+        path.with_suffix(ENDING).write_bytes(msgspec.json.encode(figures))
+        assert (measured(scene, str(path)) is None) == (figures is not found)
+
+
 # -- the signal --------------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from msgspec import Struct
 
 from tormagd.ground.files import read_bounded
 from tormagd.scenes.scene import Bandwidth, Scene, scene_path
+from tormagd_client.printable import require
 
 TOLERATED = 0.8
 "An error within this share of the tolerance may be chosen."
@@ -42,6 +43,10 @@ class Served(Struct, frozen=True):
     share: float
     plan_us: float
 
+    def __post_init__(self) -> None:
+        least = min(self.rms_N.get("signal", -1.0), self.share, *self.rms_N.values())
+        require(least >= 0.0, "rms_N and share", least, "0 or more each, one of them for signal")
+
     @property
     def worst_N(self) -> float:
         return max(self.rms_N.values())
@@ -56,6 +61,11 @@ class MeasuredScene(Struct, frozen=True):
     "See `tormagd.ground.machine_loop`."
     served: tuple[Served, ...]
     judged: tuple[Served, ...]
+
+    def __post_init__(self) -> None:
+        require(self.machine_us > 0.0, "machine_us", self.machine_us, "above 0")
+        is_whole = bool(self.judged) and self.judged[0].way in [each.way for each in self.served]
+        require(is_whole, "judged", [str(each.way) for each in self.judged], "a way that is served, first")
 
     @property
     def usual(self) -> Served:
@@ -113,7 +123,7 @@ def measured(scene: Scene, name: str) -> MeasuredScene | None:
         try:
             found = msgspec.json.decode(read_bounded(path, LONGEST), type=MeasuredScene)
         except (OSError, msgspec.DecodeError):
-            continue  # of another version
+            continue  # of another version, or damaged
         if found.fingerprint == scene.fingerprint:
             return found
     return None
