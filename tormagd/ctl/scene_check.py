@@ -12,6 +12,7 @@ from tormagd.scenes.measured import MeasuredScene, OperatingPoint, measured
 from tormagd.scenes.scene import Force, Scene, load_scene
 from tormagd_client.endpoints import ConfigError
 
+NEW_FILE = "allowed is a new file in a folder that exists"
 LONGEST_S = 30.0
 "The daemon's own check takes half a second."
 

@@ -144,8 +144,7 @@ def served(
     else:
         rms_N = errors_N(course, heard, scene, range_N)
     plan_us = heard.status["rates"]["inference"]["exec_us"]["p50"]
-    share, machine = round(heard.share, 4), heard.machine_us
-    return Served(way, f"{_kind(scene)}_{sample}", rms_N, share, plan_us), machine
+    return Served(way, f"{_kind(scene)}_{sample}", rms_N, round(heard.share, 4), plan_us), heard.machine_us
 
 
 def _kind(scene: Scene) -> str:
@@ -215,8 +214,7 @@ def _heard(name: str, scene: Scene, way: OperatingPoint, sample: int, course: Co
             "realtime": {"fifo_priority": FIFO, "lock_memory": True},
         }
         (folder / "tormagd.toml").write_text(as_toml(tables), encoding="utf-8")
-        module = "-P", "-m", "tormagd.daemon.main"
-        daemon = begun(stack, folder / LOG, *module, "--config", str(folder / "tormagd.toml"))
+        daemon = begun(stack, folder / LOG, "-P", "-m", "tormagd.daemon.main", "--config", str(folder / "tormagd.toml"))
         client = stack.enter_context(contextlib.closing(Client.local(str(folder), STARTS_S, "measure")))
         if not is_linked(client, daemon, STARTS_S):
             raise _ended("the daemon", folder)
@@ -230,10 +228,9 @@ def _heard(name: str, scene: Scene, way: OperatingPoint, sample: int, course: Co
 
 def _device(stack: contextlib.ExitStack, folder: Path, scene: Scene, sample: int) -> str:
     hand = f"steady={scene.handle.most_mm_s:g}" if scene.finger is UNSET else f"pressing={scene.finger.depth_mm:g}"
-    plant = ["--plant", f"{_kind(scene)}_{sample}", "--hand", hand]
-    plant += ["--insert", scene.insert.name] if scene.element == "torque" else []
-    module = "-P", "-m", "tormagd.simulation"
-    device = begun(stack, folder / LOG, *module, "--can", "--truth", str(folder / "truth.csv"), *plant)
+    arguments = ["--can", "--truth", str(folder / "truth.csv"), "--plant", f"{_kind(scene)}_{sample}", "--hand", hand]
+    arguments += ["--insert", scene.insert.name] if scene.element == "torque" else []
+    device = begun(stack, folder / LOG, "-P", "-m", "tormagd.simulation", *arguments)
     _as_another_machine(device.pid, FIFO - 10)
     if not (port := first_line(device)):
         raise _ended("the simulated device", folder)

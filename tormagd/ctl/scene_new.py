@@ -12,7 +12,7 @@ import msgspec
 
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ctl.scene_check import as_toml, check_scene
+from tormagd.ctl.scene_check import NEW_FILE, as_toml, check_scene
 from tormagd.ground.force_file import read_column, read_forces, stated_columns
 from tormagd.ground.table import TableError
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Scene
@@ -50,7 +50,7 @@ class Recorded(NamedTuple):
 
 def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
     if out.exists() or not out.parent.is_dir():
-        raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
+        raise usage_error(f"{out}: {NEW_FILE}", "name another file")
     force_file, told = _forces_of(out, recorded)
     try:
         made = _proposed(out, force_file, recorded, config)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.ctl.scene_check import as_toml, loaded, measured_as
+from tormagd.ctl.scene_check import NEW_FILE, as_toml, loaded, measured_as
 from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import OperatingPoint
 from tormagd.scenes.scene import load_scene, scene_path
@@ -30,6 +30,8 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
             "--share, --tolerance and --out choose how a scene is served",
             "tormagctl scene check NAME with one of --share S and --tolerance N, and --out FILE.toml to write it",
         )
+    if out is not None and out.exists():
+        raise usage_error(f"{out}: File exists: {NEW_FILE}", "name another")
     scene = loaded(name)
     found = measured_as(name, scene)
     scale = machine_us() / found.machine_us
@@ -79,6 +81,4 @@ def write_scene(name: str, way: OperatingPoint, out: Path) -> None:
         with out.open("x", encoding="utf-8") as file:
             file.write(as_toml(tables) + "\n")
     except OSError as error:
-        raise usage_error(
-            f"{out}: {error.strerror}: allowed is a new file in a folder that exists", "name another"
-        ) from error
+        raise usage_error(f"{out}: {error.strerror}: {NEW_FILE}", "name another") from error
