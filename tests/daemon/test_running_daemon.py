@@ -423,12 +423,13 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
     causes.tell(control.new_faults(), control.stepper, None)
     stall(11.0, 0.006, "somebody else")
     control.latch(Fault.PLAN_FAILED)
+    causes.unplanned = "no field"
     causes.tell(control.new_faults(), control.stepper, None)
     assert control.new_faults() == ()
     assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("fault")] == [
         "fault: HOST_STALL: the control loop stood still for 83 ms (kernel); "
         f"the device opened the gap by itself after 50 ms; next: {FAULTS[Fault.HOST_STALL].remedy}",
-        f"fault: PLAN_FAILED: {FAULTS[Fault.PLAN_FAILED].cause}; next: {FAULTS[Fault.PLAN_FAILED].remedy}",
+        f"fault: PLAN_FAILED: no gap could be planned: no field; next: {FAULTS[Fault.PLAN_FAILED].remedy}",
     ]
 
 

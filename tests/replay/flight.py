@@ -114,7 +114,7 @@ class Flight:
         self._inbox.in_force = None if setpoint is None else Taken(setpoint, "a", 0, setpoint.stamp_s)
         return setpoint is not None and (before is None or setpoint.stamp_s > before.stamp_s)
 
-    def _fail(self) -> None:
+    def _fail(self, _why: str) -> None:
         self._journal.note(LATCH, str(Fault.PLAN_FAILED))
         self.loop.stepper.latch(Fault.PLAN_FAILED)
 

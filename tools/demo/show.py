@@ -25,7 +25,7 @@ from machines.own import own_machine
 
 from tormag_lab.arrays import Array
 from tormag_lab.human_pulse import pulse_profile
-from tormagd.control.safety.codes import FAULTS, Fault
+from tormagd.control.safety.codes import Fault
 from tormagd.ctl.processes import begun, end, first_line, is_linked, processor_s
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd_client import Client, ClientError, UnreachableError
@@ -80,11 +80,12 @@ OF_TIME = frozenset(
         Fault.STATUS_STALE,
         Fault.CLOCK,
         Fault.FOLLOWING_ERROR,
+        Fault.PLAN_FAILED,
         Fault.DEVICE_COMMAND_TIMEOUT,
         Fault.DEVICE_NOT_RUNNING,
     }
 )
-"""Faults by which daemon or device protect themselves from one that stands still."""
+"""Faults by which daemon or device protect themselves from one that stands still, as a search beside the plans may."""
 
 
 OUT_OF_TIME = frozenset({"not_fresh", "timeout", "not_begun", "not_homed"})
@@ -222,7 +223,7 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
     axis = (truth["t_ns"] - answer["result"]["start_ns"]) * 1e-9
     inside = (axis >= times_s[0]) & (axis <= times_s[-1])
     if len(spacings_s) == 0 or not inside.any():
-        raise ShowError("nothing was recorded", f"look at the logs in {RUN_DIR}")
+        raise ShowError("nothing was recorded", f"look at the logs in {RUN_DIR}", is_of_time=True)
     first, last = before["rates"]["control"], after["rates"]["control"]
     runs, merged = last["runs"] - first["runs"], last["merged"] - first["merged"]
     return Shown(
@@ -307,8 +308,8 @@ def raise_fault(state: dict[str, Any]) -> None:
         return
     fault = Fault(state["faults"][0])
     others = "".join(f", then {code}" for code in state["faults"][1:])
-    known = FAULTS[fault]
-    raise ShowError(f"{fault}{others}: {known.cause}", known.remedy, is_of_time=fault in OF_TIME)
+    known = state["fault_details"][0]
+    raise ShowError(f"{fault}{others}: {known['cause']}", known["remedy"], is_of_time=fault in OF_TIME)
 
 
 def watch(

@@ -11,7 +11,9 @@ from typing import Any
 
 from tormagd_client import Client, ClientError
 
-PATIENCE_S, LOOK_S = 20.0, 0.05
+PATIENCE_S = 90.0
+"A recorder on a busy machine writes for up to 60 s what waits."
+LOOK_S = 0.05
 
 
 def begun(

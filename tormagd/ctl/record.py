@@ -129,8 +129,9 @@ def _record(
             _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
         # what waits at the end came before it
         until_s = time.monotonic() + (LONGEST_END_S if is_over else POLL_MS / 1e3)
-        for socket in (telemetry, ticks):
-            while socket.poll(0) and time.monotonic() < until_s:
+        # in turn: a recorder that is starved keeps some of both
+        while (ready := [each for each in (ticks, telemetry) if each.poll(0)]) and time.monotonic() < until_s:
+            for socket in ready:
                 data = socket.recv_multipart()[-1]
                 try:
                     if socket is telemetry:

@@ -7,7 +7,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 
 import msgspec
 
@@ -86,7 +85,7 @@ class Daemon:
             self._endpoint.inbox,
             NS // rates.inference_hz,
             journal=self._box.journal,
-            on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
+            on_failure=self._fail_plan,
             beside=beside,
         )
         self._profiles = self._profiles_of(core)
@@ -196,6 +195,10 @@ class Daemon:
         is_asked = self._endpoint.take_setpoints() and self._config.rates.plan_every_setpoint
         stepper = self._control.stepper
         self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
+
+    def _fail_plan(self, why: str) -> None:
+        self._causes.unplanned = why
+        self._control.latch(Fault.PLAN_FAILED)
 
     def _drive(self, beat: Beat) -> None:
         control, timing = self._control, self._control.timing

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class InferenceLoop:
-    """Plans for the inbox's newest setpoint, and calls `on_failure` if a plan failed."""
+    """Plans for the inbox's newest setpoint, and calls `on_failure` with the reason if a plan failed."""
 
     def __init__(
         self,
@@ -28,7 +28,7 @@ class InferenceLoop:
         period_ns: int,
         *,
         journal: Journal,
-        on_failure: Callable[[], None],
+        on_failure: Callable[[str], None],
         clock_ns: Callable[[], int] = time.monotonic_ns,
         beside: SearchProcess | None = None,
     ) -> None:
@@ -87,6 +87,6 @@ class InferenceLoop:
                 "the gap opens: none could be planned for %s; report the trace", self._inbox.newest, exc_info=error
             )
         self._inbox.withdraw(f"no gap could be planned: {error}")
-        self._on_failure()
+        self._on_failure(str(error))
         self._journal.note(AFRESH, now_s)
         self.planner.afresh(now_s)
