@@ -6,11 +6,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 from judge import numerics
 from judge.ends import Became, End, became, drawn_ends, ends, summed
 from judge.stage_table import stages
@@ -19,18 +16,11 @@ from leaves import leaves
 
 import tormagd.control
 from tormag_lab.arrays import Json
-from tormag_lab.design.force_law import radial_moment_for_force_Tm
 from tormagd.config import Position
 from tormagd.control.move.pid import Pid
 from tormagd.control.safety.codes import Limit
 from tormagd.element.physics.brake_curve import BrakeCurve
 from tormagd.element.physics.errors import DomainError
-from tormagd.element.physics.force import (
-    Elastomer,
-    Geometry,
-    brake_force_N,
-    max_radial_moment_Tm,
-)
 
 EPISODES = 12
 
@@ -182,21 +172,3 @@ def test_a_naive_formula_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
         lambda self, y: ((1 - self.a * y) ** 2 + 2 * self.b * y) ** 0.5 - (1 - self.a * y),
     )
     assert numerics.check_chunk(seed=3, devices=8, references=20).worst["float64", "stretch"][1] > 10.0
-
-
-@given(
-    st.builds(Elastomer, st.floats(1e3, 1e7), st.floats(1.0, 10.0), st.just(0.2)),
-    st.tuples(st.floats(1e-3, 20e-3), st.floats(1e-4, 0.05), st.floats(0.5e-3, 0.05)),
-    st.floats(1e-30, 1.0),
-    st.sampled_from([np.float32, np.float64]),
-)
-def test_no_load_in_the_domain_gives_anything_but_a_number(
-    elastomer: Elastomer, shape: tuple[float, float, float], share: float, dtype: type
-) -> None:
-    inner, wall, thickness = shape
-    geometry = Geometry(inner, inner + wall, thickness, 0.02)
-    moment: Any = np.array([min(share, 0.999) * max_radial_moment_Tm(elastomer, geometry)], dtype=dtype)
-    force = brake_force_N(moment, elastomer, geometry)
-    assert force.dtype == dtype
-    assert 0.0 <= force[0] < math.inf
-    assert np.isfinite(radial_moment_for_force_Tm(force, elastomer, geometry)).all()

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import socket
 import subprocess
 import tempfile
 import time
@@ -11,18 +10,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import zmq
 from machines.own import own_machine
 from machines.stream import received
 from machines.wire import carried
 
-from tormag_lab.arrays import Array
 from tormagd.config import load_config
-from tormagd.ctl.processes import begun, end, first_line
+from tormagd.ctl.processes import begun, first_line
 from tormagd.ctl.record import listening
 from tormagd_client import Client, ClientError
-from tormagd_client.keys import SECRET, SERVER, generate
+from tormagd_client.endpoints import ENDPOINTS
 
 FIFO_PRIORITY, DEVICE_PRIORITY = 50, 55
 "Of the daemon, and of the device, which stands for a machine of its own; used if granted."
@@ -45,21 +42,12 @@ class Stand:
         self.latched: list[tuple[str, float, float]] = []
         stack.enter_context(carried(DEVICE_PRIORITY))
         self.plug_in(transport)
-        self.keys = self.folder / "keys"
-        generate(SERVER, self.keys, self.keys)
-        for role in ("publish", "operate", "observe"):
-            generate(role, self.keys, self.keys / role)
-        with socket.socket() as probe:
-            probe.bind(("", 0))
-            addresses = {"telemetry": f"tcp://0.0.0.0:{probe.getsockname()[1]}"}
-        addresses |= {name: f"ipc://{self.folder}/{name}" for name in ("setpoint", "control", "recording")}
         config = self.folder / "tormagd.toml"
         config.write_text(
             f'scene = "coronary"\n[realtime]\nfifo_priority = {FIFO_PRIORITY}\nlock_memory = true\n'
             f'[device]\nport = "{self.folder}/device"\n{BACKENDS[transport]}\nmeasurement_timeout_ms = 50.0\n'
             + "[endpoints]\n"
-            + "".join(f'{name} = "{address}"\n' for name, address in addresses.items())
-            + f'[endpoints.curve]\nserver_secret = "{self.keys}/{SERVER}{SECRET}"\n'
+            + "".join(f'{name} = "ipc://{self.folder}/{name}"\n' for name in ENDPOINTS)
         )
         self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(config))
         self.endpoints = load_config(config).endpoints
@@ -72,8 +60,7 @@ class Stand:
 
     def plug_in(self, transport: str) -> None:
         """Start a device; a symbolic link to its line stands for udev's stable name."""
-        simulated = ("--seed", "1", "--truth", str(self.folder / "truth.csv"))
-        self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], *simulated))
+        self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], "--seed", "1"))
         line, port = first_line(self.device), self.folder / "device"
         port.unlink(missing_ok=True)
         port.symlink_to(line)
@@ -122,11 +109,6 @@ class Stand:
 
             yield read
 
-    def truth(self) -> Array:
-        """End the device; return its true t_ns, force_N and gap_mm."""
-        end(self.device)
-        return np.loadtxt(self.folder / "truth.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
-
     def unhandled(self) -> list[str]:
         lines = (self.folder / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         return [line for line in lines if any(sign in line for sign in UNHANDLED)]
@@ -136,7 +118,3 @@ def used(child: "subprocess.Popen[str]") -> tuple[int, int]:
     folder = Path(f"/proc/{child.pid}")
     pages = int((folder / "statm").read_text().split()[1])
     return len(list((folder / "fd").iterdir())), pages * os.sysconf("SC_PAGE_SIZE") // 1024
-
-
-def is_at_rest(status: dict[str, Any]) -> bool:
-    return status["link"]["state"] == "RUNNING" and not status["is_busy"]
