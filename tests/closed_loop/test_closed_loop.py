@@ -107,26 +107,6 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.02)
 
 
-@pytest.mark.parametrize("direction", [-1.0, 1.0], ids=["closing", "opening"])
-@pytest.mark.parametrize("start_mm", [85.0, 60.0])
-def test_a_millimetre_of_gap(arm, hold_gap, direction: float, start_mm: float) -> None:
-    loop = arm(planned=False)
-    hold_gap(loop, start_mm, 1.8)
-    from_mm = loop.device.truth.gap_mm
-    assert from_mm == pytest.approx(start_mm, abs=0.02)
-    samples = hold_gap(loop, start_mm + direction, 0.5)
-    travelled = np.array([direction * (sample.truth.gap_mm - from_mm) for sample in samples])
-    reference = [direction * (sample.reference.gap_mm - start_mm) for sample in samples if sample.reference]
-    rise_s = (int(np.argmax(travelled >= 0.9)) - int(np.argmax(travelled >= 0.1))) * 1e-3
-    assert 0.0 < rise_s <= 0.06
-    assert travelled.max() <= 1.02
-    assert len(reference) == len(samples)
-    assert max(reference) <= 1.001
-    assert travelled[-1] == pytest.approx(1.0, abs=0.02)
-    assert max(abs(sample.truth.left_mm - sample.truth.right_mm) for sample in samples) < 0.2
-    assert faults_of(samples) == ()
-
-
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
 @pytest.mark.parametrize(("from_mm", "to_mm"), [(47.0, 95.0), (95.0, 47.0)], ids=["opening", "closing"])
 def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, from_mm: float, to_mm: float) -> None:

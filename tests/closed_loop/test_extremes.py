@@ -6,7 +6,6 @@ All data here are synthetic: the device is the simulator's.
 import math
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
@@ -18,11 +17,10 @@ from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.control.safety.operating_state import Conditions, OperatingState
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.closed_loop import Array, ClosedLoop, Sample, gap_plan
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.faults import parse_fault
-from tormagd.simulation.hand import RecordedHand, SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.hand import RecordedHand
+from tormagd.simulation.parameters import load_plant
 
 CONFIG = Config()
 SCENE = load_scene("coronary")
@@ -45,41 +43,6 @@ def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
     told += [expected.gap_mm, expected.speed_mm_s, expected.filtered_mm_s, sample.truth.gap_mm]
     assert all(map(math.isfinite, told))
     return sample
-
-
-def uneven() -> PlantParameters:
-    """Sample 1 with three times the drag on the left."""
-    plant = load_plant("sample_1")
-    return msgspec.structs.replace(
-        plant, screw=msgspec.structs.replace(plant.screw, drag_left_N=12.0, drag_right_N=4.0)
-    )
-
-
-def skews_um(synchronisation: float) -> Array:
-    """Skew on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
-    config = msgspec.structs.replace(
-        CONFIG, position=msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
-    )
-    device = VirtualDevice(uneven(), SteadyHand(), [parse_fault("drag_left=+50%@2.7")], 1)
-    loop = ClosedLoop(config, Stepper(config, SCENE), None, device)
-    loop.arm(gap_plan(OPEN_MM))
-    assert loop.now_s < 2.6
-    samples = []
-    for tick in range(1_600):
-        gap_mm, speed_mm_s = (94.0 - 15e-3 * tick, -15.0) if tick < 800 else (82.0 + 15e-3 * (tick - 800), 15.0)
-        samples.append(ticked(loop, gap_mm, speed_mm_s))
-    assert (samples[-1].safety.operating_state, samples[-1].truth.gap_mm) == (
-        OperatingState.ENABLED,
-        pytest.approx(94.0, abs=0.1),
-    )
-    return np.array([sample.measured.skew_mm for sample in samples if sample.measured is not None]) * 1e3
-
-
-def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:
-    coupled, apart = skews_um(CONFIG.position.synchronisation), skews_um(0.0)
-    assert np.abs(coupled).max() <= 30.0
-    # in the mean: the worst of either is one or two encoder counts
-    assert np.sqrt(np.mean(coupled**2)) < 0.8 * np.sqrt(np.mean(apart**2))
 
 
 def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
