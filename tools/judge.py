@@ -10,7 +10,7 @@ JUDGES = {
     "models": "the shipped models beside devices",
     "contact": "what a hand feels of a wall",
     "faults": "the fault matrix on a serial line and on a CAN bus",
-    "numerics": "the physics in 50 digits, hostile inputs to every stage, extreme configurations",
+    "numerics": "the physics in 50 digits, hostile inputs to every stage",
     "endure": "long, destructive cases: fuzz, replug, soak",
 }
 

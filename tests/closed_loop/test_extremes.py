@@ -3,11 +3,15 @@
 All data here are synthetic: the device is the simulator's.
 """
 
+import contextlib
 import math
+from collections.abc import Iterator
+from typing import get_type_hints
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
+from leaves import leaves
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
@@ -15,11 +19,11 @@ from tormagd.control.core import Stepper
 from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
 from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, TimedSetpoint
-from tormagd.control.safety.operating_state import Conditions, OperatingState
+from tormagd.control.safety.operating_state import Conditions, OperatingState, RefusedError
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import RecordedHand
+from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import load_plant
 
 CONFIG = Config()
@@ -201,3 +205,64 @@ def test_a_rollover_changes_no_duty(core: Core, recorded: list[Sample], device_s
     assert max(abs(duty.left_duty) for duty in usual) > 0.1
     for ours, duty in zip(duties(core, recorded, device_s - BEFORE_S, host_s - BEFORE_S), usual, strict=True):
         assert (ours.left_duty, ours.right_duty) == pytest.approx((duty.left_duty, duty.right_duty), abs=SAME_DUTY)
+
+
+# -- configurations at the ends of what is accepted --------------------------------------------------------------------
+
+
+End = tuple[str, str, float]
+"A key at one end, of the configuration, the scene's `insert`, or the device's `electronics`."
+
+
+def ends() -> Iterator[End]:
+    """Yield both ends of every number that shapes control."""
+    for section in ("motor", "position", "trim", "limits", "rates", "device", "insert"):
+        struct = type(getattr(SCENE if section == "insert" else CONFIG, section))
+        for key, hint in get_type_hints(struct, include_extras=True).items():
+            for meta in getattr(hint, "__metadata__", ()):
+                if isinstance(meta, msgspec.Meta) and meta.le is not None:
+                    least = meta.ge if meta.ge is not None else math.nextafter(meta.gt or 0.0, math.inf)
+                    yield from ((section, key, least), (section, key, meta.le))
+
+
+OF_DEVICE = {"encoder_counts_per_rev": (16, 1_000_000), "supply_V": (3.0, 25.0)}
+ENDS = [*ends(), *(("electronics", key, value) for key, both in OF_DEVICE.items() for value in both)]
+
+
+def at_ends(case: list[End]) -> ClosedLoop:
+    """Return a loop with these keys at their ends; raise ValueError where that is refused."""
+    config, scene, plant = CONFIG, msgspec.structs.replace(SCENE, signal=None), load_plant("sample_1")
+    for section, key, value in case:
+        of = {"insert": scene, "electronics": plant}.get(section, config)
+        changed = {section: msgspec.structs.replace(getattr(of, section), **{key: value})}
+        if of is config:
+            config = msgspec.structs.replace(config, **changed)
+        elif of is scene:
+            scene = msgspec.structs.replace(scene, **changed)
+        else:
+            plant = msgspec.structs.replace(plant, **changed)
+    made = build_core(config, scene)
+    assert all(map(math.isfinite, made.margins))
+    return ClosedLoop(config, made.stepper(), made.planner(), VirtualDevice(plant, SteadyHand(), seed=1))
+
+
+@pytest.mark.long
+@settings(max_examples=settings.default.max_examples // 2, deadline=None)
+@example(case=[("motor", "supply_V", 60.0)])
+@example(case=[("limits", "skew_fault_mm", 10.0)])
+@example(case=[("electronics", "encoder_counts_per_rev", 1_000_000)])
+@given(case=st.lists(st.sampled_from(ENDS), min_size=1, max_size=2, unique_by=lambda end: end[:2]))
+def test_at_its_ends_a_configuration_is_refused_by_name_or_runs_on_numbers(case: list[End]) -> None:
+    refused = ""
+    try:
+        loop = at_ends(case)
+    except ValueError as error:
+        refused = str(error)
+    if refused:
+        assert "allowed is" in refused
+        return
+    with contextlib.suppress(RuntimeError, RefusedError):  # what may not be enabled says so
+        loop.arm()
+    for sample in loop.run(0.1, swinging):
+        found = leaves([sample.output, sample.plan, sample.measured])
+        assert [path for path, value in found if not math.isfinite(value) and not path.endswith("stamp_s")] == []

@@ -400,7 +400,7 @@ def test_what_came_twice_is_one_repetition(transport: str, moving: ClosedLoop, l
     line = lines(transport, moving.device, CASES["duplicates"])
     moving.device = line  # type: ignore[assignment]
     count = len(list(ticks(moving, 0.3)))
-    # on serial every frame has a number, and the second is dropped; on CAN only State has, and the link drops it
+    # on serial every frame has a number; on CAN only State has, and the link drops it
     repeated = line.backend.statistics.repeated + (moving.connection.report().repeated or 0)
     assert repeated / count == pytest.approx(2.05 if transport == "serial" else 1.0, abs=0.06)
 
