@@ -77,15 +77,6 @@ def test_jitter_of_a_few_periods_is_ridden_out(arm, periods_s: list[float]) -> N
     assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
 
 
-@settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
-@given(periods_s=st.lists(st.sampled_from([1e-5, 1e-3, 0.03, 0.1]), min_size=60, max_size=60))
-def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(arm, periods_s: list[float]) -> None:
-    samples = unevenly(arm(planned=False), 90.0, periods_s)
-    if max(periods_s) > 0.05:
-        assert samples[-1].safety.operating_state is OperatingState.FAULT
-    assert min(sample.truth.gap_mm for sample in samples) > 90.0 - 2.0
-
-
 def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm) -> None:
     loop = arm(planned=False)
     on_the_way(loop, 85.0, 500)
