@@ -77,18 +77,6 @@ def test_jitter_of_a_few_periods_is_ridden_out(arm, periods_s: list[float]) -> N
     assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
 
 
-def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm) -> None:
-    loop = arm(planned=False)
-    on_the_way(loop, 85.0, 500)
-    flipping = [ticked(loop, 80.0 + 10.0 * (tick % 2)) for tick in range(600)]
-    assert all(79.9 < sample.truth.gap_mm < 90.1 for sample in flipping)
-    after = on_the_way(loop, 85.0, 600)
-    assert (after[-1].safety.operating_state, after[-1].truth.gap_mm) == (
-        OperatingState.ENABLED,
-        pytest.approx(85.0, abs=0.03),
-    )
-
-
 AT_REST = RecordedHand((0.0,), (0.0,))
 "A handle that moves would bring a force over the scene's, and a fault."
 

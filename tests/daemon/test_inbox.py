@@ -265,7 +265,7 @@ def test_what_is_wrong_with_a_clock_is_corrected_and_named(
     assert publishing.inbox.accepted > 0.75 * count
 
 
-def test_a_clock_that_is_set_loses_no_setpoint_and_is_logged(
+def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(
     publishing: Publishing, caplog: pytest.LogCaptureFixture
 ) -> None:
     for tick in range(100):
