@@ -1,7 +1,7 @@
 """The daemon as its users meet it: real processes, a real pty, real sockets.
 
-Its loops are tested in virtual time (tests/daemon/test_running_daemon.py, tests/closed_loop), and a device is unplugged
-by `judge.py endure`. Here the daemon is killed and started again, and another process reads what it leaves.
+Its loops are tested in virtual time (tests/daemon/test_running_daemon.py, tests/closed_loop). Here processes are
+killed, unplugged and started again, and another one reads what they leave.
 """
 
 import json
@@ -17,6 +17,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
+from tormagd.ctl.processes import end
 from tormagd.record.reader import Seen, read_recording
 
 pytestmark = pytest.mark.live
@@ -24,10 +25,11 @@ pytestmark = pytest.mark.live
 README = Path(__file__).parents[2] / "README.md"
 
 
-def test_a_daemon_that_is_killed_and_ended(new_rig):
+def test_a_daemon_that_is_killed_unplugged_and_ended(new_rig):
     assert not new_rig.status()["profile"]["is_used"]
     killed_it_leaves_a_whole_recording(new_rig)
     started_again_it_says_why_the_device_has_opened(new_rig)
+    unplugged_it_names_the_loss_and_does_not_arm_again(new_rig)
     told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(new_rig)
 
 
@@ -36,13 +38,13 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
     ctl = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(rig.config), "--wait", "30"]
     recorder = subprocess.Popen([*ctl, "record", str(path)])
     try:
-        rig.until(path.exists, "recording")
+        rig.until(lambda _status: path.exists(), "recording")
         rig.arm()
         rig.render(1.6)
         newest = rig.status()
-        rig.until(lambda: rig.status()["t_ns"] > newest["t_ns"] + 100_000_000, "what it has told is on its way")
-        assert rig.end(rig.daemon, signal.SIGKILL) == -signal.SIGKILL
-        rig.end(recorder, signal.SIGINT)
+        rig.until(lambda status: status["t_ns"] > newest["t_ns"] + 100_000_000, "what it has told is on its way")
+        assert end(rig.daemon, signal.SIGKILL) == -signal.SIGKILL
+        end(recorder, signal.SIGINT)
     finally:
         recorder.kill()
         recorder.wait()
@@ -54,7 +56,7 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
         numbers = [each.message[name] for each in seen if each.is_tick is is_tick]
         assert np.array_equal(np.diff(numbers), np.ones(len(numbers) - 1))
     about = recording.metadata
-    assert json.loads(about["configuration"])["device"]["port"] == str(rig.port)
+    assert json.loads(about["configuration"])["device"]["port"] == str(rig.folder / "device")
     assert json.loads(about["scene"])["name"] == "coronary"
     assert (len(about["model"]), about["firmware"]) == (64, "1.0")
     assert int(about["serial_number"]) >= 0
@@ -72,23 +74,37 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
 
 def started_again_it_says_why_the_device_has_opened(rig) -> None:
     rig.start_daemon()
-    rig.until(lambda: rig.status()["faults"] == ["DEVICE_COMMAND_TIMEOUT"], "the reason is reported")
+    rig.until(lambda status: status["faults"] == ["DEVICE_COMMAND_TIMEOUT"], "the reason is reported")
     assert rig.refused("enable") == "fault"
-    rig.until(lambda: not rig.status()["is_busy"], "the gap is open")
+    rig.until(lambda status: not status["is_busy"], "the gap is open")
     rig.client.request("clear-fault")
-    rig.until(lambda: rig.status()["faults"] == [], "cleared")
+    rig.until(lambda status: status["faults"] == [], "cleared")
     assert rig.refused("enable") == "not_homed"
+
+
+def unplugged_it_names_the_loss_and_does_not_arm_again(rig) -> None:
+    rig.arm()
+    rig.ask(1.5)
+    rig.until(lambda status: (status["gap_mm"] or 95.0) < 85.0, "closing")
+    end(rig.device, signal.SIGKILL)
+    lost = rig.until(lambda status: "LINK_LOST" in status["faults"], "the loss is named")
+    assert lost["link"]["cause"]
+    rig.plug_in("serial")
+    back = rig.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "it has opened")
+    assert back["operating_state"] == "FAULT"
+    rig.client.request("clear-fault")
+    assert rig.status()["operating_state"] == "DISABLED"
 
 
 def told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(rig) -> None:
     rig.client.publish(0.5, 30_000.0)
     rig.arm()
     rig.render(1.6)
-    assert rig.end(rig.daemon, signal.SIGTERM) == 0
+    assert end(rig.daemon, signal.SIGTERM) == 0
     assert not (rig.folder / "setpoint").exists()
     assert len(list((rig.folder / "profiles").iterdir())) == 1
     rig.start_daemon()
-    rig.until(lambda: rig.status()["profile"]["is_used"], "the profile is used")
+    rig.until(lambda status: status["profile"]["is_used"], "the profile is used")
     again = rig.status()
     assert again["device"]["scale_sd"] < 0.1
     assert again["profile"]["age_s"] < 3600.0
@@ -102,7 +118,7 @@ def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
     for force_N in (1.0, 1.5):
         rig.render(force_N)
     rig.client.request("stop")
-    rig.until(lambda: rig.status()["black_box"]["newest"].endswith("-STOPPED.mcap"), "written")
+    rig.until(lambda status: status["black_box"]["newest"].endswith("-STOPPED.mcap"), "written")
     box = rig.status()["black_box"]
     command = [sys.executable, "-m", "tormagd.record.replay", str(rig.folder / "boxes" / box["newest"])]
     result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0).stdout)

@@ -1,4 +1,4 @@
-"""A daemon on a simulated device, as processes, and its operator: what every case in real time runs on."""
+"""A daemon on a simulated device, as processes, and its operator: what runs in real time stands on."""
 
 import contextlib
 import os
@@ -36,23 +36,27 @@ Figures = dict[str, Any]
 class Stand:
     """Daemon, device and an operator's client. All of it ends with `stack`."""
 
-    def __init__(self, stack: ExitStack, transport: str = "serial") -> None:
+    def __init__(self, stack: ExitStack, transport: str = "serial", control_hz: int = 500) -> None:
         self._stack = stack
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
         self.latched: list[tuple[str, float, float]] = []
         stack.enter_context(carried(DEVICE_PRIORITY))
         self.plug_in(transport)
-        config = self.folder / "tormagd.toml"
-        config.write_text(
+        self.config = self.folder / "tormagd.toml"
+        self.config.write_text(
             f'scene = "coronary"\n[realtime]\nfifo_priority = {FIFO_PRIORITY}\nlock_memory = true\n'
             f'[device]\nport = "{self.folder}/device"\n{BACKENDS[transport]}\nmeasurement_timeout_ms = 50.0\n'
-            + "[endpoints]\n"
+            f'profiles = "{self.folder}/profiles"\n[black_box]\nfolder = "{self.folder}/boxes"\n'
+            f"[rates]\ncontrol_hz = {control_hz}\n[endpoints]\n"
             + "".join(f'{name} = "ipc://{self.folder}/{name}"\n' for name in ENDPOINTS)
         )
-        self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(config))
-        self.endpoints = load_config(config).endpoints
+        self.endpoints = load_config(self.config).endpoints
         # patient, because the host may be busy: timing is measured, not waited for
         self.client = stack.enter_context(Client(self.endpoints, 10.0))
+        self.start_daemon()
+
+    def start_daemon(self) -> None:
+        self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(self.config))
         self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
 
     def begin(self, *arguments: str) -> "subprocess.Popen[str]":
@@ -60,7 +64,8 @@ class Stand:
 
     def plug_in(self, transport: str) -> None:
         """Start a device; a symbolic link to its line stands for udev's stable name."""
-        self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], "--seed", "1"))
+        simulated = (DOORS[transport], "--seed", "1", "--truth", str(self.folder / "truth.csv"))
+        self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", *simulated))
         line, port = first_line(self.device), self.folder / "device"
         port.unlink(missing_ok=True)
         port.symlink_to(line)

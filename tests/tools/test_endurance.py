@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from judge import endure, fuzz
 from judge.frame import parsed
-from judge.stand import Stand
+from stand import Stand
 
 from firmware_protocol.c.build import BuildError
 

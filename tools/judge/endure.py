@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 import msgspec
 from machines.host import HOST_SHARE, HostWatch
 from mcap.reader import make_reader
+from stand import FIFO_PRIORITY, PATIENCE_S, Figures, Stand, used
 from tqdm import tqdm
 
 from judge import fuzz
-from judge.stand import FIFO_PRIORITY, PATIENCE_S, Figures, Stand, used
 from tormag_lab.main import whole
 from tormagd.ctl.processes import end
 from tormagd.record.writer import TICKS_TOPIC
