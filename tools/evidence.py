@@ -55,13 +55,9 @@ PARTS = {
     "replug-can": Part(
         "tools/judge.py endure replug-can --json", "{cycles} cycles; lost after {lost_after_ms} ms at most"
     ),
-    "stalls": Part(
-        "tools/judge.py endure stalls --json", "{stops} stops, {faulted} latched, force off by {worst_N} N at most"
-    ),
     "soak": Part(
         "tools/judge.py endure soak --json", "{minutes} min, growth in kB {growth_kB}, {ticks:,} ticks recorded"
     ),
-    "siege": Part("tools/judge.py endure siege --json", "{count} stops beside each attack"),
     "faults": Part("tools/judge.py faults --json", "all cells: [the matrix](../fault-matrix.md)", is_kept=True),
     "numerics": Part(
         "tools/judge.py numerics --json",

@@ -87,14 +87,6 @@ def test_from_each_state_the_force_goes_to_a_live_setpoint_along_the_ramp(
     assert samples[-1].truth.force_N == pytest.approx(ASKED_N, abs=0.05)
 
 
-def test_after_a_silence_and_before_the_first_setpoint_there_is_the_same_ramp(armed: ClosedLoop, core: Core) -> None:
-    for silent_s in (0.5, 1.0, 0.12):
-        ticks(armed, silent_s, None)
-        samples = ticks(armed, 1.5)
-        assert steepest_step_N_s(samples) <= core.scene.force.release_N_s + 1e-6
-        assert samples[-1].truth.force_N == pytest.approx(ASKED_N, abs=0.05)
-
-
 def test_a_fault_that_comes_on_the_way_ends_it_and_nothing_is_cleared_twice() -> None:
     arming, given = Arming(0.0, STOPPED.faults), list[str]()
     arming.advance(0.0, latch(STOPPED, (Fault.ENCODER,)), READY, given.append)

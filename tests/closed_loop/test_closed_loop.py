@@ -6,7 +6,6 @@ All data here are synthetic: the device is the simulator's, the pulse is a formu
 import math
 import statistics
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -67,20 +66,6 @@ def test_a_pulse_is_rendered(arm, plant: str, from_s: float, within_N: float, tr
     assert not any(sample.plan.limits for sample in samples[-1_000:])
 
 
-def test_a_staircase_rises_at_every_step(armed: ClosedLoop, core: Core) -> None:
-    least = core.portrait.min_N
-    steps = [least, *np.arange(math.ceil(10.0 * least) / 10.0, 2.05, 0.1)]
-    rendered, gaps = [], []
-    for force in steps:
-        samples = publish(armed, lambda time_s, force=force: float(force), 0.4, rate_hz=100)  # type: ignore[misc]
-        assert faults_of(samples) == ()
-        rendered.append(float(np.mean([sample.truth.force_N for sample in samples[-100:]])))
-        gaps.append(samples[-1].truth.gap_mm)
-    assert all(before < after for before, after in pairwise(rendered))
-    assert all(before > after for before, after in pairwise(gaps))
-    assert rendered == pytest.approx(steps, abs=0.06)
-
-
 def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
     samples = publish(arm(hand=ReversingHand()), lambda time_s: 1.0, 4.0, rate_hz=100)[1_500:]
     assert min(abs(sample.truth.handle_mm_s) for sample in samples) < 0.1
@@ -88,43 +73,6 @@ def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
     assert all(abs(sample.truth.force_N) < 1.08 for sample in samples)
     sliding_N = [abs(sample.truth.force_N) for sample in samples if abs(sample.truth.handle_mm_s) > 20.0]
     assert sliding_N == pytest.approx([1.0] * len(sliding_N), abs=0.02)
-
-
-def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Core) -> None:
-    publish(armed, lambda time_s: 1.4, 1.0)
-    at_s = armed.now_s
-    samples = list(armed.run(1.2, stream(np.array([at_s]), np.array([1.4]))))
-    stale = [sample for sample in samples if Limit.STALE in sample.plan.limits]
-    assert stale[0].time_s - at_s == pytest.approx(0.1, abs=0.01)
-    # nobody asks for less than the least force
-    assert not any(Limit.F_MIN in sample.plan.limits for sample in stale)
-    governed = [sample.plan.governed_N for sample in stale]
-    assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061
-    # this device's least force, as far as it has shown itself
-    least_N = armed.planner.believe.min_N
-    assert governed[-1] == pytest.approx(least_N, abs=0.01)
-    assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
-    assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.02)
-
-
-@pytest.mark.parametrize("direction", [-1.0, 1.0], ids=["closing", "opening"])
-@pytest.mark.parametrize("start_mm", [85.0, 60.0])
-def test_a_millimetre_of_gap(arm, hold_gap, direction: float, start_mm: float) -> None:
-    loop = arm(planned=False)
-    hold_gap(loop, start_mm, 1.8)
-    from_mm = loop.device.truth.gap_mm
-    assert from_mm == pytest.approx(start_mm, abs=0.02)
-    samples = hold_gap(loop, start_mm + direction, 0.5)
-    travelled = np.array([direction * (sample.truth.gap_mm - from_mm) for sample in samples])
-    reference = [direction * (sample.reference.gap_mm - start_mm) for sample in samples if sample.reference]
-    rise_s = (int(np.argmax(travelled >= 0.9)) - int(np.argmax(travelled >= 0.1))) * 1e-3
-    assert 0.0 < rise_s <= 0.06
-    assert travelled.max() <= 1.02
-    assert len(reference) == len(samples)
-    assert max(reference) <= 1.001
-    assert travelled[-1] == pytest.approx(1.0, abs=0.02)
-    assert max(abs(sample.truth.left_mm - sample.truth.right_mm) for sample in samples) < 0.2
-    assert faults_of(samples) == ()
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])

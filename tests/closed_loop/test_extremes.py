@@ -3,12 +3,15 @@
 All data here are synthetic: the device is the simulator's.
 """
 
+import contextlib
 import math
+from collections.abc import Iterator
+from typing import get_type_hints
 
 import msgspec
-import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
+from leaves import leaves
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
@@ -16,13 +19,12 @@ from tormagd.control.core import Stepper
 from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
 from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, TimedSetpoint
-from tormagd.control.safety.operating_state import Conditions, OperatingState
+from tormagd.control.safety.operating_state import Conditions, OperatingState, RefusedError
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.closed_loop import Array, ClosedLoop, Sample, gap_plan
+from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import RecordedHand, SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import load_plant
 
 CONFIG = Config()
 SCENE = load_scene("coronary")
@@ -45,41 +47,6 @@ def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
     told += [expected.gap_mm, expected.speed_mm_s, expected.filtered_mm_s, sample.truth.gap_mm]
     assert all(map(math.isfinite, told))
     return sample
-
-
-def uneven() -> PlantParameters:
-    """Sample 1 with three times the drag on the left."""
-    plant = load_plant("sample_1")
-    return msgspec.structs.replace(
-        plant, screw=msgspec.structs.replace(plant.screw, drag_left_N=12.0, drag_right_N=4.0)
-    )
-
-
-def skews_um(synchronisation: float) -> Array:
-    """Skew on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
-    config = msgspec.structs.replace(
-        CONFIG, position=msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
-    )
-    device = VirtualDevice(uneven(), SteadyHand(), [parse_fault("drag_left=+50%@2.7")], 1)
-    loop = ClosedLoop(config, Stepper(config, SCENE), None, device)
-    loop.arm(gap_plan(OPEN_MM))
-    assert loop.now_s < 2.6
-    samples = []
-    for tick in range(1_600):
-        gap_mm, speed_mm_s = (94.0 - 15e-3 * tick, -15.0) if tick < 800 else (82.0 + 15e-3 * (tick - 800), 15.0)
-        samples.append(ticked(loop, gap_mm, speed_mm_s))
-    assert (samples[-1].safety.operating_state, samples[-1].truth.gap_mm) == (
-        OperatingState.ENABLED,
-        pytest.approx(94.0, abs=0.1),
-    )
-    return np.array([sample.measured.skew_mm for sample in samples if sample.measured is not None]) * 1e3
-
-
-def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:
-    coupled, apart = skews_um(CONFIG.position.synchronisation), skews_um(0.0)
-    assert np.abs(coupled).max() <= 30.0
-    # in the mean: the worst of either is one or two encoder counts
-    assert np.sqrt(np.mean(coupled**2)) < 0.8 * np.sqrt(np.mean(apart**2))
 
 
 def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
@@ -108,27 +75,6 @@ def test_jitter_of_a_few_periods_is_ridden_out(arm, periods_s: list[float]) -> N
     samples = unevenly(arm(planned=False), 92.0, periods_s)
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
-
-
-@settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
-@given(periods_s=st.lists(st.sampled_from([1e-5, 1e-3, 0.03, 0.1]), min_size=60, max_size=60))
-def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(arm, periods_s: list[float]) -> None:
-    samples = unevenly(arm(planned=False), 90.0, periods_s)
-    if max(periods_s) > 0.05:
-        assert samples[-1].safety.operating_state is OperatingState.FAULT
-    assert min(sample.truth.gap_mm for sample in samples) > 90.0 - 2.0
-
-
-def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly(arm) -> None:
-    loop = arm(planned=False)
-    on_the_way(loop, 85.0, 500)
-    flipping = [ticked(loop, 80.0 + 10.0 * (tick % 2)) for tick in range(600)]
-    assert all(79.9 < sample.truth.gap_mm < 90.1 for sample in flipping)
-    after = on_the_way(loop, 85.0, 600)
-    assert (after[-1].safety.operating_state, after[-1].truth.gap_mm) == (
-        OperatingState.ENABLED,
-        pytest.approx(85.0, abs=0.03),
-    )
 
 
 AT_REST = RecordedHand((0.0,), (0.0,))
@@ -238,3 +184,64 @@ def test_a_rollover_changes_no_duty(core: Core, recorded: list[Sample], device_s
     assert max(abs(duty.left_duty) for duty in usual) > 0.1
     for ours, duty in zip(duties(core, recorded, device_s - BEFORE_S, host_s - BEFORE_S), usual, strict=True):
         assert (ours.left_duty, ours.right_duty) == pytest.approx((duty.left_duty, duty.right_duty), abs=SAME_DUTY)
+
+
+# -- configurations at the ends of what is accepted --------------------------------------------------------------------
+
+
+End = tuple[str, str, float]
+"A key at one end, of the configuration, the scene's `insert`, or the device's `electronics`."
+
+
+def ends() -> Iterator[End]:
+    """Yield both ends of every number that shapes control."""
+    for section in ("motor", "position", "trim", "limits", "rates", "device", "insert"):
+        struct = type(getattr(SCENE if section == "insert" else CONFIG, section))
+        for key, hint in get_type_hints(struct, include_extras=True).items():
+            for meta in getattr(hint, "__metadata__", ()):
+                if isinstance(meta, msgspec.Meta) and meta.le is not None:
+                    least = meta.ge if meta.ge is not None else math.nextafter(meta.gt or 0.0, math.inf)
+                    yield from ((section, key, least), (section, key, meta.le))
+
+
+OF_DEVICE = {"encoder_counts_per_rev": (16, 1_000_000), "supply_V": (3.0, 25.0)}
+ENDS = [*ends(), *(("electronics", key, value) for key, both in OF_DEVICE.items() for value in both)]
+
+
+def at_ends(case: list[End]) -> ClosedLoop:
+    """Return a loop with these keys at their ends; raise ValueError where that is refused."""
+    config, scene, plant = CONFIG, msgspec.structs.replace(SCENE, signal=None), load_plant("sample_1")
+    for section, key, value in case:
+        of = {"insert": scene, "electronics": plant}.get(section, config)
+        changed = {section: msgspec.structs.replace(getattr(of, section), **{key: value})}
+        if of is config:
+            config = msgspec.structs.replace(config, **changed)
+        elif of is scene:
+            scene = msgspec.structs.replace(scene, **changed)
+        else:
+            plant = msgspec.structs.replace(plant, **changed)
+    made = build_core(config, scene)
+    assert all(map(math.isfinite, made.margins))
+    return ClosedLoop(config, made.stepper(), made.planner(), VirtualDevice(plant, SteadyHand(), seed=1))
+
+
+@pytest.mark.long
+@settings(max_examples=settings.default.max_examples // 2, deadline=None)
+@example(case=[("motor", "supply_V", 60.0)])
+@example(case=[("limits", "skew_fault_mm", 10.0)])
+@example(case=[("electronics", "encoder_counts_per_rev", 1_000_000)])
+@given(case=st.lists(st.sampled_from(ENDS), min_size=1, max_size=2, unique_by=lambda end: end[:2]))
+def test_at_its_ends_a_configuration_is_refused_by_name_or_runs_on_numbers(case: list[End]) -> None:
+    refused = ""
+    try:
+        loop = at_ends(case)
+    except ValueError as error:
+        refused = str(error)
+    if refused:
+        assert "allowed is" in refused
+        return
+    with contextlib.suppress(RuntimeError, RefusedError):  # what may not be enabled says so
+        loop.arm()
+    for sample in loop.run(0.1, swinging):
+        found = leaves([sample.output, sample.plan, sample.measured])
+        assert [path for path, value in found if not math.isfinite(value) and not path.endswith("stamp_s")] == []

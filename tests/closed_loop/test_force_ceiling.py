@@ -12,7 +12,6 @@ from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import Governor
 from tormagd.control.assembly.build import Core
 from tormagd.control.believe.believe import Learned
-from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
@@ -89,45 +88,6 @@ def test_a_sensor_that_reads_too_little_presses_more_by_no_more_and_too_much_les
     lying, render, lie: str, most_N: float
 ) -> None:
     assert worst_N(render(lying(lie), ASKED_N, 3.0)) < most_N
-
-
-@pytest.mark.parametrize("lie", ["+0.3 N", "-0.3 N"])
-def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(lying, render, lie: str) -> None:
-    loop = lying(lie, hand=ReversingHand(4.0))
-    render(loop, ASKED_N, 3.0)
-    samples = render(loop, ASKED_N, 3.0)
-    assert samples[-1].plan.limits == (Limit.SENSOR_ZERO,)
-    assert worst_N(samples) < ASKED_N + 0.1
-
-
-def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(arm, render) -> None:
-    loop = arm("sample_3", ReversingHand(2.0))
-    render(loop, ASKED_N, 2.0)
-    start_s = loop.device.truth.time_s
-    LyingSensor(
-        loop.simulated.plant, lambda _, reading_N: reading_N + 0.2 / 60.0 * (loop.device.truth.time_s - start_s)
-    )
-    samples = render(loop, ASKED_N, 24.0)
-    assert loop.planner.believe.zero.zero_N == pytest.approx(0.08, abs=0.04)
-    sliding = [abs(each.truth.force_N) for each in samples[-4_000:] if slides(each)]
-    assert np.mean(sliding) == pytest.approx(ASKED_N, abs=0.02)
-    assert not NAMED & set(samples[-1].plan.limits)
-
-
-def slides(sample: Sample) -> bool:
-    estimate = sample.measured
-    return estimate is not None and estimate.handle.rate_mm_s > 20.0 and estimate.handle.displacement_mm >= 2.0
-
-
-def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(render, armed: ClosedLoop) -> None:
-    render(armed, ASKED_N, 2.0)
-    before = armed.planner.believe.strength.fit
-    # as after ten minutes of turning one way
-    armed.planner.believe.zero.variance_N2 = 1.01 * UNKNOWN_SD_N**2
-    LyingSensor(armed.simulated.plant, lambda _, reading_N: reading_N + 0.1)
-    samples = render(armed, ASKED_N, 3.0)
-    assert (samples[-1].plan.limits, armed.planner.believe.strength.fit) == ((Limit.OFFSET_UNKNOWN,), before)
-    assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 
 def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(render, armed: ClosedLoop) -> None:

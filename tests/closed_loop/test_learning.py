@@ -124,8 +124,3 @@ def test_the_trim_takes_up_what_the_elastomer_relaxes(arm, allowed_N: float) -> 
     time_s, error_N = errors_after_step(arm)
     held_N = error_N[time_s > TRIMMED_S]
     assert max(abs(second.mean()) for second in np.array_split(held_N, round(HOLD_S - TRIMMED_S))) < allowed_N
-
-
-def test_without_a_trim_the_relaxation_is_seen(arm, hold_gap, allowed_N: float) -> None:
-    forces_N = [sample.truth.force_N for sample in hold_gap(arm(planned=False), 65.0, HOLD_S)]
-    assert forces_N[round(TRIMMED_S * 1e3)] - forces_N[-1] > 2.0 * allowed_N

@@ -22,8 +22,6 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 
 CLOSED_MM, HALF_MM, OPEN_MM = 48.0, 70.0, 95.0
 NAMED_S = 0.5
-SHOULD_S = (OPEN_MM - HALF_MM) / 2.0 / Config().device.retract_mm_s + 0.3
-"When it should be open: the way at the device's speed, turning round and tapering."
 MM_S = 20.0
 "More than the weakest device closes the gap by."
 Spoils = Callable[[MessageDevice, float], None]
@@ -149,16 +147,3 @@ def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: f
     loop.command("disable")
     assert named_s(loop, seconds=4.0) == math.inf
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
-
-
-@pytest.mark.parametrize("side", ["left", "right"])
-@pytest.mark.parametrize("shift_mm", [-0.6, 0.6])
-def test_a_zero_that_has_shifted_is_named_at_the_open_switch(closed: Opens, side: str, shift_mm: float) -> None:
-    loop = closed("serial")
-    firmware, zero = loop.simulated.firmware, f"_{side}_zero_mm"
-    setattr(firmware, zero, getattr(firmware, zero) - shift_mm)
-    held(loop, HALF_MM, 0.2)
-    assert loop.stepper.safety.faults == ()
-    loop.command("disable")
-    held(loop, CLOSED_MM, SHOULD_S + 1.0)  # behind its zero a carriage creeps
-    assert loop.stepper.safety.faults == (Fault.OUT_OF_STROKE,)

@@ -1,14 +1,14 @@
 """Several publishers, with clocks and ways of their own, at one brake: inbox, core and device in virtual time."""
 
 import contextlib
-import heapq
 import math
 import random
 from collections import Counter
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
@@ -16,103 +16,19 @@ from tormagd.config import Sources
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Limit
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
-from tormagd.daemon.force_delay import ForceDelay
-from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
+from tormagd.daemon.inbox import SetpointInbox
 from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.hand import ReversingHand, SteadyHand
-from tormagd_client.messages import SourceReport
 
-START_NS = 1_800_000_000_000_000_000
+REALTIME_NS = 1_800_000_000 * 10**9
 PERIOD_S = 0.002
-VALID_MS = 100.0
-WAY_S = 0.001
 
 
-class Publisher(NamedTuple):
-    """One process that sends a force by its own clock."""
-
-    force_N: Callable[[float], float]
-    source: str = "a"
-    from_s: float = 0.0
-    to_s: float = math.inf
-    way_s: Callable[[float], float] = lambda t: WAY_S
-    first_seq: int = 0
-    session: int | None = None
-
-    def messages(self, start_s: float, lasts_s: float) -> Iterable[tuple[float, bytes]]:
-        arrived_s = -math.inf
-        for number in range(round(self.from_s / PERIOD_S), round(min(self.to_s, lasts_s) / PERIOD_S)):
-            sent_s = number * PERIOD_S
-            arrived_s = max(arrived_s, sent_s + self.way_s(sent_s))
-            fields = {
-                "v": 1,
-                "source": self.source,
-                "session": self.session,
-                "seq": self.first_seq + number - round(self.from_s / PERIOD_S),
-                "stamp_ns": START_NS + round((start_s + sent_s) * 1e9),
-                "servo_cf": self.force_N(sent_s),
-                "valid_for_ms": VALID_MS,
-            }
-            yield start_s + arrived_s, msgpack.packb(fields)
-
-
-class Run(NamedTuple):
-    samples: list[Sample]
-    inbox: SetpointInbox
-    way: ForceDelay
-    start_s: float
-
-    def of(self, source: str) -> SourceReport:
-        return self.inbox.report(self.samples[-1].time_s).by_source[source]
-
-    def held_by(self, limit: Limit) -> list[float]:
-        return [each.time_s - self.start_s for each in self.samples if limit in each.plan.limits]
-
-    def error_N(self, force_N: Callable[[float], float], from_s: float, to_s: float = math.inf) -> float:
-        return max(
-            abs(each.truth.force_N - force_N(each.time_s - self.start_s))
-            for each in self.samples
-            if from_s <= each.time_s - self.start_s <= to_s
-        )
-
-    def fastest_loss_N_s(self, over_s: float = 0.05) -> float:
-        forces, over = [each.truth.force_N for each in self.samples], round(over_s * 1e3)
-        return max((a - b) / over_s for a, b in zip(forces, forces[over:], strict=False))
-
-
-def run(
-    loop: ClosedLoop,
-    *publishers: Publisher,
-    lasts_s: float = 3.0,
-    sources: Sources = EQUAL_SOURCES,
-    at: Callable[[SetpointInbox, float], None] = lambda inbox, now_s: None,
-) -> Run:
-    """Run the loop with these publishers; `at` is called in every tick."""
-    inbox, way, samples, start_s = SetpointInbox(sources), ForceDelay(), [], loop.now_s
-    coming = heapq.merge(*(each.messages(start_s, lasts_s) for each in publishers))
-    following = next(coming, None)
-    for _ in range(round(lasts_s * 1e3)):
-        now_s = loop.now_s
-        while following is not None and following[0] <= now_s:
-            inbox.take(following[1], now_s, START_NS + round(now_s * 1e9))
-            following = next(coming, None)
-        inbox.hand_on(now_s)
-        at(inbox, now_s - start_s)
-        used = loop.planner.planned
-        samples.append(loop.tick(inbox.newest))
-        way.ticked(loop.stepper.time_s, used, sources.playout_ms * 1e-3)
-    for _ in range(8):
-        inbox.refresh(loop.now_s)
-    way.to_duty.refresh()
-    return Run(samples, inbox, way, start_s)
-
-
-def constant(force_N: float) -> Callable[[float], float]:
-    return lambda time_s: force_N
-
-
-def swell_N(time_s: float) -> float:
-    return 1.3 - 0.3 * math.cos(math.tau * 0.8 * time_s)
+def send(inbox: SetpointInbox, source: str, seq: int, now_s: float, force_N: float) -> None:
+    """Send a setpoint of a millisecond ago."""
+    realtime_ns = REALTIME_NS + round(now_s * 1e9)
+    fields = {"v": 1, "source": source, "seq": seq, "stamp_ns": realtime_ns - 10**6, "servo_cf": force_N}
+    inbox.take(msgpack.packb(fields | {"valid_for_ms": 100.0}), now_s, realtime_ns)
 
 
 @pytest.mark.parametrize(
@@ -134,68 +50,27 @@ def test_another_takes_over_along_the_ramp(
     passes_s: float,
     state: str,
 ) -> None:
-    def give(inbox: SetpointInbox, time_s: float) -> None:
-        if abs(time_s - given_s) < 5e-4:
+    inbox, samples, start_s = SetpointInbox(Sources(priority=priority)), list[Sample](), armed.now_s
+    for tick in range(3_000):
+        since_s = 1e-3 * tick
+        for source, force_N, from_s, to_s in (("a", 1.6, 0.0, ends_s), ("b", 0.8, begins_s, math.inf)):
+            if tick % 2 and from_s <= since_s < to_s:
+                send(inbox, source, tick, armed.now_s, force_N)
+        if since_s == given_s:
             inbox.give("b", armed.now_s)
-
-    publishers = Publisher(constant(1.6), to_s=ends_s), Publisher(constant(0.8), "b", from_s=begins_s)
-    done = run(armed, *publishers, sources=Sources(priority=priority), at=give)
-    assert done.error_N(constant(1.6), 0.9, min(ends_s, passes_s)) < 0.05
-    assert done.error_N(constant(0.8), passes_s + 0.6) < 0.05
-    passed_s = [time_s for time_s in done.held_by(Limit.TAKEOVER) if time_s > 0.9]
-    assert passed_s[0] == pytest.approx(passes_s, abs=0.01)
-    assert done.fastest_loss_N_s() <= 1.25 * core.scene.force.release_N_s
-    assert done.of("a").state == state
-
-
-@pytest.mark.parametrize(
-    ("session", "gap_s"), [((1, 2), 0.0), ((None, None), 3 * PERIOD_S)], ids=["with session", "without"]
-)
-def test_a_restarted_publisher_goes_on_without_a_gap(
-    armed: ClosedLoop, session: tuple[int | None, int | None], gap_s: float
-) -> None:
-    done = run(
-        armed,
-        Publisher(swell_N, to_s=1.5, session=session[0], first_seq=5_000),
-        Publisher(swell_N, from_s=1.5, session=session[1]),
-    )
-    assert not done.held_by(Limit.STALE)
-    assert max(each.plan.setpoint_age_s or 0.0 for each in done.samples[100:]) <= WAY_S + PERIOD_S + gap_s + 0.004
-    assert done.error_N(swell_N, 1.0) < 0.05
-    assert done.of("a").restarts == 1
-
-
-def aligned_rms_N(done: Run, from_s: float = 1.5) -> float:
-    """Return how well the plant's force follows the swell, with the best delay taken out."""
-    known = [(each.time_s - done.start_s, each.truth.force_N) for each in done.samples]
-    counted = [(time_s, force_N) for time_s, force_N in known if time_s >= from_s]
-    return min(
-        math.sqrt(sum((force_N - swell_N(time_s - late_s)) ** 2 for time_s, force_N in counted) / len(counted))
-        for late_s in (0.002 * step for step in range(60))
-    )
-
-
-def test_a_playout_of_the_delays_p99_makes_jitter_as_good_as_a_steady_way(arm: Callable[[], ClosedLoop]) -> None:
-    def jittery() -> Publisher:
-        noise = random.Random(3)
-        return Publisher(swell_N, way_s=lambda t: 0.02 + noise.expovariate(1.0 / 0.01))
-
-    before = run(arm(), jittery())
-    playout_ms = before.of("a").delay_us.p99 * 1e-3
-    steady = run(arm(), Publisher(swell_N, way_s=lambda t: playout_ms * 1e-3))
-    played = run(arm(), jittery(), sources=Sources(playout_ms=playout_ms))
-    assert aligned_rms_N(played) <= 1.2 * aligned_rms_N(steady) < aligned_rms_N(before)
-    found = played.inbox.report(played.samples[-1].time_s).playout
-    assert found is not None
-    assert 0 < found.late <= 0.03 * found.setpoints
-    assert found.held_us.p50 == pytest.approx(playout_ms * 1e3 - before.of("a").delay_us.p50, rel=0.1)
-    assert played.way.to_duty.report.p50 == pytest.approx(playout_ms * 1e3 + 1_000.0, rel=0.05)
+        samples.append(armed.tick(inbox.newest))
+    time_s, force = np.array([(each.time_s - start_s, each.truth.force_N) for each in samples]).T
+    assert force[(time_s >= 0.9) & (time_s <= min(ends_s, passes_s))] == pytest.approx(1.6, abs=0.05)
+    assert force[time_s >= passes_s + 0.6] == pytest.approx(0.8, abs=0.05)
+    is_passing = np.array([Limit.TAKEOVER in each.plan.limits for each in samples])
+    assert time_s[is_passing & (time_s > 0.9)][0] == pytest.approx(passes_s, abs=0.01)
+    assert ((force[:-50] - force[50:]) / 0.05).max() <= 1.25 * core.scene.force.release_N_s
+    assert inbox.report(armed.now_s).by_source["a"].state == state
 
 
 # -- whatever a publisher sends ----------------------------------------------------------------------------------------
 
 
-REALTIME_NS = 1_800_000_000 * 10**9
 LAST = 2**63 - 1
 Fields = dict[str, Any]
 

@@ -5,7 +5,6 @@ example ends with the cause put right and the documented commands, which have to
 """
 
 from functools import cache
-from typing import ClassVar
 
 import msgspec
 import pytest
@@ -29,7 +28,6 @@ from firmware_protocol.framing import DELIMITER, cobs_decode
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
-from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import COMMANDS, OperatingState, RefusedError
 from tormagd.daemon.arming import Arming
 from tormagd.hardware.measurement import DeviceRequest
@@ -82,7 +80,6 @@ STREAMS = [
 "What a spell hits: a direction and a function, 0 for all."
 FRAMES = st.sampled_from([1, 2, 10, 25, 40, 60, 200])
 MS = st.sampled_from([1, 5, 20, 49, 52, 120, 250])
-Pair = tuple[OperatingState, DeviceMode]
 
 
 class BadLine:
@@ -141,10 +138,6 @@ def rare_plans() -> Core:
 
 
 class Together(RuleBasedStateMachine):
-    visited: ClassVar[set[Pair]] = set()
-    faults: ClassVar[set[Fault]] = set()
-    examples = periods = 0
-
     def __init__(self) -> None:
         super().__init__()
         core = rare_plans()
@@ -227,8 +220,6 @@ class Together(RuleBasedStateMachine):
     def teardown(self) -> None:
         if self.line.period:
             self.lead_out()
-        type(self).examples += 1
-        type(self).periods += self.line.period
 
     def put_right(self) -> None:
         self.loop.simulated.mend()
@@ -286,8 +277,6 @@ class Together(RuleBasedStateMachine):
             self.undriven = line.period
         self.asked[safety.request] = line.period
         self.is_armed = self.is_armed and safety.is_driven
-        self.visited.add((safety.operating_state, self.mode))
-        self.faults.update(safety.faults)
         assert safety.is_driven == self.is_armed, f"driven, and not armed: {safety}"
         if line.period > self.hangs_until:
             self.judge_device(before)
@@ -328,6 +317,3 @@ class Together(RuleBasedStateMachine):
 def test_whatever_happens_to_both_nothing_moves_unarmed_and_every_fault_has_a_way_out() -> None:
     examples = settings().max_examples // 6
     run_state_machine_as_test(Together, settings=settings(max_examples=examples, stateful_step_count=25))
-    pairs = sorted(f"{one} {other.name}" for one, other in Together.visited)
-    print(f"\n{Together.examples} examples, {Together.periods:,} periods, {len(pairs)} pairs: {', '.join(pairs)}")
-    print(f"{len(Together.faults)} faults: {', '.join(sorted(Together.faults))}")

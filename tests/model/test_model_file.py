@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mpmath
 import msgspec
 import numpy as np
 import pytest
@@ -379,16 +378,6 @@ def states(count: int) -> Array:
     return rows
 
 
-def exact_N(model: ForceModel, row: list[float]) -> mpmath.mpf:
-    weight, bias, output, constant = model.physical
-    with mpmath.workdps(50):
-        total = mpmath.mpf(constant)
-        for column, shift, height in zip(weight.tolist(), bias.tolist(), output.tolist(), strict=True):
-            exponent = mpmath.mpf(shift) + mpmath.fdot(column, row)
-            total += mpmath.mpf(height) / (1 + mpmath.exp(-exponent))
-        return total
-
-
 @pytest.fixture(params=["model", "shipped"])
 def either(request: pytest.FixtureRequest) -> ForceModel:
     return request.getfixturevalue(request.param)
@@ -404,20 +393,15 @@ def test_the_force_is_that_of_the_model(either: ForceModel) -> None:
         assert forces == pytest.approx(others, rel=0, abs=1e-12 * model.curve(0.5, 10.0, 40.0).magnitude_N)
 
 
-def test_the_force_agrees_with_50_digits(either: ForceModel) -> None:
-    for row in states(60).tolist():
-        curve = either.curve(row[0], row[1], row[3])
-        assert (curve.force_N(row[2]), curve.force_and_slope(row[2])[0]) == (
-            pytest.approx(float(exact_N(either, row)), rel=0, abs=1e-13 * curve.magnitude_N),
-            curve.force_N(row[2]),
-        )
-
-
 def test_the_slope_is_that_of_the_model(either: ForceModel) -> None:
     rows = states(300)
-    slopes = [either.curve(row[0], row[1], row[3]).force_and_slope(row[2])[1] for row in rows.tolist()]
+    curves = [either.curve(row[0], row[1], row[3]) for row in rows.tolist()]
+    told = [curve.force_and_slope(row[2]) for curve, row in zip(curves, rows.tolist(), strict=True)]
+    assert [force_N for force_N, _ in told] == [
+        curve.force_N(row[2]) for curve, row in zip(curves, rows.tolist(), strict=True)
+    ]
     steepest = float(np.abs(either.physical.output_weight) @ np.abs(either.physical.hidden_weight[:, 2]))
-    assert slopes == pytest.approx(either.field_slope_N_per_mT(rows), rel=0, abs=1e-12 * steepest)
+    assert [slope for _, slope in told] == pytest.approx(either.field_slope_N_per_mT(rows), rel=0, abs=1e-12 * steepest)
 
 
 @pytest.mark.parametrize(("dtype", "accuracy"), [(np.float64, 1e-13), (np.float32, 1e-5)])

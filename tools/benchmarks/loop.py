@@ -35,7 +35,6 @@ from machines.stream import received
 
 from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compiler
 from tormag_lab.arrays import Array
-from tormag_lab.pages import subplots
 from tormagd.config import Config, RealTime, load_config
 from tormagd.ctl.processes import begun, first_line, is_linked, processor_s
 from tormagd.ctl.record import listening
@@ -263,16 +262,6 @@ def merge(blocks: list[Block]) -> Block:
     )
 
 
-def draw(path: Path, phases_us: dict[str, dict[str, float]], control_hz: int) -> None:
-    figure, axes = subplots((9, 0.5 * len(phases_us) + 1.5))
-    names = list(phases_us)[::-1]
-    axes.barh(names, [phases_us[name]["p99"] for name in names], color="#d8dee9", label="p99")
-    axes.barh(names, [phases_us[name]["p50"] for name in names], color="#2a6f97", label="p50")
-    axes.set(xlabel="us", title=f"What a beat does (eight clients and recording; a period is {1e6 / control_hz:g} us)")
-    axes.legend(loc="lower right")
-    figure.savefig(path, dpi=110)
-
-
 def quantiles(values: Array) -> dict[str, float]:
     return {name: round(float(np.percentile(values, share)), 1) for name, share in QUANTILES.items()}
 
@@ -419,7 +408,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("CONTROL", "PLANS"),
         help="Hz (1000 and 1000)",
     )
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="PNG of one beat, phase by phase")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
@@ -434,7 +422,4 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         )
         for _ in range(options.pairs)
     ]
-    result = summary(pairs, ours.realtime)
-    if options.picture is not None and "phases_us" in result:
-        draw(options.picture, result["phases_us"], ours.rates_hz[0])
-    return result
+    return summary(pairs, ours.realtime)

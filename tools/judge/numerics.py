@@ -1,9 +1,9 @@
-"""Numbers at their extremes: the force law against 50 digits, hostile inputs to every stage, extreme configurations.
+"""Numbers at their extremes: the force law against 50 digits, hostile inputs to every stage.
 
 Part `stages` feeds each stage of the core with NaN, infinities, denormals, largest floats, time that stands or goes
 back, and tables that do not rise. Steps are `refused` by name, or `stated`: a limit or a fault was told after them.
 `travelled` must be 0: numbers that came out `nonfinite`, `swallowed` steps with NaN of which nothing was said, and
-errors that are `unnamed` or `wrong`. `configurations` takes each end of what is accepted, alone and in pairs.
+errors that are `unnamed`.
 
 `cases` inputs are evaluated as arrays in float64 and float32, and `reference_cases` of them in 50 digits. The allowed
 relative error is 1e-12 in float64, in float32 1e-5 for lambda1 >= 0.7 and 3e-4 down to 0.05; 8 eps kappa if that is
@@ -22,7 +22,6 @@ import numpy as np
 from digits import DIGITS, Batch, draw_batch, reference
 from numpy.typing import NDArray
 
-from judge.ends import became, drawn_ends, summed
 from judge.frame import each
 from judge.stage_table import stages
 from judge.stages import tried
@@ -183,17 +182,13 @@ def measure(options: argparse.Namespace) -> Json:
 
 
 def of_core(options: argparse.Namespace) -> Json:
-    ends, places = drawn_ends(options.configurations, options.seed), range(len(stages()))
     row = partial(stage_row, episodes=options.episodes, seed=options.seed)
-    told = each(row, "stages", places, workers=options.workers)
-    came = each(partial(became, seconds=options.seconds), "configurations", ends, workers=options.workers)
-    of_ends = summed(came)
-    travelled = sum(row["nonfinite"] + row["swallowed"] + row["unnamed"] for row in told) + of_ends["wrong"]
+    told = each(row, "stages", range(len(stages())), workers=options.workers)
+    travelled = sum(row["nonfinite"] + row["swallowed"] + row["unnamed"] for row in told)
     return {
         "stage_cases": sum(row["cases"] for row in told),
         "travelled": travelled,
         "stages": told,
-        "configurations": of_ends,
         "passed": travelled == 0,
     }
 
@@ -222,9 +217,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("cases", 1_000_000, "inputs of the physics, as arrays"),
         ("reference", 12_000, "of them, computed in 50 digits"),
         ("episodes", 1_000, "of hostile inputs to each stage"),
-        ("configurations", 200, "at their ends"),
         ("seed", 1, "of what is drawn"),
         ("workers", 2, "processes"),
     ):
         parser.add_argument(f"--{name}", type=whole(1, 10**9), default=default, help=f"{says} (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=10.0, help="that each configuration runs (%(default)s)")

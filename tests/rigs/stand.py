@@ -1,8 +1,7 @@
-"""A daemon on a simulated device, as processes, and its operator: what every case in real time runs on."""
+"""A daemon on a simulated device, as processes, and its operator: what runs in real time stands on."""
 
 import contextlib
 import os
-import socket
 import subprocess
 import tempfile
 import time
@@ -11,18 +10,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import zmq
 from machines.own import own_machine
 from machines.stream import received
 from machines.wire import carried
 
-from tormag_lab.arrays import Array
 from tormagd.config import load_config
-from tormagd.ctl.processes import begun, end, first_line
+from tormagd.ctl.processes import begun, first_line
 from tormagd.ctl.record import listening
 from tormagd_client import Client, ClientError
-from tormagd_client.keys import SECRET, SERVER, generate
+from tormagd_client.endpoints import ENDPOINTS
 
 FIFO_PRIORITY, DEVICE_PRIORITY = 50, 55
 "Of the daemon, and of the device, which stands for a machine of its own; used if granted."
@@ -39,32 +36,27 @@ Figures = dict[str, Any]
 class Stand:
     """Daemon, device and an operator's client. All of it ends with `stack`."""
 
-    def __init__(self, stack: ExitStack, transport: str = "serial") -> None:
+    def __init__(self, stack: ExitStack, transport: str = "serial", control_hz: int = 500) -> None:
         self._stack = stack
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
         self.latched: list[tuple[str, float, float]] = []
         stack.enter_context(carried(DEVICE_PRIORITY))
         self.plug_in(transport)
-        self.keys = self.folder / "keys"
-        generate(SERVER, self.keys, self.keys)
-        for role in ("publish", "operate", "observe"):
-            generate(role, self.keys, self.keys / role)
-        with socket.socket() as probe:
-            probe.bind(("", 0))
-            addresses = {"telemetry": f"tcp://0.0.0.0:{probe.getsockname()[1]}"}
-        addresses |= {name: f"ipc://{self.folder}/{name}" for name in ("setpoint", "control", "recording")}
-        config = self.folder / "tormagd.toml"
-        config.write_text(
+        self.config = self.folder / "tormagd.toml"
+        self.config.write_text(
             f'scene = "coronary"\n[realtime]\nfifo_priority = {FIFO_PRIORITY}\nlock_memory = true\n'
             f'[device]\nport = "{self.folder}/device"\n{BACKENDS[transport]}\nmeasurement_timeout_ms = 50.0\n'
-            + "[endpoints]\n"
-            + "".join(f'{name} = "{address}"\n' for name, address in addresses.items())
-            + f'[endpoints.curve]\nserver_secret = "{self.keys}/{SERVER}{SECRET}"\n'
+            f'profiles = "{self.folder}/profiles"\n[black_box]\nfolder = "{self.folder}/boxes"\n'
+            f"[rates]\ncontrol_hz = {control_hz}\n[endpoints]\n"
+            + "".join(f'{name} = "ipc://{self.folder}/{name}"\n' for name in ENDPOINTS)
         )
-        self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(config))
-        self.endpoints = load_config(config).endpoints
+        self.endpoints = load_config(self.config).endpoints
         # patient, because the host may be busy: timing is measured, not waited for
         self.client = stack.enter_context(Client(self.endpoints, 10.0))
+        self.start_daemon()
+
+    def start_daemon(self) -> None:
+        self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(self.config))
         self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
 
     def begin(self, *arguments: str) -> "subprocess.Popen[str]":
@@ -72,8 +64,8 @@ class Stand:
 
     def plug_in(self, transport: str) -> None:
         """Start a device; a symbolic link to its line stands for udev's stable name."""
-        simulated = ("--seed", "1", "--truth", str(self.folder / "truth.csv"))
-        self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], *simulated))
+        simulated = (DOORS[transport], "--seed", "1", "--truth", str(self.folder / "truth.csv"))
+        self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", *simulated))
         line, port = first_line(self.device), self.folder / "device"
         port.unlink(missing_ok=True)
         port.symlink_to(line)
@@ -122,11 +114,6 @@ class Stand:
 
             yield read
 
-    def truth(self) -> Array:
-        """End the device; return its true t_ns, force_N and gap_mm."""
-        end(self.device)
-        return np.loadtxt(self.folder / "truth.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
-
     def unhandled(self) -> list[str]:
         lines = (self.folder / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         return [line for line in lines if any(sign in line for sign in UNHANDLED)]
@@ -136,7 +123,3 @@ def used(child: "subprocess.Popen[str]") -> tuple[int, int]:
     folder = Path(f"/proc/{child.pid}")
     pages = int((folder / "statm").read_text().split()[1])
     return len(list((folder / "fd").iterdir())), pages * os.sysconf("SC_PAGE_SIZE") // 1024
-
-
-def is_at_rest(status: dict[str, Any]) -> bool:
-    return status["link"]["state"] == "RUNNING" and not status["is_busy"]
