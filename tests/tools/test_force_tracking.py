@@ -12,6 +12,7 @@ from judge.frame import parsed, told
 from judge.signals import (
     Signal,
     pulse_signal,
+    recorded_signals,
 )
 from judge.tracking import (
     ARRIVES_S,
@@ -140,6 +141,17 @@ def test_a_publisher_sends_what_follows() -> None:
         pytest.approx(forces[6:16]),
     )
     assert publisher(times, forces, 0.0)(0.1).preview_N == ()
+
+
+def test_recorded_signals_are_in_the_devices_range(recordings, monkeypatch) -> None:
+    monkeypatch.setenv("TORMAG_DATA", str(recordings))
+    found = recorded_signals()
+    assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "haptic"}
+    for signal in found:
+        assert np.all(np.diff(signal.time_s) > 0.0)
+        assert (
+            0.55 <= signal.force_N.min() <= signal.force_N.max() <= (2.0 if signal.name.startswith("haptic") else 1.75)
+        )
 
 
 ROOT = Path(__file__).parents[2]

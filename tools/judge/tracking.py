@@ -2,9 +2,10 @@
 
 How soon a device is known: `steps`, `creep` and `speeds`, of samples, second plant and draws of the plant card. How
 well signals are followed: the `pulse` of `make run` on all of these, and in full on the `samples` and the second plant,
-at 500 setpoints a second, with a preview of 70 ms and live. Beside these `samples` are what ideal carriages miss
-(`tormag-lab bound`) and the same core with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the second
-plant only judge. Errors are as they are, without any mean or delay taken out. A step has *arrived* ARRIVES_S
+at 500 setpoints a second, with a preview of 70 ms and live; and the recorded `signals` of the folder TORMAG_DATA, with
+a preview of 400 ms, as for a file that is played, and live. Beside them are what ideal carriages miss (`tormag-lab
+bound`), and beside `samples` the same core with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the
+second plant only judge. Errors are as they are, without any mean or delay taken out. A step has *arrived* ARRIVES_S
 after the device's ideal carriages would have brought the force.
 """
 
@@ -13,9 +14,10 @@ from collections.abc import Iterator
 from itertools import pairwise, product
 
 import numpy as np
-from devices import device, judging
+from devices import SAMPLES, device, judging
 
 from judge.following import (
+    FILE_PREVIEW_S,
     PREVIEW_S,
     RATE_HZ,
     VALID_S,
@@ -32,7 +34,9 @@ from judge.hands import Legs
 from judge.signals import (
     TRIM_S,
     Signal,
+    palpation,
     pulse_signal,
+    recorded_signals,
     with_approach,
 )
 from tormag_lab.arrays import Json
@@ -62,6 +66,7 @@ SPEED_S, SLID_S = 4.0, 1.0
 SPEEDS_N = (1.0, 2.0)
 START_N, RAMP_S, HOLD_S = 0.6, 1.0, 1.0
 PULSE_S, DRAWN_PULSE_S = 20.0, 15.0
+PALPATION_SEEDS = 1, 2
 
 
 # -- how soon and how well a device is known ------------------------------------------------------------------------
@@ -170,11 +175,14 @@ def track(
     times = np.concatenate([approach_s[:-1], lead_s + signal.time_s])
     forces = np.concatenate([approach_N[:-1], signal.force_N])
     found = played(loop, times, forces, preview_s, lead_s=lead_s)
-    return found._replace(asked_N=np.interp(found.time_s, signal.time_s, signal.force_N))
+    asked = np.interp(found.time_s, signal.time_s, signal.force_N)
+    if not signal.is_known_ahead:  # an event holds until the next
+        asked = signal.force_N[np.searchsorted(signal.time_s, found.time_s, side="right") - 1]
+    return found._replace(asked_N=asked)
 
 
 def ideal(name: str, signal: Signal) -> Bound:
-    return bound(device(name), signal.time_s, signal.force_N)
+    return bound(device(name), signal.time_s, signal.force_N, is_held=not signal.is_known_ahead)
 
 
 def compared(found: Followed, best: Bound, start_s: float) -> Json:
@@ -211,11 +219,32 @@ def pulse(name: str) -> Json:
     return {key: found.since(TRIM_S).rms_N for key, found in runs.items()}
 
 
+def recorded(name: str, signal: Signal, preview_s: float) -> Json:
+    found = track(device(name), signal, "coronary", preview_s)
+    row = {"plant": name, "signal": signal.name, "preview": preview_s > 0.0}
+    return row | compared(found, ideal(name, signal), 0.0) | {"limits": found.limits}
+
+
+def signals() -> Json:
+    found = recorded_signals()
+    if not found:
+        return {"rows": [], "note": "no recorded signals: TORMAG_DATA names no folder of them"}
+    found += [palpation(seed) for seed in PALPATION_SEEDS]
+    cases = [
+        (name, signal, preview_s)
+        for signal in found
+        for preview_s in ((FILE_PREVIEW_S, 0.0) if signal.is_known_ahead else (0.0,))
+        for name in SAMPLES
+    ]
+    return {"rows": each(recorded, "signals", *zip(*cases, strict=True))}
+
+
 # -- all cases -------------------------------------------------------------------------------------------------------
 
 
 OF_DEVICES = {"steps": steps, "creep": creep, "speeds": speeds, "pulse": pulse}
-CASES = (*OF_DEVICES, "samples")
+OF_SIGNALS = {"samples": samples, "signals": signals}
+CASES = (*OF_DEVICES, *OF_SIGNALS)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -227,14 +256,14 @@ def measure(options: argparse.Namespace) -> Json:
 
 
 def of_case(case: str) -> Json:
-    if case == "samples":
-        return samples()
+    if case in OF_SIGNALS:
+        return OF_SIGNALS[case]()
     names = judging(DRAWS)
     return dict(zip(names, each(OF_DEVICES[case], case, names), strict=True))
 
 
 def shown(figures: Json) -> Iterator[str]:
-    return lines({case: found if case == "samples" else worst(found) for case, found in figures.items()})
+    return lines({case: found if case in OF_SIGNALS else worst(found) for case, found in figures.items()})
 
 
 def worst(devices: dict[str, Json]) -> list[Json]:
