@@ -29,24 +29,6 @@ COMPILED = {
     ),
     "tormagd/control/safety": ("operating_state",),
     "tormagd/control": (*("interpolation", "records", "contact", "nominal", "sight", "plausible", "measure", "core"),),
-    "tormagd/control/believe": (
-        *(
-            "strength",
-            "slow_friction",
-            "sensor_zero",
-            "freshness",
-            "anchor",
-            "ripple",
-            "sensor",
-            "carriage_lag",
-            "handle",
-            "memory",
-            "believe",
-        ),
-    ),
-    "tormagd/control/ask": ("forecast", "path", "way", "governor"),
-    "tormagd/control/aim": ("portrait", "aim"),
-    "tormagd/control/move": ("motor", "pid", "reference", "homing", "opening", "watch", "actuator", "carriages"),
     "tormagd/control/assembly": ("conditions",),
     "tormagd/record": ("journal", "telemetry"),
     "tormagd/simulation": (
@@ -59,7 +41,10 @@ COMPILED = {
         *("endpoint", "listeners", "daemon"),
     ),
 }
+WHOLE = [f"tormagd/control/{room}" for room in ("believe", "ask", "aim", "move")]
+"Rooms of which every file is compiled, also one that is added."
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]
+SOURCES += [path.as_posix() for room in WHOLE for path in sorted(Path(room).glob("[!_]*.py"))]
 GROUP = "firmware_protocol.core"
 "One library of all modules, so that calls between them are calls between C functions."
 RECORD = Path("firmware_protocol/core.json")
