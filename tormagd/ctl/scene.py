@@ -102,13 +102,16 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     """Show every measured way to serve a scene, the chosen one, and how well it does on a device that chose nothing."""
     scene, derived = loaded(name), derived_of(name, config)
     found = measured_as(name, scene)
-    runs, machine = way_of(derived), machine_us()
+    runs, machine = way_of(scene, derived), machine_us()
     scale, offered, chosen = machine / found.machine_us, found.offered(scene.bandwidth), found.chosen
     lines = [
         f"{scene.name}: tolerance {1e3 * found.tolerance_N:g} mN RMS",
         "",
         f"{'mN RMS':26} {' '.join(f'{each:>8}' for each in found.usual.rms_N)} {'share':>7}",
         *(_row(each, scale, _marks(each, found, each.way == runs, each in offered)) for each in found.served),
+        "",
+        *([f"{chosen.way}, and one thing more:"] if found.more else []),
+        *(_row(each, scale, _marks(each, found, each.way == runs, each in offered)) for each in found.more),
         "",
         f"on {found.judged[0].device}, which chose nothing:",
         *(_row(each, scale) for each in found.judged),

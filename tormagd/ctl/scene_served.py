@@ -63,11 +63,11 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
         )
     least_N = min(way.figures[1] for way in fits)
     alike = [way for way in fits if share is None or way.figures[1] <= (1.0 + ALIKE) * least_N]
-    return min(alike, key=lambda way: way.figures[0])
+    return min(alike, key=lambda way: (len(way.way.given), way.figures[0]))
 
 
 def write_scene(name: str, way: OperatingPoint, out: Path) -> None:
-    """Write the scene with this way's rates and search to the new file `out`; relative paths are adapted."""
+    """Write the scene as this way serves it to the new file `out`; relative paths are adapted."""
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
     tables = {key: value for key, value in tables.items() if value is not None}
@@ -77,6 +77,12 @@ def write_scene(name: str, way: OperatingPoint, out: Path) -> None:
         tables["insert"]["model"] = os.path.relpath(path.parent / tables["insert"]["model"], out.parent)
     tables["bandwidth"] = {"control_hz": way.control_hz, "inference_hz": way.inference_hz}
     tables["solver"] = {"name": way.search}
+    if way.standby_N:
+        tables["force"]["standby_N"] = way.standby_N
+    if way.gap_speed_mm_s:
+        tables["insert"]["gap_speed_mm_s"] = way.gap_speed_mm_s
+    if signal:
+        signal["is_known_ahead"] = way.ahead_ms > 0.0
     try:
         with out.open("x", encoding="utf-8") as file:
             file.write(as_toml(tables) + "\n")
