@@ -67,7 +67,7 @@ def _price(name: str, scene: Scene, derived: dict[str, Any], sent_hz: float) -> 
     way = way_of(scene, derived)
     plans_hz = max(way.inference_hz, sent_hz if derived["plan_every_setpoint"] else 0.0)
     found = None if derived["terms_out"] else measured(scene, name)
-    return None if found is None else found.share_of(way, machine_us(), plans_hz), plans_hz
+    return None if found is None else found.share_of(way, machine_us(), plans_hz, derived["backend"]), plans_hz
 
 
 def torque_range(scene: Scene) -> str:

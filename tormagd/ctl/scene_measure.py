@@ -13,6 +13,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,12 +41,12 @@ CHOOSES, JUDGES = 2, 3
 "Samples; models learned from the first."
 DENSE_HZ, PREVIEW_STEP_S = 1_000, 0.02
 SELDOM_HZ = 20.0
-STEP_S, COMES_S, STEPS = 1.6, 1.2, (0.8, 0.2)
+STEP_S, COMES_S, STEPS = 1.5, 1.1, (0.8, 0.2)
 "Shares of the range."
 CONTACT_S = 2.0
 "So long the wall's force rises from 0."
-LASTS_S = {"approach": 1.0, "signal": 3.6, "seldom": 1.6, "steps": len(STEPS) * STEP_S, "contact": CONTACT_S + 0.2}
-PRESSES_S = 6.0
+LASTS_S = {"approach": 1.0, "signal": 3.0, "seldom": 1.4, "steps": len(STEPS) * STEP_S, "contact": CONTACT_S + 0.2}
+PRESSES_S = 9.0
 "A finger comes late: the approach of a pad lasts so much longer."
 NEARER, NEARER_N = 0.25, 0.2
 "A standby is above the least force by this share of the range, and at most so much."
@@ -100,8 +101,7 @@ def measure_scene(name: str) -> Outcome:
             "tormagctl guide scene says how one is stated",
         )
     range_N = max(scene.force.least_N, derived["least_N"]), min(scene.force.most_N, derived["most_N"])
-    ways, tolerance_N = ways_of(scene, derived["solver"]["solver"]), scene.force.tolerance_rms_N
-    machines = list[float]()
+    ways, machines = ways_of(scene, derived["solver"]["solver"]), list[float]()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that what was begun is ended
 
     def run(way: OperatingPoint, sample: int) -> Served:
@@ -111,30 +111,37 @@ def measure_scene(name: str) -> Outcome:
         write_line(f"{way} on {found.device}: {errors} mN, {found.share:.1%} of a processor", sys.stderr)
         return found
 
-    def like(runs: list[Served]) -> list[Served]:
-        return served_like(runs, tolerance_N, scene.bandwidth)
-
     with tempfile.TemporaryDirectory(prefix="tormag-") as profiles:
-        write_line(
-            f"{scene.name}: up to {len(ways) + 7} live runs of about {sum(LASTS_S.values()) + 4:.0f} s", sys.stderr
-        )
-        tried = [run(way, CHOOSES) for way in ways]
-        cheapest = min(like(tried), key=lambda each: each.way.sum_hz)
-        judged = [run(way, JUDGES) for way in dict.fromkeys((cheapest.way, ways[0]))]
-        if judged[0] not in like(judged[::-1]):
-            judged.reverse()
-        chosen = next(each for each in tried if each.way == judged[0].way)
-        more = [run(way, CHOOSES) for way in more_of(scene, chosen.way, range_N)]
-        best = min(like([chosen, *more]), key=lambda each: each.worst_N)
-        judged += [run(best.way, JUDGES)] if best in more else []
+        lasts_s = sum(LASTS_S.values()) + 4.0
+        write_line(f"{scene.name}: up to {len(ways) + 7} live runs of about {lasts_s:.0f} s", sys.stderr)
+        runs = _runs(scene, ways, range_N, run)
     machine = round(statistics.median(machines), 1)
-    found = MeasuredScene(scene.fingerprint, tolerance_N, machine, tuple(tried), tuple(judged), tuple(more))
+    found = MeasuredScene(scene.fingerprint, scene.force.tolerance_rms_N, machine, *runs)
     with as_usage_error(OSError, hint="copy the scene to a folder that you may write to"), in_place_of(out) as beside:
         beside.write_bytes(msgspec.json.format(msgspec.json.encode(found), indent=1) + b"\n")
     return Outcome(
         msgspec.to_builtins(found) | {"file": str(out)},
         f"{out} is written; chosen: {found.chosen.way}. tormagctl scene explain {name} shows all",
     )
+
+
+def _runs(
+    scene: Scene, ways: list[OperatingPoint], range_N: tuple[float, float], run: Callable[[OperatingPoint, int], Served]
+) -> tuple[tuple[Served, ...], ...]:
+    """Return what was served, judged, and given more; the best of that is judged too."""
+
+    def like(runs: list[Served]) -> list[Served]:
+        return served_like(runs, scene.force.tolerance_rms_N, scene.bandwidth)
+
+    tried = [run(way, CHOOSES) for way in ways]
+    cheapest = min(like(tried), key=lambda each: each.way.sum_hz)
+    judged = [run(way, JUDGES) for way in dict.fromkeys((cheapest.way, ways[0]))]
+    if judged[0] not in like(judged[::-1]):
+        judged.reverse()
+    chosen = tried[ways.index(judged[0].way)]
+    more = [run(way, CHOOSES) for way in more_of(scene, chosen.way, range_N)]
+    best = min(like([chosen, *more]), key=lambda each: each.worst_N)
+    return tuple(tried), (*judged, *([run(best.way, JUDGES)] if best in more else [])), tuple(more)
 
 
 def ways_of(scene: Scene, runs: str) -> list[OperatingPoint]:
@@ -150,8 +157,9 @@ def ways_of(scene: Scene, runs: str) -> list[OperatingPoint]:
 def more_of(scene: Scene, way: OperatingPoint, range_N: tuple[float, float]) -> list[OperatingPoint]:
     """Return the way with one thing more each that the scene does not state."""
     nearer_N = range_N[0] + min(NEARER * (range_N[1] - range_N[0]), NEARER_N)
-    more = {"ahead_ms": AHEAD_MS, "slid_s": sum(LASTS_S.values()), "gap_speed_mm_s": SLOWER_MM_S}
-    more |= {"standby_N": round(nearer_N, 3)} if scene.element == "torque" else {}
+    more = {"ahead_ms": AHEAD_MS, "slid_s": sum(LASTS_S.values())}
+    if scene.element == "torque":
+        more |= {"standby_N": round(nearer_N, 3), "gap_speed_mm_s": SLOWER_MM_S}
     return [msgspec.structs.replace(way, **{key: value}) for key, value in more.items() if not getattr(way, key)]
 
 
