@@ -36,39 +36,35 @@ def front(name: str, found: MeasuredScene) -> float:
 
 
 def page(found: dict[str, MeasuredScene]) -> str:
-    flat = [f"`{name}` ({_why_flat(each)})" for name, each in found.items() if front(name, each) < FRONT]
+    flat = [name for name, each in found.items() if front(name, each) < FRONT]
+    met = [name for name in flat if found[name].chosen.worst_N <= found[name].tolerance_N]
+    bound = [name for name in flat if name not in met]
+    seldom = [name for name, each in found.items() if each.chosen.rms_N["seldom"] > FRONT * each.chosen.rms_N["signal"]]
+    slid_s = max((each.way.slid_s for scene in found.values() for each in scene.more), default=0.0)
     machines = [each.machine_us for each in found.values()]
-    slid_s = max(each.way.slid_s for scene in found.values() for each in scene.more)
-    seldom = [
-        f"`{name}`" for name, each in found.items() if each.chosen.rms_N["seldom"] > FRONT * each.chosen.rms_N["signal"]
-    ]
     parts = [
         _head(),
         table(
             ["scene", "asked, N", "device gives, N", "tolerance", "served", "share", "worst error", *MORE.values()],
             [_row(name, each) for name, each in found.items()],
         ),
-        "Errors are RMS, in mN, of the true force, live, from a second after arming, on a simulated device that no "
-        "model was learned from, with the handle at the scene's greatest speed. The worst of four counts: the scene's "
-        "own *signal*; the same *seldom*, from a publisher of 20 setpoints a second; *steps*, 1.1 s after each; "
-        "*contact*, a wall whose force rises in two seconds. **Bold** is over the tolerance. *Share* is what the "
-        f"daemon took of one processor meanwhile (`machine_us` {min(machines):.0f} to {max(machines):.0f}).",
-        "The last columns give one thing more each, and their price is not the processor's:\n\n"
-        f"- *told ahead*: the patient side must know what comes {AHEAD_MS:g} ms ahead (`signal.is_known_ahead`)\n"
-        f"- *learned*: the device slid for {slid_s:.0f} s before, and the daemon kept that (`device.profiles`)\n"
-        "- *waits nearer*: the hand feels the force in brackets, N, while less is asked, and less is no error then "
+        "Errors are RMS, mN, of the true force, live, from a second after arming, at the handle's greatest speed, on a "
+        "simulated device that no model was learned from. The worst counts of *signal*, the same *seldom* (20 "
+        "setpoints a second), *steps* (from 1.1 s after each) and *contact*, a wall whose force rises in two seconds. "
+        "**Bold** is over the tolerance. *Share* is what the daemon took of a processor meanwhile (`machine_us` "
+        f"{min(machines):.0f} to {max(machines):.0f}). The last columns give one thing more each:\n\n"
+        f"- *told ahead*: the patient side knows what comes in {AHEAD_MS:g} ms (`signal.is_known_ahead`)\n"
+        f"- *learned*: the device slid for {slid_s:.0f} s before (`device.profiles`)\n"
+        "- *waits nearer*: the hand feels the force in brackets, N, where less is asked; that is no error then "
         "(`force.standby_N`)\n"
-        "- *slower gap*: closing at 38 mm/s (`insert.gap_speed_mm_s`) instead of what the motors can spares their "
-        "current\n"
-        f"- how often the publisher sends: *seldom* is over {FRONT} times the signal's own error in "
-        f"{', '.join(seldom) or 'none'}",
-        "~~Struck out~~ is not offered by `tormagctl scene check`: it makes the signal or the worst error worse, here "
-        "or on another device.",
+        "- *slower gap*: 38 mm/s (`insert.gap_speed_mm_s`) spare the current of closing as fast as the motors can",
+        "~~Struck out~~ is worse, here or on another device, and not offered by `tormagctl scene check`. A publisher "
+        f"that sends seldom costs over {FRONT} times the signal's error in {_named(seldom)}.",
         f"![worst error of each scene, as served and with one thing more](<{PICTURE.as_posix()}>)",
-        f"Further left is more exact. In {len(found) - len(flat)} of {len(found)} scenes the worst way on offer is at "
-        f"least {FRONT} times as far off as the most exact. "
-        + (f"Not in {', '.join(flat)}. " if flat else "")
-        + "Rates and searches hardly matter; `tormagctl scene explain NAME` lists every way.",
+        f"Further left is more exact. In {len(found) - len(flat)} of {len(found)} scenes the worst way is at least "
+        f"{FRONT} times as far off as the most exact. Not where all is within the tolerance ({_named(met)}), nor where "
+        f"only the device's least force and its gap's speed decide ({_named(bound)}). "
+        "Rates and searches hardly matter; `tormagctl scene explain NAME` lists every way.",
     ]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
@@ -105,9 +101,8 @@ def _head() -> str:
     )
 
 
-def _why_flat(found: MeasuredScene) -> str:
-    is_met = found.chosen.worst_N <= found.tolerance_N
-    return f"{worst_case(found.chosen)} {'is within the tolerance anyway' if is_met else 'is bound by the device'}"
+def _named(names: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names) or "none"
 
 
 def worst_case(served: Served) -> str:

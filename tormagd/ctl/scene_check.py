@@ -123,7 +123,7 @@ def measured_as(name: str, scene: Scene) -> MeasuredScene:
             Exit.REFUSED,
             "not_measured",
             f"scene {scene.name} was not measured as it is now",
-            f"tormagctl scene measure {name}: about two minutes",
+            f"tormagctl scene measure {name}: about three minutes",
         )
     return found
 

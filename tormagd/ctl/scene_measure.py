@@ -112,8 +112,7 @@ def measure_scene(name: str) -> Outcome:
         return found
 
     with tempfile.TemporaryDirectory(prefix="tormag-") as profiles:
-        lasts_s = sum(LASTS_S.values()) + 4.0
-        write_line(f"{scene.name}: up to {len(ways) + 7} live runs of about {lasts_s:.0f} s", sys.stderr)
+        write_line(f"{scene.name}: up to {len(ways) + 7} live runs, about three minutes", sys.stderr)
         runs = _runs(scene, ways, range_N, run)
     machine = round(statistics.median(machines), 1)
     found = MeasuredScene(scene.fingerprint, scene.force.tolerance_rms_N, machine, *runs)

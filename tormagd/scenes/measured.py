@@ -113,8 +113,10 @@ class MeasuredScene(Struct, frozen=True):
 
     def offered(self, least: Bandwidth) -> tuple[Served, ...]:
         """The ways at these rates or more that nothing refused."""
-        groups = self.judged, self.served, (self.chosen, *self.more)
-        judged, rates, more = (served_like(group, self.tolerance_N, least) for group in groups)
+        judged, rates, more = (
+            served_like(group, self.tolerance_N, least)
+            for group in (self.judged, self.served, (self.chosen, *self.more))
+        )
         refused = [each.way for each in self.judged if each not in judged]
         fits = [each for each in rates if each.way.sum_hz >= self.chosen.way.sum_hz] + more
         return tuple(each for each in fits if each.way not in refused)
