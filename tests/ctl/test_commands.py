@@ -202,8 +202,9 @@ def run_of(way: str, share: float, contact_N: float) -> Served:
 
 
 @pytest.fixture
-def fast(tmp_path: Path) -> Path:
+def fast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A scene with what was measured of it beside it: the cheap way is as exact as its tolerance asks, but not more."""
+    monkeypatch.setattr("tormagd.scenes.measured.SERIAL_SAVES", 0.0)
     path = tmp_path / "fast.toml"
     stated = scene_path("coronary").read_text(encoding="utf-8").replace("most_N = 2.0", "most_N = 1.9")
     path.write_text(stated, encoding="utf-8")

@@ -108,10 +108,10 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     def price(each: Served) -> float:
         return found.share_here(each, machine, backend)
 
-    def row(each: Served) -> str:
+    def row(each: Served, is_marked: bool = True) -> str:
         errors = " ".join(f"{1e3 * error_N:8.1f}" for error_N in each.rms_N.values())
         marks = {"chosen": each is chosen, "runs here": each.way == runs, "not offered": each not in offered}
-        said = ", ".join(word for word, holds in marks.items() if holds and each not in found.judged)
+        said = ", ".join(word for word, holds in marks.items() if holds and is_marked)
         return f"{each.way!s:{width}} {errors} {price(each):7.1%}  {said}".rstrip()
 
     width = max(len(str(each.way)) for each in (*found.served, *found.more))
@@ -123,7 +123,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
         *(["", "one thing more:", *map(row, found.more)] if found.more else []),
         "",
         f"on {found.judged[0].device}, which chose nothing:",
-        *map(row, found.judged),
+        *(row(each, is_marked=False) for each in found.judged),
         "",
         *([] if found.is_met else ["NOT MET: the usual way itself is over the tolerance\n"]),
         *(

@@ -118,7 +118,7 @@ class MeasuredScene(Struct, frozen=True):
             for group in (self.judged, self.served, (self.chosen, *self.more))
         )
         refused = [each.way for each in self.judged if each not in judged]
-        fits = [each for each in rates if each.way.sum_hz >= self.chosen.way.sum_hz] + more
+        fits = [each for each in rates if each.way.sum_hz >= self.chosen.way.sum_hz] + more[1:]
         return tuple(each for each in fits if each.way not in refused)
 
     def share_here(self, each: Served, machine_us: float, backend: str) -> float:
