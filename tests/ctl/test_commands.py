@@ -189,7 +189,12 @@ def test_a_scene_is_checked_as_the_daemon_does(ctl):
     assert list(comes_s) == sorted(comes_s, reverse=True)
 
 
-WAYS = {"usual": (1000, 500, "newton"), "cheap": (500, 83, "newton"), "dear": (1000, 500, "nearest")}
+WAYS: dict[str, tuple[Any, ...]] = {
+    "usual": (1000, 500, "newton"),
+    "cheap": (500, 83, "newton"),
+    "dear": (1000, 500, "nearest"),
+    "nearer": (500, 83, "newton", 0.8),
+}
 
 
 def run_of(way: str, share: float, contact_N: float) -> Served:
@@ -197,15 +202,17 @@ def run_of(way: str, share: float, contact_N: float) -> Served:
 
 
 @pytest.fixture
-def fast(tmp_path: Path) -> Path:
+def fast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A scene with what was measured of it beside it: the cheap way is as exact as its tolerance asks, but not more."""
+    monkeypatch.setattr("tormagd.scenes.measured.SERIAL_SAVES", 0.0)
     path = tmp_path / "fast.toml"
     stated = scene_path("coronary").read_text(encoding="utf-8").replace("most_N = 2.0", "most_N = 1.9")
     path.write_text(stated, encoding="utf-8")
     usual, cheap, dear = run_of("usual", 0.2, 0.100), run_of("cheap", 0.1, 0.105), run_of("dear", 0.3, 0.02)
+    nearer = run_of("nearer", 0.28, 0.015)
     scene = load_scene(str(path))
     assert scene.force.most_N == 1.9
-    found = MeasuredScene(scene.fingerprint, 0.05, 1e3, (usual, cheap, dear), (cheap, usual))
+    found = MeasuredScene(scene.fingerprint, 0.05, 1e3, (usual, cheap, dear), (cheap, usual), (nearer,))
     path.with_suffix(ENDING).write_bytes(msgspec.json.encode(found))
     return path
 
@@ -216,6 +223,7 @@ def test_every_measured_way_is_shown_with_what_it_costs(fast, ctl, checked_here)
     assert [("chosen" in row, "runs here" in row) for row in shown.values()] == [
         (False, False),
         (True, True),
+        (False, False),
         (False, False),
     ]
     assert "10.0    105.0" in shown["cheap"]
@@ -228,8 +236,9 @@ def test_every_measured_way_is_shown_with_what_it_costs(fast, ctl, checked_here)
     [
         (("--tolerance", "0.11"), "cheap"),
         (("--tolerance", "0.1"), "usual"),
-        (("--tolerance", "0.02"), "dear"),
-        (("--share", "100"), "dear"),
+        (("--tolerance", "0.02"), "dear"),  # more of the processor, and nothing of a hand
+        (("--tolerance", "0.016"), "nearer"),
+        (("--share", "100"), "nearer"),
     ],
 )
 def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_written(
@@ -239,10 +248,11 @@ def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_writ
     out = fast.with_name("mine.toml")
     found = ctl("--json", "scene", "check", str(fast), *bound, "--out", str(out)).ended(0).result
     assert tuple(found["way"].values()) == WAYS[way]
-    assert found["daemon_share"] == pytest.approx({"usual": 0.4, "cheap": 0.2, "dear": 0.6}[way])
+    assert found["daemon_share"] == pytest.approx({"usual": 0.4, "cheap": 0.2, "dear": 0.6, "nearer": 0.56}[way])
     assert load_scene(str(out)).fingerprint == load_scene(str(fast)).fingerprint
+    assert (load_scene(str(out)).force.standby_N or None) == (0.8 if way == "nearer" else None)
     derived = ctl("--json", "scene", "check", str(out)).ended(0).result  # what is written is taken, and keeps its rates
-    assert (derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"]) == WAYS[way]
+    assert (derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"]) == WAYS[way][:3]
 
 
 def test_of_ways_that_are_alike_the_cheaper_is_taken(fast, ctl, monkeypatch):

@@ -303,9 +303,10 @@ def test_what_the_judging_device_refuses_is_not_offered_nor_anything_cheaper() -
 def test_a_share_is_scaled_to_the_machine_and_to_the_plans_that_a_publisher_causes() -> None:
     found = MeasuredScene("", 0.05, 100.0, (USUAL, FEW, BOTH), (FEW, USUAL))
     few = FEW.way
-    assert [found.share_of(few, 100.0, hz) for hz in (83, 500)] == pytest.approx([0.1, 0.15])
-    assert found.share_of(few, 200.0, 83) == pytest.approx(0.2)
-    assert found.share_of(USUAL.way, 100.0, 1000.0) is None
+    assert [found.share_of(few, 100.0, hz, "can") for hz in (83, 500)] == pytest.approx([0.1, 0.15])
+    assert found.share_of(few, 200.0, 83, "can") == pytest.approx(0.2)
+    assert found.share_of(few, 200.0, 83, "serial") == pytest.approx(0.18)  # 500 ticks save 40 us each
+    assert found.share_of(USUAL.way, 100.0, 1000.0, "can") is None
 
 
 def test_an_error_is_allowed_within_the_tolerance_or_beside_the_usual_way() -> None:

@@ -9,7 +9,7 @@ from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, folded, usage_error
 from tormagd.ctl.scene_check import LONGEST_S, as_toml, check_scene, derived_of, loaded, measured_as, way_of
 from tormagd.ground.machine_loop import machine_us
-from tormagd.scenes.measured import MeasuredScene, Served
+from tormagd.scenes.measured import Served
 from tormagd.scenes.scene import load_scene, shipped_scenes
 from tormagd_client.endpoints import Endpoints
 
@@ -45,7 +45,7 @@ def scene(
     if share is not None or tolerance_N is not None or out is not None:
         from tormagd.ctl.scene_served import serve_scene
 
-        return serve_scene(action, named, share, tolerance_N, out)
+        return serve_scene(action, named, share, tolerance_N, out, config.device.backend)
     match action:
         case "list":
             return list_scenes()
@@ -102,34 +102,36 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     """Show every measured way to serve a scene, the chosen one, and how well it does on a device that chose nothing."""
     scene, derived = loaded(name), derived_of(name, config)
     found = measured_as(name, scene)
-    runs, machine = way_of(derived), machine_us()
-    scale, offered, chosen = machine / found.machine_us, found.offered(scene.bandwidth), found.chosen
+    runs, machine, backend = way_of(scene, derived), machine_us(), derived["backend"]
+    offered, chosen = found.offered(scene.bandwidth), found.chosen
+
+    def price(each: Served) -> float:
+        return found.share_here(each, machine, backend)
+
+    def row(each: Served, is_marked: bool = True) -> str:
+        errors = " ".join(f"{1e3 * error_N:8.1f}" for error_N in each.rms_N.values())
+        marks = {"chosen": each is chosen, "runs here": each.way == runs, "not offered": each not in offered}
+        said = ", ".join(word for word, holds in marks.items() if holds and is_marked)
+        return f"{each.way!s:{width}} {errors} {price(each):7.1%}  {said}".rstrip()
+
+    width = max(len(str(each.way)) for each in (*found.served, *found.more))
     lines = [
         f"{scene.name}: tolerance {1e3 * found.tolerance_N:g} mN RMS",
         "",
-        f"{'mN RMS':26} {' '.join(f'{each:>8}' for each in found.usual.rms_N)} {'share':>7}",
-        *(_row(each, scale, _marks(each, found, each.way == runs, each in offered)) for each in found.served),
+        f"{'mN RMS':{width}} {' '.join(f'{each:>8}' for each in found.usual.rms_N)} {'share':>7}",
+        *map(row, found.served),
+        *(["", "one thing more:", *map(row, found.more)] if found.more else []),
         "",
         f"on {found.judged[0].device}, which chose nothing:",
-        *(_row(each, scale) for each in found.judged),
+        *(row(each, is_marked=False) for each in found.judged),
         "",
         *([] if found.is_met else ["NOT MET: the usual way itself is over the tolerance\n"]),
         *(
-            [f"The scene states {runs}; {chosen.way} serves it for {chosen.share * scale:.1%}.\n"]
+            [f"The scene states {runs}; {chosen.way} serves it for {price(chosen):.1%}.\n"]
             if runs != chosen.way
             else []
         ),
         "Live beside simulated devices: the true force's error in each situation, and what the daemon's processes take",
-        f"of a processor, scaled from a machine_us of {found.machine_us:g} to this machine's {machine:.0f}.",
+        f"of a processor by {backend}, scaled from a machine_us of {found.machine_us:g} to {machine:.0f} here.",
     ]
     return Outcome(msgspec.to_builtins(found) | {"here_us": machine, "derived": derived}, folded("\n".join(lines)))
-
-
-def _row(each: Served, scale: float, marks: str = "") -> str:
-    errors = " ".join(f"{1e3 * error_N:8.1f}" for error_N in each.rms_N.values())
-    return f"{each.way!s:26} {errors} {each.share * scale:7.1%}  {marks}".rstrip()
-
-
-def _marks(each: Served, found: MeasuredScene, runs_here: bool, is_offered: bool) -> str:
-    marks = {"chosen": each == found.chosen, "runs here": runs_here, "not offered": not is_offered}
-    return ", ".join(word for word, holds in marks.items() if holds)

@@ -8,7 +8,7 @@ from msgspec import UNSET
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, answer_of, as_usage_error, folded
 from tormagd.ground.machine_loop import machine_us
-from tormagd.scenes.measured import MeasuredScene, OperatingPoint, measured
+from tormagd.scenes.measured import MeasuredScene, OperatingPoint, measured, own_way
 from tormagd.scenes.scene import Force, Scene, load_scene
 from tormagd_client.endpoints import ConfigError
 
@@ -48,7 +48,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
         f"{1e3 * force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster",
         *([] if sent_hz is UNSET else [f"           its publisher sends {sent_hz:g} times a second"]),
         *_waiting(force, derived["approaches_s"]),
-        f"served     {way_of(derived)}",
+        f"served     {way_of(scene, derived)}",
         "cost       not measured of these rates, search and terms"
         if share is None
         else f"cost       {share:.1%} of a processor of this machine for {plans_hz:g} plans a second, "
@@ -64,10 +64,10 @@ def check_scene(name: str, config: Path | None) -> Outcome:
 
 def _price(name: str, scene: Scene, derived: dict[str, Any], sent_hz: float) -> tuple[float | None, float]:
     """Return the share of this machine's processor, if it was measured, and the plans a second that it is for."""
-    way = way_of(derived)
+    way = way_of(scene, derived)
     plans_hz = max(way.inference_hz, sent_hz if derived["plan_every_setpoint"] else 0.0)
     found = None if derived["terms_out"] else measured(scene, name)
-    return None if found is None else found.share_of(way, machine_us(), plans_hz), plans_hz
+    return None if found is None else found.share_of(way, machine_us(), plans_hz, derived["backend"]), plans_hz
 
 
 def torque_range(scene: Scene) -> str:
@@ -111,8 +111,8 @@ def derived_of(name: str, config: Path | None) -> dict[str, Any]:
     return derived
 
 
-def way_of(derived: dict[str, Any]) -> OperatingPoint:
-    return OperatingPoint(derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
+def way_of(scene: Scene, derived: dict[str, Any]) -> OperatingPoint:
+    return own_way(scene, derived["control_hz"], derived["inference_hz"], derived["solver"]["solver"])
 
 
 def measured_as(name: str, scene: Scene) -> MeasuredScene:
@@ -123,7 +123,7 @@ def measured_as(name: str, scene: Scene) -> MeasuredScene:
             Exit.REFUSED,
             "not_measured",
             f"scene {scene.name} was not measured as it is now",
-            f"tormagctl scene measure {name}: about two minutes",
+            f"tormagctl scene measure {name}: about three minutes",
         )
     return found
 

@@ -23,7 +23,9 @@ class Served(NamedTuple):
     figures: tuple[float, float]
 
 
-def serve_scene(action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None) -> Outcome:
+def serve_scene(
+    action: str, name: str, share: float | None, tolerance_N: float | None, out: Path | None, backend: str
+) -> Outcome:
     """Choose the most exact way within `share` of a processor, or the cheapest within an error."""
     if action != "check" or (share is None) == (tolerance_N is None):
         raise usage_error(
@@ -33,9 +35,9 @@ def serve_scene(action: str, name: str, share: float | None, tolerance_N: float 
     if out is not None and out.exists():
         raise usage_error(f"{out}: File exists: {NEW_FILE}", "name another")
     scene = loaded(name)
-    found = measured_as(name, scene)
-    scale = machine_us() / found.machine_us
-    ways = [Served(each.way, (each.share * scale, each.worst_N)) for each in found.offered(scene.bandwidth)]
+    found, machine = measured_as(name, scene), machine_us()
+    offered = found.offered(scene.bandwidth)
+    ways = [Served(each.way, (found.share_here(each, machine, backend), each.worst_N)) for each in offered]
     way, (daemon_share, rms_N) = _best(ways, share, tolerance_N or 0.0)
     text = (
         f"{scene.name}: {way}: {1e3 * rms_N:.1f} mN RMS in the worst situation, "
@@ -63,11 +65,11 @@ def _best(ways: list[Served], share: float | None, tolerance_N: float) -> Served
         )
     least_N = min(way.figures[1] for way in fits)
     alike = [way for way in fits if share is None or way.figures[1] <= (1.0 + ALIKE) * least_N]
-    return min(alike, key=lambda way: way.figures[0])
+    return min(alike, key=lambda way: (len(way.way.given), way.figures[0]))
 
 
 def write_scene(name: str, way: OperatingPoint, out: Path) -> None:
-    """Write the scene with this way's rates and search to the new file `out`; relative paths are adapted."""
+    """Write the scene as this way serves it to the new file `out`; relative paths are adapted."""
     path = scene_path(name)
     tables: dict[str, Any] = msgspec.to_builtins(load_scene(name))
     tables = {key: value for key, value in tables.items() if value is not None}
@@ -77,6 +79,9 @@ def write_scene(name: str, way: OperatingPoint, out: Path) -> None:
         tables["insert"]["model"] = os.path.relpath(path.parent / tables["insert"]["model"], out.parent)
     tables["bandwidth"] = {"control_hz": way.control_hz, "inference_hz": way.inference_hz}
     tables["solver"] = {"name": way.search}
+    tables["force"] |= {"standby_N": way.standby_N} if way.standby_N else {}
+    tables["insert"] |= {"gap_speed_mm_s": way.gap_speed_mm_s} if way.gap_speed_mm_s else {}
+    tables |= {"signal": signal | {"is_known_ahead": way.ahead_ms > 0.0}} if signal else {}
     try:
         with out.open("x", encoding="utf-8") as file:
             file.write(as_toml(tables) + "\n")

@@ -191,9 +191,9 @@ class Daemon:
         self._endpoint.hear()
 
     def _plan(self, beat: Beat) -> None:
-        # before the step: a setpoint is driven in the beat that takes it
-        is_asked = self._endpoint.take_setpoints() and self._config.rates.plan_every_setpoint
-        stepper = self._control.stepper
+        # before the step: a setpoint is driven in the beat that takes it; several at once are cheaper than one by one
+        is_every, stepper = self._config.rates.plan_every_setpoint, self._control.stepper
+        is_asked = (is_every or self._inference.is_due(beat)) and self._endpoint.take_setpoints() and is_every
         self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
 
     def _fail_plan(self, why: str) -> None:

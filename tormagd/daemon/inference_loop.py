@@ -46,10 +46,13 @@ class InferenceLoop:
         self._journal.note(CONFIRM, wrong)
         self.planner.confirm(wrong)
 
+    def is_due(self, beat: Beat) -> bool:
+        # counted from when beats are due, not when they begin: lateness does not lower the rate
+        return beat.due_ns >= self._due_ns
+
     def plan(self, beat: Beat, measured: Measured | None, *, is_asked: bool, is_followed: bool) -> None:
         period_ns = self.timing.period_ns
-        # counted from when beats are due, not when they begin: lateness does not lower the rate
-        if not is_asked and beat.due_ns < self._due_ns:
+        if not is_asked and not self.is_due(beat):
             return
         start_ns = self._clock_ns()
         now_s, setpoint, beside = start_ns * 1e-9, self._inbox.newest, self.beside

@@ -81,6 +81,7 @@ def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
             "phase_margin_deg": core.margins.phase_margin_deg,
             "gain_margin_dB": core.margins.gain_margin_dB,
             "solver": core.solver._asdict(),
+            "backend": config.device.backend,
             "control_hz": config.rates.control_hz,
             "inference_hz": config.rates.inference_hz,
             "plan_every_setpoint": config.rates.plan_every_setpoint,

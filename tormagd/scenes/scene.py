@@ -229,14 +229,15 @@ class Scene(Strict, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """A hash, 16 hex digits, of what the scene asks for."""
-        signal, insert = self.signal, self.insert
-        task = msgspec.structs.replace(
+        """A hash, 16 hex digits, of what the scene asks for, however it is served."""
+        replace, signal, insert = msgspec.structs.replace, self.signal, self.insert
+        task = replace(
             self,
             name="",
             description="",
-            signal=None if signal is None else msgspec.structs.replace(signal, file=Path(signal.file).name),
-            insert=msgspec.structs.replace(insert, model=Path(insert.model).name),
+            force=replace(self.force, standby_N=UNSET),
+            signal=None if signal is None else replace(signal, file=Path(signal.file).name, is_known_ahead=False),
+            insert=replace(insert, model=Path(insert.model).name, gap_speed_mm_s=UNSET),
             terms=EVERY_TERM,
             bandwidth=Bandwidth(),
             solver=Solver(),
