@@ -8,11 +8,10 @@ from typing import Any, Final
 from firmware_protocol.codec import FUNCTION, Identity, State
 
 MODES: Final = ("IDLE", "RUN", "HOMING", "RETRACTING", "LATCHED")
-IDENTITY: Final = ("Identity",) * 5
 TAKES: Final = {
     "Drive OFF": ("answered", "RETRACTING", "answered", "answered", "answered"),
     "Drive RUN": ("RUN, or answered", "obeyed", "answered", "answered", "answered"),
-    "Hello that fits": IDENTITY,
+    "Hello that fits": ("Identity",) * 5,
     "Hello that does not": ("LATCHED", "RETRACTING", "RETRACTING", "goes on, with the fault", "another fault"),
     "Retract": ("RETRACTING", "RETRACTING", "RETRACTING, not homed", "accepted, goes on", "refused"),
     "Home": ("HOMING", "refused", "refused", "refused", "refused"),
