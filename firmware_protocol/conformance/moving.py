@@ -14,6 +14,7 @@ from firmware_protocol.conformance.check import Check, Hazard, check
 from firmware_protocol.conformance.host import (
     ANSWER_S,
     COLUMNS,
+    ENDS,
     INSIDE_MM,
     NO_FAULT,
     OPENED_S,
@@ -139,7 +140,7 @@ def _duty_moves(side: int, host: Host) -> str:
     "Modes",
     f"in RUN, duties of +{AT_STOP_DUTY:g} at both open switches; then each carriage alone {BESIDE_MM:g} mm in, "
     f"Drives of {PHASES} every {SLOW_S * 1e3:g} ms",
-    f"at a switch, or behind it, no motion over {AT_STOP_MM:g} mm, none over {AT_STOP_A:g} A; the other one opens",
+    f"at a switch, or behind it, no motion over {AT_STOP_MM:g} mm, none over {AT_STOP_A:g} A; the other opens",
     moves=True,
 )
 def open_switch_stops(host: Host) -> str:
@@ -148,19 +149,23 @@ def open_switch_stops(host: Host) -> str:
     for inside, duty in (((False, False), AT_STOP_DUTY), *product(((True, False), (False, True)), PHASES)):
         host.bring(*np.where(inside, -BESIDE_MM, places(host.last(State))))
         host.pass_time(SEEN_S, DriveMode.RUN)
-        first = len(host.rows)
+        first, is_shown = len(host.rows), [each not in host.status.switches for each in ENDS[:2]] == list(inside)
         host.pass_time(0.3, DriveMode.RUN, SLOW_S if any(inside) else PERIOD_S, duty)
         rows = columns(host, first)
         behind_A = [rows[f"{name}_A"][rows[f"{name}_mm"] > SWITCH_MM].max(initial=0.0) for name in ("left", "right")]
         moved_mm = np.array([rows[name][-1] - rows[name][0] for name in ("left_mm", "right_mm")])
         most_A = np.array([np.abs(rows[name]).max() for name in ("left_A", "right_A")])
         seen.append(f"by {moved_mm[0]:+.2f} and {moved_mm[1]:+.2f} mm, {most_A[0]:.2f} and {most_A[1]:.2f} A at most")
-        stirs = (most_A > AT_STOP_A) | (np.abs(moved_mm) > AT_STOP_MM)
         host.shows(
             DeviceMode.RUN,
             DriveMode.RUN,
             besides=seen[-1],
-            wrong=np.where(inside, (moved_mm < MOVED_MM) | (np.array(behind_A) > AT_STOP_A), stirs).any(),
+            wrong=not is_shown
+            or np.where(
+                inside,
+                (moved_mm < MOVED_MM) | (np.array(behind_A) > AT_STOP_A),
+                (most_A > AT_STOP_A) | (np.abs(moved_mm) > AT_STOP_MM),
+            ).any(),
         )
     return "; ".join(seen)
 
