@@ -78,10 +78,10 @@ def _row(result: Result) -> dict[str, Any]:
 def told(result: Result) -> str:
     """Return a result as text: one line if the check passed, else what was sent, seen and expected."""
     one = result.check
-    if result.passed:
-        return f"ok    {one.name}: {result.seen}"
-    if result.passed is None:
-        return f"-     {one.name}: not tested: {result.seen}"
+    if result.passed is not False:
+        return (
+            f"{'ok    ' if result.passed else '-     '}{one.name}: {'not tested: ' * (not result.passed)}{result.seen}"
+        )
     return (
         f"FAIL  {one.name}\n      sent      {one.sent}\n      seen      {result.seen}\n"
         f"      expected  {one.expected}\n      page      {PAGE}: {one.page}\n      hazard    {one.hazard.value}"
@@ -123,8 +123,8 @@ def _examined(line: Line, checks: Sequence[Check], options: argparse.Namespace) 
 
 def _summary(host: Host, results: Sequence[Result]) -> str:
     passed, failed, untested = (sum(result.passed is each for result in results) for each in (True, False, None))
-    identities = [identity for _, identity in host.all_of(Identity)]
-    names = [f"device {it.serial_number}, firmware {it.firmware_major}.{it.firmware_minor}" for it in identities]
+    known = host.all_of(Identity)
+    names = [f"device {it.serial_number}, firmware {it.firmware_major}.{it.firmware_minor}" for _, it in known]
     besides = f", {untested} not tested" if untested else ""
     return f"{(names or ['nobody'])[-1]}: {passed} of {passed + failed} checks passed{besides}"
 

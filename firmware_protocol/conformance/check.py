@@ -64,9 +64,7 @@ def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = la
 
 def _performed(host: Host, one: Check) -> Result:
     """Perform one check; repeat a failure while this process was late during it."""
-    attempt = 0
-    while True:
-        attempt += 1
+    for attempt in range(ATTEMPTS):
         host.begin()
         try:
             return Result(one, passed=True, seen=one.perform(host))
@@ -76,5 +74,6 @@ def _performed(host: Host, one: Check) -> Result:
             seen = str(unmet)
             if host.stalled_s > STALLED_S:
                 seen += f" (this computer was {host.stalled_s * 1e3:.0f} ms late meanwhile)"
-            if host.stalled_s <= STALLED_S or attempt == ATTEMPTS:
-                return Result(one, passed=False, seen=seen)
+            if host.stalled_s <= STALLED_S or attempt == ATTEMPTS - 1:
+                break
+    return Result(one, passed=False, seen=seen)

@@ -36,14 +36,15 @@ def _is_new(host: Host, how: str) -> str:
     host.counter = 255
     seen = [moving.keeps_still(host, "after the reset")]
     host.send(Home(0))
-    host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT, besides="after a Home with nonce 0")
+    host.shows(DeviceMode.IDLE, None, homed=False, fault=NO_FAULT, besides="after a Home with nonce 0")
     start_s, start = host.now_s, host.last(State)
-    host.obeyed(Retract)
-    host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S)
+    host.obeyed(Retract, None)
+    host.until(lambda: host.is_resting() and is_open(host.status), OPENED_S, None)
     seen.append(f"opens in {host.now_s - start_s:.1f} s from {positions(start)}")
     limit_s = FAR_INSIDE_MM / (taking.MIN_SHARE * UNHOMED_SHARE * host.opening_mm_s) + TO_TURN_S
     host.shows(
         DeviceMode.IDLE,
+        None,
         homed=False,
         opened=True,
         fault=NO_FAULT,
@@ -57,20 +58,15 @@ def _is_new(host: Host, how: str) -> str:
     return host.shows(DeviceMode.RUN, DriveMode.RUN, homed=True, besides=f"{'; '.join(seen)}; after it")
 
 
-LIKE_NEW: Final = (
-    f"nonce 0, IDLE, not HOMED, no fault, drives off; opens {FAR_INSIDE_MM:g} mm at over "
-    f"{taking.MIN_SHARE * UNHOMED_SHARE:g} of the device's speed and {TO_TURN_S:g} s; "
-    "runs after Home and Hello, not before"
-)
-
-
 RESETS: Final = [
     Check(
         f"{how}_reset",
         Hazard.CLOSES,
         "Reset",
         f"in RUN, {FAR_INSIDE_MM:g} mm in, {what}",
-        LIKE_NEW,
+        f"nonce 0, IDLE, not HOMED, no fault, drives off; opens {FAR_INSIDE_MM:g} mm at over "
+        f"{taking.MIN_SHARE * UNHOMED_SHARE:g} of the device's speed and {TO_TURN_S:g} s; "
+        "runs after Home and Hello, not before",
         partial(_is_new, how=how),
         moves=True,
         is_gate=False,

@@ -8,7 +8,7 @@ import random
 from array import array
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Final, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -46,6 +46,8 @@ HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
+BRAKED: Final = 3
+"Status, in 50 ms of braking and after."
 TIME_SPAN_S: Final = period(State, "device_time_s")
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
 OPEN: Final = ENDS[0] | ENDS[1]
@@ -110,6 +112,7 @@ class Host:
         self.rows = array("d")
         """A row of COLUMNS for each Sense."""
         self._unpaired = deque[State](maxlen=99)
+        self._opens = 0
         self.drives = self.states = 0
         """How many Drives that must be answered were sent, and how many State came."""
         self.drive_s = line.port.now_s()
@@ -174,13 +177,15 @@ class Host:
         left: float = 0.0,
         right: float = 0.0,
         period_s: float = PERIOD_S,
-        besides: Callable[[], None] = lambda: None,
+        besides: Callable[[], object] = lambda: None,
     ) -> None:
         """Send a Drive, or none, and another message `besides`; then listen."""
         if beat is not None:
             self.drive(beat, left, right)
         besides()
-        self._listen(period_s)
+        times = max(round(period_s / PERIOD_S), 1)
+        for _ in range(times):
+            self._listen(period_s / times)
 
     def pass_time(self, seconds: float, beat: Beat = None, period_s: float = PERIOD_S, duty: float = 0.0) -> None:
         """Repeat `beat` for a time, with `duty` for both motors."""
@@ -205,7 +210,7 @@ class Host:
         """The greatest lateness of this process since `begin`."""
         self._unpaired.clear()
         self._next_s = self.now_s
-        self._status_s = math.inf
+        self._status_s, self._owed = math.inf, 0.0
 
     def forget(self) -> None:
         """Forget the messages heard, except `newest`."""
@@ -229,8 +234,10 @@ class Host:
     def next_status(self, beat: Beat) -> Status:
         """Wait for a Status that comes from now on."""
         before = self.newest.get(Status)
-        has_come = self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat)
-        unless(not has_come, f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
+        unless(
+            not self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat),
+            f"no Status for {5 * STATUS_S * 1e3:.0f} ms",
+        )
         return self.last(Status)
 
     def shows(
@@ -283,21 +290,28 @@ class Host:
             self._unpaired.append(message)
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
             state = self._unpaired.popleft()
-            self.rows.extend((heard.time_s, state.device_time_s, state.counter, *places(state)))
-            self.rows.extend(
-                (message.left_current_A, message.right_current_A, message.force_N, message.handle_position_mm)
-            )
+            sensed = message.left_current_A, message.right_current_A, message.force_N, message.handle_position_mm
+            self.rows.extend((heard.time_s, state.device_time_s, state.counter, *places(state), *sensed))
+        if isinstance(message, Identity):
+            self.contradictions["another Identity"] += message != self.newest.get(Identity, heard).message
         if isinstance(message, Status):
-            self.contradictions["a Status that was late"] += (
-                self.stalled_s < STALLED_S and heard.time_s - self._status_s > 2.5 * STATUS_S
-            )
-            self.contradictions["nonce 0 again: a reset"] += (
-                Status in self.newest and self.last(Status).command_nonce > message.command_nonce == 0
-            )
-            self._status_s = heard.time_s
+            before: Any = self.newest.get(Status, heard).message
+            self._opens = (self._opens + 1) * is_open(message)
+            is_unbraked = before.mode is DeviceMode.RETRACTING is not message.mode and 0 < self._opens < BRAKED
+            self.contradictions["at rest without braking"] += is_unbraked
+            self.contradictions["a Status that was late"] += self._is_late(heard.time_s)
+            self.contradictions["nonce 0 again: a reset"] += before.command_nonce > message.command_nonce == 0
             self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
         self.heard.append(heard)
         self.newest[type(message)] = heard
+
+    def _is_late(self, time_s: float) -> bool:
+        """Whether a Status is late that no standing line owed."""
+        gap, owed = (time_s - self._status_s) / STATUS_S, self._owed
+        stood = time_s - max((heard.time_s for heard in self.newest.values()), default=time_s) > STATUS_S
+        self._owed = max(gap - 1.0 + owed * (gap < 0.5), 0.0)
+        self._status_s = time_s
+        return self.stalled_s < STALLED_S and ((gap > 2.5 and not stood) or (gap > 0.5 and owed > 1.5))
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
         """Return the end switches in a Status that do not fit the State just before it."""
@@ -349,8 +363,10 @@ class Host:
     def running(self, inside_mm: float = 0.0) -> None:
         self.homed()
         self.pass_time(2 * PERIOD_S, DriveMode.OFF)
-        self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, DriveMode.RUN)
-        unless(self.status.mode is not DeviceMode.RUN, f"Drive RUN does not lead to RUN: {shown(self.status)}")
+        unless(
+            not self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, DriveMode.RUN),
+            f"Drive RUN does not lead to RUN: {shown(self.status)}",
+        )
         if inside_mm > 0.0:
             self.bring(-inside_mm, -inside_mm)
             self.pass_time(SEEN_S, DriveMode.RUN)
@@ -386,8 +402,10 @@ class Host:
     def _answered(self, beat: Beat) -> State:
         before = self.newest.get(State)
         self.beat(beat)
-        is_answered = self.until(lambda: self.newest.get(State) is not before, ANSWER_S, None)
-        unless(not is_answered, f"no State: {shown(self.status)}")
+        unless(
+            not self.until(lambda: self.newest.get(State) is not before, ANSWER_S, None),
+            f"no State: {shown(self.status)}",
+        )
         return self.last(State)
 
     def latched(self) -> None:

@@ -4,9 +4,17 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 from firmware_protocol.codec import can_identifier
-from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, cobs_decode, cobs_encode, encode_frame
+from firmware_protocol.framing import (
+    DELIMITER,
+    MAX_ENCODED,
+    FrameDecoder,
+    FramingStatistics,
+    cobs_decode,
+    cobs_encode,
+    encode_frame,
+)
 
-NODES: Final = 16
+NODES, NO_FUNCTION = 16, 127
 NOISE: Final = bytes((0x55, 0xAA, 0xFF, 0x01, 0x7E, 0x80, 0x0D, 0x0A, 0x11, 0x13)) * 3
 "Not a frame; it includes bytes that a terminal acts on: XON and XOFF, CR and LF."
 
@@ -42,7 +50,7 @@ class SerialLine:
         self.port = port
         self._decoder = FrameDecoder()
         self._sequence = 0
-        self._before: tuple[int, int, int] | None = None
+        self._has_begun = False
         port.write(DELIMITER)  # ends whatever was there before
 
     def send(self, function: int, payload: bytes) -> None:
@@ -67,9 +75,13 @@ class SerialLine:
         }
 
     def unusual(self, function: int, payload: bytes) -> tuple[tuple[bytes, ...], ...]:
-        """Return writes that are one frame each time: repeated, among empty ones, in two parts."""
+        """Return writes that are one frame each time."""
         first, second, third = (self._frame(function, payload) for _ in range(3))
-        return (first, first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])
+        beside = encode_frame(NO_FUNCTION, self._sequence, payload)
+        return (
+            *((first, first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])),
+            (beside, self._frame(function, payload)),
+        )
 
     def send_damaged(self, unit: bytes) -> None:
         self.port.write(unit)
@@ -81,9 +93,8 @@ class SerialLine:
             for time_s, data in self.port.read(until_s)
             for frame in self._decoder.feed(data)
         ]
-        if self._before is None and arrivals:
-            statistics = self._decoder.statistics
-            self._before = statistics.corrupt, statistics.lost, statistics.repeated
+        if arrivals and not self._has_begun:
+            self._has_begun, self._decoder.statistics = True, FramingStatistics()
         return arrivals
 
     def _frame(self, function: int, payload: bytes) -> bytes:
@@ -95,12 +106,11 @@ class SerialLine:
     def frame_errors(self) -> dict[str, int]:
         """What was wrong with the device's frames, and how often."""
         statistics = self._decoder.statistics
-        now = statistics.corrupt, statistics.lost, statistics.repeated
-        corrupt, lost, repeated = (count - before for count, before in zip(now, self._before or (1, 0, 0), strict=True))
         errors = {
-            f"not a frame ({statistics.refused.get('frame', '')})": corrupt,
-            "missing from the sequence": lost - corrupt,  # a damaged frame is missing too, and is one error
-            "sequence number repeated": repeated,
+            f"not a frame ({statistics.refused.get('frame', '')})": statistics.corrupt - (not self._has_begun),
+            "missing from the sequence": statistics.lost
+            - statistics.corrupt,  # a damaged frame is missing too, and is one error
+            "sequence number repeated": statistics.repeated,
         }
         return {what: count for what, count in errors.items() if count > 0}
 

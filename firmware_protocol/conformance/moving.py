@@ -4,6 +4,7 @@ import math
 from collections import deque
 from functools import partial
 from itertools import product
+from operator import methodcaller
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from firmware_protocol.conformance.check import Check, Hazard, check
 from firmware_protocol.conformance.host import (
     ANSWER_S,
     COLUMNS,
+    ENDS,
     INSIDE_MM,
     NO_FAULT,
     OPENED_S,
@@ -30,7 +32,7 @@ from firmware_protocol.conformance.host import (
     unless,
     ways_mm,
 )
-from firmware_protocol.conformance.taking import DUTY, PLACES, SPARSE_S, Sent, opens_fully, refused, taken
+from firmware_protocol.conformance.taking import DUTY, PLACES, RESTING_A, SPARSE_S, Sent, opens_fully, refused, taken
 from firmware_protocol.conformance.telling import columns
 
 RUNNING: Final = next(place for place in PLACES if place.name == "RUN")
@@ -39,8 +41,8 @@ SILENCE, DRIVE = "Who says what when, 6", "Drive"
 ZERO_MM, JUMP_MM, LAST_S = 1.0, 0.2, 8.0
 """A carriage rests ZERO_MM from its zero at most: behind its switch, where it was braked from a creep. It is braked
 when HOMED shows, so that a State further off than JUMP_MM has the old origin."""
-RAMP_PER_S, MAX_DUTY, MOVED_MM = 1.0, 0.5, 0.3
-AT_STOP_DUTY, AT_STOP_MM, AT_STOP_A = 0.3, 0.1, 0.3
+RAMP_PER_S, MAX_DUTY, MOVED_MM, SLOW_S = 1.0, 0.5, 0.3, 0.045
+AT_STOP_DUTY, AT_STOP_MM, AT_STOP_A, PHASES = 0.3, 0.1, 0.3, (1.0, 0.9, 0.8, 0.7)
 "A motor that pushes into the stop at AT_STOP_DUTY draws several times AT_STOP_A."
 SLOW_MM_S, BESIDE_MM, SCALE_MM = 2.0, 1.5, 0.02 * STROKE_MM
 SKEW_MM, BOUND_MM, AHEAD_MM = 2.0, 0.3, 1.2
@@ -56,7 +58,7 @@ PAIRED: Final = (
     *((0.4, 0.53), (0.55, 0.46), (0.62, 0.71), (0.75, 0.66), (0.79, 0.88), (0.93, 0.83), (0.97, 1.0), (1.0, 0.86)),
 )
 "Left and right duties; the smallest leave a motor at rest."
-MAX_OFF, STARTED_S, STARTED_MM, STALL_A = 0.01, 0.02, 0.015, (0.7, 30.0)
+MAX_OFF, STARTED_S, STARTED_MM, STALL_A = 0.01, 0.03, 0.1, (0.7, 30.0)
 """By MAX_OFF of duty a current may differ from what duty and speed make; a whole duty makes STALL_A in a motor at rest,
 outside the unit is wrong."""
 SHORT_S, LONG_S, BORNE_S, NOTICED_S = 0.047, 0.053, 0.0495, 0.0515
@@ -87,8 +89,14 @@ def home_homes(host: Host) -> str:
         seen.append(f"{seconds:.1f} s, first {positions(first)}, then {positions(state)}")
         jump_mm = max(map(abs, ways_mm(first, places(state))))
         is_off = beat is DriveMode.OFF and (max(map(abs, places(state))) > ZERO_MM or jump_mm > JUMP_MM)
-        wrong = is_off or DeviceMode.HOMING not in modes or seconds > LAST_S
-        host.shows(DeviceMode.IDLE, homed=True, opened=True, fault=NO_FAULT, besides=seen[-1], wrong=wrong)
+        host.shows(
+            DeviceMode.IDLE,
+            homed=True,
+            opened=True,
+            fault=NO_FAULT,
+            besides=seen[-1],
+            wrong=is_off or DeviceMode.HOMING not in modes or seconds > LAST_S,
+        )
     return "; ".join(seen)
 
 
@@ -116,8 +124,7 @@ def _duty_moves(side: int, host: Host) -> str:
         duty -= RAMP_PER_S * PERIOD_S
         host.beat(DriveMode.RUN, 0.0 if side else duty, duty if side else 0.0)
         moved_mm = ways_mm(host.last(State), start)
-        sense = host.last(Sense)
-        currents_A = abs(sense.left_current_A), abs(sense.right_current_A)
+        currents_A = abs(host.last(Sense).left_current_A), abs(host.last(Sense).right_current_A)
         seen = (
             f"by {moved_mm[0]:+.2f} and {moved_mm[1]:+.2f} mm, "
             f"{currents_A[0]:.2f} and {currents_A[1]:.2f} A, {duty:.2f}"
@@ -131,25 +138,34 @@ def _duty_moves(side: int, host: Host) -> str:
 @check(
     Hazard.WORN,
     "Modes",
-    f"in RUN, duties of +{AT_STOP_DUTY:g} at both open switches; then one carriage {BESIDE_MM:g} mm in, +{MAX_DUTY:g}",
-    f"at a switch no motion over {AT_STOP_MM:g} mm, no current over {AT_STOP_A:g} A; the other one opens",
+    f"in RUN, duties of +{AT_STOP_DUTY:g} at both open switches; then each carriage alone {BESIDE_MM:g} mm in, "
+    f"Drives of {PHASES} every {SLOW_S * 1e3:g} ms",
+    f"at a switch, or behind it, no motion over {AT_STOP_MM:g} mm, none over {AT_STOP_A:g} A; the other opens",
     moves=True,
 )
 def open_switch_stops(host: Host) -> str:
     host.running()
     seen = []
-    for inside in ((False, False), (True, False), (False, True)):
+    for inside, duty in (((False, False), AT_STOP_DUTY), *product(((True, False), (False, True)), PHASES)):
         host.bring(*np.where(inside, -BESIDE_MM, places(host.last(State))))
         host.pass_time(SEEN_S, DriveMode.RUN)
-        first = len(host.rows)
-        host.pass_time(0.2, DriveMode.RUN, duty=MAX_DUTY if any(inside) else AT_STOP_DUTY)
+        first, is_shown = len(host.rows), [each not in host.status.switches for each in ENDS[:2]] == list(inside)
+        host.pass_time(0.3, DriveMode.RUN, SLOW_S if any(inside) else PERIOD_S, duty)
         rows = columns(host, first)
+        behind_A = [rows[f"{name}_A"][rows[f"{name}_mm"] > SWITCH_MM].max(initial=0.0) for name in ("left", "right")]
         moved_mm = np.array([rows[name][-1] - rows[name][0] for name in ("left_mm", "right_mm")])
         most_A = np.array([np.abs(rows[name]).max() for name in ("left_A", "right_A")])
         seen.append(f"by {moved_mm[0]:+.2f} and {moved_mm[1]:+.2f} mm, {most_A[0]:.2f} and {most_A[1]:.2f} A at most")
-        stirs = (most_A > AT_STOP_A) | (np.abs(moved_mm) > AT_STOP_MM)
         host.shows(
-            DeviceMode.RUN, DriveMode.RUN, besides=seen[-1], wrong=np.where(inside, moved_mm < MOVED_MM, stirs).any()
+            DeviceMode.RUN,
+            DriveMode.RUN,
+            besides=seen[-1],
+            wrong=not is_shown
+            or np.where(
+                inside,
+                (moved_mm < MOVED_MM) | (np.array(behind_A) > AT_STOP_A),
+                (most_A > AT_STOP_A) | (np.abs(moved_mm) > AT_STOP_MM),
+            ).any(),
         )
     return "; ".join(seen)
 
@@ -199,8 +215,9 @@ def duties_make_currents(host: Host) -> str:
     host.bring(-MIDDLE_MM, -MIDDLE_MM)
     host.pass_time(SETTLED_S, DriveMode.RUN)
     start_mm = places(host.last(State))
-    # the second Drive measures what the first began; an answer that lags shows a motor at rest
-    host.pass_time(2 * STARTED_S, DriveMode.RUN, STARTED_S, duty=1.0)
+    # the second Drive measures what the first began and no message ended; an answer that lags shows a motor at rest
+    host.beat(DriveMode.RUN, 1.0, 1.0, STARTED_S, lambda: [*map(methodcaller("send"), taken(host, RUNNING))])
+    host.beat(DriveMode.RUN, 1.0, 1.0, STARTED_S)
     sense, way_mm = host.last(Sense), min(ways_mm(host.last(State), start_mm))
     seen = [f"{sense.left_current_A:+.2f} and {sense.right_current_A:+.2f} A, {way_mm:+.2f} mm at once"]
     unless(way_mm < STARTED_MM or min(sense.left_current_A, sense.right_current_A) < STALL_A[0], seen[-1])
@@ -243,7 +260,7 @@ def _has_left(host: Host) -> bool:
     Hazard.CLOSES,
     "Modes",
     f"4 times silence in RUN, Drive RUN, Clear, Home, Drive RUN of {DUTY:g}; one Drive OFF, each time in another mode",
-    "RUN, in whatever mode the Drive OFF came; IDLE and still before it",
+    "RUN, in whatever mode the Drive OFF came, and the first Drive's duties act; IDLE and still before it",
     moves=True,
 )
 def let_go_after_all(host: Host) -> str:
@@ -264,8 +281,10 @@ def let_go_after_all(host: Host) -> str:
         if lets_go is DeviceMode.IDLE:
             keeps_still(host, "before a Drive OFF")
             host.beat(DriveMode.OFF)
-        host.pass_time(SEEN_S, DriveMode.RUN, duty=DUTY)
-        seen.append(host.shows(DeviceMode.RUN, DriveMode.RUN, besides=lets_go.name, wrong=_has_left(host)))
+        host.pass_time(2 * SPARSE_S, DriveMode.RUN, SPARSE_S, DUTY)
+        most_A = max(host.last(Sense).left_current_A, host.last(Sense).right_current_A)
+        seen.append(f"{lets_go.name} {most_A:+.2f} A at once")
+        host.shows(DeviceMode.RUN, DriveMode.RUN, besides=seen[-1], wrong=most_A > -RESTING_A)
     return "; ".join(seen)
 
 
@@ -286,8 +305,12 @@ def _is_noticed(host: Host, silent_s: float) -> bool:
     status = host.next_status(DriveMode.RUN)
     has_ended = status.mode is not DeviceMode.RUN
     seen = f"after {silence_s * 1e3:.2f} ms on the device's clock: {shown(status)}"
-    unless(silence_s < BORNE_S if has_ended else silence_s > NOTICED_S, seen)
-    unless(status.faults != (TIMED_OUT if has_ended else NO_FAULT), seen)
+    unless(
+        (silence_s < BORNE_S or status.faults != TIMED_OUT)
+        if has_ended
+        else (silence_s > NOTICED_S or status.faults != NO_FAULT),
+        seen,
+    )
     return has_ended
 
 
@@ -295,7 +318,7 @@ def _is_noticed(host: Host, silent_s: float) -> bool:
     Hazard.SHUT,
     SILENCE,
     f"in RUN, at random times, {SHORT_S * 1e3:g} ms without a Drive {SHORTS} times; {LONG_S * 1e3:g} ms, "
-    f"then Drive RUN, {LONGS} times, first at the open end, then {INSIDE_MM:g} mm in",
+    f"then Drive RUN, {LONGS} times, first at the open end, then {INSIDE_MM:g} mm in; one Drive RUN alone",
     "the short ones are borne; after the long ones no RUN, COMMAND_TIMEOUT alone; opens, LATCHED",
     moves=True,
 )
@@ -308,6 +331,9 @@ def silence_is_noticed(host: Host) -> str:
         noticed += _is_noticed(host, LONG_S)
         host.until(host.is_resting, OPENED_S)
         host.shows(DeviceMode.LATCHED, homed=False, opened=True, fault=TIMED_OUT)
+    host.homed()
+    host.beat(DriveMode.RUN, period_s=4.0 * LONG_S)
+    host.shows(DeviceMode.LATCHED, None, fault=TIMED_OUT, besides="after one Drive RUN")
     return unless(noticed < LONGS - 1, f"{noticed} of {LONGS} noticed, the others too short by the device's clock")
 
 

@@ -6,6 +6,7 @@ import os
 import select
 import termios
 import time
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -21,8 +22,28 @@ PATIENCE_S: Final = 1.0
 "A port that takes nothing for this time is gone."
 
 
+class RealPort(ABC):
+    """Waits for a descriptor."""
+
+    now_s = staticmethod(time.monotonic)
+    _fd: int
+
+    def read(self, until_s: float) -> list[Any]:
+        came: list[Any] = []
+        while (left_s := until_s - time.monotonic()) > 0.0 or not came:
+            if select.select([self._fd], [], [], max(left_s, 0.0))[0]:
+                came.extend((time.monotonic(), *one) for one in self._received())
+            elif left_s <= 0.0:
+                break
+        return came
+
+    @abstractmethod
+    def _received(self) -> list[tuple[Any, ...]]:
+        """Take what came."""
+
+
 @final
-class SerialPort:
+class SerialPort(RealPort):
     """An open, exclusively held serial port: a `Port`."""
 
     def __init__(self, path: str, baud: int) -> None:
@@ -35,23 +56,16 @@ class SerialPort:
         # USB serial chips hold bytes back for 16 ms by default; a pty has no such mode
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             self._port.set_low_latency_mode(True)
-
-    now_s = staticmethod(time.monotonic)
+        self._fd = self._port.fileno()
 
     def write(self, data: bytes) -> None:
         self._port.write(data)
 
-    def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        came: list[tuple[float, bytes]] = []
-        while (left_s := until_s - time.monotonic()) > 0.0 or not came:
-            if select.select([self._port.fileno()], [], [], max(left_s, 0.0))[0]:
-                data = os.read(self._port.fileno(), READ_BYTES)
-                if not data:
-                    raise OSError(errno.ENODEV, "the device was unplugged")
-                came.append((time.monotonic(), data))
-            elif left_s <= 0.0:
-                break
-        return came
+    def _received(self) -> list[tuple[bytes]]:
+        data = os.read(self._fd, READ_BYTES)
+        if not data:
+            raise OSError(errno.ENODEV, "the device was unplugged")
+        return [(data,)]
 
     def close(self) -> None:
         """Close the port without waiting for unsent bytes."""
@@ -61,7 +75,7 @@ class SerialPort:
 
 
 @final
-class CanPort:
+class CanPort(RealPort):
     """An open CAN bus: a `Port`."""
 
     def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
@@ -74,13 +88,11 @@ class CanPort:
             self._bus = can.Bus(
                 interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **known.get(interface, {})
             )
-            self._fd: int = self._bus.fileno()
+            self._fd = self._bus.fileno()
         except NotImplementedError as error:
             raise OSError(f"{interface}: this driver cannot be waited for; use the kernel's, socketcan") from error
         except (can.CanError, ValueError, OSError) as error:
             raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
-
-    now_s = staticmethod(time.monotonic)
 
     def write(self, identifier: int, data: bytes) -> None:
         try:
@@ -88,34 +100,24 @@ class CanPort:
         except can.CanError as error:
             raise OSError(str(error)) from error
 
-    def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
-        came: list[tuple[float, int, bytes]] = []
-        while True:
-            left_s = until_s - time.monotonic()
-            if select.select([self._fd], [], [], max(left_s, 0.0))[0]:
-                frame = self._received()
-                if frame is not None:
-                    came.append((time.monotonic(), frame.arbitration_id, bytes(frame.data)))
-            elif left_s <= 0.0:
-                return came
-
     def close(self) -> None:
         with contextlib.suppress(can.CanError, OSError):  # it may be gone
             self._bus.shutdown()
 
-    def _received(self) -> can.Message | None:
-        """Return a classical data frame with an 11-bit identifier, if one is there."""
+    def _received(self) -> list[tuple[int, bytes]]:
+        """Return the classical data frame with an 11-bit identifier that is there, or none."""
         try:
             frame = self._bus.recv(0)
         except (can.CanError, OSError) as error:
             if isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError):
                 self._bus.flush()  # python-can would keep a line that is not text for ever
-                return None
+                return []
             raise OSError(str(error)) from error
         except (ValueError, IndexError):  # slcan's answer to a damaged line from the adapter
-            return None
-        is_other = frame and (frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd)
-        return None if is_other else frame
+            return []
+        if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
+            return []
+        return [(frame.arbitration_id, bytes(frame.data))]
 
 
 def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:

@@ -8,11 +8,10 @@ from typing import Any, Final
 from firmware_protocol.codec import FUNCTION, Identity, State
 
 MODES: Final = ("IDLE", "RUN", "HOMING", "RETRACTING", "LATCHED")
-IDENTITY: Final = ("Identity",) * 5
 TAKES: Final = {
     "Drive OFF": ("answered", "RETRACTING", "answered", "answered", "answered"),
     "Drive RUN": ("RUN, or answered", "obeyed", "answered", "answered", "answered"),
-    "Hello that fits": IDENTITY,
+    "Hello that fits": ("Identity",) * 5,
     "Hello that does not": ("LATCHED", "RETRACTING", "RETRACTING", "goes on, with the fault", "another fault"),
     "Retract": ("RETRACTING", "RETRACTING", "RETRACTING, not homed", "accepted, goes on", "refused"),
     "Home": ("HOMING", "refused", "refused", "refused", "refused"),
@@ -48,7 +47,7 @@ RULES: Final = {
     "over function, sequence and payload.": "idle_stays",
     "`00` always ends a frame. Empty frames are allowed anywhere.": "frames_as_they_come idle_stays",
     "A receiver counts gaps as lost frames,": "- the device tells nobody what it counts",
-    "It drops a frame that equals the one before in every byte.": "frames_as_they_come",
+    "It drops a frame that equals the one before in every byte, and no other.": "frames_as_they_come",
     "Refuse a payload whose length is not that of its message.": "idle_stays run_stays",
     "Drive and State carry a counter and a CRC-8 of their own": "idle_without_zero_stays own_messages",
     "until Identity answers": "identity_answers_hello",
@@ -65,7 +64,9 @@ RULES: Final = {
         "every_drive_answered run_drive_off homing_stays retracting_stays"
     ),
     "Without Drive there are none.": "every_drive_answered",
-    "is sent every 20 ms on the device's own clock, with or without a host.": "status_rate status_consistent",
+    "is sent every 20 ms on the device's own clock, with or without a host, whatever its mode.": (
+        "status_rate status_consistent"
+    ),
     "The device acts on a nonce that differs from the last accepted one": "every_nonce latched_stays",
     "A refused command leaves no trace in Status.": "run_stays homing_stays retracting_stays latched_stays",
     "Hello is always answered, and its nonce counts as accepted.": "idle_stays run_stays",
@@ -76,7 +77,9 @@ RULES: Final = {
         "let_go_after_all idle_not_let_go_stays homing_beside_run_stays retracting_beside_run_stays"
     ),
     "The Drive OFF that ends RUN counts.": "run_is_entered",
-    "Motors follow the duties only in RUN.": "left_duty right_duty duties_make_currents idle_stays",
+    "Motors follow the duties only in RUN, from the Drive that enters it on.": (
+        "let_go_after_all left_duty right_duty duties_make_currents idle_stays"
+    ),
     "At the open switch an opening duty counts as 0": "open_switch_stops",
     "LATCHED drops HOMED, and Clear does not restore it.": "latched_clear latched_hello_misfit idle_hello_misfit",
     "IDLE and RUN have no fault.": "status_consistent",
@@ -90,6 +93,7 @@ RULES: Final = {
     "A command with nonce 0 repeats the last. A watchdog resets": "warm_reset watchdog",
     "A mismatch of schemas lasts until a Hello that fits.": "misfitting_hello retracting_hello_misfit",
     "brings each carriage to its open switch at the device's own speed": "run_drive_off retracting_stays",
+    "At its switch a carriage is braked for 50 ms.": "status_consistent",
     "After 0.2 s it has moved by 0.1 mm, whatever it did before. One that is 2 mm in is open after 0.8 s.": (
         "run_drive_off run_retract"
     ),
@@ -104,9 +108,12 @@ RULES: Final = {
     "When the positions were latched, on the device's clock.": "clock_runs_on",
     "Left motor current; positive": "- its scale only an ammeter tells",
     "positive drives towards open.": "duties_make_currents",
+    "A motor at rest reads under 0.02 A, a force is at most 30 ms old.": "plausible_at_rest handle_runs_on",
     "Friction force at the roller": "- its scale only a weight tells, and its lag tormagctl commission",
     "positive against a positive motion of the handle.": "handle_runs_on force_follows_gap",
     "Roller surface position:": "handle_runs_on homing_retract homing_hello_misfit",
+    "As in Hello, as the device knows it.": "status_consistent",
+    "The handle's count starts anywhere: a reset loses its angle.": "handle_runs_on",
     "16384 counts a turn": "- how many a turn only a mark on the handle tells",
     "Temperature at the elastomer's mount.": "- only another thermometer tells",
     "Supply voltage at the motor bridges.": "- only another voltmeter tells; how it follows is for the bench",

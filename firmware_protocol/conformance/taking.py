@@ -73,7 +73,7 @@ SILENT: Final = "silence"
 ACTS: Final = TAKES | {SILENT: ("", "RETRACTING, LATCHED with COMMAND_TIMEOUT", "", "", "")}
 CAUSES: Final = {MISFITS: DeviceFault.SCHEMA_MISMATCH, SILENT: DeviceFault.COMMAND_TIMEOUT}
 MIN_SHARE, MAX_SHARE, ENDS_MM, WINDOW = 0.6, 1.15, 3.0, 50
-"""Bounds of a carriage's speed as shares of the device's opening speed: its mean without the ends, and its most over
+"""Bounds of a carriage's speed as shares of the device's opening speed: its least without the ends, and its most, over
 WINDOW States."""
 MISFITTING: Final = (
     *(Hello(SCHEMA_HASH ^ 1 << bit, PROTOCOL_VERSION, HELLO_NONCE) for bit in (0, 7, 8, 15, 16, 23, 24, 31)),
@@ -206,8 +206,10 @@ def _changes_nothing(
     after = before.replaced(command_nonce=before.command_nonce if one.nonce is None else one.nonce)
     found = _changes(host, one, after) | (_stirs(host, start) if is_still else {})
     wrong = ", ".join(what for what, is_so in found.items() if is_so)
-    is_wrong = wrong and (is_still or host.status.mode is not DeviceMode.IDLE)
-    unless(is_wrong, f"{one.name}, a Drive every {period_s * 1e3:g} ms: {wrong}, {shown(host.status)}")
+    unless(
+        wrong and (is_still or host.status.mode is not DeviceMode.IDLE),
+        f"{one.name}, a Drive every {period_s * 1e3:g} ms: {wrong}, {shown(host.status)}",
+    )
     return after
 
 
@@ -239,7 +241,6 @@ def _ends(host: Host, place: Place, first: int) -> None:
     host.until(host.is_resting, HOMED_S, place.beat)
     rows = columns(host, first)
     deepest_mm = min(rows["left_mm"].min(), rows["right_mm"].min())
-    is_deep = deepest_mm < (-HOMING_MM if place.mode is DeviceMode.HOMING else -DEEP_MM - HOMING_MM)
     host.shows(
         DeviceMode.IDLE,
         place.beat,
@@ -247,7 +248,7 @@ def _ends(host: Host, place: Place, first: int) -> None:
         opened=True,
         fault=NO_FAULT,
         besides=f"{deepest_mm:+.2f} mm at the innermost",
-        wrong=is_deep,
+        wrong=deepest_mm < (-HOMING_MM if place.mode is DeviceMode.HOMING else -DEEP_MM - HOMING_MM),
     )
 
 
@@ -278,11 +279,10 @@ def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
     host.pass_time(ANSWER_S)
     extra = unanswered - (host.drives - host.states)
     seen += f", {extra:+d} State besides one for each Drive{', Clear taken' * is_mended}"
-    is_zero_kept = not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED))
     return host.shows(
         ENDS_IN[bool(faults)],
         beat,
-        homed=is_zero_kept,
+        homed=not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED)),
         opened=True,
         fault=faults,
         besides=seen,
@@ -315,20 +315,24 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> s
     first = len(host.rows)
     host.until(host.is_resting, OPENED_S, beat)
     rows = columns(host, first)
-    means, mosts = zip(*(_speeds(rows["device_s"], rows[name]) for name in ("left_mm", "right_mm")), strict=True)
-    seen = f"{min(means):.1f} mm/s on the way, {max(mosts):.1f} at most"
-    is_wrong = min(means) < MIN_SHARE * host.opening_mm_s or max(mosts) > MAX_SHARE * host.opening_mm_s
+    leasts, mosts = zip(*(_speeds(rows["device_s"], rows[name]) for name in ("left_mm", "right_mm")), strict=True)
+    seen = f"{min(leasts):.1f} mm/s on the way, {max(mosts):.1f} at most"
     return host.shows(
-        ENDS_IN[bool(fault)], beat, homed=not fault, opened=True, fault=fault, besides=seen, wrong=is_wrong
+        ENDS_IN[bool(fault)],
+        beat,
+        homed=not fault,
+        opened=True,
+        fault=fault,
+        besides=seen,
+        wrong=min(leasts) < MIN_SHARE * host.opening_mm_s or max(mosts) > MAX_SHARE * host.opening_mm_s,
     )
 
 
 def _speeds(times_s: Array, at_mm: Array) -> tuple[float, float]:
-    """Return one carriage's mean speed without ENDS_MM at both ends, and the most over WINDOW States."""
-    most = (at_mm[WINDOW:] - at_mm[:-WINDOW]) / (times_s[WINDOW:] - times_s[:-WINDOW])
-    (way,) = np.nonzero((at_mm > at_mm[0] + ENDS_MM) & (at_mm < -ENDS_MM))
-    mean = (at_mm[way[-1]] - at_mm[way[0]]) / (times_s[way[-1]] - times_s[way[0]]) if len(way) > 1 else 0.0
-    return float(mean), float(np.max(most, initial=0.0))
+    """Return one carriage's least speed without ENDS_MM at both ends, and its most, over WINDOW States."""
+    mm_s = (at_mm[WINDOW:] - at_mm[:-WINDOW]) / (times_s[WINDOW:] - times_s[:-WINDOW])
+    is_way = (at_mm[:-WINDOW] > at_mm[0] + ENDS_MM) & (at_mm[WINDOW:] < -ENDS_MM)
+    return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0))
 
 
 def misfits(host: Host) -> str:
@@ -340,8 +344,10 @@ def misfits(host: Host) -> str:
         host.hello(hello.schema_hash, hello.protocol_version)
         count, seen = len(host.all_of(Identity)), f"schema {hello.schema_hash:08X}, version {hello.protocol_version}"
         host.shows(DeviceMode.LATCHED, homed=False, fault=fault, besides=seen, wrong=count != 1)
-        is_taken = host.status.command_nonce != HELLO_NONCE or host.command(Clear, DriveMode.OFF, SEEN_S)
-        unless(is_taken, f"{seen}: its nonce is not shown, or Clear's is, {shown(host.status)}")
+        unless(
+            host.status.command_nonce != HELLO_NONCE or host.command(Clear, DriveMode.OFF, SEEN_S),
+            f"{seen}: its nonce is not shown, or Clear's is, {shown(host.status)}",
+        )
         host.hello()
         host.shows(DeviceMode.LATCHED, fault=fault, besides=f"{seen}, then a Hello that fits")
     host.idle()
@@ -350,13 +356,12 @@ def misfits(host: Host) -> str:
 
 def put_off(host: Host) -> None:
     """Bring the device to IDLE without letting go."""
-    host.running()
-    host.obeyed(Retract, DriveMode.RUN)
+    _retracting(host, DriveMode.RUN, 0.0)
     host.until(host.is_resting, OPENED_S, DriveMode.RUN)
 
 
-def _deep(host: Host, beat: Beat) -> None:
-    host.running(DEEP_MM)
+def _retracting(host: Host, beat: Beat, inside_mm: float = DEEP_MM) -> None:
+    host.running(inside_mm)
     host.obeyed(Retract, beat)
 
 
@@ -380,8 +385,10 @@ PLACES: Final = (
     Place("RUN", DeviceMode.RUN, lambda host: host.running(INSIDE_MM), DriveMode.RUN, 0.0),
     Place("HOMING", DeviceMode.HOMING, partial(_homing, beat=DriveMode.OFF), DriveMode.OFF, -1.0),
     Place("HOMING beside RUN", DeviceMode.HOMING, partial(_homing, beat=DriveMode.RUN), DriveMode.RUN, DUTY),
-    Place("RETRACTING", DeviceMode.RETRACTING, partial(_deep, beat=DriveMode.OFF), DriveMode.OFF, -1.0),
-    Place("RETRACTING beside RUN", DeviceMode.RETRACTING, partial(_deep, beat=DriveMode.RUN), DriveMode.RUN, -1.0),
+    Place("RETRACTING", DeviceMode.RETRACTING, partial(_retracting, beat=DriveMode.OFF), DriveMode.OFF, -1.0),
+    Place(
+        "RETRACTING beside RUN", DeviceMode.RETRACTING, partial(_retracting, beat=DriveMode.RUN), DriveMode.RUN, -1.0
+    ),
     Place("LATCHED", DeviceMode.LATCHED, Host.latched, DriveMode.RUN, DUTY),
 )
 HAZARDS: Final = {"Home": Hazard.OPENS, "Clear": Hazard.CLOSES, MISFITS: Hazard.CLOSES}

@@ -176,10 +176,7 @@ NOISE = random.Random(1)
         (("sensor",), {"alters": through(first_order(5.0))}, "sensor's rise after the handle's turn"),
         (("steps",), {"alters": through(read_at(12.0))}, "sensor's readings apart"),
         (("force over gap",), {"alters": through(with_play(0.06))}, "force of a closing gap over an opening one's"),
-        *(
-            (("force over gap",), {"alters": through(bent(per_N))}, "force's curve, of sensor or magnets")
-            for per_N in (0.1, -0.1)
-        ),
+        (("force over gap",), {"alters": through(bent(-0.1))}, "force's curve, of sensor or magnets"),
         (("carriages",), {"plant": with_part("screw", friction_coefficient=0.7)}, "left friction over the configured"),
         (
             ("carriages",),

@@ -1152,6 +1152,55 @@ PLANTED = (
         ),
     ),
     rogue("switches 60 ms late", "zero_is_at_switch", shows=shows_late),
+    rogue(
+        "another serial number each time",
+        "status_consistent",
+        "identity_answers_hello",
+        identity=lambda device: Identity(SCHEMA_HASH, 1, 0, device.count[Hello]),
+    ),
+    rogue(
+        "no Status as a fault latches",
+        "status_rate",
+        shows=lambda device, _, status: status if device.mode is DeviceMode.IDLE else None,
+    ),
+    rogue(
+        "not braked",
+        "status_consistent",
+        "run_drive_off",
+        shows=lambda _, time_s, status: (
+            status.replaced(switches=status.switches & ~Switches.LEFT_OPEN)
+            if status.mode is DeviceMode.RETRACTING
+            else status
+        ),
+    ),
+    rogue(
+        "a Hello ends the duties",
+        "duties_make_currents",
+        drives=lambda device, output: Output(0.0, 0.0, output.enabled) if device.ended else output,
+        before=lambda device, _, message: setattr(
+            device,
+            "ended",
+            isinstance(message, Hello)
+            or (device.ended and getattr(message, "counter", device.asked.counter) == device.asked.counter),
+        ),
+        ended=False,
+    ),
+    rogue(
+        "a lone Drive runs on",
+        "silence_is_noticed",
+        before=lambda device, time_s, message: setattr(device, "lone", not is_running(device)),
+        ticks=lambda device, time_s: setattr(device.real, "_drive_s", time_s) if device.lone else None,
+        lone=False,
+    ),
+    rogue(
+        "runs from standing only",
+        "let_go_after_all",
+        hears=lambda device, message: (
+            message.replaced(left_duty=0.0, right_duty=0.0)
+            if isinstance(message, Drive) and not is_running(device)
+            else message
+        ),
+    ),
     wire(
         "whole frames only",
         "frames_as_they_come",
