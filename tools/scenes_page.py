@@ -63,7 +63,7 @@ def page(found: dict[str, MeasuredScene]) -> str:
         f"![worst error of each scene, as served and with one thing more](<{PICTURE.as_posix()}>)",
         f"Further left is more exact. In {len(found) - len(flat)} of {len(found)} scenes the worst way is at least "
         f"{FRONT} times as far off as the most exact. Not where all is within the tolerance ({_named(met)}), nor where "
-        f"only the device's least force and its gap's speed decide ({_named(bound)}). "
+        f"nothing given helps ({_named(bound)}: its description says why). "
         "Rates and searches hardly matter; `tormagctl scene explain NAME` lists every way.",
     ]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
