@@ -88,12 +88,17 @@ def _figure_2_5(data: Json) -> str:
         )
         for name, key in (("Eq. 7", "eq_7"), ("power law", "power"))
     ]
+    energies = " and ".join(
+        f"{closed['strain_J_m3'] / 1e3:.2f} + {closed['magnetic_J_m3'] / 1e3:.2f} kJ/m3 by {name}"
+        for name, closed in (("Eq. 7", data["eq_7"]["closed"]), ("the power law", data["power"]["closed"]))
+    )
     for name, key in (("thesis", "thesis_working_point_N"), ("measured earlier", "measured_earlier_N")):
         rows.append((name, *(f"{force:.2f}" for force in data[key])))
     return (
         f"## Figure 2.5: force surfaces\n\n{data['note']}\n\n"
         + table(("field law", "least force, N (error)", "most force, N (error)"), rows)
-        + "\n![Force surfaces](reproduction/figure_2_5.png)\n"
+        + f"\nThe elastomer holds {energies} at the shaft at 45 mm: strain and magnetic energy (Eq. 22..24).\n\n"
+        "![Force surfaces](reproduction/figure_2_5.png)\n"
     )
 
 

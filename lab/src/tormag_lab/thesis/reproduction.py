@@ -13,6 +13,8 @@ import numpy as np
 
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
+from tormag_lab.design.energy import energy_at_shaft
+from tormag_lab.design.force_law import stretch_minus_one
 from tormag_lab.design.optimisation import Design, Problem, Run, coverage, sweep
 from tormag_lab.design.phase_portrait import PhasePortrait
 from tormag_lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
@@ -34,7 +36,7 @@ from tormag_lab.thesis.values import (
     USE_CASES,
 )
 from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.element.physics.force import Elastomer
+from tormagd.element.physics.force import TORMAG, Elastomer
 from tormagd.element.physics.inserts import INSERTS, Insert, insert
 
 CONTROLLER_SPEED_MM_S = 40.0
@@ -176,7 +178,9 @@ def figure_2_5() -> Json:
     result: Json = {}
     laws: tuple[tuple[str, FieldLaw], ...] = (("eq_7", ThesisFieldLaw()), ("power", PowerFieldLaw()))
     for name, law in laws:
-        at_point = Brake.as_built(Elastomer(277e3, 4.0, 0.2), law)
+        elastomer = Elastomer(277e3, 4.0, 0.2)
+        at_point, moment_Tm = Brake.as_built(elastomer, law), float(law.radial_moment_Tm(CLOSED_MM))
+        stretch = 1.0 + float(stretch_minus_one(moment_Tm, elastomer, TORMAG))
         grid = [
             [Brake.as_built(Elastomer(1e3 * float(g0), float(mu_r), 0.2), law) for g0 in moduli_kPa]
             for mu_r in permeabilities
@@ -184,6 +188,10 @@ def figure_2_5() -> Json:
         result[name] = {
             "working_point_N": [at_point.least_N, at_point.most_N],
             "error_N": [at_point.least_N - FIGURE_2_5_N[0], at_point.most_N - FIGURE_2_5_N[1]],
+            "closed": {
+                "stretch": stretch,
+                **energy_at_shaft(stretch, moment_Tm / TORMAG.inner_radius_m, elastomer)._asdict(),
+            },
             "least_N": [[brake.least_N for brake in row] for row in grid],
             "most_N": [[brake.most_N for brake in row] for row in grid],
         }
