@@ -2,6 +2,7 @@
 
 import datetime
 import math
+import statistics
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -477,13 +478,18 @@ def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name
     assert build_core(Config(scene=name)).solver.solver == wanted
 
 
-@pytest.mark.parametrize("name", shipped_scenes())
-def test_no_other_search_without_torch_is_worth_its_price_in_any_measured_scene(name: str) -> None:
-    found = measured_as(name, load_scene(name))
-    (nearest,) = (each for each in found.served if each.way.search == "nearest")
-    newton = found.of(msgspec.structs.replace(nearest.way, search="newton"))
-    assert nearest.worst_N > 0.8 * newton.worst_N
-    assert nearest.share > 0.9 * newton.share
+def test_no_other_search_without_torch_is_worth_its_price() -> None:
+    errors, shares = [], []
+    for name in shipped_scenes():
+        found = measured_as(name, load_scene(name))
+        (nearest,) = (each for each in found.served if each.way.search == "nearest")
+        newton = found.of(msgspec.structs.replace(nearest.way, search="newton"))
+        errors.append(nearest.worst_N / newton.worst_N)
+        shares.append(nearest.share / newton.share)
+    # of one scene, a live run and the next differ by up to a fifth
+    assert statistics.median(errors) > 0.9
+    assert statistics.median(shares) > 1.05
+    assert min(shares) > 0.8
 
 
 def test_a_scene_may_name_its_search() -> None:
