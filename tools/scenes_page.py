@@ -7,6 +7,7 @@ from tormag_lab.pages import stamp, subplots, table
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
 from tormagd.ctl.scene_check import measured_as
+from tormagd.ctl.scene_measure import COMES_S, CONTACT_S, SLOWER_MM_S
 from tormagd.scenes.measured import AHEAD_MS, MeasuredScene, Served
 from tormagd.scenes.scene import load_scene, shipped_scenes
 
@@ -38,7 +39,6 @@ def front(name: str, found: MeasuredScene) -> float:
 def page(found: dict[str, MeasuredScene]) -> str:
     flat = [name for name, each in found.items() if front(name, each) < FRONT]
     met = [name for name in flat if found[name].chosen.worst_N <= found[name].tolerance_N]
-    bound = [name for name in flat if name not in met]
     seldom = [name for name, each in found.items() if each.chosen.rms_N["seldom"] > FRONT * each.chosen.rms_N["signal"]]
     slid_s = max((each.way.slid_s for scene in found.values() for each in scene.more), default=0.0)
     machines = [each.machine_us for each in found.values()]
@@ -50,20 +50,22 @@ def page(found: dict[str, MeasuredScene]) -> str:
         ),
         "Errors are RMS, mN, of the true force, live, from a second after arming, at the handle's greatest speed, on a "
         "simulated device that no model was learned from. The worst counts of *signal*, the same *seldom* (20 "
-        "setpoints a second), *steps* (from 1.1 s after each) and *contact*, a wall whose force rises in two seconds. "
-        "**Bold** is over the tolerance. *Share* is what the daemon took of a processor meanwhile (`machine_us` "
+        f"setpoints a second), *steps* (from {COMES_S:g} s after each) and *contact*, a wall whose force "
+        f"rises in {CONTACT_S:g} s. **Bold** is over the tolerance. *Share* is what the daemon took of a "
+        "processor meanwhile (`machine_us` "
         f"{min(machines):.0f} to {max(machines):.0f}). The last columns give one thing more each:\n\n"
         f"- *told ahead*: the patient side knows what comes in {AHEAD_MS:g} ms (`signal.is_known_ahead`)\n"
         f"- *learned*: the device slid for {slid_s:.0f} s before (`device.profiles`)\n"
         "- *waits nearer*: the hand feels the force in brackets, N, where less is asked; that is no error then "
         "(`force.standby_N`)\n"
-        "- *slower gap*: 38 mm/s (`insert.gap_speed_mm_s`) spare the current of closing as fast as the motors can",
+        f"- *slower gap*: {SLOWER_MM_S:g} mm/s (`insert.gap_speed_mm_s`) spare the current of closing as fast as the "
+        "motors can",
         "~~Struck out~~ is worse, here or on another device, and not offered by `tormagctl scene check`. A publisher "
         f"that sends seldom costs over {FRONT} times the signal's error in {_named(seldom)}.",
         f"![worst error of each scene, as served and with one thing more](<{PICTURE.as_posix()}>)",
         f"Further left is more exact. In {len(found) - len(flat)} of {len(found)} scenes the worst way is at least "
         f"{FRONT} times as far off as the most exact. Not where all is within the tolerance ({_named(met)}), nor where "
-        f"nothing given helps ({_named(bound)}: its description says why). "
+        f"nothing given helps ({_named([name for name in flat if name not in met])}: its description says why). "
         "Rates and searches hardly matter; `tormagctl scene explain NAME` lists every way.",
     ]
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
@@ -105,10 +107,6 @@ def _named(names: list[str]) -> str:
     return ", ".join(f"`{name}`" for name in names) or "none"
 
 
-def worst_case(served: Served) -> str:
-    return max(served.rms_N, key=served.rms_N.__getitem__)
-
-
 def _row(name: str, found: MeasuredScene) -> list[str]:
     scene = load_scene(name)
     force, reach = scene.force, build_core(Config(scene=name), scene).portrait
@@ -123,7 +121,7 @@ def _row(name: str, found: MeasuredScene) -> list[str]:
         f"{1e3 * force.tolerance_rms_N:g}",
         str(chosen.way),
         f"{chosen.share:.0%}",
-        f"{_shown(chosen, found)} {worst_case(chosen)}",
+        f"{_shown(chosen, found)} {max(chosen.rms_N, key=chosen.rms_N.__getitem__)}",
         *("-" if each is None else _shown(each, found, each in offered) for each in more.values()),
     ]
 

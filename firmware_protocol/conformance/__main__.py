@@ -78,14 +78,12 @@ def _row(result: Result) -> dict[str, Any]:
 def told(result: Result) -> str:
     """Return a result as text: one line if the check passed, else what was sent, seen and expected."""
     one = result.check
-    if result.passed is not False:
+    if result.passed is False:
         return (
-            f"{'ok    ' if result.passed else '-     '}{one.name}: {'not tested: ' * (not result.passed)}{result.seen}"
+            f"FAIL  {one.name}\n      sent      {one.sent}\n      seen      {result.seen}\n"
+            f"      expected  {one.expected}\n      page      {PAGE}: {one.page}\n      hazard    {one.hazard.value}"
         )
-    return (
-        f"FAIL  {one.name}\n      sent      {one.sent}\n      seen      {result.seen}\n"
-        f"      expected  {one.expected}\n      page      {PAGE}: {one.page}\n      hazard    {one.hazard.value}"
-    )
+    return f"ok    {one.name}: {result.seen}" if result.passed else f"-     {one.name}: not tested: {result.seen}"
 
 
 def _examined(line: Line, checks: Sequence[Check], options: argparse.Namespace) -> bool:

@@ -64,7 +64,7 @@ def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = la
 
 def _performed(host: Host, one: Check) -> Result:
     """Perform one check; repeat a failure while this process was late during it."""
-    for attempt in range(ATTEMPTS):
+    for _ in range(ATTEMPTS):
         host.begin()
         try:
             return Result(one, passed=True, seen=one.perform(host))
@@ -72,8 +72,7 @@ def _performed(host: Host, one: Check) -> Result:
             return Result(one, passed=None, seen=str(untested))
         except Unmet as unmet:
             seen = str(unmet)
-            if host.stalled_s > STALLED_S:
-                seen += f" (this computer was {host.stalled_s * 1e3:.0f} ms late meanwhile)"
-            if host.stalled_s <= STALLED_S or attempt == ATTEMPTS - 1:
+            if host.stalled_s <= STALLED_S:
                 break
+            seen += f" (this computer was {host.stalled_s * 1e3:.0f} ms late meanwhile)"
     return Result(one, passed=False, seen=seen)

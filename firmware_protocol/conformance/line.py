@@ -108,8 +108,8 @@ class SerialLine:
         statistics = self._decoder.statistics
         errors = {
             f"not a frame ({statistics.refused.get('frame', '')})": statistics.corrupt - (not self._has_begun),
-            "missing from the sequence": statistics.lost
-            - statistics.corrupt,  # a damaged frame is missing too, and is one error
+            # a damaged frame is missing too, and is one error
+            "missing from the sequence": statistics.lost - statistics.corrupt,
             "sequence number repeated": statistics.repeated,
         }
         return {what: count for what, count in errors.items() if count > 0}

@@ -4,7 +4,6 @@ import math
 from collections import deque
 from functools import partial
 from itertools import product
-from operator import methodcaller
 from typing import Final
 
 import numpy as np
@@ -189,6 +188,11 @@ def zero_is_at_switch(host: Host) -> str:
     return unless(+host.contradictions, ", ".join(+host.contradictions) or "all changed in their place")
 
 
+def _send_all(host: Host) -> None:
+    for message in taken(host, RUNNING):
+        message.send()
+
+
 @check(
     Hazard.MISLED,
     DRIVE,
@@ -216,7 +220,7 @@ def duties_make_currents(host: Host) -> str:
     host.pass_time(SETTLED_S, DriveMode.RUN)
     start_mm = places(host.last(State))
     # the second Drive measures what the first began and no message ended; an answer that lags shows a motor at rest
-    host.beat(DriveMode.RUN, 1.0, 1.0, STARTED_S, lambda: [*map(methodcaller("send"), taken(host, RUNNING))])
+    host.beat(DriveMode.RUN, 1.0, 1.0, STARTED_S, partial(_send_all, host))
     host.beat(DriveMode.RUN, 1.0, 1.0, STARTED_S)
     sense, way_mm = host.last(Sense), min(ways_mm(host.last(State), start_mm))
     seen = [f"{sense.left_current_A:+.2f} and {sense.right_current_A:+.2f} A, {way_mm:+.2f} mm at once"]

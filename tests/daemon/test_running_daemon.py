@@ -423,7 +423,7 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
     causes.tell(control.new_faults(), control.stepper, None)
     stall(11.0, 0.006, "somebody else")
     control.latch(Fault.PLAN_FAILED)
-    causes.unplanned = "no field"
+    causes.plan_failure = "no gap could be planned: no field"
     causes.tell(control.new_faults(), control.stepper, None)
     assert control.new_faults() == ()
     assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("fault")] == [

@@ -486,10 +486,11 @@ def test_no_other_search_without_torch_is_worth_its_price() -> None:
         newton = found.of(msgspec.structs.replace(nearest.way, search="newton"))
         errors.append(nearest.worst_N / newton.worst_N)
         shares.append(nearest.share / newton.share)
-    # of one scene, a live run and the next differ by up to a fifth
+        # of one scene, a live run and the next differ by up to a fifth
+        assert newton.worst_N - nearest.worst_N < 0.5 * found.tolerance_N, name
     assert statistics.median(errors) > 0.9
     assert statistics.median(shares) > 1.05
-    assert min(shares) > 0.8
+    assert min(shares) > 0.9
 
 
 def test_a_scene_may_name_its_search() -> None:

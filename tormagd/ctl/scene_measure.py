@@ -26,6 +26,7 @@ from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usa
 from tormagd.ctl.processes import begun, first_line, is_linked, processor_s
 from tormagd.ctl.scene_check import as_toml, derived_of, loaded
 from tormagd.ctl.scene_served import write_scene
+from tormagd.element.physics.force import TORMAG
 from tormagd.ground.files import in_place_of
 from tormagd.ground.machine_loop import machine_us
 from tormagd.ground.terminal import write_line
@@ -54,8 +55,8 @@ SLOWER_MM_S = 38.0
 "The gap closes as slowly as it opens: a motor is spared."
 PRICED, LOOKS_HZ = ("signal", "steps"), 2.0
 "Where setpoints come as often as plans; meanwhile the machine is looked at."
-MM_S_AT_1_RPM = 40.0 * math.pi / 60.0
-"A hand turns the simulated roller of 20 mm."
+MM_S_AT_1_RPM = 1e3 * math.tau * TORMAG.roller_radius_m / 60.0
+"So fast the simulated roller's surface is."
 OPEN_MM = 0.1
 "A gap so near its end is open: excess force is the device's."
 VALID_FOR_MS = 200.0

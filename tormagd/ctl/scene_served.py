@@ -36,8 +36,10 @@ def serve_scene(
         raise usage_error(f"{out}: File exists: {NEW_FILE}", "name another")
     scene = loaded(name)
     found, machine = measured_as(name, scene), machine_us()
-    offered = found.offered(scene.bandwidth)
-    ways = [Served(each.way, (found.share_here(each, machine, backend), each.worst_N)) for each in offered]
+    ways = [
+        Served(each.way, (found.share_here(each, machine, backend), each.worst_N))
+        for each in found.offered(scene.bandwidth)
+    ]
     way, (daemon_share, rms_N) = _best(ways, share, tolerance_N or 0.0)
     text = (
         f"{scene.name}: {way}: {1e3 * rms_N:.1f} mN RMS in the worst situation, "

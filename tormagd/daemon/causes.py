@@ -28,7 +28,7 @@ class Causes:
         self._device = device
         self.stall: StallReport | None = None
         "The newest stall of the control loop; None before the first."
-        self.unplanned = ""
+        self.plan_failure = ""
         "Why the newest plan that failed did."
         self._told: dict[str, Explained] = {}
         self._waits = deque([(-math.inf, 0.0)], maxlen=1_000)
@@ -59,7 +59,7 @@ class Causes:
         causes[Fault.HOST_STALL] = (
             f"{self._stood_still()}; the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
         )
-        causes[Fault.PLAN_FAILED] = f"no gap could be planned: {self.unplanned}"
+        causes[Fault.PLAN_FAILED] = self.plan_failure
         self._told |= {fault: _explained(fault, FAULTS, causes, host) for fault in faults}
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)

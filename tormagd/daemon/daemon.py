@@ -191,13 +191,14 @@ class Daemon:
         self._endpoint.hear()
 
     def _plan(self, beat: Beat) -> None:
-        # before the step: a setpoint is driven in the beat that takes it; several at once are cheaper than one by one
+        # before the step: a setpoint is driven in the beat that takes it
         is_every, stepper = self._config.rates.plan_every_setpoint, self._control.stepper
-        is_asked = (is_every or self._inference.is_due(beat)) and self._endpoint.take_setpoints() and is_every
-        self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
+        # those that wait for a plan are cheaper together
+        has_come = (is_every or self._inference.is_due(beat)) and self._endpoint.take_setpoints()
+        self._inference.plan(beat, stepper.measured, is_asked=is_every and has_come, is_followed=stepper.is_followed)
 
     def _fail_plan(self, why: str) -> None:
-        self._causes.unplanned = why
+        self._causes.plan_failure = why
         self._control.latch(Fault.PLAN_FAILED)
 
     def _drive(self, beat: Beat) -> None:

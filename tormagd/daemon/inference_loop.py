@@ -84,12 +84,12 @@ class InferenceLoop:
         return is_made
 
     def _begin_afresh(self, now_s: float, error: Exception) -> None:
-        if str(error) != self._failure:  # only the first of equal failures is news
-            self._failure = str(error)
+        before, self._failure = self._failure, f"no gap could be planned: {error}"
+        if self._failure != before:  # only the first of equal failures is news
             log.error(
                 "the gap opens: none could be planned for %s; report the trace", self._inbox.newest, exc_info=error
             )
-        self._inbox.withdraw(f"no gap could be planned: {error}")
-        self._on_failure(str(error))
+        self._inbox.withdraw(self._failure)
+        self._on_failure(self._failure)
         self._journal.note(AFRESH, now_s)
         self.planner.afresh(now_s)

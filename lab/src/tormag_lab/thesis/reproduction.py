@@ -177,8 +177,8 @@ def figure_2_5() -> Json:
     moduli_kPa = np.linspace(80.0, 280.0, 11)
     result: Json = {}
     laws: tuple[tuple[str, FieldLaw], ...] = (("eq_7", ThesisFieldLaw()), ("power", PowerFieldLaw()))
+    elastomer = Elastomer(277e3, 4.0, 0.2)
     for name, law in laws:
-        elastomer = Elastomer(277e3, 4.0, 0.2)
         at_point, moment_Tm = Brake.as_built(elastomer, law), float(law.radial_moment_Tm(CLOSED_MM))
         stretch = 1.0 + float(stretch_minus_one(moment_Tm, elastomer, TORMAG))
         grid = [
