@@ -85,7 +85,7 @@ def model_of(route: np.ndarray, friction: float, stiffness_N_mm: float) -> mujoc
     {walls}
     <body pos="{x / 1e3} {y / 1e3} 0" euler="0 0 {way}">
       <joint name="lesion" type="slide" axis="1 0 0" stiffness="{1e3 * stiffness_N_mm}" damping="2" armature="2e-3"/>
-      <geom class="wall" type="box" size="1e-3 {2 * VESSEL_MM / 1e3} 2e-3" pos="1e-3 0 0"/>
+      <geom class="wall" type="box" size="1e-2 1e-2 1e-2" pos="1e-2 0 0" solref="0.004 1" priority="1"/>
     </body>
     {wire}{"</body>" * SEGMENTS}
   </worldbody>
@@ -164,7 +164,7 @@ def draw(path: str, route: np.ndarray, rows: list[Any], shapes_mm: list[np.ndarr
 def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder")
-    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--picture")
     parser.add_argument("--friction", type=float, default=0.2)
     parser.add_argument("--stiffness-N-mm", type=float, default=0.1)

@@ -43,11 +43,20 @@ def test_the_wire_meets_a_lesion_which_the_estimator_finds_and_is_drawn(tmp_path
     assert len(rows) == len(daemon.published) == round(SECONDS / guidewire.STEP_S)
     assert min(force_N for force_N, *_ in daemon.published) >= 0.0
     assert there_N[place_mm < LESION_MM].max() < 0.4
-    assert 1.0 < there_N.max() < 3.0
+    spring_N = guidewire.SCALE * 0.1 * (PUSH_MM_S * SECONDS - LESION_MM)
+    assert there_N.max() == pytest.approx(spring_N, rel=0.1)
     known = [contact for *_, contact in daemon.published if contact is not None]
     assert known[-1].handle_mm == pytest.approx(LESION_MM, abs=1.0)
     guidewire.draw(str(tmp_path / "wire.png"), route, rows, shapes_mm)
     assert (tmp_path / "wire.png").stat().st_size > 10_000
+
+
+def test_a_wire_that_draws_back_leaves_the_lesion_at_once() -> None:
+    wire = guidewire.Guidewire(guidewire.route_of(ROUTE), 0.2, 0.1)
+    way_mm = np.concatenate([np.arange(0.0, LESION_MM + 14.0, 0.12), np.arange(LESION_MM + 14.0, 40.0, -0.12)])
+    there_N = np.array([wire.push(float(place_mm)) for place_mm in way_mm])
+    assert there_N.max() > 1.0
+    assert there_N.min() > -0.1
 
 
 @pytest.mark.parametrize("text", ["", "40", "40:nan", "5:90", "40:0,1e9:0", "10:0", "100:0,100:0", "-40:0"])
