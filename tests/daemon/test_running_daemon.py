@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import msgspec
@@ -25,9 +26,11 @@ from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.ctl.record import listening
 from tormagd.daemon import daemon as daemon_module, service
 from tormagd.daemon.beat import KERNEL, Beat, Delay
+from tormagd.daemon.causes import Causes
 from tormagd.daemon.daemon import Daemon
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.backend import BackendError
+from tormagd.hardware.link_quality import LinkQuality
 from tormagd.record.telemetry import COLUMNS
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import is_tick
@@ -390,6 +393,26 @@ def test_a_silence_of_the_device_is_put_down_to_a_host_that_kept_the_loop_waitin
     ]
     assert [("160 ms of the last second, 8 ms at once; " in each.cause, "doctor" in each.remedy) for each in told] == [
         *((is_blamed, is_blamed), (False, False)) * 2
+    ]
+
+
+@pytest.mark.parametrize(
+    ("link", "is_blamed"),
+    [
+        (LinkQuality(unanswered=0.03), True),
+        (LinkQuality(unsent=0.03), True),
+        (LinkQuality(unanswered=0.05), False),
+        (LinkQuality(unanswered=0.03, damaged=0.03), False),
+        (LinkQuality(round_trip_s=9e-3), False),
+    ],
+)
+def test_a_wire_loses_by_a_host_that_waited_as_much(link: LinkQuality, is_blamed: bool) -> None:
+    causes, measurement = Causes(DeviceTable()), SimpleNamespace(link=link)
+    for number in range(21):
+        causes.note_wait(10.0 + 0.05 * number, 2e-3)
+    told = causes.of_limits(["LINK_DEGRADED"], "", {}, measurement, 11.0)
+    assert [("40 ms of the last second" in each.cause, "cable" in each.remedy) for each in told] == [
+        (is_blamed, not is_blamed)
     ]
 
 

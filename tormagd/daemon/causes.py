@@ -10,6 +10,7 @@ from tormagd.config import Device
 from tormagd.control.core import Stepper
 from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd.daemon.beat import Delay
+from tormagd.hardware.link_quality import LOSES
 from tormagd.hardware.measurement import Measurement
 from tormagd_client.messages import Explained, StallReport
 
@@ -43,10 +44,10 @@ class Causes:
         """Note that the control loop was not given the processor for the last `wait_s`, or since the last such wait."""
         self._waits.append((now_s, min(wait_s, now_s - self._waits[-1][0])))
 
-    def host(self, now_s: float) -> str:
-        """Say how long this host kept the control loop waiting; empty if that is WAITED_SHARE or less."""
+    def host(self, now_s: float, least: float = WAITED_SHARE) -> str:
+        """Say how long this host kept the control loop waiting; empty if that is `least` of a second or less."""
         waits_s = [min(wait_s, at_s + 1.0 - now_s) for at_s, wait_s in self._waits if now_s - at_s < 1.0]
-        if sum(waits_s) <= WAITED_SHARE:
+        if sum(waits_s) <= least:
             return ""
         return (
             f"this host kept the control loop waiting for {sum(waits_s) * 1e3:.0f} ms of the last second, "
@@ -55,18 +56,19 @@ class Causes:
 
     def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
         """Log the newly latched `faults` as errors with cause and remedy, and remember the figures of their causes."""
-        causes, host = {} if measurement is None else _causes(stepper, measurement), self.host(stepper.time_s)
+        causes = {} if measurement is None else _causes(stepper, measurement)
+        hosts = self._hosts(stepper.time_s, measurement)
         causes[Fault.HOST_STALL] = (
             f"{self._stood_still()}; the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
         )
         causes[Fault.PLAN_FAILED] = self.plan_failure
-        self._told |= {fault: _explained(fault, FAULTS, causes, host) for fault in faults}
+        self._told |= {fault: _explained(fault, FAULTS, causes, hosts) for fault in faults}
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
         """Return each fault with its cause and its remedy, in the order of `faults`."""
-        return tuple(self._told.get(fault) or _explained(fault, FAULTS, {}, "") for fault in faults)
+        return tuple(self._told.get(fault) or _explained(fault, FAULTS, {}, {}) for fault in faults)
 
     def of_limits(
         self,
@@ -83,8 +85,15 @@ class Causes:
         if measurement is not None:
             told[Limit.LINK_DEGRADED] = f"{LIMITS[Limit.LINK_DEGRADED].cause}: {measurement.link}"
             told[Limit.CLOCK] = f"{LIMITS[Limit.CLOCK].cause}: {measurement.link.clock_drift:+.1%}"
-        known, host = {**LIMITS, **of_sources}, self.host(now_s)
-        return tuple(_explained(limit, known, told, host) for limit in limits)
+        known, hosts = {**LIMITS, **of_sources}, self._hosts(now_s, measurement)
+        return tuple(_explained(limit, known, told, hosts) for limit in limits)
+
+    def _hosts(self, now_s: float, measurement: Measurement | None) -> dict[str, str]:
+        """Return what the host did to each of SILENCES; a lossy wire is its doing if it waited as much as was lost."""
+        hosts = dict.fromkeys(SILENCES, self.host(now_s))
+        if measurement is not None and measurement.link.damaged <= LOSES < measurement.link.lost:
+            hosts["LINK_DEGRADED"] = self.host(now_s, min(measurement.link.lost, WAITED_SHARE))
+        return hosts
 
     def _stood_still(self) -> str:
         stall = self.stall
@@ -114,9 +123,11 @@ def _causes(stepper: Stepper, measurement: Measurement) -> dict[Fault, str]:
     }
 
 
-def _explained(code: str, table: Mapping[Any, Explanation], told: Mapping[Any, str], host: str) -> Explained:
+def _explained(
+    code: str, table: Mapping[Any, Explanation], told: Mapping[Any, str], hosts: Mapping[str, str]
+) -> Explained:
     """Return a code with its cause and remedy from `table`; a cause in `told` goes before."""
     cause = told.get(code, table[code].cause)
-    if host and code in SILENCES:
+    if host := hosts.get(code):
         return Explained(str(code), f"{host}; {cause}", table["HOST_STALL"].remedy)
     return Explained(str(code), cause, table[code].remedy)

@@ -33,8 +33,12 @@ class LinkQuality(Value):
         self.clock_drift: Final = clock_drift
 
     @property
+    def lost(self) -> float:
+        return max(self.unanswered, self.unsent)
+
+    @property
     def is_lossy(self) -> bool:
-        return self.unanswered > LOSES or self.damaged > LOSES or self.unsent > LOSES
+        return self.lost > LOSES or self.damaged > LOSES
 
     def __str__(self) -> str:
         return (
