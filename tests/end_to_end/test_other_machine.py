@@ -65,8 +65,6 @@ class Machines:
         subprocess.run([*CTL, "keys", "generate", str(self.keys), *clients], check=True, capture_output=True)
         addresses = "".join(f'{name} = "tcp://{HERE}:{5_555 + n}"\n' for n, name in enumerate(ENDPOINTS))
         simulator = self.start(0, sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "1")
-        with contextlib.suppress(OSError):  # a device does not wait for the host's processors
-            os.sched_setscheduler(simulator.pid, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(40))
         port = simulator.stdout.readline().strip()
         self.config = folder / "tormagd.toml"
         self.config.write_text(

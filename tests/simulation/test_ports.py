@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import itertools
+import os
 import select
 import signal
 import socket
@@ -92,6 +93,8 @@ def on_a_bus(channel: str) -> Device:
 def test_hosts_come_and_go_on_the_simulators_bus(start: Start) -> None:
     process = start("--can")
     path = channel(process)
+    is_granted = subprocess.run(["chrt", "--fifo", "1", "true"], capture_output=True).returncode == 0
+    assert os.sched_getscheduler(process.pid) & os.SCHED_FIFO == is_granted * os.SCHED_FIFO
     assert Path(path).is_socket()
     assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
     for _ in range(2):

@@ -7,7 +7,6 @@ each, of what a hand or its publisher gives.
 
 import contextlib
 import math
-import os
 import signal
 import statistics
 import sys
@@ -29,6 +28,7 @@ from tormagd.ctl.scene_served import write_scene
 from tormagd.element.physics.force import TORMAG
 from tormagd.ground.files import in_place_of
 from tormagd.ground.machine_loop import machine_us
+from tormagd.ground.scheduling import ask_for_fifo
 from tormagd.ground.terminal import write_line
 from tormagd.scenes.measured import AHEAD_MS, ENDING, MeasuredScene, OperatingPoint, Served, own_way, served_like
 from tormagd.scenes.scene import MIN_CONTROL_HZ, Scene, scene_path
@@ -258,16 +258,9 @@ def _device(stack: contextlib.ExitStack, folder: Path, scene: Scene, sample: int
     arguments = ["--can", "--truth", str(folder / "truth.csv"), "--plant", f"{_kind(scene)}_{sample}", "--hand", hand]
     arguments += ["--insert", scene.insert.name] if scene.element == "torque" else []
     device = begun(stack, folder / LOG, "-P", "-m", "tormagd.simulation", *arguments)
-    _as_another_machine(device.pid, FIFO - 10)
     if not (port := first_line(device)):
         raise _ended("the simulated device", folder)
     return port
-
-
-def _as_another_machine(pid: int, priority: int) -> None:
-    """Let a process run first, if the kernel grants it."""
-    with contextlib.suppress(PermissionError):
-        os.sched_setscheduler(pid, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
 def _ended(what: str, folder: Path) -> CommandError:
@@ -276,7 +269,7 @@ def _ended(what: str, folder: Path) -> CommandError:
 
 
 def _play(client: Client, course: Course, pid: int) -> tuple[int, float, float]:
-    _as_another_machine(0, FIFO - 20)
+    ask_for_fifo(FIFO - 20)
     start_s, start_ns = time.monotonic(), time.time_ns()
     spent_s, took_s, machine = 0.0, 0.0, list[float]()
     for part in course.parts:

@@ -8,6 +8,7 @@ if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_
 
 import argparse
 import contextlib
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from pathlib import Path
 
 from firmware_protocol.c.build import BuildError
 from tormagd.element.physics.errors import DomainError
-from tormagd.ground.scheduling import ask_for_slices
+from tormagd.ground.scheduling import ask_for_fifo, ask_for_slices
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
 from tormagd.simulation.can_port import FOLDER_PREFIX, CanPort
@@ -32,6 +33,8 @@ from tormagd.simulation.real_time import Door, PacedDevice, serve
 from tormagd.simulation.slcan_port import SlcanPort
 from tormagd_client.printable import printable
 
+FIFO = 40
+"A real device has a processor of its own: this is under a daemon's usual priority, and above all else."
 # The C sources are what a microcontroller runs, in qemu or natively; the Python twin needs no compiler.
 FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware, "qemu": EmulatedFirmware}
 
@@ -40,7 +43,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT; the first line on stdout names its port or channel."""
     command = parser()
     options = command.parse_args(arguments)
-    ask_for_slices()  # a real device has a processor of its own
     with contextlib.ExitStack() as resources:
         # before anything is opened, so that all of it is closed again
         is_stopped = resources.enter_context(interrupted_by(signal.SIGTERM, signal.SIGINT))
@@ -52,6 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if write_line(door.address, sys.stdout) is not None:
             print(f"{command.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
             return 1
+        if os.sched_getscheduler(0) == os.SCHED_OTHER:
+            ask_for_slices()
+            ask_for_fifo(FIFO)
         try:
             punctuality = serve(device, door, is_stopped, truth)
         except EmulationError as error:
