@@ -2,7 +2,7 @@
 
 from typing import Final
 
-CRC8_POLYNOMIAL: Final = 0x1D  # SAE J1850: Hamming distance 3 over the 64 bits that it guards here
+CRC8_POLYNOMIAL: Final = 0x1D  # SAE J1850: Hamming distance 3 over 64 bits
 CRC8_INITIAL: Final = 0xFF
 CRC8_FINAL_XOR: Final = 0xFF
 
@@ -19,11 +19,12 @@ def _crc8_table() -> bytes:
 
 
 CRC8_TABLE: Final = _crc8_table()
-"The register after a byte, by (register before) XOR byte."
+"The next register, by register XOR byte."
+CRC8_RESIDUE: Final = CRC8_TABLE[0xFF] ^ CRC8_FINAL_XOR
+"`crc8` of data and their CRC."
 
 
-def crc8(data: bytes) -> int:
-    register = CRC8_INITIAL
-    for byte in data:
-        register = CRC8_TABLE[register ^ byte]
+def crc8(data: bytes, register: int = CRC8_INITIAL) -> int:
+    for place in range(len(data)):  # compiled, fastest
+        register = CRC8_TABLE[register ^ data[place]]
     return register ^ CRC8_FINAL_XOR

@@ -25,7 +25,7 @@ from operator import index
 from struct import Struct
 from typing import Final
 
-from firmware_protocol.checksum import CRC8_FINAL_XOR, CRC8_TABLE
+from firmware_protocol.checksum import CRC8_RESIDUE, crc8
 '''
 _ROUNDING: Final = """_HALVES: Final = 1.5 * 2.0**52
 # Between 2**52 and 2**53 floats are the whole numbers, and a sum goes to the nearest, of two as near to the even one.
@@ -181,15 +181,22 @@ def _is_wide(signal: SignalSource) -> bool:
     return signal.python_type != "float" and signal.length > 8
 
 
-def _crc(message: MessageSource, data: str) -> list[str]:
-    """Return the lines that compute the CRC-8 register over the function and a payload's bytes `data`."""
-    start = CRC8_TABLE[CRC8_INITIAL ^ message.function]
-    lines = [f"crc = CRC8_TABLE[{_mask(start)} ^ {data}[0]]  # the register after the function, and the first byte"]
-    return lines + [f"crc = CRC8_TABLE[crc ^ {data}[{place}]]" for place in range(1, message.length - 1)]
+def _crc(message: MessageSource, data: str) -> str:
+    """Return the CRC-8 of `data`, from the register that the function leaves."""
+    return f"crc8({data}, {_mask(CRC8_TABLE[CRC8_INITIAL ^ message.function])})"
+
+
+def _none_where(*tests: str) -> list[str]:
+    """Return the lines that end a function with None where one of the tests is true."""
+    whole = f"if {' or '.join(tests)}:"
+    if len(whole) > LINE_WIDTH - 4:
+        inner = "\n        or ".join(tests)
+        whole = f"if (\n        {inner}\n    ):"
+    return [whole, "    return None"] if tests else []
 
 
 def _pack(message: MessageSource) -> str:
-    lines, steps = [], []
+    lines, steps, tests = [], [], []
     for s in message.fields:
         name, (lowest, highest) = s.name, s.steps
         if s.kind == "Wrapping":
@@ -200,23 +207,18 @@ def _pack(message: MessageSource) -> str:
             ]
             steps.append(f"int({name} + _HALVES - _HALVES) & {_mask((1 << s.length) - 1)}")
         elif s.python_type == "float":
-            lines += [
-                f"{name} = float(message.{name} / {s.scale!r}) + _HALVES - _HALVES",
-                f"if not {float(lowest)!r} <= {name} <= {float(highest)!r}:",
-                "    return None",
-            ]
+            lines.append(f"{name} = float(message.{name} / {s.scale!r}) + _HALVES - _HALVES")
+            tests.append(f"not {float(lowest)!r} <= {name} <= {float(highest)!r}")
             steps.append(f"int({name})")
         else:
             value = f"index(message.{name})" if _is_wide(s) else f"message.{name}"
-            lines += [f"{name}: int = {value}", f"if not {lowest} <= {name} <= {highest}:", "    return None"]
+            lines.append(f"{name}: int = {value}")
+            tests.append(f"not {lowest} <= {name} <= {highest}")
             steps.append(name)
+    lines += _none_where(*tests)
     packer = f"_PACK_{_constant(message.name)}"
     if message.protected:
-        lines += [
-            _call(f"body = {packer}", steps),
-            *_crc(message, "body"),
-            "return body + _BYTES[crc ^ CRC8_FINAL_XOR]",
-        ]
+        lines += [_call(f"body = {packer}", steps), f"return body + _BYTES[{_crc(message, 'body')}]"]
     else:
         lines.append(_call(f"return {packer}", steps))
     head = f"def pack_{message.name.lower()}(message: {message.name}) -> bytes | None:\n"
@@ -224,11 +226,10 @@ def _pack(message: MessageSource) -> str:
 
 
 def _unpack(message: MessageSource) -> str:
-    lines = [f"if len(data) != {message.length}:", "    return None"]
+    lines = _none_where(f"len(data) != {message.length}")
     if message.protected:
-        last = message.length - 1
-        lines += [*_crc(message, "data"), f"if data[{last}] != crc ^ CRC8_FINAL_XOR:", "    return None"]
-    values = []
+        lines += _none_where(f"{_crc(message, 'data')} != CRC8_RESIDUE")
+    values, tests = [], []
     for s in message.fields:
         first, count = s.start // 8, s.length // 8
         raw = " | ".join(f"data[{first + k}]" + (f" << {8 * k}" if k else "") for k in range(count))
@@ -239,8 +240,7 @@ def _unpack(message: MessageSource) -> str:
         lowest, highest = s.steps
         held = steps_held(s.length, s.signed)
         if s.steps != held:
-            test = f"not {lowest} <= {s.name} <= {highest}" if lowest > held[0] else f"{s.name} > {highest}"
-            lines += [f"if {test}:", "    return None"]
+            tests.append(f"not {lowest} <= {s.name} <= {highest}" if lowest > held[0] else f"{s.name} > {highest}")
         if s.python_type == "float":
             values.append(f"{s.name} * {s.scale!r}")
         elif s.kind == "Enumeration":
@@ -249,24 +249,23 @@ def _unpack(message: MessageSource) -> str:
             values.append(f"_{_constant(s.type_name)}({s.name})")
         else:
             values.append(s.name)
-    lines.append(_call(f"return {message.name}", values))
+    lines += [*_none_where(*tests), _call(f"return {message.name}", values)]
     head = f"def unpack_{message.name.lower()}(data: bytes) -> {message.name} | None:\n"
     return head + "".join(f"    {line}\n" for line in lines)
 
 
 def _dispatch(schema: Schema) -> str:
     packs = "".join(
-        f"    if isinstance(message, {m.name}):\n        return pack_{m.name.lower()}(message)\n"
-        for m in schema.messages
+        f"        case {m.name}():\n            return pack_{m.name.lower()}(message)\n" for m in schema.messages
     )
     unpacks = "".join(
-        f"    if function == {m.function}:\n        return unpack_{m.name.lower()}(data)\n" for m in schema.messages
+        f"        case {m.function}:\n            return unpack_{m.name.lower()}(data)\n" for m in schema.messages
     )
     return (
         "def pack(message: Message) -> bytes | None:\n"
         '    """The payload of a message; None where a value does not fit."""\n'
-        f"{packs}    return None\n\n\n"
+        f"    match message:\n{packs}    return None\n\n\n"
         "def unpack(function: int, data: bytes) -> Message | None:\n"
         '    """The message in a payload; None for bytes that are none."""\n'
-        f"{unpacks}    return None\n"
+        f"    match function:\n{unpacks}    return None\n"
     )

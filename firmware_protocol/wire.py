@@ -8,7 +8,7 @@ from operator import index
 from struct import Struct
 from typing import Final
 
-from firmware_protocol.checksum import CRC8_FINAL_XOR, CRC8_TABLE
+from firmware_protocol.checksum import CRC8_RESIDUE, crc8
 from firmware_protocol.enumerations import DeviceFault, DeviceMode, DriveMode, Switches
 from firmware_protocol.layouts import Clear, Drive, Hello, Home, Identity, Message, Retract, Sense, State, Status
 
@@ -51,48 +51,31 @@ def unpack_retract(data: bytes) -> Retract | None:
 
 def pack_drive(message: Drive) -> bytes | None:
     left_duty = float(message.left_duty / 0.0001) + _HALVES - _HALVES
-    if not -10000.0 <= left_duty <= 10000.0:
-        return None
     right_duty = float(message.right_duty / 0.0001) + _HALVES - _HALVES
-    if not -10000.0 <= right_duty <= 10000.0:
-        return None
     mode: int = message.mode
-    if not 0 <= mode <= 1:
-        return None
     counter: int = message.counter
-    if not 0 <= counter <= 255:
+    if (
+        not -10000.0 <= left_duty <= 10000.0
+        or not -10000.0 <= right_duty <= 10000.0
+        or not 0 <= mode <= 1
+        or not 0 <= counter <= 255
+    ):
         return None
     body = _PACK_DRIVE(int(left_duty), int(right_duty), mode, counter)
-    crc = CRC8_TABLE[0xFE ^ body[0]]  # the register after the function, and the first byte
-    crc = CRC8_TABLE[crc ^ body[1]]
-    crc = CRC8_TABLE[crc ^ body[2]]
-    crc = CRC8_TABLE[crc ^ body[3]]
-    crc = CRC8_TABLE[crc ^ body[4]]
-    crc = CRC8_TABLE[crc ^ body[5]]
-    return body + _BYTES[crc ^ CRC8_FINAL_XOR]
+    return body + _BYTES[crc8(body, 0xFE)]
 
 
 def unpack_drive(data: bytes) -> Drive | None:
     if len(data) != 7:
         return None
-    crc = CRC8_TABLE[0xFE ^ data[0]]  # the register after the function, and the first byte
-    crc = CRC8_TABLE[crc ^ data[1]]
-    crc = CRC8_TABLE[crc ^ data[2]]
-    crc = CRC8_TABLE[crc ^ data[3]]
-    crc = CRC8_TABLE[crc ^ data[4]]
-    crc = CRC8_TABLE[crc ^ data[5]]
-    if data[6] != crc ^ CRC8_FINAL_XOR:
+    if crc8(data, 0xFE) != CRC8_RESIDUE:
         return None
     left_duty = ((data[0] | data[1] << 8) ^ 0x8000) - 0x8000
-    if not -10000 <= left_duty <= 10000:
-        return None
     right_duty = ((data[2] | data[3] << 8) ^ 0x8000) - 0x8000
-    if not -10000 <= right_duty <= 10000:
-        return None
     mode = data[4]
-    if mode > 1:
-        return None
     counter = data[5]
+    if not -10000 <= left_duty <= 10000 or not -10000 <= right_duty <= 10000 or mode > 1:
+        return None
     return Drive(left_duty * 0.0001, right_duty * 0.0001, _DRIVE_MODE[mode], counter)
 
 
@@ -115,27 +98,13 @@ def pack_state(message: State) -> bytes | None:
         int(device_time_s + _HALVES - _HALVES) & 0xFFFF,
         counter,
     )
-    crc = CRC8_TABLE[0xE3 ^ body[0]]  # the register after the function, and the first byte
-    crc = CRC8_TABLE[crc ^ body[1]]
-    crc = CRC8_TABLE[crc ^ body[2]]
-    crc = CRC8_TABLE[crc ^ body[3]]
-    crc = CRC8_TABLE[crc ^ body[4]]
-    crc = CRC8_TABLE[crc ^ body[5]]
-    crc = CRC8_TABLE[crc ^ body[6]]
-    return body + _BYTES[crc ^ CRC8_FINAL_XOR]
+    return body + _BYTES[crc8(body, 0xE3)]
 
 
 def unpack_state(data: bytes) -> State | None:
     if len(data) != 8:
         return None
-    crc = CRC8_TABLE[0xE3 ^ data[0]]  # the register after the function, and the first byte
-    crc = CRC8_TABLE[crc ^ data[1]]
-    crc = CRC8_TABLE[crc ^ data[2]]
-    crc = CRC8_TABLE[crc ^ data[3]]
-    crc = CRC8_TABLE[crc ^ data[4]]
-    crc = CRC8_TABLE[crc ^ data[5]]
-    crc = CRC8_TABLE[crc ^ data[6]]
-    if data[7] != crc ^ CRC8_FINAL_XOR:
+    if crc8(data, 0xE3) != CRC8_RESIDUE:
         return None
     left_position_mm = ((data[0] | data[1] << 8) ^ 0x8000) - 0x8000
     right_position_mm = ((data[2] | data[3] << 8) ^ 0x8000) - 0x8000
@@ -151,17 +120,17 @@ def unpack_state(data: bytes) -> State | None:
 
 def pack_sense(message: Sense) -> bytes | None:
     left_current_A = float(message.left_current_A / 0.001) + _HALVES - _HALVES
-    if not -32768.0 <= left_current_A <= 32767.0:
-        return None
     right_current_A = float(message.right_current_A / 0.001) + _HALVES - _HALVES
-    if not -32768.0 <= right_current_A <= 32767.0:
-        return None
     force_N = float(message.force_N / 0.001) + _HALVES - _HALVES
-    if not -32768.0 <= force_N <= 32767.0:
-        return None
     handle_position_mm = float(message.handle_position_mm / 0.007669903939428206)
     if not -_WHOLE < handle_position_mm < _WHOLE:
         handle_position_mm %= 65536.0
+    if (
+        not -32768.0 <= left_current_A <= 32767.0
+        or not -32768.0 <= right_current_A <= 32767.0
+        or not -32768.0 <= force_N <= 32767.0
+    ):
+        return None
     return _PACK_SENSE(
         int(left_current_A), int(right_current_A), int(force_N), int(handle_position_mm + _HALVES - _HALVES) & 0xFFFF
     )
@@ -209,25 +178,21 @@ def unpack_home(data: bytes) -> Home | None:
 
 def pack_status(message: Status) -> bytes | None:
     mode: int = message.mode
-    if not 0 <= mode <= 4:
-        return None
     switches: int = message.switches
-    if not 0 <= switches <= 31:
-        return None
     faults: int = index(message.faults)
-    if not 0 <= faults <= 1023:
-        return None
     temperature_C = float(message.temperature_C / 1.0) + _HALVES - _HALVES
-    if not -128.0 <= temperature_C <= 127.0:
-        return None
     supply_V = float(message.supply_V / 0.1) + _HALVES - _HALVES
-    if not 0.0 <= supply_V <= 255.0:
-        return None
     drive_counter: int = message.drive_counter
-    if not 0 <= drive_counter <= 255:
-        return None
     command_nonce: int = message.command_nonce
-    if not 0 <= command_nonce <= 255:
+    if (
+        not 0 <= mode <= 4
+        or not 0 <= switches <= 31
+        or not 0 <= faults <= 1023
+        or not -128.0 <= temperature_C <= 127.0
+        or not 0.0 <= supply_V <= 255.0
+        or not 0 <= drive_counter <= 255
+        or not 0 <= command_nonce <= 255
+    ):
         return None
     return _PACK_STATUS(mode, switches, faults, int(temperature_C), int(supply_V), drive_counter, command_nonce)
 
@@ -236,18 +201,14 @@ def unpack_status(data: bytes) -> Status | None:
     if len(data) != 8:
         return None
     mode = data[0]
-    if mode > 4:
-        return None
     switches = data[1]
-    if switches > 31:
-        return None
     faults = data[2] | data[3] << 8
-    if faults > 1023:
-        return None
     temperature_C = (data[4] ^ 0x80) - 0x80
     supply_V = data[5]
     drive_counter = data[6]
     command_nonce = data[7]
+    if mode > 4 or switches > 31 or faults > 1023:
+        return None
     return Status(
         _DEVICE_MODE[mode],
         _SWITCHES(switches),
@@ -261,13 +222,9 @@ def unpack_status(data: bytes) -> Status | None:
 
 def pack_hello(message: Hello) -> bytes | None:
     schema_hash: int = index(message.schema_hash)
-    if not 0 <= schema_hash <= 4294967295:
-        return None
     protocol_version: int = message.protocol_version
-    if not 0 <= protocol_version <= 255:
-        return None
     nonce: int = message.nonce
-    if not 0 <= nonce <= 255:
+    if not 0 <= schema_hash <= 4294967295 or not 0 <= protocol_version <= 255 or not 0 <= nonce <= 255:
         return None
     return _PACK_HELLO(schema_hash, protocol_version, nonce)
 
@@ -283,16 +240,15 @@ def unpack_hello(data: bytes) -> Hello | None:
 
 def pack_identity(message: Identity) -> bytes | None:
     schema_hash: int = index(message.schema_hash)
-    if not 0 <= schema_hash <= 4294967295:
-        return None
     firmware_major: int = message.firmware_major
-    if not 0 <= firmware_major <= 255:
-        return None
     firmware_minor: int = message.firmware_minor
-    if not 0 <= firmware_minor <= 255:
-        return None
     serial_number: int = index(message.serial_number)
-    if not 0 <= serial_number <= 65535:
+    if (
+        not 0 <= schema_hash <= 4294967295
+        or not 0 <= firmware_major <= 255
+        or not 0 <= firmware_minor <= 255
+        or not 0 <= serial_number <= 65535
+    ):
         return None
     return _PACK_IDENTITY(schema_hash, firmware_major, firmware_minor, serial_number)
 
@@ -309,45 +265,47 @@ def unpack_identity(data: bytes) -> Identity | None:
 
 def pack(message: Message) -> bytes | None:
     """The payload of a message; None where a value does not fit."""
-    if isinstance(message, Retract):
-        return pack_retract(message)
-    if isinstance(message, Drive):
-        return pack_drive(message)
-    if isinstance(message, State):
-        return pack_state(message)
-    if isinstance(message, Sense):
-        return pack_sense(message)
-    if isinstance(message, Clear):
-        return pack_clear(message)
-    if isinstance(message, Home):
-        return pack_home(message)
-    if isinstance(message, Status):
-        return pack_status(message)
-    if isinstance(message, Hello):
-        return pack_hello(message)
-    if isinstance(message, Identity):
-        return pack_identity(message)
+    match message:
+        case Retract():
+            return pack_retract(message)
+        case Drive():
+            return pack_drive(message)
+        case State():
+            return pack_state(message)
+        case Sense():
+            return pack_sense(message)
+        case Clear():
+            return pack_clear(message)
+        case Home():
+            return pack_home(message)
+        case Status():
+            return pack_status(message)
+        case Hello():
+            return pack_hello(message)
+        case Identity():
+            return pack_identity(message)
     return None
 
 
 def unpack(function: int, data: bytes) -> Message | None:
     """The message in a payload; None for bytes that are none."""
-    if function == 1:
-        return unpack_retract(data)
-    if function == 2:
-        return unpack_drive(data)
-    if function == 3:
-        return unpack_state(data)
-    if function == 4:
-        return unpack_sense(data)
-    if function == 5:
-        return unpack_clear(data)
-    if function == 6:
-        return unpack_home(data)
-    if function == 7:
-        return unpack_status(data)
-    if function == 8:
-        return unpack_hello(data)
-    if function == 9:
-        return unpack_identity(data)
+    match function:
+        case 1:
+            return unpack_retract(data)
+        case 2:
+            return unpack_drive(data)
+        case 3:
+            return unpack_state(data)
+        case 4:
+            return unpack_sense(data)
+        case 5:
+            return unpack_clear(data)
+        case 6:
+            return unpack_home(data)
+        case 7:
+            return unpack_status(data)
+        case 8:
+            return unpack_hello(data)
+        case 9:
+            return unpack_identity(data)
     return None

@@ -85,7 +85,6 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
     (("tactile-experiment", "--out", "none"), "", "not a directory"),
     (("fleet", "/nowhere"), "", "/nowhere: no such folder or file"),
     (("fleet", "nothing://there"), "", "Protocol not known: nothing"),
-    (("tactile-hold", "--plant", "sample_1"), "", "plant sample_1: allowed is one with a [pad]"),
     (("fleet", "."), "", "no .mcap in it; `tormagctl record` makes them"),
     *(
         (("bound", "given", *more), FORCES + text, reason)
@@ -161,11 +160,10 @@ DESIGN, SWEEP = ("optimise-design", "--region", "1", "1", "2", "2"), ("bench-swe
         ),
         *(
             ((*one, "--workers", text), "1..1024")
-            for one in (DESIGN, ("fleet", "."), ("reproduce-thesis",), ("tactile-hold",))
+            for one in (DESIGN, ("fleet", "."), ("reproduce-thesis",))
             for text in ("0", "99999")
         ),
         (("reproduce-thesis", "--gap-speed", "0"), "mm/s"),
-        (("tactile-hold", "--seconds", "0"), "1..1e+06 s"),
     ],
 )
 def test_an_option_outside_its_range_is_refused_before_anything_runs(arguments, allowed, capsys, tmp_path, monkeypatch):

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tormag_lab.errors import LabError
-from tormag_lab.tactile import experiment, held, models, report, shipped
-from tormag_lab.tactile.held import Case, hold
+from tormag_lab.tactile import experiment, models, report, shipped
 from tormag_lab.tactile.models import QUICK
 from tormag_lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
 from tormag_lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape
@@ -160,12 +158,6 @@ def test_field_errors_count_only_where_the_force_depends_on_the_field():
     assert not along.scored[0]
 
 
-def test_a_hold_that_ends_in_its_first_second_says_by_what(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(held, "_held", lambda _case: iter([(1.0, "SENSOR")]))
-    with pytest.raises(LabError, match="plant pad_1: SENSOR ends the hold"):
-        held.hold(held.Case("pad_1", relaxation=True, is_learning=True))
-
-
 def test_a_pads_model_is_trained_and_taken_by_a_scene(tmp_path: Path) -> None:
     effort = replace(QUICK, samples_per_cycle=8, hold_samples=80, pad_epochs=8, settling_epochs=2)
     model = shipped.trained("pad_1", effort, datetime.date(2026, 11, 22))
@@ -175,10 +167,3 @@ def test_a_pads_model_is_trained_and_taken_by_a_scene(tmp_path: Path) -> None:
     text = Path(scene_path("radial_pulse")).read_text().replace('"tactile_mre_c"', '"mine.safetensors"')
     (tmp_path / "scene.toml").write_text(text.replace('file = "radial_pulse.csv"', "bandwidth_hz = 0.1"))
     assert build_core(Config(scene=str(tmp_path / "scene.toml"))).model == model.fingerprint
-
-
-def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
-    within, without = (hold(Case("pad_1", remembers, False, 200.0)) for remembers in (True, False))
-    assert within["force_error"] < 0.01
-    assert not within["fault"]
-    assert without["last_force_error"] < -0.05

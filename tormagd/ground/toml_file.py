@@ -31,11 +31,6 @@ _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place at the end of msgspec's refusals."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
-GONE = {
-    "limits.neutral_margin_N": "; delete it: `enable` goes to any setpoint along a ramp now",
-    "recordings.key": "; delete it: recordings have no seals now; `tormagctl recordings export` tells a file's SHA-256",
-}
-"Keys of earlier versions, and what to do about them."
 _NOTHING = object()
 "A table's value may be None."
 
@@ -117,12 +112,11 @@ def table_in(kind: Any) -> type[msgspec.Struct] | None:
 
 
 def _known_key(kind: Any, message: str) -> str:
-    """Return `; did you mean ...?` for an unknown key, or what to do about a key in GONE."""
-    key = _key_in(message)
-    if (unknown := _UNKNOWN.search(message)) is None or ".".join(key) in GONE:
-        return GONE[".".join(key)] if unknown else ""
+    """Return `; did you mean ...?` for an unknown key."""
+    if (unknown := _UNKNOWN.search(message)) is None:
+        return ""
     table = table_in(kind)
-    for name in key[:-1]:
+    for name in _key_in(message)[:-1]:
         fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}
         table = table_in(fields.get(name))
     return did_you_mean(unknown[1], [field.name for field in msgspec.structs.fields(table)]) if table else ""
