@@ -15,7 +15,6 @@ from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Ask, GapSpeeds, TimedSetpoint, Travel
 from tormagd.control.safety.codes import Limit
-from tormagd.element.physics.errors import DomainError
 from tormagd.ground.plain_values import plain, restore
 from tormagd.record.journal import KNOWN
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
@@ -498,20 +497,3 @@ def test_nan_never_travels(history: list[tuple[float | None, list[float], float,
         assert np.all((given_N >= PORTRAIT.min_N) & (given_N <= PORTRAIT.max_N))
         is_stale = setpoint is not None and now_s - setpoint.stamp_s > valid_s
         assert (Limit.STALE in ask.limits, Limit.NO_SETPOINT in ask.limits) == (is_stale, setpoint is None)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
-@pytest.mark.parametrize(
-    "name", ["force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "preview_N", "preview_dt_s"]
-)
-def test_what_is_no_number_is_refused_by_name(name: str, value: float) -> None:
-    usual = TimedSetpoint(1.0, 0.0, VALID_S, 2.0, 42.0, (1.0, 1.0), 0.1)
-    setpoint = usual.replaced(**{name: (1.0, value) if name == "preview_N" else value})
-    with pytest.raises(DomainError, match=f"^{name} = .* is not allowed: ") as caught:
-        decide(governor(), 0.01, setpoint)
-    assert caught.value.variable == name
-
-
-def test_a_preview_without_a_spacing_is_refused_by_name() -> None:
-    with pytest.raises(DomainError, match=r"^preview_dt_s = 0.0 is not allowed: above 0 s$"):
-        decide(governor(), 0.01, TimedSetpoint(1.0, 0.0, VALID_S, preview_N=(1.0,)))
