@@ -108,16 +108,6 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
 # -- faults; others are rows of the fault matrix
 
 
-def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
-    loop = arm(faults=["worn_gearbox@2.5"])
-    publish(loop, lambda time_s: 1.6, 1.5)
-    closed_mm = loop.device.truth.gap_mm
-    for _ in range(2_500):
-        loop.skip()
-        assert loop.device.truth.gap_mm > closed_mm - 1.0
-    assert loop.device.truth.gap_mm > OPEN_MM - 2.0
-
-
 def test_a_loop_without_a_planner_wants_plans(make) -> None:
     with pytest.raises(ValueError, match="allowed is a plan"):
         make(planned=False).tick()

@@ -12,10 +12,8 @@ from tormagd.control.plausible import LEAP_MM
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import CLEARING_S, OperatingState
 from tormagd.control.sight import BLIND_S
-from tormagd.element.physics.errors import DomainError
 from tormagd.ground.plain_values import plain
-from tormagd.hardware.link_quality import LinkQuality
-from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.measurement import DeviceRequest
 
 PERIOD_S = 1e-3
 CONFIG = Config()
@@ -141,26 +139,6 @@ def test_a_number_that_is_not_finite(running) -> None:
     running.command("enable")
     running.step(79.0, count=10)
     assert all(math.isfinite(duty) for duty in running.driven[1:])
-
-
-FLOATS = [name for name in Measurement.__match_args__ if name.endswith(("_s", "_mm", "_A", "_N", "_C", "_V"))]
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300], ids=str)
-@pytest.mark.parametrize("name", [*FLOATS, "round_trip_s", "clock_drift"])
-def test_a_measurement_that_is_not_finite_is_a_fault_and_goes_no_further(running, name: str, value: float) -> None:
-    link = {"link": LinkQuality(**{name: value})} if name not in FLOATS else {name: value}
-    running.step(79.0, **link)
-    assert (running.opened_for, running.stepper.measured) == ((Fault.NOT_FINITE,), None)
-
-
-@pytest.mark.parametrize("now_s", [math.nan, math.inf, -math.inf])
-def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> None:
-    before_s, planner = running.stepper.time_s, core.planner()
-    for late in (lambda: running.at(now_s, running.measure(9)), lambda: planner.plan(now_s, None, None)):
-        with pytest.raises(DomainError, match=r"^now_s = .* is not allowed: a finite number"):
-            late()
-    assert (running.stepper.time_s, planner.planned.number) == (before_s, 0)
 
 
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:

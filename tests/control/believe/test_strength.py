@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 
 from tormagd.control.believe.strength import (
     ERROR_N2_S,
@@ -93,22 +92,6 @@ def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
 def test_where_stronger_devices_are_allowed_the_ceiling_holds_for_them() -> None:
     strong = DeviceFit(3.0, scale_variance=0.0, offset_variance_N2=0.0)
     assert strong.force_N(strong.surely_within_N(2.5, DeviceBounds(0.6, 4.0, -0.2, 0.3))) == pytest.approx(2.5)
-
-
-readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))
-
-
-@settings(deadline=None)
-@given(history=st.lists(readings, max_size=60))
-def test_no_history_makes_it_impossible(history: list[tuple[float, float, float]]) -> None:
-    fit = DeviceFit()
-    for model_N, measured_N, elapsed_s in history:
-        fit, _ = observe(fit, model_N, measured_N, elapsed_s, adapts_in_s=0.5, bounds=BOUNDS)
-        assert all(math.isfinite(getattr(fit, name)) for name in DeviceFit.__match_args__)
-        assert 0.0 <= fit.scale_variance <= SCALE_SD**2 * (1.0 + 1e-9)
-        assert 0.0 <= fit.offset_variance_N2 <= OFFSET_SD_N**2 * (1.0 + 1e-9)
-        # a covariance matrix: no combination of both has a negative variance
-        assert fit.covariance_N**2 <= fit.scale_variance * fit.offset_variance_N2 * (1.0 + 1e-6) + 1e-15
 
 
 @pytest.mark.parametrize("relaxed_N", [0.0, 0.1, 0.25])
