@@ -6,7 +6,7 @@ All data here are synthetic: the device is the simulator's.
 import contextlib
 import math
 from collections.abc import Iterator
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import msgspec
 import pytest
@@ -160,16 +160,13 @@ ENDS = [*ends(), *(("electronics", key, value) for key, both in OF_DEVICE.items(
 
 def at_ends(case: list[End]) -> ClosedLoop:
     """Return a loop with these keys at their ends; raise ValueError where that is refused."""
-    config, scene, plant = CONFIG, msgspec.structs.replace(SCENE, signal=None), load_plant("sample_1")
+    scene = msgspec.structs.replace(SCENE, signal=None)
+    parts: dict[str, Any] = {"": CONFIG, "insert": scene, "electronics": load_plant("sample_1")}
     for section, key, value in case:
-        of = {"insert": scene, "electronics": plant}.get(section, config)
-        changed = {section: msgspec.structs.replace(getattr(of, section), **{key: value})}
-        if of is config:
-            config = msgspec.structs.replace(config, **changed)
-        elif of is scene:
-            scene = msgspec.structs.replace(scene, **changed)
-        else:
-            plant = msgspec.structs.replace(plant, **changed)
+        of = section if section in parts else ""
+        changed = msgspec.structs.replace(getattr(parts[of], section), **{key: value})
+        parts[of] = msgspec.structs.replace(parts[of], **{section: changed})
+    config, scene, plant = parts.values()
     made = build_core(config, scene)
     assert all(map(math.isfinite, made.margins))
     return ClosedLoop(config, made.stepper(), made.planner(), VirtualDevice(plant, SteadyHand(), seed=1))

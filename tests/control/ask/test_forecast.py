@@ -145,18 +145,6 @@ def test_what_does_not_repeat_itself_is_not_planned_worse_and_steps_are_never_tr
     assert followed.trust.mean() < most_trust
 
 
-def test_a_pulse_that_stops_is_held() -> None:
-    times_s = times_at("250 Hz", 9.0)
-    forces_N = pulse_N(times_s)
-    stopped = int(np.argmax(np.where((times_s > 7.0) & (times_s < 8.0), forces_N, 0.0))) - 12  # on the steepest flank
-    forces_N[stopped:] = forces_N[stopped]
-    followed = follow(times_s, forces_N)
-    errors_N = np.abs(followed.mixture_N).max(axis=1)
-    stop_s = times_s[stopped]
-    assert errors_N[(followed.time_s > stop_s) & (followed.time_s < stop_s + 0.15)].max() < 0.12
-    assert errors_N[(followed.time_s > stop_s + 0.15) & (followed.time_s < 8.9)].max() < 0.01
-
-
 def test_a_pulse_that_suddenly_beats_faster_is_followed() -> None:
     times_s = times_at("250 Hz", 14.0)
     later_s = np.where(times_s < 8.0, times_s, 8.0 + 1.6 * (times_s - 8.0))
@@ -301,11 +289,3 @@ def test_where_one_finds_nothing_alike_the_other_speaks_for_both(learned: Foreca
             constants, _ = by_regression(np.frombuffer(learned.history), RISE_DELAYS)
             assert learned.changes_N == pytest.approx(constants, abs=1e-9)
     assert spoken > 10 / EVERY
-
-
-def test_a_constant_force_for_ever_is_no_division_by_zero() -> None:
-    forecast = Forecast()
-    for tick in range(300):
-        tell(forecast, tick * GRID_S, 1.5)
-    forecast.long = Skill(0.0, 0.0)
-    assert (forecast.trust, forecast.forces_N(0.0, AHEAD_S.tolist())) == (0.0, pytest.approx([1.5] * 3))

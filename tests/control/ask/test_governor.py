@@ -469,31 +469,3 @@ def test_touches_that_nobody_foresees_are_gone_for() -> None:
                 following.foresee()
                 ask = decide(following, now_s, TimedSetpoint(force_N, now_s, VALID_S))
                 assert (ask.force_N, ask.limits) == (force_N, ())
-
-
-events = st.tuples(
-    st.none() | st.floats(0.0, 1_000.0),
-    st.lists(st.floats(0.0, 1_000.0), max_size=20),
-    st.floats(-2.0, 2.0) | st.just(0.0) | st.just(1e6),
-    st.floats(1e-3, 60.0),
-    st.floats(0.0, 0.5) | st.just(0.0) | st.just(1e-9) | st.just(1e5),
-)
-
-
-@settings(max_examples=150, deadline=None)
-@given(history=st.lists(events, min_size=1, max_size=30))
-def test_nan_never_travels(history: list[tuple[float | None, list[float], float, float, float]]) -> None:
-    following, now_s = governor(), 0.0
-    for force_N, preview, age_s, valid_s, elapsed_s in history:
-        now_s += elapsed_s
-        setpoint = None
-        if force_N is not None:
-            setpoint = TimedSetpoint(
-                force_N, now_s - age_s, valid_s, preview_N=tuple(preview), preview_dt_s=max(valid_s / 20.0, 1e-6)
-            )
-        ask = decide(following, now_s, setpoint)
-        assert np.all(np.isfinite((following.slope_N_s, following.asked_N)))
-        given_N = np.append(path_N(ask), ask.force_N)
-        assert np.all((given_N >= PORTRAIT.min_N) & (given_N <= PORTRAIT.max_N))
-        is_stale = setpoint is not None and now_s - setpoint.stamp_s > valid_s
-        assert (Limit.STALE in ask.limits, Limit.NO_SETPOINT in ask.limits) == (is_stale, setpoint is None)
