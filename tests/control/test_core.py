@@ -3,7 +3,6 @@
 import math
 
 import pytest
-from hypothesis import given, strategies as st
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
@@ -263,16 +262,3 @@ def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_
     assert running.run_into(fault, **opened) == 1
     running.step(count=300, **opened | {"mode": DeviceMode.LATCHED})
     assert running.opened_for == (fault,)
-
-
-@pytest.mark.long
-@given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
-def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:
-    bench = make_bench().enabled()
-    for stall_ms, ran_ms in stalls_ms:
-        bench.ticks += stall_ms
-        bench.step(79.9)
-        assert bench.is_held
-        bench.step(79.9, count=ran_ms)
-        assert not bench.faults
-        assert abs(bench.move.left.integral) < 0.3
