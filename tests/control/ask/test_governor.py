@@ -387,23 +387,6 @@ def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> 
     assert worst_N < share * extrapolated_N
 
 
-def test_of_what_is_foreseen_a_slow_gap_makes_the_best(learned: Governor) -> None:
-    fastest_N_s = GAP_SPEED_MM_S * (PORTRAIT.force_N[-1] - PORTRAIT.force_N[0]) / (95.0 - 45.0)
-    follower_N = learned.asked_N
-    missed_N, followed_N = [], []
-    for tick in range(5_001, 5_956):
-        now_s = tick / 500
-        learned.foresee()
-        ask = decide(learned, now_s, at(beats_N, now_s))
-        assert np.all(np.abs(np.diff(path_N(ask))) <= fastest_N_s * np.diff(PATH_S) + 0.01)
-        assert ask.force_N == pytest.approx(beats_N(now_s))
-        step_N = fastest_N_s / 500
-        follower_N += min(max(beats_N(now_s) - follower_N, -step_N), step_N)
-        missed_N.append(ask.path_N[0] - beats_N(now_s))
-        followed_N.append(follower_N - beats_N(now_s))
-    assert np.std(missed_N) < 0.8 * np.std(followed_N)
-
-
 def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> None:
     for tick in range(1, 1_000):
         now_s = 10.0 + tick * 1e-3
@@ -445,14 +428,3 @@ def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> No
                 assert len(wanted_N) == max(MIN_TIMES, sum(after_s < known_s for after_s in TIMES_S))
                 found.append(wanted_N[MIN_TIMES - 1] - beats_N(now_s + TIMES_S[MIN_TIMES - 1]))
     assert np.std(missed[True]) < 0.5 * np.std(missed[False])
-
-
-def test_touches_that_nobody_foresees_are_gone_for() -> None:
-    random, following, now_s = np.random.default_rng(8), governor(0.0, 0.7), 0.0
-    for _ in range(20):
-        for force_N in (0.7, random.uniform(1.2, 1.9)):
-            for _ in range(round(100 * random.uniform(0.2, 0.5))):
-                now_s += 0.01
-                following.foresee()
-                ask = decide(following, now_s, TimedSetpoint(force_N, now_s, VALID_S))
-                assert (ask.force_N, ask.limits) == (force_N, ())
