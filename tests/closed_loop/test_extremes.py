@@ -6,85 +6,30 @@ All data here are synthetic: the device is the simulator's.
 import contextlib
 import math
 from collections.abc import Iterator
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, example, given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 from leaves import leaves
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.control.core import Stepper
-from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
-from tormagd.control.move.reference import Reference
+from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE
 from tormagd.control.records import Duty, TimedSetpoint
-from tormagd.control.safety.operating_state import Conditions, OperatingState, RefusedError
+from tormagd.control.safety.operating_state import Conditions, RefusedError
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
+from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import load_plant
 
 CONFIG = Config()
 SCENE = load_scene("coronary")
-OPEN_MM = 95.0
-
-
-def on_the_way(loop: ClosedLoop, gap_mm: float, ticks: int) -> list[Sample]:
-    return [ticked(loop, gap_mm) for _ in range(ticks)]
-
-
-def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
-    """Tick towards a gap, and check that all is finite and nothing winds up beyond the duty limit."""
-    sample, move = loop.tick(plan=gap_plan(gap_mm, loop.now_s, speed_mm_s)), loop.stepper.move
-    limit = CONFIG.position.duty_limit
-    assert isinstance(move, Carriages)
-    assert max(abs(sample.output.left_duty), abs(sample.output.right_duty)) <= limit
-    assert max(abs(move.left.integral), abs(move.right.integral)) <= limit
-    reference, expected = move.reference or Reference(0.0), move.expected
-    told = [reference.gap_mm, reference.speed_mm_s, reference.acceleration_mm_s2]
-    told += [expected.gap_mm, expected.speed_mm_s, expected.filtered_mm_s, sample.truth.gap_mm]
-    assert all(map(math.isfinite, told))
-    return sample
-
-
-def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
-    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), AT_REST, seed=1))
-    loop.arm(gap_plan(OPEN_MM))
-    samples = on_the_way(loop, 47.0, 2_000) + on_the_way(loop, 93.0, 2_000)
-    assert (samples[-1].safety.operating_state, samples[-1].truth.gap_mm) == (
-        OperatingState.ENABLED,
-        pytest.approx(93.0, abs=0.1),
-    )
-
-
-def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sample]:
-    samples = []
-    for period_s in periods_s:
-        now_s = loop.now_s
-        loop._period_s = (now_s + period_s) / (loop._ticks + 1)
-        samples.append(ticked(loop, gap_mm))
-        assert samples[-1].time_s - now_s == pytest.approx(period_s, abs=1e-12)
-    return samples
-
-
-@settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
-@given(periods_s=st.lists(st.floats(1e-5, 4e-3), min_size=300, max_size=300))
-def test_jitter_of_a_few_periods_is_ridden_out(arm, periods_s: list[float]) -> None:
-    samples = unevenly(arm(planned=False), 92.0, periods_s)
-    assert samples[-1].safety.operating_state is OperatingState.ENABLED
-    assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
 
 
 AT_REST = RecordedHand((0.0,), (0.0,))
 "A handle that moves would bring a force over the scene's, and a fault."
-
-
-def lag_mm(loop: ClosedLoop) -> float:
-    stepper = loop.stepper
-    assert isinstance(stepper.move, Carriages)
-    return abs(stepper.move.expected.gap_mm - stepper.measured.gap_mm)  # type: ignore[union-attr]
 
 
 def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm, hold_gap, gap_ticks) -> None:
@@ -93,7 +38,11 @@ def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm, hold_gap, gap_tick
         config = msgspec.structs.replace(CONFIG, motor=msgspec.structs.replace(CONFIG.motor, pull_V=pull_V))
         loop = arm(hand=AT_REST, planned=False, config=config, core=build_core(config))
         hold_gap(loop, 47.0, 2.5)
-        seen = [(lag_mm(loop), sample.truth.gap_mm) for sample in gap_ticks(loop, 70.0, 1.2)]
+        move = loop.stepper.move
+        seen = [
+            (abs(move.expected.gap_mm - sample.measured.gap_mm), sample.truth.gap_mm)
+            for sample in gap_ticks(loop, 70.0, 1.2)
+        ]
         lags_mm.append(max(lag for lag, _ in seen))
         overshoots_mm.append(max(gap for _, gap in seen) - 70.0)
     assert lags_mm[0] < 0.1
@@ -121,6 +70,7 @@ def test_lively_motors_are_asked_for_more_and_weak_ones_for_no_less(
     for stroke in range(6):
         hold_gap(loop, 60.0 if stroke % 2 else 80.0, 0.8)
     move = loop.stepper.move
+    assert loop.stepper.safety.faults == ()
     assert least <= move.acceleration_scale <= most
     resting = [move.acceleration_scale for _ in gap_ticks(loop, 80.0, 0.5)]
     assert resting[-1] == resting[250]
@@ -210,16 +160,13 @@ ENDS = [*ends(), *(("electronics", key, value) for key, both in OF_DEVICE.items(
 
 def at_ends(case: list[End]) -> ClosedLoop:
     """Return a loop with these keys at their ends; raise ValueError where that is refused."""
-    config, scene, plant = CONFIG, msgspec.structs.replace(SCENE, signal=None), load_plant("sample_1")
+    scene = msgspec.structs.replace(SCENE, signal=None)
+    parts: dict[str, Any] = {"": CONFIG, "insert": scene, "electronics": load_plant("sample_1")}
     for section, key, value in case:
-        of = {"insert": scene, "electronics": plant}.get(section, config)
-        changed = {section: msgspec.structs.replace(getattr(of, section), **{key: value})}
-        if of is config:
-            config = msgspec.structs.replace(config, **changed)
-        elif of is scene:
-            scene = msgspec.structs.replace(scene, **changed)
-        else:
-            plant = msgspec.structs.replace(plant, **changed)
+        of = section if section in parts else ""
+        changed = msgspec.structs.replace(getattr(parts[of], section), **{key: value})
+        parts[of] = msgspec.structs.replace(parts[of], **{section: changed})
+    config, scene, plant = parts.values()
     made = build_core(config, scene)
     assert all(map(math.isfinite, made.margins))
     return ClosedLoop(config, made.stepper(), made.planner(), VirtualDevice(plant, SteadyHand(), seed=1))

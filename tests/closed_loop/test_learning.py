@@ -1,7 +1,5 @@
 """What a device shows of itself is learned while a step arrives; what is believed is told (synthetic)."""
 
-from collections.abc import Callable
-
 import msgspec
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.records import TimedSetpoint
 from tormagd.scenes.scene import EVERY_TERM, Terms, load_scene
-from tormagd.simulation.closed_loop import ClosedLoop, stream
 from tormagd.simulation.hand import ReversingHand
 
 VALID_S = 0.2
@@ -92,35 +89,3 @@ def test_a_term_that_is_left_out_does_not_act_though_a_preview_tells_what_comes(
     acting = {"offset", "sensor_zero", "carriage_lag", "acceleration_scale"}
     assert {name for name, it in told.items() if it.acts} == acting
     assert (told["scale"].value, told["field_lag"].value) == (1.0, 0.0)
-
-
-Maker = Callable[..., ClosedLoop]
-LOW_N, HIGH_N = 0.7, 2.0
-REST_S, HOLD_S = 12.0, 12.0
-TRIMMED_S = 3.0
-PERIOD_S = 0.01
-
-
-def errors_after_step(arm: Maker) -> tuple[np.ndarray, np.ndarray]:
-    loop = arm("sample_2")
-    times_s = loop.now_s + PERIOD_S * np.arange(round((REST_S + HOLD_S) / PERIOD_S))
-    step_s = loop.now_s + REST_S
-    forces_N = np.where(times_s < step_s, LOW_N, HIGH_N)
-    samples = [
-        (sample.time_s - step_s, sample.truth.force_N - HIGH_N)
-        for sample in loop.run(REST_S + HOLD_S, stream(times_s, forces_N))
-        if sample.time_s >= step_s
-    ]
-    time_s, error_N = np.array(samples).T
-    return time_s, error_N
-
-
-@pytest.fixture(scope="module")
-def allowed_N(core: Core) -> float:
-    return 0.2 * core.scene.force.tolerance_rms_N
-
-
-def test_the_trim_takes_up_what_the_elastomer_relaxes(arm, allowed_N: float) -> None:
-    time_s, error_N = errors_after_step(arm)
-    held_N = error_N[time_s > TRIMMED_S]
-    assert max(abs(second.mean()) for second in np.array_split(held_N, round(HOLD_S - TRIMMED_S))) < allowed_N

@@ -3,7 +3,6 @@
 import math
 
 import pytest
-from hypothesis import given, strategies as st
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
@@ -12,10 +11,8 @@ from tormagd.control.plausible import LEAP_MM
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import CLEARING_S, OperatingState
 from tormagd.control.sight import BLIND_S
-from tormagd.element.physics.errors import DomainError
 from tormagd.ground.plain_values import plain
-from tormagd.hardware.link_quality import LinkQuality
-from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.measurement import DeviceRequest
 
 PERIOD_S = 1e-3
 CONFIG = Config()
@@ -143,26 +140,6 @@ def test_a_number_that_is_not_finite(running) -> None:
     assert all(math.isfinite(duty) for duty in running.driven[1:])
 
 
-FLOATS = [name for name in Measurement.__match_args__ if name.endswith(("_s", "_mm", "_A", "_N", "_C", "_V"))]
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300], ids=str)
-@pytest.mark.parametrize("name", [*FLOATS, "round_trip_s", "clock_drift"])
-def test_a_measurement_that_is_not_finite_is_a_fault_and_goes_no_further(running, name: str, value: float) -> None:
-    link = {"link": LinkQuality(**{name: value})} if name not in FLOATS else {name: value}
-    running.step(79.0, **link)
-    assert (running.opened_for, running.stepper.measured) == ((Fault.NOT_FINITE,), None)
-
-
-@pytest.mark.parametrize("now_s", [math.nan, math.inf, -math.inf])
-def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> None:
-    before_s, planner = running.stepper.time_s, core.planner()
-    for late in (lambda: running.at(now_s, running.measure(9)), lambda: planner.plan(now_s, None, None)):
-        with pytest.raises(DomainError, match=r"^now_s = .* is not allowed: a finite number"):
-            late()
-    assert (running.stepper.time_s, planner.planned.number) == (before_s, 0)
-
-
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:
     broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED, "left_mm": 0.0, "right_mm": 0.0}
     bench.step(**broken)
@@ -190,8 +167,10 @@ def make_moving(make_bench):
     return make
 
 
-@pytest.mark.parametrize("elapsed_s", [0.0, -1e-3, -1e6])
-def test_a_clock_that_stands_still_is_one_ordinary_period(make_moving, elapsed_s: float) -> None:
+@pytest.mark.parametrize(("elapsed_s", "periods"), [(0.0, 1.0), (-1e-3, 1.0), (-1e6, 1.0), (2e-3, 2.1)])
+def test_a_period_is_as_long_as_it_was_and_an_ordinary_one_where_the_clock_stands_still(
+    make_moving, elapsed_s: float, periods: float
+) -> None:
     moved_mm = []
     for after_s in (PERIOD_S, elapsed_s):
         moving = make_moving()
@@ -199,7 +178,7 @@ def test_a_clock_that_stands_still_is_one_ordinary_period(make_moving, elapsed_s
         moving.at(later_s, moving.measure(moving.ticks + 1, received_s=later_s, **moving.there), 60.0)
         moved_mm.append(moving.move.reference.gap_mm - before_mm)
     assert moved_mm[0] < -0.01
-    assert moved_mm[1] == pytest.approx(moved_mm[0])
+    assert moved_mm[1] == pytest.approx(periods * moved_mm[0], rel=0.05)
 
 
 @pytest.mark.parametrize("elapsed_s", [BLIND_S + 1e-4, 0.011, 0.048, 1.0, 1e9])
@@ -283,16 +262,3 @@ def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_
     assert running.run_into(fault, **opened) == 1
     running.step(count=300, **opened | {"mode": DeviceMode.LATCHED})
     assert running.opened_for == (fault,)
-
-
-@pytest.mark.long
-@given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
-def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:
-    bench = make_bench().enabled()
-    for stall_ms, ran_ms in stalls_ms:
-        bench.ticks += stall_ms
-        bench.step(79.9)
-        assert bench.is_held
-        bench.step(79.9, count=ran_ms)
-        assert not bench.faults
-        assert abs(bench.move.left.integral) < 0.3

@@ -134,14 +134,6 @@ def test_encoder_noise_at_rest_is_no_reversal(follow_handle) -> None:
     assert abs(handle.rate_mm_s) < 1.0
 
 
-@given(positions=st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=60))
-def test_displacement_never_leaves_its_range(follow_handle, positions: list[float]) -> None:
-    handle = follow_handle(positions).handle
-    assert 0.0 <= handle.displacement_mm <= MOBILISED_MM
-    assert handle.turn.direction in (-1.0, 1.0)
-    assert math.isfinite(handle.rate_mm_s)
-
-
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_force_and_rate_are_positive_along_the_motion(follow_handle, way: float) -> None:
     measured = follow_handle([way * 0.05 * k for k in range(200)], force_N=way * 0.6)

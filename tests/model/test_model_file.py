@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, strategies as st
 from safetensors import safe_open
 
 from tormagd.element.model import model_file
@@ -357,20 +356,6 @@ def shipped() -> ForceModel:
     return load_model(model_path("torque_mre_50_40", Path()), element="torque")
 
 
-@pytest.fixture(scope="module")
-def steep(metadata: ModelMetadata) -> ForceModel:
-    rng = np.random.default_rng(4)
-    narrow = msgspec.structs.replace(
-        metadata,
-        element=Element.TACTILE,
-        insert="pad",
-        hidden=20,
-        ranges=dict.fromkeys(UNITS, (0.0, 1e-3)),
-        scaling=Scaling((0.0,) * 4, (2e3,) * 4, 0.0, 2e3),
-    )
-    return ForceModel(narrow, 50 * rng.normal(size=(20, 4)), rng.normal(size=20), rng.normal(size=20), 0.0)
-
-
 def states(count: int) -> Array:
     rng = np.random.default_rng(11)
     rows = rng.uniform(*BOX, (count, 4))
@@ -428,24 +413,6 @@ def test_a_unit_far_from_its_step_is_shut_or_open(exponent: float, side: int) ->
         (expected, pytest.approx(0.0, abs=1e-300)),
     )
     assert curve.forces_N(np.array([400.0])) == pytest.approx([expected], abs=1e-15)
-
-
-@pytest.mark.parametrize("fixture", ["shipped", "steep"])
-@given(
-    displacement=st.floats(-LARGEST, LARGEST),
-    rate=st.floats(-LARGEST, LARGEST),
-    field=st.floats(-LARGEST, LARGEST),
-    cip=st.floats(-LARGEST, LARGEST),
-)
-def test_no_state_and_no_field_has_no_force(
-    request: pytest.FixtureRequest, fixture: str, displacement: float, rate: float, field: float, cip: float
-) -> None:
-    curve = request.getfixturevalue(fixture).curve(displacement, rate, cip)
-    force, slope = curve.force_and_slope(field)
-    assert abs(force) <= curve.magnitude_N * (1 + 1e-12)
-    assert force == curve.force_N(field)
-    assert math.isfinite(slope)
-    assert 0.0 <= curve.confidence(field, force) <= 1.0
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from tormagd.scenes.measured import (
     measured,
     served_like,
 )
-from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Signal, Terms, load_scene, scene_path, shipped_scenes
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Signal, Terms, load_scene, shipped_scenes
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
@@ -82,13 +82,6 @@ def test_a_shipped_scene_gives_a_core_that_can_render_it(name: str) -> None:
     assert core.portrait.min_N < core.scene.force.most_N <= core.portrait.max_N
     assert core.margins.phase_margin_deg >= 45.0
     assert core.margins.gain_margin_dB >= 6.0
-
-
-def test_a_scene_file_is_named_by_its_path(write) -> None:
-    path = write()
-    assert scene_path(path) == Path(path)
-    assert load_scene(path).name == "bench"
-    assert build_core(Config(scene=path)).scene.name == "bench"
 
 
 def test_a_scene_survives_its_own_listing() -> None:

@@ -6,13 +6,12 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.config import Config
 from tormagd.control.aim.portrait import CEILING, LAW_SHARE, Portrait, ceiling_mm
 from tormagd.control.assembly.build import build_core
 from tormagd.control.believe.believe import Learned
-from tormagd.control.believe.carriage_lag import MAX_LAG_S
 from tormagd.control.believe.strength import DeviceFit, device_bounds
 from tormagd.control.records import Ask, Belief, Handle, Measured, Outside, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Limit
@@ -207,66 +206,24 @@ def test_a_stale_setpoints_motion_is_not_used_any_more(core, moving, waited_s: f
     assert len(gaps_mm) == 1 + is_used
 
 
-measurements = st.none() | st.fixed_dictionaries(
-    {
-        "gap_mm": st.floats(-200.0, 400.0),
-        "force_N": st.floats(-33.0, 33.0),
-        "is_homed": st.booleans(),
-        "handle": st.builds(
-            Handle,
-            displacement_mm=st.floats(0.0, MOBILISED_MM),
-            rate_mm_s=st.floats(-2_000.0, 2_000.0),
-            turn=st.sampled_from([Turn(-1.0, 0.0, 0.0), Turn(1.0, 0.0, 0.0)]),
-            sliding_mm_s=st.floats(0.0, 2_000.0),
-        ),
-    }
-)
-setpoints = st.none() | st.builds(
-    TimedSetpoint,
-    force_N=st.floats(0.0, 1_000.0),
-    stamp_s=st.floats(-10.0, 100.0),
-    valid_for_s=st.floats(1e-6, 60.0),
-    displacement_mm=st.none() | st.floats(-1e9, 1e9),
-    rate_mm_s=st.none() | st.floats(-1e9, 1e9),
-    preview_N=st.lists(st.floats(0.0, 1_000.0), max_size=10).map(tuple),
-    preview_dt_s=st.floats(1e-9, 1.0),
-)
-
-
-@settings(max_examples=80, deadline=None)
-@given(history=st.lists(st.tuples(st.floats(0.0, 20.0), setpoints, measurements), min_size=1, max_size=8))
-def test_nan_never_travels(core, moving, history: list[tuple[float, TimedSetpoint | None, dict | None]]) -> None:
-    planner, now_s = core.planner(), 0.0
-    for number, (elapsed_s, setpoint, changes) in enumerate(history):
-        now_s += elapsed_s
-        plan = planner.plan(now_s, setpoint, None if changes is None else moving(number=number, **changes))
-        device, lag_s = planner.believe.device, planner.believe.carriages.lag_s
-        told = [plan.governed_N, plan.field_mT, plan.predicted_N or 0.0, plan.gap_acceleration_mm_s2]
-        told += [plan.confidence, plan.trim, plan.min_gap_mm]
-        told += [getattr(device, name) for name in DeviceFit.__match_args__]
-        assert all(map(math.isfinite, told))
-        assert -core.gap_speeds.closing_mm_s <= plan.gap_speed_mm_s <= CONFIG.position.gap_speed_mm_s
-        assert max(45.0, plan.min_gap_mm) <= plan.gap_mm <= 95.0
-        assert CONFIG.trim.least <= device.scale <= CONFIG.trim.most
-        assert plan.governed_N <= max(core.scene.force.most_N, device.force_N(core.portrait.min_N))
-        assert 0.0 <= lag_s <= MAX_LAG_S
-        assert plan.number == number + 1
-
-
 fits = st.builds(
     DeviceFit, st.floats(0.6, 2.0), st.floats(-0.2, 0.3), st.floats(0.0, 0.03), st.just(0.0), st.floats(0.0, 0.01)
 )
 
 
 @given(device=fits, unseen=st.none() | fits, asked_N=st.floats(0.0, 5.0))
-def test_the_most_open_of_the_guards_wins(core, device: DeviceFit, unseen: DeviceFit | None, asked_N: float) -> None:
+def test_the_most_open_of_the_guards_wins_at_a_speed_that_there_is(
+    core, device: DeviceFit, unseen: DeviceFit | None, asked_N: float
+) -> None:
     belief = Belief(device, device, unseen, 0.0, None, (), 0.0)
     planner = core.planner()
-    plan = planner.aim.update(0.1, None, Ask(asked_N, [asked_N] * 7, None, ()), belief, planner.believe.memory, None)
+    ask = Ask(asked_N, [asked_N, *[0.5] * 6], None, ())
+    plan = planner.aim.update(0.1, None, ask, belief, planner.believe.memory, None)
     ceiling_N = CEILING * core.scene.force.most_N
     for guard in (device, unseen):
         assert guard is None or plan.gap_mm >= ceiling_mm(core.portrait, guard, ceiling_N, device_bounds(CONFIG.trim))
     assert plan.gap_mm >= plan.min_gap_mm
+    assert -core.gap_speeds.closing_mm_s <= plan.gap_speed_mm_s <= CONFIG.position.gap_speed_mm_s
 
 
 GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)
@@ -299,23 +256,8 @@ def test_a_force_is_found_as_bisection_finds_it(least_N: float, gains_N: list[fl
         assert math.isclose(shown.slope_at_N_mm(force_N), np.interp(force_N, forces_N, shown.slope_N_mm), rel_tol=1e-9)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
-def test_a_table_with_what_is_no_number_is_refused(value: float) -> None:
-    with pytest.raises(DomainError, match=r"^values = .* is not allowed: a finite number"):
-        Portrait([95.0, 70.0, 45.0], [0.5, value, 2.0], [0.1, 0.1, 0.1])
-
-
 def test_points_between_which_no_slope_is_are_refused_and_equal_ones_are_not() -> None:
     with pytest.raises(DomainError, match=r"^values = 5e-324 is not allowed: 0, or 1e-200 from there$"):
         Portrait([95.0, 70.0, 45.0], [0.0, 5e-324, 2.0], [0.1, 0.1, 0.1])
     flat = Portrait([95.0, 70.0, 45.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0])
     assert (flat.gap_mm_at(0.9), flat.gap_mm_at(1.1)) == (95.0, 45.0)
-
-
-def test_a_force_or_gap_that_is_no_number_has_no_place() -> None:
-    shown = drawn_portrait(0.4, [0.2] * 8)
-    for asked, name in ((shown.gap_mm_at, "value"), (shown.gap_and_slope_at, "value"), (shown.force_N_at, "steps")):
-        with pytest.raises(DomainError, match=f"^{name} = nan is not allowed: a number$"):
-            asked(math.nan)
-    assert (shown.gap_mm_at(math.inf), shown.gap_mm_at(-math.inf)) == (15.0, 40.0)
-    assert (shown.force_N_at(-math.inf), shown.force_N_at(math.inf)) == (shown.max_N, shown.min_N)

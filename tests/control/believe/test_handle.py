@@ -55,39 +55,37 @@ def test_friction_at_rest_falls_with_the_gap_and_does_not_come_back() -> None:
         assert not watch.is_lost
 
 
-@pytest.mark.parametrize("speed_mm_s", [-42.0, -0.1, 0.1, 0.5, 42.0])
-def test_a_handle_that_moves_is_none_that_is_lost(speed_mm_s: float) -> None:
-    assert not watched(5.0, lambda now_s: speed_mm_s * now_s, swinging, swinging).is_lost
+def pressing(now_s: float) -> float:
+    """A hand that presses within a count."""
+    return 1.0 + STIFFEST_N_MM * STANDS_MM / 2.0 * math.sin(math.tau * now_s)
 
 
-def test_a_hand_that_presses_within_a_count_is_a_resting_one() -> None:
-    assert STIFFEST_N_MM * STANDS_MM < RISES_N
+def still_moving(now_s: float) -> float:
+    return 2.0 - math.exp(-now_s / 0.05)
 
-    def pressing(now_s: float) -> float:
-        return 1.0 + STIFFEST_N_MM * STANDS_MM / 2.0 * math.sin(math.tau * now_s)
 
-    assert not watched(10.0, still, pressing, swinging).is_lost
+def drifting(now_s: float) -> float:
+    return 1.0 + 0.3 * RISES_N / FORGETS_S * now_s
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "speed_mm_s", "force_N", "model_N"),
+    [
+        *((5.0, speed_mm_s, swinging, swinging) for speed_mm_s in (-42.0, -0.1, 0.1, 0.5, 42.0)),
+        (10.0, 0.0, pressing, swinging),
+        (3.0, 0.0, still_moving, still_moving),
+        (20.0 * FORGETS_S, 0.0, drifting, swinging),
+    ],
+)
+def test_a_handle_that_moves_or_is_pressed_or_a_zero_that_drifts_is_no_lost_encoder(
+    duration_s: float, speed_mm_s: float, force_N: Callable[[float], float], model_N: Callable[[float], float]
+) -> None:
+    assert not watched(duration_s, lambda now_s: speed_mm_s * now_s, force_N, model_N).is_lost
 
 
 def test_a_force_that_leaps_while_the_gap_stands_is_the_sensors_own() -> None:
     watch = watched(2.0, still, lambda now_s: 1.5, lambda now_s: 1.5)
     assert not watched(2.0, still, lambda now_s: 2.3, lambda now_s: 1.5 + 0.9 * MODEL_RISES_N, watch).is_lost
-
-
-def test_what_the_handles_last_motion_leaves_is_not_taken_for_a_rise() -> None:
-
-    def still_moving(now_s: float) -> float:
-        return 2.0 - math.exp(-now_s / 0.05)
-
-    assert not watched(3.0, still, still_moving, still_moving).is_lost
-
-
-def test_a_zero_that_drifts_is_forgotten() -> None:
-
-    def drifting(now_s: float) -> float:
-        return 1.0 + 0.3 * RISES_N / FORGETS_S * now_s
-
-    assert not watched(20.0 * FORGETS_S, still, drifting, swinging).is_lost
 
 
 def test_a_gap_that_moved_since_the_handle_came_to_stand_moved_at_rest() -> None:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import msgspec
 import pytest
-from hypothesis import given, strategies as st
 
 from tormagd.config import Config
 from tormagd.control.aim.aim import Element
@@ -138,15 +137,3 @@ def test_a_gap_that_no_device_has_is_not_believed_to_have_been_one(follow, eleme
 def test_a_brake_that_loses_its_position_remembers_what_it_knew(follow, element: Element) -> None:
     known = follow(found(95.0), found(60.0), memory=element.memory)
     assert plain(follow(found(95.0), found(60.0), found(45.0, is_homed=False), memory=element.memory)) == plain(known)
-
-
-@given(steps=st.lists(st.tuples(st.floats(43.0, 97.0), st.floats(0.0, 1e6)), min_size=1, max_size=30))
-def test_it_never_remembers_more_than_there_was(follow, element: Element, steps: list[tuple[float, float]]) -> None:
-    remembered, curve = follow(found(FAR_MM)), element.nominal.only
-    most_N = curve.force_N(remembered.field_mT)
-    for gap_mm, time_s in steps:
-        remembered.update(time_s, found(gap_mm))
-        own_mT = within(remembered.field_mT - remembered.lag_mT, element.nominal.fields_mT)
-        most_N = max(most_N, curve.force_N(own_mT))
-        assert abs(remembered.lag_mT) <= MEMORY.lag_mT
-        assert remembered.relaxed_N <= sum(MEMORY.fractions) * most_N * (1.0 + 1e-12)

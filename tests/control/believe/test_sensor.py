@@ -3,8 +3,6 @@
 The gap follows whichever explanation has more force, and doubt never presses harder.
 """
 
-from collections.abc import Callable
-
 import pytest
 
 from tormagd.config import Config
@@ -17,7 +15,6 @@ from tormagd.control.believe.sensor import (
     SLACK_N,
     WRONG_S,
 )
-from tormagd.control.core import Planner
 from tormagd.control.records import Handle
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
@@ -35,7 +32,7 @@ def force_N(believe: Believe) -> float:
 
 
 @pytest.fixture
-def known(planner: Planner, hear: Callable[..., Planner], moving) -> Planner:
+def known(planner, hear, moving):
     return hear(planner, 4.0, moving())
 
 

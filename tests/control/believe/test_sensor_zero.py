@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 
 from tormagd.control.believe.sensor_zero import (
     LEVEL_S,
@@ -139,22 +138,3 @@ def test_a_drift_is_followed() -> None:
     for _ in range(180):
         _, now_s = strokes(0.005 / 60.0 * now_s, zero, number=2, stroke_s=1.0, rest_s=9.0, from_s=now_s)
     assert zero.zero_N == pytest.approx(0.3, abs=0.02)
-
-
-readings = st.tuples(
-    st.floats(0.0, 30.0), st.sampled_from([-1.0, 1.0]), st.floats(-33.0, 33.0), st.floats(0.0, 8.0), st.floats(0, 300)
-)
-
-
-@given(history=st.lists(readings, max_size=80))
-def test_no_history_makes_it_impossible(history: list[tuple[float, float, float, float, float]]) -> None:
-    zero, now_s = SensorZero(), 0.0
-    for gone_s, direction, reading_N, model_N, rate_mm_s in history:
-        now_s += gone_s + PERIOD_S
-        zero.begin(now_s)
-        zero.update(
-            now_s, direction, reading_N, model_N, rate_mm_s, min(gone_s + PERIOD_S, 0.02), 1.0, 0.17, is_disputed=False
-        )
-        assert abs(zero.zero_N) <= MAX_ZERO_N
-        assert 0.0 < zero.variance_N2 <= MAX_SD_N**2
-        assert math.isfinite(zero.sd_N(now_s + 1.0))

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 
 from tormagd.control.believe.strength import (
     ERROR_N2_S,
@@ -95,22 +94,6 @@ def test_where_stronger_devices_are_allowed_the_ceiling_holds_for_them() -> None
     assert strong.force_N(strong.surely_within_N(2.5, DeviceBounds(0.6, 4.0, -0.2, 0.3))) == pytest.approx(2.5)
 
 
-readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))
-
-
-@settings(deadline=None)
-@given(history=st.lists(readings, max_size=60))
-def test_no_history_makes_it_impossible(history: list[tuple[float, float, float]]) -> None:
-    fit = DeviceFit()
-    for model_N, measured_N, elapsed_s in history:
-        fit, _ = observe(fit, model_N, measured_N, elapsed_s, adapts_in_s=0.5, bounds=BOUNDS)
-        assert all(math.isfinite(getattr(fit, name)) for name in DeviceFit.__match_args__)
-        assert 0.0 <= fit.scale_variance <= SCALE_SD**2 * (1.0 + 1e-9)
-        assert 0.0 <= fit.offset_variance_N2 <= OFFSET_SD_N**2 * (1.0 + 1e-9)
-        # a covariance matrix: no combination of both has a negative variance
-        assert fit.covariance_N**2 <= fit.scale_variance * fit.offset_variance_N2 * (1.0 + 1e-6) + 1e-15
-
-
 @pytest.mark.parametrize("relaxed_N", [0.0, 0.1, 0.25])
 def test_over_the_force_without_memory_it_says_the_same(relaxed_N: float) -> None:
     fit = DeviceFit(0.9, -0.05, 0.01, -0.004, 0.006)
@@ -148,7 +131,7 @@ def test_what_is_known_is_forgotten_in_its_time() -> None:
     assert 0.0 < relaxed.covariance_N < left**0.5 * known.covariance_N
 
 
-@pytest.mark.parametrize("learns", [(True, False), (False, True)])
+@pytest.mark.parametrize("learns", [(True, False), (False, True), (False, False)])
 def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns: tuple[bool, bool]) -> None:
     fit, terms = DeviceFit(1.1, 0.02, 0.02, 0.001, 0.008), {"adapts_in_s": 0.5, "bounds": BOUNDS}
     found, _ = observe(fit, 1.5, 1.7, 0.01, learns=learns, **terms)
@@ -168,8 +151,8 @@ def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns: tupl
 KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)
 
 
-def heard(off_N: float, seconds: float, learns: tuple[bool, bool] = (True, True)) -> Strength:
-    strength = Strength(0.5, BOUNDS, learns)
+def heard(off_N: float, seconds: float) -> Strength:
+    strength = Strength(0.5, BOUNDS, (True, True))
     strength.forget(KNOWN)
     for noise_N in np.random.default_rng(2).normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
         strength.update(1.5, 1.5 + off_N + noise_N, PERIOD_S)
@@ -180,12 +163,6 @@ def test_a_surprise_is_learned_sooner_and_noise_is_none() -> None:
     assert heard(0.1, 0.15).fit.force_N(1.5) > 1.58
     assert shown([(0.15, 1.5)], 1.0, 0.1, KNOWN).force_N(1.5) < 1.52
     assert heard(0.0, 10.0).fit.force_N(1.5) == pytest.approx(1.5, abs=5e-4)
-
-
-@pytest.mark.parametrize("learns", [(False, True), (True, False), (False, False)])
-def test_what_it_may_not_learn_it_leaves_as_it_was(learns: tuple[bool, bool]) -> None:
-    fit = heard(0.1, 10.0, learns).fit
-    assert (fit.scale != KNOWN.scale, fit.offset_N != KNOWN.offset_N) == learns
 
 
 def test_a_pause_ends_a_surprise_and_what_was_held_and_leaves_the_fit() -> None:

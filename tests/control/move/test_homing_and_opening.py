@@ -8,7 +8,6 @@ from tormagd.control.move.homing import BACKS_OFF_MM, LONGEST_S, Homing
 from tormagd.control.move.opening import LATE_S, OPEN_MM, Opening, is_open
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import SafetyState, latch
-from tormagd.ground.plain_values import plain
 from tormagd.hardware.measurement import DeviceRequest
 from tormagd.scenes.scene import load_scene
 
@@ -42,13 +41,6 @@ def home(measure) -> Home:
     return Home(measure)
 
 
-def test_no_homing_is_watched_while_there_is_none(home: Home) -> None:
-    home.look(100, mode=DeviceMode.IDLE, left_mm=-3.0)
-    home.look(100, mode=DeviceMode.RETRACTING, left_mm=-30.0)
-    assert plain(home.homing) == plain(Homing(CEILING_N))
-    assert not home.faults
-
-
 @pytest.mark.parametrize("zeroed", [False, True], ids=["homed again", "the zero moves"])
 def test_an_ordinary_homing(home: Home, zeroed: bool) -> None:
     home.travel(20.0, 20.0)
@@ -80,15 +72,6 @@ def test_a_carriage_that_closes_with_its_open_switch_closed_has_a_switch_that_is
         home.look(**stuck, **{f"{side}_mm": -8.0 - mm})
     home.look(**stuck, mode=mode, **{f"{side}_mm": -8.1 - mm})
     assert home.faults[0] is Fault.HOMING
-
-
-def test_a_firmware_that_gives_up_on_the_wrong_way_is_asked_which_way_it_went(home: Home) -> None:
-    home.travel(-1.0, 0.4)
-    assert not home.faults
-    home.look(mode=DeviceMode.LATCHED, faults=DeviceFault.HOMING_FAILED, left_mm=-21.0, right_mm=-19.6)
-    assert home.faults == [Fault.WRONG_DIRECTION]
-    home.look(50, mode=DeviceMode.LATCHED, faults=DeviceFault.HOMING_FAILED)
-    assert home.faults == [Fault.WRONG_DIRECTION], "told once"
 
 
 @pytest.mark.parametrize("seen", [Switches(0), Switches.LEFT_OPEN, Switches.RIGHT_OPEN])
@@ -125,16 +108,6 @@ def test_what_is_borne_for_a_while_is_then_a_fault(
     assert not home.faults
     home.look(3, **seen)
     assert home.faults[0] is fault
-
-
-def test_the_next_homing_begins_anew(home: Home) -> None:
-    home.travel(20.0, 20.0)
-    home.look(20, left_mm=0.0, right_mm=0.0, **HOMED)
-    home.faults.clear()
-    home.look(20, left_mm=-30.0, right_mm=-30.0)
-    home.look(20, left_mm=-30.0, right_mm=-30.0, switches=BOTH)
-    home.look(20, left_mm=-30.0, right_mm=-30.0, **HOMED)
-    assert not home.faults
 
 
 # -- the opening -------------------------------------------------------------------------------------------------------

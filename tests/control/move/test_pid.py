@@ -9,7 +9,6 @@ from simple_pid import PID
 
 from tormagd.config import Config, Position
 from tormagd.control.move.pid import ON_TARGET_MM, Pid
-from tormagd.element.physics.errors import DomainError
 
 DT_S = 1e-3
 SHIPPED = Config().position
@@ -130,13 +129,3 @@ def test_a_carriage_at_rest_on_target_forgets_within_its_integral_time(integral:
 
 def test_no_carriage_is_nearer_than_on_target() -> None:
     assert 0.5 * 8.0 / 4480.0 < ON_TARGET_MM < 8.0 / 4480.0
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_what_is_no_number_is_refused_and_not_learned(place: int, value: float) -> None:
-    stage, given = begun(integral=0.1), [0.0, 0.0, 0.0]
-    given[place] = value
-    with pytest.raises(DomainError, match=r"^duty = .* is not allowed: a finite number"):
-        updated(stage, *given)
-    assert (stage.integral, stage.is_saturated) == (0.1, False)

@@ -88,12 +88,6 @@ def test_a_step_is_reached_without_overshoot(position: Position, speeds: Speeds,
     assert abs(reference.speed_mm_s) < 0.1
 
 
-def test_a_step_takes_hardly_longer_than_its_limits_ask() -> None:
-    ticks = int(1.3 * 2.0 * math.sqrt(1.0 / MAX_MM_S2) / DT_S)
-    *_, reference = followed(70.0, [Reference(69.0)] * ticks)
-    assert abs(reference.gap_mm - 69.0) <= 0.1
-
-
 @given(start=st.floats(60.0, 80.0), speed=st.floats(-0.8, 0.8).map(lambda share: share * LIMITS.gap_speed_mm_s))
 def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, speed: float) -> None:
     reference, target, is_limited = Reference(start), start, True
