@@ -145,6 +145,18 @@ def test_what_does_not_repeat_itself_is_not_planned_worse_and_steps_are_never_tr
     assert followed.trust.mean() < most_trust
 
 
+def test_a_pulse_that_stops_is_held() -> None:
+    times_s = times_at("250 Hz", 9.0)
+    forces_N = pulse_N(times_s)
+    stopped = int(np.argmax(np.where((times_s > 7.0) & (times_s < 8.0), forces_N, 0.0))) - 12  # on the steepest flank
+    forces_N[stopped:] = forces_N[stopped]
+    followed = follow(times_s, forces_N)
+    errors_N = np.abs(followed.mixture_N).max(axis=1)
+    stop_s = times_s[stopped]
+    assert errors_N[(followed.time_s > stop_s) & (followed.time_s < stop_s + 0.15)].max() < 0.12
+    assert errors_N[(followed.time_s > stop_s + 0.15) & (followed.time_s < 8.9)].max() < 0.01
+
+
 def test_a_pulse_that_suddenly_beats_faster_is_followed() -> None:
     times_s = times_at("250 Hz", 14.0)
     later_s = np.where(times_s < 8.0, times_s, 8.0 + 1.6 * (times_s - 8.0))
