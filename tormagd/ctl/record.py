@@ -152,12 +152,15 @@ def _record(
         "telemetry_lost": writer.telemetry_lost,
         "ticks": writer.tick_count,
         "ticks_lost": writer.ticks_lost,
+        "restarts": writer.restarts,
         "silent_ms": round(silent_s * 1e3, 3),
         "unreadable": unreadable,
     }
     text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots"
     text += f"; {writer.ticks_lost} ticks and {writer.telemetry_lost} snapshots lost"
+    if writer.restarts:
+        text += f"; the daemon began anew {writer.restarts} times, and nothing is known of between"
     if silent_s > SILENT_S:
         text += f"; nothing came in the last {silent_s:.1f} s: the daemon has gone, or does not run any more"
         return Outcome(result, text, Exit.UNREACHABLE)
-    return Outcome(result, text, Exit.REFUSED if writer.ticks_lost else Exit.DONE)
+    return Outcome(result, text, Exit.REFUSED if writer.ticks_lost or writer.restarts else Exit.DONE)

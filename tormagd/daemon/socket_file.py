@@ -1,6 +1,7 @@
 """The file of an `ipc://` socket: one process at a time has it, and only a left socket is ever replaced."""
 
 import contextlib
+import errno
 import fcntl
 import os
 import socket
@@ -100,17 +101,26 @@ def _lock(path: Path, descriptor: int) -> None:
 
 def _listening(path: Path) -> socket.socket:
     """Return a socket that listens at `path`, in place of one that was left there."""
-    if _identity(path) is not None and not stat.S_ISSOCK(path.lstat().st_mode):
-        raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
+    if _identity(path) is not None:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
+        if not _is_left(path):
+            raise OSError(f"{path} is the socket of another program that runs; it is left alone: name another path")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
-        path.unlink(missing_ok=True)  # nobody else holds the lock: a killed process left the socket
+        path.unlink(missing_ok=True)
         made.bind(str(path))
         made.listen(100)
     except OSError as error:
         made.close()
         raise OSError(f"{path} cannot be bound: {error.strerror or error}; name another path") from error
     return made
+
+
+def _is_left(path: Path) -> bool:
+    """Tell whether nobody has the socket open: the kernel then refuses a connection, of whatever type it was."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+        return probe.connect_ex(str(path)) in (errno.ECONNREFUSED, errno.ENOENT)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

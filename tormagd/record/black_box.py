@@ -15,7 +15,15 @@ from mcap.records import Message
 from tormagd.ground.files import in_place_of
 from tormagd.record.reader import Contents, RecordingError, damage_in, opened, scan
 from tormagd.record.ticks import MISSING, TOLD
-from tormagd.record.writer import CORE_TOPIC, FRAMES_TOPIC, TICKS_TOPIC, Derived, RecordingWriter
+from tormagd.record.writer import (
+    CORE_TOPIC,
+    FRAMES_TOPIC,
+    NUMBER_COLUMN,
+    TICKS_TOPIC,
+    Derived,
+    RecordingWriter,
+    is_tick,
+)
 from tormagd_client.messages import Telemetry
 
 MAX_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
@@ -72,6 +80,7 @@ class _Reading(Contents):
         self.odd, self.is_over = "", False
         self._derived = Derived()
         self._size = 0
+        self._tick: int | None = None
 
     def message(self, sent: Message) -> None:
         """Keep the entries in a message of `/core`, or compare one that is derived with them, or pass it over."""
@@ -96,8 +105,12 @@ class _Reading(Contents):
         self.is_over = self._size > MAX_BYTES or len(self.entries) + len(entries) > MAX_ENTRIES
         if self.is_over:
             return
-        self.entries.extend(entries)
         columns = msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...])
+        numbers = [dict(zip(columns, each, strict=False)).get(NUMBER_COLUMN) for each in entries if is_tick(each)]
+        if numbers and self._tick is not None and numbers[0] != self._tick + 1:
+            self.entries.append([MISSING])  # lost on the way, or another daemon's
+        self._tick = numbers[-1] if numbers and isinstance(numbers[-1], int) else self._tick
+        self.entries.extend(entries)
         try:
             for topic, t_ns, number, shown in self._derived.of(columns, entries) if self.expected else ():
                 self.expected[topic].append((number, t_ns, msgspec.json.encode(shown)))

@@ -120,7 +120,7 @@ class RecordingWriter:
         self._last_tick: int | None = None
         self._mark: Mark | None = None
         self.telemetry_count = self.telemetry_lost = 0
-        self.tick_count = self.ticks_lost = 0
+        self.tick_count = self.ticks_lost = self.restarts = 0
         self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
     def _begin(self, path: Path) -> None:
@@ -199,8 +199,9 @@ class RecordingWriter:
                 self._add(each)
                 continue
             if isinstance(number := each.message.get(NUMBER_COLUMN), int):
-                if self._last_tick is not None and number > self._last_tick + 1:
-                    self.ticks_lost += number - self._last_tick - 1
+                if self._last_tick is not None:
+                    self.ticks_lost += max(number - self._last_tick - 1, 0)
+                    self.restarts += number < self._last_tick
                 self._last_tick = number
             for kept in self._thinning.take(each):
                 self._add(kept)
