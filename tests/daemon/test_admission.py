@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import zmq
-from served import NAMES, PATIENCE_S, Served, command, setpoint
+from served import NAMES, PATIENCE_S, Served, command, free_ports, setpoint
 
 from tormagd.config import Config, Sources
 from tormagd.daemon import admission
@@ -24,15 +24,6 @@ from tormagd_client.messages import Reply, decode
 KINDS = {"setpoint": zmq.XPUB, "control": zmq.DEALER, "telemetry": zmq.SUB, "recording": zmq.SUB}
 STRANGER = KeyPair(*zmq.curve_keypair())
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
-
-
-def free_ports(count: int) -> list[int]:
-    """So many, and no two the same: each is held until all are known."""
-    with contextlib.ExitStack() as held:
-        probes = [held.enter_context(socket.socket()) for _ in range(count)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [int(probe.getsockname()[1]) for probe in probes]
 
 
 class Rig(Served):

@@ -182,7 +182,7 @@ def test_a_command_is_answered_or_refused_with_code_message_and_hint(rig: Rig, k
     client = rig.connect(kind, "control")
     rig.refused["enable"] = RefusedError("busy", "homing", "wait")
     client.send(encode(Request(v=VERSION, id="x7", command="status")))
-    assert rig.reply(client) == Reply(v=VERSION, id="x7", ok=True, result={"command": "status"})
+    assert rig.reply(client) == Reply(v=VERSION, id="x7", ok=True, result={"operating_state": "DISABLED"})
     client.send(command("enable", 3))
     assert rig.reply(client) == Reply(v=VERSION, id=3, ok=False, error=ErrorReply("busy", "homing", "wait"))
 

@@ -198,15 +198,6 @@ def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> No
     assert again(core, entries).difference.field == "request"
 
 
-def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
-    entries = [*box.entries]
-    place = [p for p, it in enumerate(entries) if it[0] == "state"][4]
-    state = msgspec.msgpack.decode(msgspec.msgpack.encode(entries[place]))
-    state[1]["Stepper"]["measure"]["Measure"]["measured"]["Measured"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
-    entries[place] = state
-    assert again(core, entries, 1.5).difference.field == "state.step.measure.measured.handle.sliding_mm_s"
-
-
 @pytest.mark.parametrize(
     ("edit", "said"),
     [

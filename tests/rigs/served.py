@@ -1,5 +1,7 @@
 """An endpoint with real sockets, served as the daemon does it, and its peers."""
 
+import contextlib
+import socket
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +14,8 @@ from tormagd.daemon.endpoint import Endpoint
 from tormagd.record.ticks import encode_ticks
 from tormagd_client.messages import VERSION, Request, encode
 
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
+"Only a failure waits so long."
 MOST = 3
 "Requests answered at a time."
 NAMES = ("setpoint", "telemetry", "control", "recording")
@@ -26,6 +29,15 @@ def setpoint(seq: int, force_N: float = 1.0) -> bytes:
 
 def command(name: str, request_id: int = 1, **args: Any) -> bytes:
     return encode(Request(v=VERSION, id=request_id, command=name, args=args))
+
+
+def free_ports(count: int) -> list[int]:
+    """So many, and no two the same: each is held until all are known."""
+    with contextlib.ExitStack() as held:
+        probes = [held.enter_context(socket.socket()) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [int(probe.getsockname()[1]) for probe in probes]
 
 
 class Served:
@@ -48,7 +60,7 @@ class Served:
         if request.command in self.refused:
             raise self.refused[request.command]
         self.answered.append(request)
-        return {"command": request.command}
+        return {"operating_state": "DISABLED"}
 
     def serve(self) -> None:
         """Take what has come, then give a few answers."""
