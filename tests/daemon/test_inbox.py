@@ -1,5 +1,6 @@
 import random
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import msgpack
@@ -13,7 +14,7 @@ from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
-from tormagd.daemon.source import AHEAD_S, FACTORS, SETTLED_S
+from tormagd.daemon.source import AHEAD_S, FACTORS, SETTLED_S, STRAYS_S
 from tormagd_client.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, SourceReport, decode, encode
 
 PRIORITY = ("patient", "console")
@@ -199,16 +200,23 @@ def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None
     assert publishing.send(3, 1.0, "a")
 
 
-def test_two_publishers_of_one_name_do_not_alternate_on_the_brake(publishing: Publishing) -> None:
-    forces = []
+@pytest.mark.parametrize("sessions", [(None, None), (1, 1), (1, 2), (2, 1)])
+@pytest.mark.parametrize("rates", [(1, 1), (1, 2), (2, 1), (5, 1), (1, 5)])
+def test_two_publishers_of_one_name_do_not_alternate_on_the_brake(
+    publishing: Publishing, sessions: tuple[int | None, int | None], rates: tuple[int, int]
+) -> None:
+    numbers, forces_N, doubled = [0, 50_000], [], 0
     for tick in range(200):
-        publishing.now_s = tick * 0.004
-        for seq, force_N in ((tick + 1, 0.9), (tick + 1_000_000, 1.6)):
-            publishing.send(seq, force_N)
-            forces.append(publishing.force_N)
-    assert set(forces[4:]) in ({0.9}, {1.6})
-    assert publishing.newest.limits == (Limit.OTHER_SOURCE,)
-    assert "two publishers call themselves 'a'" in publishing.inbox.told(publishing.now_s)[Limit.OTHER_SOURCE].cause
+        publishing.now_s = tick * 0.01
+        for who in (*[0] * rates[0], *[1] * rates[1]):
+            numbers[who] += 1
+            publishing.send(numbers[who], (0.9, 1.6)[who], session=sessions[who])
+            forces_N.append(publishing.force_N)
+        doubled += publishing.newest.limits == (Limit.OTHER_SOURCE,)
+    assert sum(a != b for a, b in pairwise(forces_N)) <= 2
+    assert doubled > 150
+    why = [publishing.inbox.told(now_s)[Limit.OTHER_SOURCE].cause for now_s in (2.0, 2.0 + STRAYS_S)]
+    assert ["two publishers call themselves 'a'" in each for each in why] == [True, False]
 
 
 def test_why_it_is_stale_is_said(publishing: Publishing) -> None:
