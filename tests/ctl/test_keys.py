@@ -111,10 +111,11 @@ async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever
     [
         (("--key", "KEYS/console.key_secret"), "--server-key"),
         (("--key", "/nowhere/a.key_secret", "--server-key", "KEYS/server.key"), "/nowhere/a.key_secret: No such file"),
+        (("--key", "/dev/zero", "--server-key", "KEYS/server.key"), "/dev/zero: allowed is a regular file"),
         (("--key", "KEYS/operate/console.key", "--server-key", "KEYS/server.key"), "holds no secret key"),
         (("--key", "KEYS/console.key_secret", "--server-key", "/dev/zero"), "/dev/zero: allowed is a regular file"),
     ],
-    ids=range(4),
+    ids=range(5),
 )
 def test_a_key_that_is_no_good_is_a_usage_error(keys: Path, ctl, arguments: tuple[str, ...], named: str) -> None:
     placed = [each.replace("KEYS", str(keys)) for each in arguments]

@@ -23,8 +23,8 @@ START_NS = 1_800_000_000_000_000_000
 
 
 class Publishing:
-    def __init__(self, priority: tuple[str, ...] = ()) -> None:
-        self.inbox = SetpointInbox(Sources(priority=priority))
+    def __init__(self, sources: Sources = Sources()) -> None:  # noqa: B008 it is immutable
+        self.inbox = SetpointInbox(sources)
         self.now_s = 0.0
         self.step_s = 0.0
 
@@ -139,7 +139,7 @@ def test_what_is_listed_goes_before_what_comes_later_or_is_not(holder: str, othe
         (PRIORITY, True, 0.0),
         ((), False, 0.0),
     ):
-        publishing = Publishing(priority)
+        publishing = Publishing(Sources(priority=priority))
         publishing.send(1, 1.0, holder)
         if is_given:
             publishing.inbox.give(holder, 0.0)
@@ -353,7 +353,7 @@ def test_one_publisher_too_many_is_refused_until_one_is_silent(publishing: Publi
 
 
 def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> None:
-    publishing = Publishing(("patient",))
+    publishing = Publishing(Sources(priority=("patient",)))
     for number in range(2_000):
         publishing.send(1, source=f"source {number}")
         publishing.now_s += 0.01
@@ -468,17 +468,17 @@ TICK_S = 1e-3
 PERIOD_S = 0.01
 
 
-class Listening:
+class Listening(Publishing):
     """What is in force in each tick: (now_s, stamp_s, force_N)."""
 
     def __init__(self, playout_ms: float, valid_for_ms: float = 500.0) -> None:
-        self.inbox, self.valid_for_ms = SetpointInbox(Sources(playout_ms=playout_ms)), valid_for_ms
+        super().__init__(Sources(playout_ms=playout_ms))
+        self.valid_for_ms = valid_for_ms
         self.followed: list[tuple[float, float, float]] = []
 
     def take(self, now_s: float, seq: int, sent_s: float, source: str = "a") -> bool:
-        message = {"v": 1, "source": source, "seq": seq, "stamp_ns": START_NS + round(sent_s * 1e9)}
-        fields = message | {"servo_cf": 1.0 + 1e-3 * seq, "valid_for_ms": self.valid_for_ms}
-        return self.inbox.take(msgpack.packb(fields), now_s, START_NS + round(now_s * 1e9))
+        force_N, age_s = 1.0 + 1e-3 * seq, now_s - sent_s
+        return self.send(seq, force_N, source, age_s, at_s=now_s, valid_for_ms=self.valid_for_ms)
 
     def listen(self, delay_s: Callable[[int], float], lasts_s: float) -> None:
         arrives_s, coming = 0.0, []
