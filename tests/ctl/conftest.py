@@ -195,7 +195,6 @@ class FakeDaemon(threading.Thread):
         self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | changes)}
 
     def in_turn(self, command: str, *results: dict[str, Any]) -> None:
-        """Answer with each of the results, and then with the last."""
         each = chain(results, repeat(results[-1]))
         self.answers[command] = lambda: {"ok": True, "result": next(each)}
 

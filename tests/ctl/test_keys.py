@@ -57,7 +57,7 @@ def test_a_folder_of_keys_is_shown(keys: Path, ctl) -> None:
 
 @pytest.fixture
 def guarded(keys: Path) -> Iterator[str]:
-    """A control endpoint that believes the listed keys only."""
+    """An endpoint that believes listed keys."""
     address = f"tcp://127.0.0.1:{free_ports(1)[0]}"
     addresses = {name: f"ipc://{keys}/{name}" for name in NAMES} | {"control": address}
     curve = Curve(server_secret=str(keys / "server.key_secret"), also_local=True)

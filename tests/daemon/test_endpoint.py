@@ -577,7 +577,6 @@ SAID: list[tuple[list[tuple[bytes, Peer | None]], list[bytes]]] = [
     ([(OFF + MOTION_TOPIC, GONE)], [VERDICT_TOPIC]),
     ([(OFF + VERDICT_TOPIC, A)], []),
 ]
-"What is said one after the other, and the topics that are asked for then."
 
 
 def test_who_came_and_went_is_counted_for_each_topic_and_nobody_ends_it_for_another() -> None:

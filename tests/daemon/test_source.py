@@ -214,7 +214,7 @@ def test_the_delay_is_believed_to_be_what_it_is_whatever_the_clock_shows(name: s
 
 Way = tuple[Callable[[float], float], float, float, float, float, dict[str, float]]
 WAYS: dict[str, Way] = {
-    # the way, how far behind the clock is, from when on the delay is believed to within what, its last, what is known
+    # way, clock's lag, from when on the delay is believed to within what, the last, what is known
     "longer for a while": (
         *(lambda t: 0.001 + (0.4 if 4.0 < t < 40.0 else 0.0), 1.0),
         *(1.0, 0.001 + DRIFT * 37.0, 0.0, {"steps": 0.0}),

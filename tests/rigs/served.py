@@ -1,4 +1,4 @@
-"""An endpoint with real sockets, served as the daemon does it, and its peers."""
+"""An endpoint, served as by the daemon, and its peers."""
 
 import contextlib
 import socket
@@ -15,7 +15,6 @@ from tormagd.record.ticks import encode_ticks
 from tormagd_client.messages import VERSION, Request, encode
 
 PATIENCE_S = 30.0
-"Only a failure waits so long."
 MOST = 3
 "Requests answered at a time."
 NAMES = ("setpoint", "telemetry", "control", "recording")
@@ -32,7 +31,7 @@ def command(name: str, request_id: int = 1, **args: Any) -> bytes:
 
 
 def free_ports(count: int) -> list[int]:
-    """So many, and no two the same: each is held until all are known."""
+    """No two are the same: each is held until all are known."""
     with contextlib.ExitStack() as held:
         probes = [held.enter_context(socket.socket()) for _ in range(count)]
         for probe in probes:
@@ -63,7 +62,6 @@ class Served:
         return {"operating_state": "DISABLED"}
 
     def serve(self) -> None:
-        """Take what has come, then give a few answers."""
         self.endpoint.take_requests(self.answer)
         self.endpoint.serve(self.answer, MOST)
 
