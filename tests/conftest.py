@@ -78,7 +78,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
             if attempt == ATTEMPTS or not host.took_much:
                 raise
             warnings.warn(f"{pyfuncitem.nodeid} is started again: {host}; {error}", HostWarning, stacklevel=2)
-        folder = tmp_path_factory(pyfuncitem).mktemp("again")
+        folder = pyfuncitem._request.getfixturevalue("tmp_path_factory").mktemp("again")
         if "tmp_path" in call:
             call["tmp_path"] = folder
         for argument in call.values():
@@ -95,8 +95,3 @@ def host_watch(config: pytest.Config) -> HostWatch:
             config.stash[WATCHED] = stack.enter_context(HostWatch(WATCHED_ABOVE, nowhere))
             config.add_cleanup(stack.pop_all().close)
     return config.stash[WATCHED]
-
-
-def tmp_path_factory(item: pytest.Function) -> pytest.TempPathFactory:
-    factory: pytest.TempPathFactory = item._request.getfixturevalue("tmp_path_factory")
-    return factory

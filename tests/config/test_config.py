@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import MIN_INFERENCE_HZ, Config, Rates, load_calibration, load_config
-from tormagd.control.assembly.build import build_core
 from tormagd.control.move.motor import gap_speeds
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
@@ -274,6 +273,7 @@ def test_check_prints_the_resolved_configuration_and_names_a_broken_plugin(write
         ("[device.options]\ninterface = 'slcan'", "unknown field `interface` - at `$.device.options`"),
         ("[device]\nbackend = 'can'", "missing required field `interface` - at `$.device.options`"),
         ("[position]\nproportional_per_mm = 500.0", "margin"),
+        ("[position]\nclosing_mm_s = 60.0", "closing_mm_s = 60: allowed is at most 43.7, what the motors can"),
         ("[rates]\ncontrol_hz = 250", "rates.control_hz"),
         ("not toml", "line 1"),
         # refusals that need more than the file name line and key, too
@@ -350,11 +350,6 @@ def test_a_gap_speed_alone_is_of_both_ways(write, stated: str, closing_mm_s: flo
     for config in (load_config(write(table)), calibrated):
         closing, opening = gap_speeds(config).reach_mm(1.0)
         assert (closing, opening) == (pytest.approx(closing_mm_s, abs=0.1), opening_mm_s)
-
-
-def test_closing_faster_than_the_motors_can_is_refused(write) -> None:
-    with pytest.raises(ConfigError, match=r"closing_mm_s = 60: allowed is at most 43\.7, what the motors can"):
-        build_core(load_config(write("[position]\nclosing_mm_s = 60.0")))
 
 
 def test_a_calibration_goes_before_the_configurations_own_keys(write) -> None:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -192,6 +193,10 @@ class FakeDaemon(threading.Thread):
 
     def says(self, **changes: Any) -> None:
         self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | changes)}
+
+    def in_turn(self, command: str, *results: dict[str, Any]) -> None:
+        each = chain(results, repeat(results[-1]))
+        self.answers[command] = lambda: {"ok": True, "result": next(each)}
 
     def taken(self) -> dict[str, Any]:
         counts = Counter(setpoint.source for setpoint in self.setpoints)

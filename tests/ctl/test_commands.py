@@ -2,7 +2,6 @@ import math
 import re
 import subprocess
 import sys
-from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -270,18 +269,14 @@ def test_a_scene_that_was_not_measured_as_it_is_now_says_how(fast, ctl):
 
 
 @pytest.fixture
-def states(status_with: Any) -> Any:
-    def answers(*pairs: tuple[bool, bool], **changes: Any) -> Any:
-        sequence = chain(pairs, repeat(pairs[-1]))
+def states(fake_daemon: Any, status_with: Any) -> Any:
+    def told(*pairs: tuple[bool, bool]) -> None:
+        shown = [
+            {"is_homed": is_homed, "is_busy": is_busy, "operating_state": "DISABLED"} for is_homed, is_busy in pairs
+        ]
+        fake_daemon.in_turn("status", *(status_with(**each) for each in shown))
 
-        def answer() -> dict[str, Any]:
-            is_homed, is_busy = next(sequence)
-            shown = {"is_homed": is_homed, "is_busy": is_busy, "operating_state": "DISABLED"}
-            return {"ok": True, "result": status_with(**shown | changes)}
-
-        return answer
-
-    return answers
+    return told
 
 
 @pytest.mark.parametrize(
@@ -294,7 +289,7 @@ def states(status_with: Any) -> Any:
     ],
 )
 def test_home_waits_until_the_device_is_homed(fake_daemon, ctl, states, options, sequence):
-    fake_daemon.answers["status"] = states(*sequence)
+    states(*sequence)
     assert ("seconds" in ctl(*fake_daemon.at, "--json", "home", *options).ended(0).result) == (not options)
     assert fake_daemon.commands == ["status", "home", *["status"] * (len(sequence) - 1)]
 
@@ -309,7 +304,7 @@ def test_home_waits_until_the_device_is_homed(fake_daemon, ctl, states, options,
 )
 def test_home_that_does_not_succeed_says_how(fake_daemon, ctl, monkeypatch, states, sequence, timeout, expected):
     monkeypatch.setattr("tormagd.ctl.operate.BEGIN_S", 0.2)
-    fake_daemon.answers["status"] = states(*sequence)
+    states(*sequence)
     ended = ctl(*fake_daemon.at, "--json", "home", "--timeout", timeout)
     assert (ended.code, ended.error["code"]) == (1, expected)
 
@@ -482,12 +477,9 @@ def test_a_command_loads_only_what_it_needs(command, run_dir):
 def test_a_black_box_is_fetched_once_it_is_written(fake_daemon, status_with, ctl, tmp_path):
     original, copy = tmp_path / "20260101T000000.000Z-REQUEST.mcap", tmp_path / "mine.mcap"
     original.write_bytes(b"what is in it")
-    boxes = iter([{"newest": "an older one"}, {"newest": original.name}])
     fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": str(original)}}
-    fake_daemon.answers["status"] = lambda: {
-        "ok": True,
-        "result": status_with(black_box={"folder": str(tmp_path)} | next(boxes)),
-    }
+    boxes = [{"folder": str(tmp_path), "newest": newest} for newest in ("an older one", original.name)]
+    fake_daemon.in_turn("status", *(status_with(black_box=each) for each in boxes))
     fetch = (*fake_daemon.at, "--json", "blackbox", str(copy))
     assert ctl(*fetch).ended(0).result == {"file": str(copy), "original": str(original)}
     assert copy.read_bytes() == b"what is in it"

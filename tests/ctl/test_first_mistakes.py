@@ -69,6 +69,10 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl replay /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
     ("tormagctl dashboard /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
     ("tormagctl dashboard --port 70000", 2, "--port: 70000: allowed is 0..65535", {}),
+    *(
+        (f"tormagctl dashboard --origin {origin}", 2, "allowed are https://HOST", {})
+        for origin in ("*", "null", "http://elsewhere.example", "https://a/b", "https://", "ftp://a")
+    ),
     ("tormagctl dashboard --port 1.5", 2, "--port: 1.5: allowed is a whole number", {}),
     ("tormagctl metrics --port http", 2, "--port: 'http': allowed is a finite number", {}),
     ("tormagctl completion fish", 2, "shell: 'fish': allowed are bash, zsh", {}),

@@ -3,18 +3,17 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgpack
 import pytest
-import zmq
-from zmq.auth import load_certificate
-from zmq.utils import z85
+from served import NAMES, Served, free_ports
 
+from tormagd.config import Config
 from tormagd.ctl.commands import KEY, SERVER_KEY
+from tormagd.daemon.endpoint import Endpoint
+from tormagd.ground.access_keys import KeyRing
 from tormagd_client.aio import AsyncClient
 from tormagd_client.blocking import Client
-from tormagd_client.endpoints import Endpoints
+from tormagd_client.endpoints import Curve, Endpoints
 from tormagd_client.errors import UnreachableError
-from tormagd_client.messages import VERSION
 
 
 @pytest.fixture
@@ -58,33 +57,18 @@ def test_a_folder_of_keys_is_shown(keys: Path, ctl) -> None:
 
 @pytest.fixture
 def guarded(keys: Path) -> Iterator[str]:
-    """A control endpoint that believes `console` only."""
-    context = zmq.Context()
-    zap, router = context.socket(zmq.REP), context.socket(zmq.ROUTER)
-    zap.bind("inproc://zeromq.zap.01")
-    router.curve_server = True
-    router.curve_secretkey = load_certificate(keys / "server.key_secret")[1]
-    router.setsockopt(zmq.ZAP_DOMAIN, b"control")
-    port = router.bind_to_random_port("tcp://127.0.0.1")
-    known = z85.decode(load_certificate(keys / "operate/console.key")[0])
-    is_over = threading.Event()
-
-    def serve() -> None:
-        while not is_over.is_set():
-            if zap.poll(2):
-                version, number, *_, public = zap.recv_multipart()
-                zap.send_multipart([version, number, b"200" if public == known else b"400", b"", b"", b""])
-            while router.poll(0):
-                *envelope, data = router.recv_multipart()
-                reply = {"v": VERSION, "ok": True, "result": {"operating_state": "DISABLED"}}
-                router.send_multipart([*envelope, msgpack.packb(reply | {"id": msgpack.unpackb(data)["id"]})])
-        context.destroy(linger=0)
-
-    serving = threading.Thread(target=serve)
+    """An endpoint that believes listed keys."""
+    address = f"tcp://127.0.0.1:{free_ports(1)[0]}"
+    addresses = {name: f"ipc://{keys}/{name}" for name in NAMES} | {"control": address}
+    curve = Curve(server_secret=str(keys / "server.key_secret"), also_local=True)
+    endpoints = Config(endpoints=Endpoints(**addresses, curve=curve)).endpoints
+    served, is_over = Served(addresses, Endpoint(endpoints, keys=KeyRing(endpoints))), threading.Event()
+    serving = threading.Thread(target=served.until, args=(is_over.is_set,))
     serving.start()
-    yield f"tcp://127.0.0.1:{port}"
+    yield address
     is_over.set()
-    serving.join(5.0)
+    serving.join()
+    served.close()
 
 
 def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
@@ -127,10 +111,11 @@ async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever
     [
         (("--key", "KEYS/console.key_secret"), "--server-key"),
         (("--key", "/nowhere/a.key_secret", "--server-key", "KEYS/server.key"), "/nowhere/a.key_secret: No such file"),
+        (("--key", "/dev/zero", "--server-key", "KEYS/server.key"), "/dev/zero: allowed is a regular file"),
         (("--key", "KEYS/operate/console.key", "--server-key", "KEYS/server.key"), "holds no secret key"),
         (("--key", "KEYS/console.key_secret", "--server-key", "/dev/zero"), "/dev/zero: allowed is a regular file"),
     ],
-    ids=range(4),
+    ids=range(5),
 )
 def test_a_key_that_is_no_good_is_a_usage_error(keys: Path, ctl, arguments: tuple[str, ...], named: str) -> None:
     placed = [each.replace("KEYS", str(keys)) for each in arguments]

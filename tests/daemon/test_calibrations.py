@@ -66,11 +66,8 @@ def test_a_refusal_of_the_core_names_the_calibration(rig: Rig, tmp_path: Path) -
     assert rig.calibrations.report().refusal == f"{tmp_path / '00000007.toml'}: force.most_N = 9: allowed is less"
 
 
-def test_a_scene_that_changed_while_the_device_was_away_stays(rig: Rig) -> None:
-    async def unplugged() -> None:
-        rig.calibrations.look(7, rig.running, is_idle=True)
-        rig.running = rig.calibrations.configured = msgspec.structs.replace(Config(), scene="pulse")
-        await rig.look(None, 7)
-
-    asyncio.run(unplugged())
+async def test_a_scene_that_changed_while_the_device_was_away_stays(rig: Rig) -> None:
+    rig.calibrations.look(7, rig.running, is_idle=True)
+    rig.running = rig.calibrations.configured = msgspec.structs.replace(Config(), scene="pulse")
+    await rig.look(None, 7)
     assert (rig.running.scene, rig.running.motor.resistance_ohm) == ("pulse", 2.5)

@@ -9,15 +9,15 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import msgpack
 import pytest
 import zmq
+from sent import telemetry
+from served import MOST, NAMES, Served, command, setpoint
 
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
@@ -36,139 +36,57 @@ from tormagd_client.messages import (
     Reply,
     Request,
     Telemetry,
-    Tick,
     decode,
     encode,
 )
 
-PATIENCE_MS = 10_000
-MOST = 3
-"Requests answered at a time."
-NAMES = ("setpoint", "telemetry", "control", "recording")
 OURSELVES = f"process {os.getpid()} of user {os.getuid()}"
-TELEMETRY = Telemetry(
-    v=1,
-    t_ns=1,
-    seq=2,
-    operating_state="DISABLED",
-    is_homed=False,
-    is_busy=False,
-    setpoint_cf=None,
-    governed_cf=None,
-    measured_cf=None,
-    predicted_cf=None,
-    field_mT=None,
-    gap_mm=None,
-    gap_setpoint_mm=None,
-    measured_jp=None,
-    skew_mm=None,
-    duty=(0.0, 0.0),
-    limits=(),
-    faults=(),
-    setpoint_age_ms=None,
-    confidence=None,
-    tick=Tick(0.0, 0.0),
-)
+TELEMETRY = telemetry(0, 2)
 
 
-class Rig:
-    """An endpoint and its peers."""
-
+class Rig(Served):
     def __init__(self, folder: Path) -> None:
-        self.addresses = {name: f"ipc://{folder}/{name}" for name in NAMES}
-        self.endpoint = Endpoint(Endpoints(**self.addresses))
-        self.context = zmq.Context()
-        self.idle = self.context.socket(zmq.PULL)
-        self.now_s = 0.0
-        self.answered: list[Request] = []
-
-    def connect(self, kind: int, name: str) -> "zmq.Socket[bytes]":
-        made = self.context.socket(kind)
-        made.linger = 0
-        made.connect(self.addresses[name])
-        return made
+        addresses = {name: f"ipc://{folder}/{name}" for name in NAMES}
+        super().__init__(addresses, Endpoint(Endpoints(**addresses)))
 
     def publisher(self) -> "zmq.Socket[bytes]":
         """A publisher that the endpoint has subscribed to: what is published earlier is lost, as everywhere in
         ZeroMQ."""
         socket = self.connect(zmq.XPUB, "setpoint")
-        self.until(lambda: socket.poll(0) > 0)
+        self.until(lambda: socket.poll(0))
         assert socket.recv() == b"\x01"
         return socket
 
-    def until(self, reached: Callable[[], bool], work: Callable[[], object] | None = None) -> None:
-        """Does some work, or drains setpoints, until it is so; in between others have their turn."""
-        for _ in range(PATIENCE_MS // 5):
-            self.endpoint.arrivals.look()
-            (work or self.endpoint.take_setpoints)()
-            self.endpoint.admission.update()
-            if reached():
-                return
-            self.idle.poll(5)
-        pytest.fail("not reached")
-
-    def serve(self, socket: "zmq.Socket[bytes]", answer: Callable[[Request], dict[str, Any]]) -> Reply:
+    def reply(self, socket: "zmq.Socket[bytes]") -> Reply:
         """Serves until this client has its reply."""
-        self.until(lambda: socket.poll(0) > 0, lambda: self.take_and_serve(answer))
+        self.until(lambda: socket.poll(0), self.serve)
         return decode(socket.recv_multipart()[-1], Reply)
-
-    def take_and_serve(self, answer: Callable[[Request], dict[str, Any]]) -> None:
-        """As the daemon does: what has come, then a few answers."""
-        self.endpoint.take_requests(answer)
-        self.endpoint.serve(answer, MOST)
-
-    def answer(self, request: Request) -> dict[str, Any]:
-        self.answered.append(request)
-        return {}
 
     def take_until(self, reached: Callable[[], bool]) -> list[str]:
         """Takes requests, as the daemon does each tick, and serves none of those that wait."""
         self.until(reached, lambda: self.endpoint.take_requests(self.answer))
         return [request.command for request in self.answered]
 
-    def look(self) -> None:
-        """Serves where nobody asks anything."""
-        self.take_and_serve(never)
-        self.endpoint.tell(self.now_s)
-
     def tell(self) -> None:
         """Publishes on both sockets."""
-        self.endpoint.hear()
         self.endpoint.publish(TELEMETRY)
-        self.endpoint.publish_ticks(encode_ticks([(1,)], ("a",)))
+        self.work()
 
     def is_answered(self) -> bool:
         """Whether a new client has its status."""
         client = self.connect(zmq.DEALER, "control")
         client.send(command("status"))
-        return self.serve(client, self.answer).ok
+        return self.reply(client).ok
 
     def drops(self) -> list[tuple[str, str, str, str]]:
         """Endpoint, address, key and reason of all whose messages were not read."""
         return [(it.endpoint, it.address, it.key, it.reason) for it in self.endpoint.report().drops]
-
-    def close(self) -> None:
-        self.endpoint.close()
-        self.context.destroy(linger=0)
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
     with contextlib.closing(Rig(tmp_path)) as made:
         yield made
-
-
-def setpoint(seq: int, force_N: float = 1.0) -> bytes:
-    message = {"v": 1, "source": "a", "seq": seq, "servo_cf": force_N, "valid_for_ms": 50.0}
-    return msgpack.packb(message | {"stamp_ns": time.time_ns()})
-
-
-def command(name: str, request_id: int = 1, **args: Any) -> bytes:
-    return encode(Request(v=VERSION, id=request_id, command=name, args=args))
-
-
-def never(request: Request) -> dict[str, Any]:
-    pytest.fail(f"{request} was answered")
 
 
 # -- setpoints -----------------------------------------------------------------------------------------------------
@@ -209,8 +127,7 @@ def test_a_message_that_is_too_large_is_not_read_and_its_publisher_is_heard_agai
 
 
 def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
-    subscriber = rig.connect(zmq.SUB, "recording")
-    subscriber.setsockopt(zmq.RCVHWM, 1)
+    subscriber = rig.connect(zmq.SUB, "recording", rcvhwm=1)
     subscriber.subscribe(b"")
     rows = [tuple(range(30))] * 100
 
@@ -262,16 +179,12 @@ def test_a_topic_has_listeners_only_where_it_was_asked_for_by_its_name(rig: Rig)
 
 @pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
 def test_a_command_is_answered_or_refused_with_code_message_and_hint(rig: Rig, kind: int) -> None:
-    def answer(request: Request) -> dict[str, Any]:
-        if request.command == "enable":
-            raise RefusedError("busy", "homing", "wait")
-        return {"command": request.command}
-
     client = rig.connect(kind, "control")
+    rig.refused["enable"] = RefusedError("busy", "homing", "wait")
     client.send(encode(Request(v=VERSION, id="x7", command="status")))
-    assert rig.serve(client, answer) == Reply(v=VERSION, id="x7", ok=True, result={"command": "status"})
+    assert rig.reply(client) == Reply(v=VERSION, id="x7", ok=True, result={"operating_state": "DISABLED"})
     client.send(command("enable", 3))
-    assert rig.serve(client, answer) == Reply(v=VERSION, id=3, ok=False, error=ErrorReply("busy", "homing", "wait"))
+    assert rig.reply(client) == Reply(v=VERSION, id=3, ok=False, error=ErrorReply("busy", "homing", "wait"))
 
 
 @pytest.mark.parametrize(
@@ -291,8 +204,8 @@ def test_a_command_is_answered_or_refused_with_code_message_and_hint(rig: Rig, k
 def test_garbage_is_answered_with_bad_request(rig: Rig, data: bytes) -> None:
     client = rig.connect(zmq.DEALER, "control")
     client.send(data)
-    reply = rig.serve(client, never)
-    assert (reply.id, reply.ok, reply.error.code) == (None, False, "bad_request")
+    reply = rig.reply(client)
+    assert (reply.id, reply.ok, reply.error.code, rig.answered) == (None, False, "bad_request", [])
     assert rig.is_answered()
 
 
@@ -311,7 +224,7 @@ def test_commands_are_answered_in_bounded_portions_and_in_their_order(rig: Rig) 
 
     def serve() -> None:
         before = len(rig.answered)
-        rig.take_and_serve(rig.answer)
+        rig.serve()
         assert len(rig.answered) - before <= MOST
 
     rig.until(lambda: len(rig.answered) == count, serve)
@@ -334,7 +247,7 @@ def test_a_reply_has_the_envelope_of_its_request(rig: Rig, envelope: list[bytes]
     client = rig.connect(zmq.DEALER, "control")
     for name in ("stop", "status"):
         client.send_multipart([*envelope, command(name)])
-        rig.until(lambda: client.poll(0) > 0, lambda: rig.take_and_serve(rig.answer))
+        rig.until(lambda: client.poll(0) > 0, rig.serve)
         assert (client.recv_multipart()[:-1], rig.answered.pop().command) == (envelope, name)
 
 
@@ -353,9 +266,10 @@ def test_a_reply_has_the_envelope_of_its_request(rig: Rig, envelope: list[bytes]
 def test_a_request_of_several_parts_is_none(rig: Rig, parts: list[bytes]) -> None:
     client = rig.connect(zmq.DEALER, "control")
     client.send_multipart(parts)
-    rig.until(lambda: client.poll(0) > 0, rig.look)
+    rig.until(lambda: client.poll(0))
     *envelope, reply = client.recv_multipart()
     assert (envelope, decode(reply, Reply).error.code) == ([part for part in parts[:1] if not part], "bad_request")
+    assert rig.answered == []
 
 
 # -- what goes first -----------------------------------------------------------------------------------------------
@@ -380,7 +294,7 @@ def test_what_was_asked_before_the_gap_was_told_to_open_is_not_done_after_it(rig
     for number, name in enumerate(("enable", "status", "disable", "enable")):
         client.send(command(name, number))
     rig.take_until(lambda: client.poll(0) > 0)
-    replies = [decode(client.recv_multipart()[-1], Reply), *(rig.serve(client, rig.answer) for _ in range(3))]
+    replies = [decode(client.recv_multipart()[-1], Reply), *(rig.reply(client) for _ in range(3))]
     assert [(reply.id, reply.error and reply.error.code) for reply in replies] == [
         (2, None),
         (0, "overtaken"),
@@ -391,18 +305,11 @@ def test_what_was_asked_before_the_gap_was_told_to_open_is_not_done_after_it(rig
 
 
 def test_a_disable_that_is_refused_overtakes_nothing(rig: Rig) -> None:
-    def answer(request: Request) -> dict[str, Any]:
-        if request.command == "disable":
-            raise RefusedError("not_connected", "no device", "plug it in")
-        return {}
-
     client = rig.connect(zmq.DEALER, "control")
+    rig.refused["disable"] = RefusedError("not_connected", "no device", "plug it in")
     client.send(command("home", 0))
     client.send(command("disable", 1))
-    assert {reply.id: reply.ok for reply in (rig.serve(client, answer), rig.serve(client, answer))} == {
-        0: True,
-        1: False,
-    }
+    assert {reply.id: reply.ok for reply in (rig.reply(client), rig.reply(client))} == {0: True, 1: False}
 
 
 @pytest.mark.parametrize(
@@ -432,8 +339,8 @@ def test_a_message_in_countless_parts_is_read_in_portions_and_answered_once(rig:
     client.send(command("status", 7))
     operator.send(command("stop"))
     rig.take_until(lambda: operator.poll(0) > 0)
-    assert rig.serve(client, rig.answer).error.code == "bad_request"
-    assert rig.serve(client, rig.answer).id == 7
+    assert rig.reply(client).error.code == "bad_request"
+    assert rig.reply(client).id == 7
     publisher = rig.publisher()
     publisher.send_multipart([setpoint(1)] * 5_000)
     publisher.send(setpoint(2, 1.5))
@@ -453,7 +360,7 @@ def test_a_publisher_that_sends_too_much_is_dropped_unread_and_named(rig: Rig) -
             publisher.send(setpoint(next(numbers)))
         for _ in range(100):
             rig.endpoint.take_setpoints()
-        rig.look()
+        rig.work()
         return rig.endpoint.report().dropped > 0
 
     # once a burst's worth has been sent faster than the rate, which any machine can
@@ -468,16 +375,12 @@ def test_a_client_that_asks_too_much_is_dropped_and_others_are_answered(rig: Rig
         flood.send(command("status", number))
     rig.take_until(lambda: rig.endpoint.report().dropped == 100 - WAITING_PER_CLIENT)
     other.send(command("status", 7))
-    assert rig.serve(other, rig.answer).id == 7
+    assert rig.reply(other).id == 7
     assert rig.drops() == [("control", OURSELVES, "", "sent too much")]
 
 
 def test_a_client_that_says_stop_without_pause_is_cut_off_and_what_it_said_is_forgotten(rig: Rig) -> None:
-    flood = rig.context.socket(zmq.DEALER)
-    flood.setsockopt(zmq.SNDHWM, 0)
-    flood.setsockopt(zmq.RECONNECT_IVL, 60_000)
-    flood.linger = 0
-    flood.connect(rig.addresses["control"])
+    flood = rig.connect(zmq.DEALER, "control", sndhwm=0, reconnect_ivl=60_000)
     for number in range(5_000):
         flood.send(command("stop", number))
     rig.take_until(lambda: rig.endpoint.report().dropped > 0 and rig.endpoint.report().connections["control"] == 0)
@@ -496,7 +399,6 @@ def test_a_subscriber_that_says_too_much_is_cut_off_and_named_and_may_come_back(
         for sign in (b"\x01", b"\x00") * 4:
             churning.send(sign + topic)
         rig.tell()
-        rig.look()
 
     rig.until(lambda: cut_off.poll(5) > 0, churn)
     assert rig.drops() == [(name, OURSELVES, "", "sent too much")]
@@ -566,71 +468,62 @@ def test_sockets_that_somebody_has_put_in_their_place_are_left_to_him(tmp_path: 
 @pytest.mark.parametrize("remove", [lambda folder: (folder / "control").unlink(), shutil.rmtree], ids=["one", "all"])
 def test_sockets_that_were_removed_are_bound_again(rig: Rig, tmp_path: Path, remove: Callable[[Path], object]) -> None:
     remove(tmp_path)
-    rig.look()
+    rig.work()
     assert rig.is_answered()
 
 
-def test_a_folder_that_others_may_write_to_is_refused_unless_it_is_as_tmp_is(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder, _: folder.chmod(0o777), r"setpoint = .*mode 0777\): .*; chmod go-w FOLDER$"),
+        (lambda folder, _: (folder.rmdir(), folder.touch()), "setpoint = .* FOLDER cannot be made: .*File exists"),
+        (lambda folder, _: (folder / "control").write_text("precious"), "control = .*FOLDER/control is .*left alone"),
+        (lambda folder, _: (folder / "control.lock").write_text("x"), "control = .*/control.lock is .*left alone"),
+        (
+            lambda _, patch: patch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available"))),
+            "setpoint = .*setpoint.lock cannot be locked: No locks available: .*; name a folder of",
+        ),
+    ],
+    ids=["others may write there", "a file instead", "a file that is not ours", "nor a lock", "no locks"],
+)
+def test_where_no_socket_can_be_it_is_said_why_and_files_are_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Path, pytest.MonkeyPatch], object], said: str
+) -> None:
+    (folder := tmp_path / "run").mkdir()
+    spoil(folder, monkeypatch)
+    before = {path: path.read_text() for path in tmp_path.glob("*/*")}
+    with pytest.raises(OSError, match=f"^endpoints.{said.replace('FOLDER', str(folder))}"):
+        Rig(folder).close()
+    assert {path: path.read_text() for path in before} == before
+    assert {*tmp_path.glob("*/*")} <= {*before, folder / "setpoint.lock"}
+
+
+def test_a_folder_as_tmp_is_may_be_written_to_by_others(tmp_path: Path) -> None:
     tmp_path.chmod(0o1777)
     Rig(tmp_path).close()
-    tmp_path.chmod(0o777)
-    with pytest.raises(OSError, match=rf"^endpoints.setpoint = .*mode 0777\): .*; chmod go-w {tmp_path}$"):
-        Rig(tmp_path)
-
-
-def test_a_file_system_without_locks_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(37, "No locks available")))
-    with pytest.raises(OSError, match=r"setpoint.lock cannot be locked: No locks available: .*; name a folder of"):
-        Rig(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["precious.txt", "precious.txt.lock"])
-def test_a_file_that_is_not_ours_is_left_alone(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_text("precious")
-    with pytest.raises(OSError, match=f"^endpoints.control = .*/{name} is .*left alone"):
-        Endpoint(
-            Endpoints(**{n: f"ipc://{tmp_path}/{n}" for n in NAMES} | {"control": f"ipc://{tmp_path}/precious.txt"})
-        )
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "precious"}
-
-
-def test_a_directory_that_cannot_be_made_is_named_with_its_endpoint(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=f"^endpoints.setpoint = .* {tmp_path}/file cannot be made: .*File exists"):
-        Endpoint(Endpoints(setpoint=f"ipc://{tmp_path}/file/setpoint"))
 
 
 # -- requests that wait ------------------------------------------------------------------------------------------------
 
 
-def waiting(client: str, number: int = 0, opens: int = 0) -> Waiting:
-    return Waiting([client.encode()], str(number).encode(), Peer(""), 0, opens)
+def waiting(client: str) -> Waiting:
+    return Waiting([client[:1].encode()], client.encode(), Peer(""), 0, 0)
 
 
-def taken(requests: Requests) -> list[str]:
-    return [f"{each.envelope[0].decode()}{each.data.decode()}" for each in iter(requests.next, None)]
-
-
-def test_every_client_has_its_turn_and_each_keeps_its_order() -> None:
+@pytest.mark.parametrize(
+    ("asked", "kept", "first"),
+    [
+        (["a0", "a1", "a2", "b", "c"], 5, ["a0", "b", "c", "a1", "a2"]),
+        ([*(f"a{number}" for number in range(WAITING_PER_CLIENT + 3)), "b"], 64 + 1, ["a0", "b", "a1"]),
+        ([chr(0x1000 + number) for number in range(WAITING + 5)], WAITING, ["က"]),
+    ],
+    ids=["each keeps its order", "none takes another's place", "all together are bounded"],
+)
+def test_every_client_has_its_turn_and_its_places(asked: list[str], kept: int, first: list[str]) -> None:
     requests = Requests()
-    asked = [waiting("a", 0), waiting("a", 1), waiting("a", 2), waiting("b"), waiting("c")]
-    assert all(requests.put(each) for each in asked)
-    assert taken(requests) == ["a0", "b0", "c0", "a1", "a2"]
-
-
-def test_one_client_takes_no_place_of_another() -> None:
-    requests = Requests()
-    assert [requests.put(waiting("a", number)) for number in range(WAITING_PER_CLIENT + 3)].count(True) == 64
-    assert requests.put(waiting("b"))
-    assert taken(requests)[:3] == ["a0", "b0", "a1"]
+    assert [requests.put(waiting(each)) for each in asked].count(True) == kept
+    assert [requests.next().data.decode() for _ in first] == first
     assert requests.put(waiting("a"))
-
-
-def test_all_together_are_bounded() -> None:
-    requests = Requests()
-    assert sum(requests.put(waiting(f"c{number}")) for number in range(WAITING + 5)) == WAITING
-    assert requests.next() is not None
-    assert requests.put(waiting("late"))
 
 
 @pytest.mark.parametrize("command", FIRST)
@@ -644,18 +537,25 @@ def test_no_packing_of_a_first_command_is_overlooked(command: str) -> None:
     assert not may_go_first(msgpack.packb({"v": 1, "id": 1, "command": "status"}))
 
 
-def test_a_peer_may_send_a_burst_and_then_its_rate() -> None:
-    allowance = Allowance(100.0, 10.0)
-    asked = (("a", 0.0, 15), ("a", 0.05, 9), ("b", 0.05, 10), ("a", 9.0, 15))
-    granted = [sum(allowance.grants(Peer(name), now_s) for _ in range(asks)) for name, now_s, asks in asked]
-    assert granted == [10, 5, 10, 10]
-
-
-def test_more_peers_than_are_kept_apart_cost_the_one_that_was_silent_longest() -> None:
-    allowance = Allowance(1.0, 1.0)
-    assert all(allowance.grants(Peer(f"p{number}"), float(number) * 1e-3) for number in range(PEERS))
-    later = (("p0", 0.5), ("new", 0.6), ("p0", 0.6), ("p1", 0.6))
-    assert [allowance.grants(Peer(name), now_s) for name, now_s in later] == [False, True, False, True]
+@pytest.mark.parametrize(
+    ("allowance", "asked", "granted"),
+    [
+        (Allowance(100.0, 10.0), (("a", 0.0, 15), ("a", 0.05, 9), ("b", 0.05, 10), ("a", 9.0, 15)), [10, 5, 10, 10]),
+        (
+            Allowance(1.0, 1.0),
+            (
+                *((f"p{number}", number * 1e-3, 1) for number in range(PEERS)),
+                *(("p0", 0.5, 1), ("new", 0.6, 1), ("p0", 0.6, 1), ("p1", 0.6, 1)),
+            ),
+            [*[1] * PEERS, 0, 1, 0, 1],
+        ),
+    ],
+    ids=["a burst, then its rate", "more peers than are kept apart cost the one that was silent longest"],
+)
+def test_a_peer_may_send_so_much(
+    allowance: Allowance, asked: tuple[tuple[str, float, int], ...], granted: list[int]
+) -> None:
+    assert [sum(allowance.grants(Peer(who), now_s) for _ in range(asks)) for who, now_s, asks in asked] == granted
 
 
 # -- who listens -------------------------------------------------------------------------------------------------------
@@ -666,27 +566,25 @@ GONE = None
 A, B = Peer("a"), Peer("b")
 
 
-def test_subscribers_to_everything_or_to_something_else_are_none() -> None:
-    listeners = Listeners()
-    for word in (ON, ON + b"mot", ON + MOTION_TOPIC + b"X", ON + b"\xde", b"", b"motion", ON + b"x" * 10_000):
-        listeners.hear(word, A)
-    assert not any(map(listeners.has, TOPICS))
+ELSE = (ON, ON + b"mot", ON + MOTION_TOPIC + b"X", ON + b"\xde", b"", b"motion", ON + b"x" * 10_000)
+SAID: list[tuple[list[tuple[bytes, Peer | None]], list[bytes]]] = [
+    ([(word, A) for word in ELSE], []),
+    ([(ON + MOTION_TOPIC, A), *[(OFF + MOTION_TOPIC, B)] * 100], [MOTION_TOPIC]),
+    (
+        [(ON + MOTION_TOPIC, B), (ON + VERDICT_TOPIC, A), (OFF + MOTION_TOPIC, A)],
+        [MOTION_TOPIC, VERDICT_TOPIC],
+    ),
+    ([(OFF + MOTION_TOPIC, GONE)], [VERDICT_TOPIC]),
+    ([(OFF + VERDICT_TOPIC, A)], []),
+]
 
 
 def test_who_came_and_went_is_counted_for_each_topic_and_nobody_ends_it_for_another() -> None:
     listeners = Listeners()
-    listeners.hear(ON + MOTION_TOPIC, A)
-    for _ in range(100):
-        listeners.hear(OFF + MOTION_TOPIC, B)
-    assert listeners.has(MOTION_TOPIC)
-    listeners.hear(ON + MOTION_TOPIC, B)
-    listeners.hear(ON + VERDICT_TOPIC, A)
-    listeners.hear(OFF + MOTION_TOPIC, A)
-    assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (True, True)
-    listeners.hear(OFF + MOTION_TOPIC, GONE)
-    assert (listeners.has(MOTION_TOPIC), listeners.has(VERDICT_TOPIC)) == (False, True)
-    listeners.hear(OFF + VERDICT_TOPIC, A)
-    assert not listeners.has(VERDICT_TOPIC)
+    for words, asked_for in SAID:
+        for word, peer in words:
+            listeners.hear(word, peer)
+        assert [topic for topic in TOPICS if listeners.has(topic)] == asked_for
 
 
 def test_however_many_come_and_go_what_is_kept_is_bounded_and_none_is_left() -> None:

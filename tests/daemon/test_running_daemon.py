@@ -20,7 +20,7 @@ from failing_search import FailingSearch
 
 from firmware_protocol.build import settle
 from firmware_protocol.codec import Message
-from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, load_calibration
+from tormagd.config import Config, Device as DeviceTable, Rates, RealTime, Sources, load_calibration
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.ctl.record import listening
@@ -39,7 +39,7 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
 from tormagd_client import Client, RefusedError, UnreachableError
-from tormagd_client.endpoints import in_folder
+from tormagd_client.endpoints import Curve, Endpoints, in_folder
 from tormagd_client.messages import VERDICT_TOPIC, Description, Motion, Verdict
 from tormagd_client.wire import Pending
 
@@ -193,10 +193,7 @@ class Running:
 
     def scene(self, name: str) -> dict[str, Any]:
         self.command("use-scene", scene=name)
-        for _ in range(PATIENCE_TICKS):
-            if (status := self.command("status"))["scene_change"]["is_over"]:
-                return status
-        pytest.fail("the scene did not change")
+        return self.until(lambda status: status["scene_change"]["is_over"], "the scene has changed")
 
     def ask(self, force_N: float, by: Client | None = None) -> None:
         inbox = self.daemon._endpoint.inbox
@@ -326,10 +323,18 @@ def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped_and_feeds_no_watchdog
     ("read", "said", "watchdog_ms"),
     [
         (
-            Config(scene="pulse", realtime=RealTime(watchdog_ms=800.0)),
+            Config(
+                scene="pulse",
+                device=DeviceTable(port="/dev/other", options={"baud": 9600}),
+                rates=Rates(inference_hz=250),
+                realtime=RealTime(watchdog_ms=800.0, fifo_priority=50),
+                endpoints=Endpoints(curve=Curve(server_secret="s", also_local=True)),
+                sources=Sources(priority=("robot",), playout_ms=60.0),
+            ),
             [
-                "configuration read again: now in force: realtime.watchdog_ms",
-                "not before a restart (systemctl restart tormagd): scene",
+                "configuration read again: now in force: realtime.watchdog_ms, sources.playout_ms, sources.priority",
+                "not before a restart (systemctl restart tormagd): device.options.baud, device.port, "
+                "endpoints.curve, rates.inference_hz, realtime.fifo_priority, scene",
             ],
             800.0,
         ),
@@ -351,14 +356,16 @@ def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped_and_feeds_no_watchdog
 def test_sighup_takes_over_what_it_can_and_names_the_rest(
     alone: Running, caplog: pytest.LogCaptureFixture, read: Config, said: list[str], watchdog_ms: float
 ) -> None:
-    alone.daemon._read_again = lambda: msgspec.structs.replace(read, endpoints=in_folder(alone.folder))
+    endpoints = msgspec.structs.replace(in_folder(alone.folder), curve=read.endpoints.curve)
+    alone.daemon._read_again = lambda: msgspec.structs.replace(read, endpoints=endpoints)
     with caplog.at_level(logging.INFO):
         signal.raise_signal(signal.SIGHUP)
         while "restart" not in caplog.text:
             alone.tick()
     found = [record.getMessage() for record in caplog.records][-1 - len(said) :]
     assert found == ["no list of keys to read again: there is no endpoints.curve", *said]
-    assert alone.command("describe")["configuration"]["realtime"]["watchdog_ms"] == watchdog_ms
+    known = msgspec.convert(alone.command("describe")["configuration"], Config)
+    assert (known.realtime.watchdog_ms, known.sources) == (watchdog_ms, read.sources)
 
 
 def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.LogCaptureFixture) -> None:

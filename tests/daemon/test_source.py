@@ -128,26 +128,6 @@ def test_what_the_messages_of_a_stream_are_taken_for(start: Start, parts: list[P
     assert {name: getattr(sequence, name) for name in known} == known
 
 
-@pytest.mark.parametrize("sessions", [(None, None), (1, 1), (1, 2), (2, 1)])
-@pytest.mark.parametrize("rates", [(1, 1), (1, 2), (2, 1), (5, 1), (1, 5)])
-def test_two_publishers_of_one_name_do_not_alternate(
-    sessions: tuple[int | None, int | None], rates: tuple[int, int]
-) -> None:
-    sequence = Sequence(sessions[0], 0)
-    numbers, taken, doubled = [0, 50_000], [], 0
-    for round_ in range(200):
-        for who in (0, 1):
-            for _ in range(rates[who]):
-                numbers[who] += 1
-                order = sequence.order(round_ * 0.01, sessions[who], numbers[who], is_over=False)
-                if order is not STRAY:
-                    taken.append(who)
-        doubled += sequence.is_doubled(round_ * 0.01)
-    assert sum(a != b for a, b in pairwise(taken)) <= 2
-    assert doubled > 150
-    assert not sequence.is_doubled(2.0 + STRAYS_S)
-
-
 @pytest.mark.parametrize(("apart_s", "is_doubled"), [(0.5 * STRAYS_S, True), (0.6, False)])
 def test_strays_that_are_far_apart_are_of_no_second_publisher(apart_s: float, is_doubled: bool) -> None:
     sequence = Sequence(None, 100)
@@ -206,31 +186,62 @@ def worst_error_s(heard: list[Heard], from_s: float) -> float:
     return max(abs(each.believed_s - each.way_s) for each in heard if each.sent_s >= from_s)
 
 
-CLOCKS: dict[str, tuple[Callable[[float], float], float]] = {
-    "right": (lambda t: t, 0.0),
-    "1 s behind": (lambda t: t - 1.0, 1.0),
-    "1 s ahead": (lambda t: t + 1.0, -1.0),
-    "since 1970": (lambda t: t - 1.8e9, 1.8e9),
-    "set back by 1 s": (lambda t: t - 1.0 * (t > 4.0), 1.0),
-    "set forward by 1 s": (lambda t: t + 1.0 * (t > 4.0), -1.0),
-    "set back by 60 ms": (lambda t: t - 0.06 * (t > 4.0), 0.06),
-    "set to and fro": (lambda t: t + (t > 3.0) - 2.0 * (t > 6.0), 1.0),
-    "1 s behind, 200 ppm fast": (lambda t: t * (1.0 + 200e-6) - 1.0, 0.998),
-    "200 ppm slow": (lambda t: t * (1.0 - 200e-6), 0.002),
+SHORT = 0.001
+HIDES_S = SHORT + 5.0 * JITTER_S
+"A wrong clock hides the constant part of the way; setting it hides the jitter of that moment."
+CLOCKS: dict[str, tuple[Callable[[float], float], float, dict[str, float]]] = {
+    "right": (lambda t: t, 0.0, {}),
+    "1 s behind": (lambda t: t - 1.0, 1.0, {}),
+    "1 s ahead": (lambda t: t + 1.0, -1.0, {}),
+    "since 1970": (lambda t: t - 1.8e9, 1.8e9, {}),
+    "set back by 1 s": (lambda t: t - 1.0 * (t > 4.0), 1.0, {"steps": 1, "stepped_s": -1.0}),
+    "set forward by 1 s": (lambda t: t + 1.0 * (t > 4.0), -1.0, {"steps": 1, "stepped_s": 1.0}),
+    "set back by 60 ms": (lambda t: t - 0.06 * (t > 4.0), 0.06, {}),
+    "set to and fro": (lambda t: t + (t > 3.0) - 2.0 * (t > 6.0), 1.0, {}),
+    "1 s behind, 200 ppm fast": (lambda t: t * (1.0 + 200e-6) - 1.0, 0.998, {}),
+    "200 ppm slow": (lambda t: t * (1.0 - 200e-6), 0.002, {}),
 }
 
 
 @pytest.mark.parametrize("name", CLOCKS)
 def test_the_delay_is_believed_to_be_what_it_is_whatever_the_clock_shows(name: str) -> None:
-    clock_s, behind_s = CLOCKS[name]
+    clock_s, behind_s, known = CLOCKS[name]
     clock, heard = listen(clock_s, exponential(1))
-    # a wrong clock hides the constant part of the way; setting it hides the jitter of that moment
-    assert worst_error_s(heard, SETTLED_S + PERIOD_S) <= 0.001 + 5.0 * JITTER_S
-    assert (clock.is_settled, clock.offset_s, clock.is_wrong) == (
-        True,
-        pytest.approx(behind_s, abs=0.001 + 5.0 * JITTER_S),
-        abs(behind_s) > AHEAD_S,
-    )
+    assert worst_error_s(heard, SETTLED_S + PERIOD_S) <= HIDES_S
+    known |= {"is_settled": True, "offset_s": behind_s, "is_wrong": abs(behind_s) > AHEAD_S}
+    assert {each: getattr(clock, each) for each in known} == pytest.approx(known, abs=HIDES_S)
+
+
+Way = tuple[Callable[[float], float], float, float, float, float, dict[str, float]]
+WAYS: dict[str, Way] = {
+    # way, clock's lag, from when on the delay is believed to within what, the last, what is known
+    "longer for a while": (
+        *(lambda t: 0.001 + (0.4 if 4.0 < t < 40.0 else 0.0), 1.0),
+        *(1.0, 0.001 + DRIFT * 37.0, 0.0, {"steps": 0.0}),
+    ),
+    "a backlog": (lambda t: 0.001 + (5.0 - t if 4.0 < t < 5.0 else 0.0), 0.0, 0.0, 1.1 * DRIFT, 0.0, {}),
+    **{
+        f"a backlog at first contact, {behind_s} s behind": (
+            *(lambda t: max(0.8 - t, 0.0) + 0.001, behind_s),
+            *(0.81 + SETTLED_S, 0.0011, 0.0, {"offset_s": behind_s}),
+        )
+        for behind_s in (0.0, 1.0)
+    },
+    **{
+        f"always {way_s} s": (lambda t, way_s=way_s: way_s, 0.0, 20.0, 1e-5, way_s, {"is_wrong": False})  # type: ignore[misc]
+        for way_s in (0.0, 0.08, MAX_WAY_S)
+    },
+    "longer than a way may be": (lambda t: 0.5, 0.0, 20.0, 0.5 + 1e-5, 0.0, {"is_wrong": True}),
+}
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_a_way_is_not_taken_for_a_clock_while_a_way_may_be_so_long(name: str) -> None:
+    way_s, behind_s, from_s, within_s, last_s, known = WAYS[name]
+    clock, heard = listen(lambda t: t - behind_s, way_s, 60.0)
+    assert worst_error_s(heard, from_s) <= within_s
+    assert heard[-1].believed_s == pytest.approx(last_s, abs=0.001)
+    assert {each: getattr(clock, each) for each in known} == pytest.approx(known, abs=0.002)
 
 
 @pytest.mark.parametrize("drift_ppm", [200.0, -200.0, 0.0])
@@ -239,37 +250,6 @@ def test_a_drifting_clock_is_followed_for_an_hour_and_its_drift_told(drift_ppm: 
     assert worst_error_s(heard, 1.0) < 0.006
     # one message in ten of the half second's five comes without a queue
     assert (clock.steps, clock.line.fit().drift_ppm) == (0, pytest.approx(drift_ppm, abs=40.0))
-
-
-def test_a_step_is_counted_with_its_size() -> None:
-    for by_s, within_s in ((-1.0, PERIOD_S), (1.0, 5.0 * JITTER_S)):
-        clock, _ = listen(lambda t, by_s=by_s: t + by_s * (t > 4.0), exponential(3))  # type: ignore[misc]
-        assert (clock.steps, clock.stepped_s) == (1, pytest.approx(by_s, abs=within_s))
-
-
-def test_a_way_that_becomes_longer_is_no_clock() -> None:
-    clock, heard = listen(lambda t: t - 1.0, lambda t: 0.001 + (0.4 if 4.0 < t < 40.0 else 0.0), 44.0)
-    assert clock.steps == 0
-    assert worst_error_s(heard, 1.0) <= 0.001 + DRIFT * 37.0
-    assert heard[-1].believed_s < 0.001
-
-
-def test_a_backlog_is_as_old_as_it_is() -> None:
-    _, heard = listen(lambda t: t, lambda t: 0.001 + (5.0 - t if 4.0 < t < 5.0 else 0.0))
-    assert worst_error_s(heard, 0.0) < 1.1 * DRIFT
-
-
-@pytest.mark.parametrize("behind_s", [0.0, 1.0])
-def test_a_backlog_at_first_contact_is_not_taken_for_a_clock(behind_s: float) -> None:
-    clock, heard = listen(lambda t: t - behind_s, lambda t: max(0.8 - t, 0.0) + 0.001)
-    assert clock.offset_s == pytest.approx(behind_s, abs=0.002)
-    assert worst_error_s(heard, 0.81 + SETTLED_S) < 0.0011
-
-
-def test_a_constant_way_is_believed_while_a_way_may_be_so_long() -> None:
-    for way_s, believed_s in ((0.0, 0.0), (0.08, 0.08), (MAX_WAY_S, MAX_WAY_S), (0.5, 0.0)):
-        clock, heard = listen(lambda t: t, lambda t, way_s=way_s: way_s, 60.0)  # type: ignore[misc]
-        assert (heard[-1].believed_s, clock.is_wrong) == (pytest.approx(believed_s, abs=1e-5), way_s > MAX_WAY_S)
 
 
 def test_until_it_is_settled_a_message_is_as_old_as_it_says() -> None:

@@ -16,7 +16,7 @@ def batch(*rows: tuple[Any, ...], columns: tuple[str, ...] = COLUMNS) -> TickBat
 
 
 def telemetry(ms: float, seq: int, **changes: Any) -> Telemetry:
-    known: dict[str, Any] = dict.fromkeys(Telemetry.__struct_fields__)
+    known: dict[str, Any] = dict.fromkeys(Telemetry.__struct_fields__[: -len(Telemetry.__struct_defaults__)])
     known |= {"v": 1, "t_ns": START_NS + int(ms * 1e6), "seq": seq, "operating_state": "ENABLED", "is_homed": True}
     known |= {"is_busy": False, "duty": (0.5, -0.5), "limits": (), "faults": (), "tick": Tick(20.0, 100.0)}
     return Telemetry(**(known | changes))

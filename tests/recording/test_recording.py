@@ -4,7 +4,6 @@ import contextlib
 import errno
 import json
 import math
-import resource
 import shutil
 from functools import cache
 from pathlib import Path
@@ -17,7 +16,7 @@ import pytest
 from hypothesis import example, given, strategies as st
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
-from sent import COLUMNS, START_NS, Back, back, batch, telemetry
+from sent import COLUMNS, START_NS, back, batch, telemetry
 
 from tormagd.record.overview import MAX_STRETCHES, Codes, Curves, Glance, OverviewBuilder, unpacked
 from tormagd.record.reader import RecordingError, RecordingFile, damage_in, summary_of
@@ -27,9 +26,9 @@ from tormagd.view.plot import figure, save_plot
 from tormagd_client.messages import Mark, MessageError, encode
 
 
-@pytest.fixture
-def written(tmp_path: Path) -> Path:
-    path = tmp_path / "a.mcap"
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("written") / "a.mcap"
     with RecordingWriter(path, {"scene": "pulse"}) as writer:
         for k in range(5):
             writer.ticks(batch(*((20 * k + i, 1.5, 1.6, 35.0, 36.0, 0.25) for i in range(20))))
@@ -152,22 +151,6 @@ def test_before_a_disk_is_full_all_that_came_is_closed_in_order(tmp_path, monkey
     assert (writer.tick_count + 400) // 500 == chunks
 
 
-def test_a_disk_that_fails_without_a_warning_leaves_what_is_whole(tmp_path):
-    path = tmp_path / "full.mcap"
-    writer = RecordingWriter(path)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (96_000, hard))
-    try:
-        with pytest.raises(OSError, match="too large"):
-            fill(writer)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    recording = back(path)
-    assert not recording.is_complete
-    assert recording.ms() == [*range(len(recording.ticks))]
-    assert len(recording.ticks) > 1_000
-
-
 def test_half_a_second_is_written_at_once(tmp_path):
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
@@ -198,22 +181,14 @@ def test_columns_may_change_while_recording(tmp_path):
 
 
 @given(place=st.floats(0.0, 1.0), value=st.integers(1, 255), keep=st.floats(0.0, 1.0))
-def test_a_damaged_file_gives_a_recording_or_a_recording_error(tmp_path_factory, place, value, keep):
-    path = Path(tmp_path_factory.getbasetemp()) / "small.mcap"
-    if not path.exists():
-        with RecordingWriter(path) as writer:
-            writer.ticks(batch((0, 1.0, 1.0, 35.0, 35.0, 0.0)))
-            writer.telemetry(telemetry(0, 0))
-    data = bytearray(path.read_bytes())
+def test_a_damaged_file_gives_a_recording_or_a_recording_error(written, place, value, keep):
+    data, damaged = bytearray(written.read_bytes()), written.with_name("damaged.mcap")
     data[int(place * (len(data) - 1))] ^= value
-    damaged = path.with_name("damaged.mcap")
     damaged.write_bytes(data[: int(keep * len(data))])
     try:
-        recording = back(damaged)
+        back(damaged)
     except RecordingError as error:
         assert "damaged.mcap" in str(error)  # noqa: PT017
-    else:
-        assert isinstance(recording, Back)
 
 
 def test_quantities_come_from_the_ticks_and_else_from_telemetry(written):
@@ -246,7 +221,7 @@ def test_a_disk_that_is_full_keeps_the_picture_that_was_there(written, tmp_path,
     monkeypatch.setattr(Path, "write_bytes", half)
     with pytest.raises(OSError, match="No space"):
         save_plot(figure(RecordingFile(written).overview, "x"), tmp_path / name)
-    assert {path.name for path in tmp_path.iterdir()} == {"a.mcap", "a.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.png"}
     assert (tmp_path / "a.png").read_bytes() == b"precious"
 
 
@@ -401,8 +376,8 @@ def test_what_no_crc_vouches_for_is_named_and_an_overview_not_shown(path, tmp_pa
 
 
 @given(place=st.floats(0.0, 1.0), value=st.integers(1, 255))
-def test_no_byte_is_changed_unnoticed(path, tmp_path_factory, place, value) -> None:
-    data, changed = bytearray(path.read_bytes()), Path(tmp_path_factory.getbasetemp()) / "changed.mcap"
+def test_no_byte_is_changed_unnoticed(path, place, value) -> None:
+    data, changed = bytearray(path.read_bytes()), path.with_name("changed.mcap")
     data[int(place * (len(data) - 1))] ^= value
     changed.write_bytes(data)
     with changed.open("rb") as file:

@@ -2,9 +2,12 @@
 
 import json
 from collections import Counter
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from flight import COLUMNS, Flight, again, frames
 from mcap.reader import make_reader
@@ -114,13 +117,21 @@ def test_another_frame_that_was_written_is_found(core: Core, box: BlackBoxFile) 
     )
 
 
-def test_a_memory_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
-    place = place_of(box.entries, "state", DAMAGED_TICK)
-    _, step, plan, connection, of = box.entries[place]
-    link = connection["link"]["DeviceLink"]
-    altered = {**connection, "link": {"DeviceLink": link | {"_least_delay_s": link["_least_delay_s"] + 1e-9}}}
-    entries = [*box.entries[:place], ["state", step, plan, altered, of], *box.entries[place + 1 :]]
-    assert again(core, entries, SNAPSHOT_S - 0.5).difference.field == "state.connection.link._least_delay_s"
+@pytest.mark.parametrize(
+    ("part", "way", "field"),
+    [
+        (1, "Stepper.measure.Measure.measured.Measured.handle.Handle.sliding_mm_s", "step.measure.measured.handle"),
+        (3, "link.DeviceLink._least_delay_s", "connection.link"),
+    ],
+)
+def test_a_memory_that_differs_is_found_where_no_tick_shows_it(
+    core: Core, box: BlackBoxFile, part: int, way: str, field: str
+) -> None:
+    place, (*outer, name) = place_of(box.entries, "state", DAMAGED_TICK), way.split(".")
+    altered = msgspec.msgpack.decode(msgspec.msgpack.encode(box.entries[place]))
+    reduce(getitem, outer, altered[part])[name] += 1e-9
+    entries = [*box.entries[:place], altered, *box.entries[place + 1 :]]
+    assert again(core, entries, SNAPSHOT_S - 0.5).difference.field == f"state.{field}.{name}"
 
 
 def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, tmp_path: Path) -> None:
