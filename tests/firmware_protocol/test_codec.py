@@ -21,7 +21,6 @@ from firmware_protocol.codec import (
     FUNCTION,
     PROTOCOL_VERSION,
     SCHEMA_HASH,
-    Clear,
     DecodeError,
     DeviceFault,
     DeviceMode,
@@ -48,8 +47,6 @@ from firmware_protocol.framing import MAX_PAYLOAD, Frame, FrameDecoder, FramingS
 from firmware_protocol.golden import bitwise_crc8, bitwise_crc16
 from firmware_protocol.layouts import LAYOUTS
 from firmware_protocol.schema import Layout, Signal
-from tormagd.simulation.firmware import Answer, Firmware, Sensors
-from tormagd.simulation.parameters import load_plant
 
 # -- against the DBC ---------------------------------------------------------------------------------------------------
 
@@ -345,72 +342,6 @@ def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
             type(message)
         ]
         assert said.format(max(serial_ms, math.ceil(100 * can_ms) / 100)) in PAGE
-
-
-# -- what each mode takes, as the page says --------------------------------------------------------------------------
-
-AT_REST = Sensors(0, 0, 0.0, 0.0, 0.0, 0, Switches(0), 12.0, 25.0)
-ASKED = 0.25
-
-
-def in_mode(mode: DeviceMode) -> Firmware:
-    firmware = Firmware(load_plant("sample_1"))
-    firmware.receive(0.0, Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255), AT_REST)
-    firmware.homed = True
-    before: dict[DeviceMode, tuple[Message, ...]] = {
-        DeviceMode.IDLE: (),
-        DeviceMode.RUN: (Drive(0.0, 0.0, DriveMode.RUN, 1),),
-        DeviceMode.HOMING: (Home(1),),
-        DeviceMode.RETRACTING: (Retract(1),),
-        DeviceMode.LATCHED: (Hello(SCHEMA_HASH ^ 1, PROTOCOL_VERSION, 255), Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255)),
-    }
-    for message in before[mode]:
-        firmware.receive(0.0, message, AT_REST)
-    assert firmware.mode is mode
-    return firmware
-
-
-SAID: dict[str, Message] = {
-    "Drive OFF": Drive(0.0, 0.0, DriveMode.OFF, 2),
-    "Drive RUN": Drive(ASKED, 0.0, DriveMode.RUN, 2),
-    "Hello that fits": Hello(SCHEMA_HASH, PROTOCOL_VERSION, 9),
-    "Hello that does not": Hello(SCHEMA_HASH ^ 1, PROTOCOL_VERSION, 9),
-    "Retract": Retract(9),
-    "Home": Home(9),
-    "Clear": Clear(9),
-}
-
-
-def taken() -> list[tuple[str, DeviceMode, str]]:
-    """Return the cells of the page's table: what is said, in which mode, and what comes of it."""
-    head, _, *rows = re.findall(r"^\|(.*)\|$", PAGE.partition("### What each mode takes")[2].partition("###")[0], re.M)
-    modes = [DeviceMode[name.strip()] for name in head.split("|")[1:]]
-    cells = [[cell.strip() for cell in row.split("|")] for row in rows]
-    return [(said, mode, what) for said, *row in cells for mode, what in zip(modes, row, strict=True)]
-
-
-def test_the_table_of_the_page_is_whole() -> None:
-    assert [(said, mode) for said, mode, _ in taken()] == [(said, mode) for said in SAID for mode in DeviceMode]
-
-
-@pytest.mark.parametrize(("said", "mode", "what"), taken())
-def test_the_firmware_does_what_the_pages_table_says(said: str, mode: DeviceMode, what: str) -> None:
-    firmware = in_mode(mode)
-    answer = firmware.receive(0.001, SAID[said], AT_REST)
-    assert firmware.mode is DeviceMode.__members__.get(re.split(r"\W", what)[0], mode)
-    nonce = firmware.status(AT_REST).command_nonce
-    if said.startswith("Drive"):
-        assert (answer, firmware.output.left_duty == ASKED) == (Answer.MEASUREMENT, firmware.mode is DeviceMode.RUN)
-    elif said.startswith("Hello"):
-        assert (answer, nonce, DeviceFault.SCHEMA_MISMATCH in firmware.faults) == (
-            Answer.IDENTITY,
-            9,
-            "not" in said or mode is DeviceMode.LATCHED,
-        )
-    else:
-        assert (answer, nonce == 9) == (Answer.NONE, what != "refused")
-    if "not homed" in what:
-        assert not firmware.homed
 
 
 # -- the C codec and framing -------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import msgspec
 import pytest
+from virtual_port import VirtualPort
 
 from firmware_protocol.codec import (
     PROTOCOL_VERSION,
@@ -36,28 +37,12 @@ PERIOD_S = 1e-3
 STATUS_PERIOD_S = 0.02
 
 
-class Port:
-    def __init__(self, device: VirtualDevice) -> None:
-        self.device = device
-        self.time_s = 0.0
-
-    def now_s(self) -> float:
-        return self.time_s
-
-    def write(self, data: bytes) -> None:
-        self.device.receive(self.time_s, data)
-
-    def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        self.time_s = until_s
-        return [(until_s, self.device.transmit(until_s))]
-
-
 class Bench(Host):
     def __init__(self, faults: Iterable[str] = (), plant: PlantParameters | None = None) -> None:
         self.device = VirtualDevice(
             plant or load_plant("sample_1"), SteadyHand(), [parse_fault(fault) for fault in faults]
         )
-        super().__init__(SerialLine(Port(self.device)))
+        super().__init__(SerialLine(VirtualPort(self.device)))
 
     def go_to(self, gap_mm: float, seconds: float = 1.5) -> None:
         target_mm = gap_mm / 2.0 - 47.5
