@@ -56,7 +56,6 @@ from tormagd.simulation.slcan_port import SlcanPort
 CONFIG = Config()
 PATIENCE_S = 10.0
 "Only a failure waits so long."
-PERIOD_S = 1e-3
 MOVING_S = 0.3
 OPENING_S = 2.4
 "The slower of two openings, with the device's own timeout before it."

@@ -90,8 +90,6 @@ def judged(case: Case) -> Json:
         "withdrawal_held_ms": held_ms(run, waiting_N),
         "withdrawal_bound_ms": held_ms(bound if case.mode.startswith("force") else opened(case, core), waiting_N),
         "tip_depth_mm": float(run.depth_mm.max()),
-        "tip_depth_bound_mm": float(bound.depth_mm.max()),
-        "tip_depth_infinite_mm": float(infinite.depth_mm.max()),
         "early_N": early_N(run, waiting_N),
         "swings": swings(run),
         "energy_error": energy_error(run),
@@ -209,8 +207,7 @@ def draw(picture: Path) -> None:
     figure.savefig(picture)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--picture", type=Path, metavar="FILE.png")
+OPTIONS = {"--picture": {"type": Path, "metavar": "FILE.png"}}
 
 
 def measure(options: argparse.Namespace) -> Json:

@@ -174,11 +174,14 @@ CASES = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    counts = ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items())
-    parser.add_argument("case", choices=CASES)
-    parser.add_argument("--count", type=whole(1, 10**9), help=f"default: {counts}")
-    parser.add_argument("--seed", type=int, default=1, help="of what is drawn (1)")
+OPTIONS = {
+    "case": {"choices": CASES},
+    "--count": {
+        "type": whole(1, 10**9),
+        "help": "default: " + ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items()),
+    },
+    "--seed": {"type": int, "default": 1, "help": "of what is drawn (1)"},
+}
 
 
 def measure(options: argparse.Namespace) -> Figures:

@@ -240,8 +240,7 @@ def picture(path: Path, result: Json, found: list[tuple[Case, Json]]) -> None:
     figure.savefig(path, dpi=130, metadata=stamp(result))
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")
+OPTIONS = {"--picture": {"type": Path, "help": "PNG of the force error over handle speed and asked force"}}
 
 
 def shown(figures: Json) -> Iterator[str]:

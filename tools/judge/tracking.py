@@ -247,8 +247,7 @@ OF_SIGNALS = {"samples": samples, "signals": signals}
 CASES = (*OF_DEVICES, *OF_SIGNALS)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("cases", nargs="*", choices=(*CASES, "all"), default="all", help="default: all")
+OPTIONS = {"cases": {"nargs": "*", "choices": (*CASES, "all"), "default": "all", "help": "default: all"}}
 
 
 def measure(options: argparse.Namespace) -> Json:
