@@ -67,8 +67,7 @@ def test_the_inverse_returns_the_radial_moment_and_needs_few_steps(
     if steps is not None:
         monkeypatch.setattr("tormag_lab.design.force_law._NEWTON_STEPS", steps)
     for case in islice(over_loads(seed), count):
-        force_N = brake_force_N(*case)
-        assert radial_moment_for_force_Tm(force_N, *case[1:]) == pytest.approx(case.moment, rel=rel)
+        assert radial_moment_for_force_Tm(brake_force_N(*case), *case[1:]) == pytest.approx(case.moment, rel=rel)
 
 
 @pytest.mark.parametrize("function", [stretch_minus_one, d_force_d_moment, radial_moment_for_force_Tm])

@@ -240,8 +240,7 @@ def test_a_friction_that_differs_by_the_way_is_believed_from_the_beginning(bench
         share = 0.04 * math.cos(message.handle_position_mm / 20.0 + 0.7) + 0.03 * math.copysign(1.0, message.force_N)
         return message.replaced(force_N=message.force_N * (1.0 + share))
 
-    turned = bench(SAMPLE, hand=Turning(), alters=rippled)
-    found, stopped = turned.commission(chosen("force over gap", "memory"))
+    found, stopped = bench(SAMPLE, hand=Turning(), alters=rippled).commission(chosen("force over gap", "memory"))
     _, way, ripple = found["memory"]
     assert (way.value, ripple.value, stopped) == (pytest.approx(3.0, abs=0.6), pytest.approx(4.0, abs=0.8), None)
     file = tmp_path / "00000007.toml"

@@ -1233,8 +1233,7 @@ def by_error(error: str) -> Line:
 
 @pytest.mark.parametrize("planted", PLANTED, ids=lambda planted: f"{planted.error}-{planted.finds}")
 def test_a_planted_error_is_found_by_name(planted: Planted) -> None:
-    checks = [named(name) for name in (*planted.first, planted.finds)]
-    result = run(hosted(planted.line()), checks)[-1]
+    result = run(hosted(planted.line()), [named(name) for name in (*planted.first, planted.finds)])[-1]
     assert (result.check.name, result.passed) == (planted.finds, False), result.seen
     assert SAID.get(planted.error, "") in result.seen
 
@@ -1411,8 +1410,7 @@ def test_the_rules_are_the_pages() -> None:
     held = " ".join(finds for finds in RULES.values() if not finds.startswith("-")).split()
     assert set(held) == {one.name for one in CHECKS}
     rows = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("| ")]
-    table = {name: tuple(cells) for name, *cells in rows if name in TAKES}
-    assert table == TAKES
+    assert {name: tuple(cells) for name, *cells in rows if name in TAKES} == TAKES
     assert ["", *MODES] in [["", *cells] for cells in rows] or list(MODES) in rows
 
 

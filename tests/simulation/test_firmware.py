@@ -1,7 +1,6 @@
 """What the device's firmware does with motors, switches and encoders, seen through the wire."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import msgspec
 import pytest
@@ -122,106 +121,72 @@ def test_duties_are_applied_in_steps_of_ten_bits() -> None:
     assert travel(513 * step) > travel(512 * step) > 60.0
 
 
-class Ending(NamedTuple):
-    """How a run from a gap of `gap_mm` ends, with these faults of the device and these duties of the host."""
-
-    faults: tuple[str, ...]
-    duties: tuple[float, float] | None
-    gap_mm: float
-    at_once: DeviceFault
-    latched: DeviceFault
-    left_mm: float
-    right_mm: float
-    within_mm: float = 0.3
-
-
 OPEN_MM = 47.5
+TIMEOUT, SUPPLY, MOVED = DeviceFault.COMMAND_TIMEOUT, DeviceFault.SUPPLY, DeviceFault.UNCOMMANDED_MOTION
+SHUT = DeviceFault.RETRACT_FAILED
+BOTH_OPEN = pytest.approx((OPEN_MM, OPEN_MM), abs=0.3)
 ENDINGS = {
-    "silence": Ending((), None, 60.0, DeviceFault.COMMAND_TIMEOUT, DeviceFault.COMMAND_TIMEOUT, OPEN_MM, OPEN_MM),
-    "a closed switch": Ending((), (-0.3, -0.3), 50.0, DeviceFault.END_STOP, DeviceFault.END_STOP, OPEN_MM, OPEN_MM),
-    "skew": Ending((), (0.4, -0.4), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM),
-    "a blocked carriage": Ending(
+    "silence": ((), None, 60.0, TIMEOUT, TIMEOUT, BOTH_OPEN),
+    "a closed switch": ((), (-0.3, -0.3), 50.0, DeviceFault.END_STOP, DeviceFault.END_STOP, BOTH_OPEN),
+    "skew": ((), (0.4, -0.4), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, BOTH_OPEN),
+    "a blocked carriage": (
         ("blocked_left@3.5",),
         (1.0, 0.0),
         60.0,
         DeviceFault.OVERCURRENT,
-        DeviceFault.OVERCURRENT | DeviceFault.RETRACT_FAILED,
-        30.0,
-        OPEN_MM,
+        DeviceFault.OVERCURRENT | SHUT,
+        pytest.approx((30.0, OPEN_MM), abs=0.3),
     ),
-    "a stiff guide": Ending(
-        ("drag_left=+1000%@3.5",),
-        None,
-        60.0,
-        DeviceFault.COMMAND_TIMEOUT,
-        DeviceFault.COMMAND_TIMEOUT,
-        OPEN_MM,
-        OPEN_MM,
-    ),
+    "a stiff guide": (("drag_left=+1000%@3.5",), None, 60.0, TIMEOUT, TIMEOUT, BOTH_OPEN),
     # what is late goes on opening
-    "weak motors": Ending(
-        ("opening=-60%@3.5",),
-        None,
-        52.0,
-        DeviceFault.COMMAND_TIMEOUT,
-        DeviceFault.COMMAND_TIMEOUT | DeviceFault.RETRACT_FAILED,
-        OPEN_MM,
-        OPEN_MM,
-    ),
+    "weak motors": (("opening=-60%@3.5",), None, 52.0, TIMEOUT, TIMEOUT | SHUT, BOTH_OPEN),
     # found by the skew, and opened blind
-    "a stuck encoder": Ending(
-        ("encoder_stuck_left@3.5",), (-0.3, -0.3), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM
-    ),
-    "no supply": Ending(
-        ("supply_loss@3.5",),
-        (0.0, 0.0),
-        60.0,
-        DeviceFault.SUPPLY,
-        DeviceFault.SUPPLY | DeviceFault.RETRACT_FAILED,
-        30.0,
-        30.0,
-        0.16,
-    ),
-    "a worn gearbox without supply": Ending(
+    "a stuck encoder": (("encoder_stuck_left@3.5",), (-0.3, -0.3), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, BOTH_OPEN),
+    "no supply": (("supply_loss@3.5",), (0.0, 0.0), 60.0, SUPPLY, SUPPLY | SHUT, pytest.approx((30.0, 30.0), abs=0.16)),
+    "a worn gearbox without supply": (
         ("worn_gearbox@3.5", "supply_loss@3.5"),
         (0.0, 0.0),
         48.0,
-        DeviceFault.SUPPLY,
-        DeviceFault.SUPPLY | DeviceFault.UNCOMMANDED_MOTION | DeviceFault.RETRACT_FAILED,
-        22.0,
-        22.0,
-        0.24,
+        SUPPLY,
+        SUPPLY | MOVED | SHUT,
+        pytest.approx((22.0, 22.0), abs=0.24),
     ),
-    "a worn gearbox after a reset": Ending(
+    "a worn gearbox after a reset": (
         ("worn_gearbox@3.6", "reset@3.5"),
         (0.0, 0.0),
         48.0,
         DeviceFault(0),
-        DeviceFault.UNCOMMANDED_MOTION,
-        OPEN_MM,
-        OPEN_MM,
+        MOVED,
+        BOTH_OPEN,
     ),
 }
 
 
-@pytest.mark.parametrize("ending", ENDINGS.values(), ids=ENDINGS)
-def test_how_a_run_ends(ending: Ending) -> None:
-    host = running(ending.faults, gap_mm=ending.gap_mm)
+@pytest.mark.parametrize(("faults", "duties", "gap_mm", "at_once", "latched", "end_mm"), ENDINGS.values(), ids=ENDINGS)
+def test_how_a_run_ends(
+    faults: tuple[str, ...],
+    duties: tuple[float, float] | None,
+    gap_mm: float,
+    at_once: DeviceFault,
+    latched: DeviceFault,
+    end_mm: object,
+) -> None:
+    host = running(faults, gap_mm=gap_mm)
     host.run_until(3.5)
-    beat = (None,) if ending.duties is None else (DriveMode.RUN, *ending.duties)
+    beat = (None,) if duties is None else (DriveMode.RUN, *duties)
     while host.status.mode is DeviceMode.RUN:
         host.beat(*beat)
         assert host.now_s < 20.0
-    assert host.status.faults == ending.at_once
+    assert host.status.faults == at_once
     truth = host.device.truth
     assert abs(truth.left_mm - truth.right_mm) < 4.0
     assert truth.gap_mm > 44.0 - 1e-6
     host.reaches(DeviceMode.LATCHED)
     host.pass_time(1.0)
     truth = host.device.truth
-    assert (host.status.faults, truth.left_A, truth.right_A) == (ending.latched, 0.0, 0.0)
-    assert (truth.left_mm, truth.right_mm) == pytest.approx((ending.left_mm, ending.right_mm), abs=ending.within_mm)
-    assert host.command(Clear) is (DeviceFault.SUPPLY not in ending.latched), "its cause lasts"
+    assert (host.status.faults, truth.left_A, truth.right_A) == (latched, 0.0, 0.0)
+    assert (truth.left_mm, truth.right_mm) == end_mm
+    assert host.command(Clear) is (SUPPLY not in latched), "its cause lasts"
 
 
 @pytest.mark.parametrize(("percent", "within_s"), [(-100, 0.4), (-75, 3.5), (-200, 3.5)])

@@ -69,8 +69,7 @@ def test_stall_torque_and_current_are_those_of_the_data_sheet() -> None:
     for step in range(steps(6.0)):
         axis.step(min(12.0, step * SUBSTEP_S * 3.0), 0.0)
     assert (axis.speed_rad_s, axis.current_A) == (0.0, pytest.approx(5.5, rel=0.05))
-    torque_Nm = axis.contact_N * (LEAD_M_RAD + axis.screw_friction_m)
-    assert torque_Nm == pytest.approx(2.65, rel=0.10)
+    assert axis.contact_N * (LEAD_M_RAD + axis.screw_friction_m) == pytest.approx(2.65, rel=0.10)
 
 
 @pytest.mark.parametrize(
@@ -330,8 +329,7 @@ def readings(plant: Plant, milliseconds: int) -> list[float]:
 def test_force_sensor_noise_has_the_stated_spread_around_the_truth(name: str) -> None:
     parameters = load_plant(name)
     plant = Plant(parameters, SteadyHand(), seed=3)
-    values = readings(plant, 4000)[200:]
-    fresh = [after for before, after in itertools.pairwise(values) if after != before]
+    fresh = [after for before, after in itertools.pairwise(readings(plant, 4000)[200:]) if after != before]
     assert len(fresh) == pytest.approx(3.8 * parameters.force_sensor.rate_Hz, abs=3)
     assert statistics.stdev(fresh) == pytest.approx(parameters.force_sensor.noise_mN * 1e-3, rel=0.08)
     assert statistics.fmean(fresh) == pytest.approx(plant.truth.force_N, abs=3e-3)
@@ -477,8 +475,7 @@ def test_a_step_creeps_with_the_logarithm_of_time_and_comes_to_an_end() -> None:
 
 def test_friction_grows_with_the_logarithm_of_speed_and_with_rest() -> None:
     quiet = second_of(creeping_share=0.0)
-    speeds = (1.0, 10.0, 100.0)
-    slow_N, middle_N, fast_N = (slid(60.0, quiet, 12.0 / speed, speed).force_N for speed in speeds)
+    slow_N, middle_N, fast_N = (slid(60.0, quiet, 12.0 / speed, speed).force_N for speed in (1.0, 10.0, 100.0))
     assert middle_N / slow_N == pytest.approx(fast_N / middle_N, rel=0.03)
     assert 1.02 < middle_N / slow_N < 1.06
     peaks_N = []

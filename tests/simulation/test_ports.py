@@ -230,8 +230,7 @@ def test_a_frame_carries_its_time_and_comes_back_where_its_sender_asks(
             with pytest.raises(can.CanOperationError, match="11-bit"):
                 one.send(can.Message(**refused))
         heard = {bus: list(iter(partial(bus.recv, 0), None)) for bus in (one, other, itself)}
-    said = [(message.arbitration_id, bytes(message.data), message.is_rx) for message in heard[itself]]
-    assert said == [
+    assert [(message.arbitration_id, bytes(message.data), message.is_rx) for message in heard[itself]] == [
         *[(0x300, b"123", True), (0x301, b"123", False)],
         *[(0x300, b"12345678", True), (0x301, b"12345678", False)],
     ]

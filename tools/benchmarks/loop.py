@@ -233,8 +233,7 @@ def as_block(rows: list[list[Any]], control_hz: int) -> Block:
     lateness_us, exec_us, received_s = np.array([row[1:] for row in rows], dtype=np.float64).T
     spanned_s = (rows[-1][0] - rows[0][0]) * 1e-9
     merged = max(0, round(spanned_s * control_hz) + 1 - len(rows))
-    fresh = int(np.count_nonzero(np.diff(received_s) > 0.0))
-    return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
+    return Block(lateness_us, exec_us, len(rows), merged, spanned_s, int(np.count_nonzero(np.diff(received_s) > 0.0)))
 
 
 def reported(address: str) -> dict[str, Any]:

@@ -164,7 +164,6 @@ def kept(rows: list[Json]) -> Json:
             if row["onset_lag_ms"] is not None and row["onset_bound_ms"] is not None
         ]
         worse = [row["rms_N"] - WORSE * row["rms_bound_N"] - WORSE_N for row in of_mode]
-        held = [row["withdrawal_held_ms"] - row["withdrawal_bound_ms"] for row in of_mode]
         found[mode] = {
             "cases": len(of_mode),
             "counted": len(late),
@@ -172,7 +171,7 @@ def kept(rows: list[Json]) -> Json:
             "short": spread([row["onset_short"] for row in of_mode if row["onset_short"] is not None]),
             "rms_kept": float(np.mean([each <= 0.0 for each in worse])),
             "rms_over_N": float(np.quantile(worse, 0.95)),
-            "held_ms": spread(held),
+            "held_ms": spread([row["withdrawal_held_ms"] - row["withdrawal_bound_ms"] for row in of_mode]),
             "early_N": spread([row["early_N"] for row in of_mode]),
             "over_most_N": max(row["most_N_exceeded"] for row in of_mode),
             "swings": max(row["swings"] for row in of_mode),
