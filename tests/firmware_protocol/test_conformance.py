@@ -114,7 +114,7 @@ def serial_line(
 
 
 def can_line(bus: type[Bus] = Bus, plant: PlantParameters = NEAR_HOME) -> CanLine:
-    return CanLine(bus(CanDevice(MessageDevice(plant, WindingHand()))), 1)
+    return CanLine(bus(CanDevice(MessageDevice(plant, WindingHand()), node=3)), 3)
 
 
 # -- the right device ----------------------------------------------------------------------------------------------
@@ -845,7 +845,7 @@ PLANTED = (
     wire("takes a zero inside", "idle_stays", down=joined),
     wire("noise is a Drive", "idle_stays", mended=noise_is_a_drive),
     wire("deafened", "idle_stays", mended=deafened),
-    Planted("every node", "idle_stays", lambda: can_line(wrong(Bus, down=lambda _, identifier: identifier & ~0xF | 1))),
+    Planted("every node", "idle_stays", lambda: can_line(wrong(Bus, down=lambda _, identifier: identifier & ~0xF | 3))),
     rogue("Home is ignored", "home_homes", hears=only_acknowledges(Home)),
     fault("motor_reversed_left", "home_homes"),
     fault("encoder_reversed_left", "home_homes"),

@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import itertools
+import math
 import select
 import signal
 import socket
@@ -195,8 +196,10 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
     good = served.host()
-    too_long = SOCKET_FRAME.pack(0x21, 9, False, bytes(8), 0.0)
-    for packet in (b"x", bytes(SOCKET_FRAME.size + 1), too_long, to_socket(CanFrame(ERROR_FLAG, b""))):
+    none = ((0x21, 9, False, bytes(8), 0.0), (0x800, 0, False, b"", 0.0), (0x21, 0, False, b"", math.nan))
+    lengths = (1, SOCKET_FRAME.size - 1, SOCKET_FRAME.size + 1)
+    packets = (*map(bytes, lengths), *(SOCKET_FRAME.pack(*one) for one in none), to_socket(CanFrame(ERROR_FLAG, b"")))
+    for packet in packets:
         bad = served.host()
         bad.send(packet)
         served.exchange(0.002)
