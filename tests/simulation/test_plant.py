@@ -8,6 +8,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
+from devices import SAMPLES
 from hypothesis import given, settings, strategies as st
 
 from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
@@ -19,8 +20,6 @@ from tormagd.simulation.plant import SUBSTEP_S, Plant
 from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.second_element import SecondElement
 from tormagd.simulation.static_laws import pull_of_magnets_N, radial_moment_Tm
-
-SAMPLES = ("sample_1", "sample_2", "sample_3")
 
 SAMPLE_1 = load_plant("sample_1")
 LEAD_M_RAD = 8e-3 / math.tau

@@ -86,34 +86,15 @@ def meet(device: Device) -> None:
             seen |= {type(message) for message in backend.receive()}
 
 
-def on_a_bus(channel: str) -> Device:
-    return Device(backend="can", options={"interface": "tormagsim"}, port=channel)
-
-
 def test_hosts_come_and_go_on_the_simulators_bus(start: Start) -> None:
     process = start("--can")
     path = channel(process)
     assert Path(path).is_socket()
     assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
     for _ in range(2):
-        meet(on_a_bus(path))
+        meet(Device(backend="can", options={"interface": "tormagsim"}, port=path))
     ended(process)
     assert not Path(path).exists()
-
-
-def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_not(start: Start, tmp_path: Path) -> None:
-    path = str(tmp_path / "can")
-    killed = start("--can", path)
-    assert channel(killed) == path
-    second = start("--can", path)
-    output, errors = second.communicate(timeout=LIMIT_S)
-    assert (second.returncode, output) == (2, "")
-    assert path in errors
-    killed.kill()
-    killed.wait()
-    assert Path(path).is_socket()
-    assert channel(start("--can", path)) == path
-    meet(on_a_bus(path))
 
 
 def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, tmp_path: Path) -> None:
@@ -192,6 +173,15 @@ def served(tmp_path: Path) -> Iterator[Served]:
     made = Served(tmp_path / "can")
     with contextlib.closing(made.door):
         yield made
+
+
+def test_what_somebody_serves_stays_and_what_a_killed_simulator_left_is_replaced(served: Served) -> None:
+    path = Path(served.door.address)
+    with pytest.raises(OSError, match=f"{path}: cannot be served"):
+        CanPort(served.device, path)
+    served.door._listener.close()
+    with contextlib.closing(CanPort(served.device, path)) as second:
+        assert second.address == served.door.address
 
 
 def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
