@@ -14,7 +14,7 @@ import sys
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeGuard, TypeVar
 
 import msgspec
 import pytest
@@ -309,7 +309,7 @@ CLEAR_ENDS_ANYTHING = rests(lambda device, message: isinstance(message, Clear) a
 OFF_ONLY_SWITCHES_OFF = rests(lambda device, message: is_running(device) and is_off(message))
 
 
-def is_off(message: Message) -> bool:
+def is_off(message: Message) -> TypeGuard[Drive]:
     return isinstance(message, Drive) and message.mode is DriveMode.OFF
 
 
