@@ -1,7 +1,6 @@
 """The codec, in Python and in C: against the DBC, the golden vectors, and what the README shows."""
 
 import contextlib
-import ctypes
 import itertools
 import json
 import math
@@ -344,98 +343,15 @@ def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
         assert said.format(max(serial_ms, math.ceil(100 * can_ms) / 100)) in PAGE
 
 
-# -- the C codec and framing -------------------------------------------------------------------------------------------
+# -- the C codec and framing; which value stands where, its twin in Python tells (test_c_device.py) --------------------
 
 
-STEP_TYPES = {
-    "b": ctypes.c_int8,
-    "B": ctypes.c_uint8,
-    "h": ctypes.c_int16,
-    "H": ctypes.c_uint16,
-    "I": ctypes.c_uint32,
-}
-OK, UNKNOWN_FUNCTION, OUT_OF_RANGE = 0, 1, 4
-REFUSALS = 4
-
-
-def structure(layout: Layout) -> type[ctypes.Structure]:
-    names = [signal.name for signal in layout.signals] + ["crc"] * layout.protected
-    fields = [(name, STEP_TYPES[code]) for name, code in zip(names, layout.format[1:], strict=True)]
-    return type(layout.message.__name__, (ctypes.Structure,), {"_fields_": fields})
-
-
-class Signals(ctypes.Union):
-    _fields_ = [(layout.message.__name__, structure(layout)) for layout in LAYOUTS]
-
-
-class CMessage(ctypes.Structure):
-    _fields_ = [("function", ctypes.c_uint8), ("signals", Signals)]
-
-
-def c_decode(library: ctypes.CDLL, function: int, payload: bytes) -> tuple[int, dict[str, int]]:
-    message = CMessage()
-    result = library.tormag_decode(
-        ctypes.byref(message), ctypes.c_uint8(function), payload, ctypes.c_size_t(len(payload))
-    )
-    if result != OK:
-        return result, {}
-    assert message.function == function
-    layout = next(layout for layout in LAYOUTS if layout.function == function)
-    steps = getattr(message.signals, layout.message.__name__)
-    return result, {signal.name: getattr(steps, signal.name) for signal in layout.signals}
-
-
-def c_encode(library: ctypes.CDLL, function: int, name: str, steps: dict[str, int]) -> tuple[int, bytes]:
-    message = CMessage(function=function)
-    signals = getattr(message.signals, name)
-    for signal, step in (steps | {"crc": 0xA5}).items():
-        setattr(signals, signal, step)  # one of no field stays in Python
-    payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-    length = ctypes.c_size_t()
-    result = library.tormag_encode(payload, ctypes.byref(length), ctypes.byref(message))
-    return result, payload.raw[: length.value]
-
-
-# -- payloads ------------------------------------------------------------------------------------------------------
-
-
-def test_c_knows_the_same_payloads_in_both_directions(library: ctypes.CDLL) -> None:
-    for vector in MESSAGES["valid"]:
-        payload = bytes.fromhex(vector["payload"])
-        assert c_decode(library, vector["function"], payload) == (OK, vector["steps"]), vector
-        assert c_encode(library, vector["function"], vector["message"], vector["steps"]) == (OK, payload), vector
-
-
-def test_c_refuses_the_same_payloads(library: ctypes.CDLL) -> None:
-    results = [
-        c_decode(library, vector["function"], bytes.fromhex(vector["payload"]))[0] for vector in MESSAGES["invalid"]
-    ]
-    assert OK not in results, MESSAGES["invalid"][results.index(OK)]
-    assert set(results) == set(range(1, REFUSALS + 1))
-
-
-DRIVE_STEPS = {"left_duty": 0, "right_duty": 0, "mode": 0, "counter": 0}
-
-
-@pytest.mark.parametrize(
-    ("function", "name", "steps", "result"),
-    [
-        (2, "Drive", DRIVE_STEPS, OK),
-        (2, "Drive", DRIVE_STEPS | {"left_duty": 10001}, OUT_OF_RANGE),
-        (2, "Drive", DRIVE_STEPS | {"right_duty": -10001}, OUT_OF_RANGE),
-        (2, "Drive", DRIVE_STEPS | {"mode": 2}, OUT_OF_RANGE),
-        (7, "Status", {"faults": 1024}, OUT_OF_RANGE),
-        (10, "Drive", DRIVE_STEPS, UNKNOWN_FUNCTION),
-        (0, "Drive", DRIVE_STEPS, UNKNOWN_FUNCTION),
-    ],
-)
-def test_c_sends_no_step_out_of_range(
-    library: ctypes.CDLL, function: int, name: str, steps: dict[str, int], result: int
-) -> None:
-    assert c_encode(library, function, name, steps)[0] == result
-
-
-# -- frames --------------------------------------------------------------------------------------------------------
+def test_under_sanitizers_c_takes_and_refuses_the_same_payloads(exchange) -> None:
+    valid, count = MESSAGES["valid"], len(MESSAGES["valid"])
+    vectors = (*valid, *MESSAGES["invalid"])
+    answers = exchange([f"decode {vector['function']} {vector['payload'] or '-'}" for vector in vectors])
+    assert answers[:count] == [f"ok {vector['payload']}" for vector in valid]
+    assert set(answers[count:]) == {f"refused {why}" for why in range(1, 5)}
 
 
 def test_under_sanitizers_any_payload_is_framed_as_by_python(exchange) -> None:

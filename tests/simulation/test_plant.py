@@ -316,19 +316,15 @@ def test_the_brake_gives_the_hand_no_energy_over_its_reversals(
     assert directions == {True, False}
 
 
-def readings(plant: Plant, milliseconds: int) -> list[float]:
-    values = []
-    for _ in range(milliseconds):
-        plant.advance(STEP_S)
-        values.append(plant.force_sensor.reading_N)
-    return values
-
-
 @pytest.mark.parametrize("name", SAMPLES)
 def test_force_sensor_noise_has_the_stated_spread_around_the_truth(name: str) -> None:
     parameters = load_plant(name)
     plant = Plant(parameters, SteadyHand(), seed=3)
-    fresh = [after for before, after in itertools.pairwise(readings(plant, 4000)[200:]) if after != before]
+    values = []
+    for _ in range(4000):
+        plant.advance(STEP_S)
+        values.append(plant.force_sensor.reading_N)
+    fresh = [after for before, after in itertools.pairwise(values[200:]) if after != before]
     assert len(fresh) == pytest.approx(3.8 * parameters.force_sensor.rate_Hz, abs=3)
     assert statistics.stdev(fresh) == pytest.approx(parameters.force_sensor.noise_mN * 1e-3, rel=0.08)
     assert statistics.fmean(fresh) == pytest.approx(plant.truth.force_N, abs=3e-3)
