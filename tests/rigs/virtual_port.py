@@ -1,4 +1,4 @@
-"""The port of a simulated device in virtual time, as the conformance kit needs it."""
+"""A simulated device's port in virtual time."""
 
 from typing import Any
 
@@ -15,9 +15,8 @@ class VirtualPort:
         self.device.receive(self.time_s, data)
 
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Let time pass; return what came, and when."""
         self.time_s = max(self.time_s, until_s)
         return [(self.time_s, self.device.transmit(self.time_s))]
 
     def close(self) -> None:
-        """Nothing is open."""
+        pass

@@ -122,7 +122,6 @@ FORCE = BrakeCurve.force
     ("name", "formula", "seen", "least"),
     [
         ("force", lambda self, eps, load: FORCE(self, eps, load) * (1.0 + 1e-11), "force", 5.0),
-        # as it is written, which loses digits
         (
             "compression",
             lambda self, y: ((1 - self.a * y) ** 2 + 2 * self.b * y) ** 0.5 - (1 - self.a * y),

@@ -39,20 +39,18 @@ def looked(time_s: float, **waited_s: float) -> host.Counters:
 @pytest.mark.parametrize(
     ("looks", "times_s", "waited", "worst_ms"),
     [
-        # a wait that led to a fault is seen by the look after it: 110 ms until 1.55, the fault is of 1.54
         (
             [
                 looked(1.0),
                 looked(1.2, device=0.010),
                 looked(1.4, device=0.014),
-                looked(1.6, device=0.134),  # it was ended at 1.58
+                looked(1.6, device=0.134),  # 110 ms until 1.55: the fault is of 1.54
                 looked(1.8),
             ],
             (1.1, 1.54),
             {"device": pytest.approx(0.134 / 0.6)},
             100.0,
         ),
-        # a worker of the wire that had to wait was held up by the host
         (
             [looked(1.0, worker=7.0), looked(1.2, worker=7.09, newer=9.0), looked(1.4, worker=7.09)],
             (1.0, 1.4),
@@ -60,7 +58,7 @@ def looked(time_s: float, **waited_s: float) -> host.Counters:
             70.0,
         ),
     ],
-    ids=["a process", "a worker"],
+    ids=["a process that faulted meanwhile", "a worker of the wire"],
 )
 def test_who_waited_is_told_and_much(tmp_path: Path, looks, times_s, waited, worst_ms) -> None:
     with (tmp_path / "log").open("w") as log, host.HostWatch(0, log) as watched:
