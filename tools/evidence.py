@@ -97,8 +97,7 @@ PARTS = {
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("part", nargs="*", choices=PARTS, metavar="PART", help=f"of {', '.join(PARTS)}; default all")
-    options = parser.parse_args(arguments)
-    return collect({name: PARTS[name] for name in options.part or PARTS}, FOLDER)
+    return collect({name: PARTS[name] for name in parser.parse_args(arguments).part or PARTS}, FOLDER)
 
 
 def collect(parts: Mapping[str, Part], folder: Path) -> int:

@@ -14,6 +14,7 @@ from typing import final
 import numpy as np
 from judge.following import RATE_HZ, Case, rehearse
 from judge.signals import pulse_signal
+from virtual_port import VirtualPort
 
 from firmware_protocol.c.build import BuildError, Target, build, debian_tool
 from firmware_protocol.conformance.check import run
@@ -105,27 +106,6 @@ def is_followed(boot: FirmwareKind, pulses: int) -> bool:
     worst_N = float(np.abs(there_N - here_N).max())
     print(f"pulse of {times_s[-1]:.0f} s: {worst_N * 1e3:.2g} mN at most from the host library's")
     return worst_N <= MAX_N
-
-
-class VirtualPort:
-    """The device's serial port in virtual time, as the kit needs it."""
-
-    def __init__(self, device: VirtualDevice) -> None:
-        self.device, self._now_s = device, 0.0
-
-    def now_s(self) -> float:
-        return self._now_s
-
-    def write(self, data: bytes) -> None:
-        self.device.receive(self._now_s, data)
-
-    def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        """Let time pass; return what came, and when."""
-        self._now_s = max(self._now_s, until_s)
-        return [(self._now_s, self.device.transmit(self._now_s))]
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 if __name__ == "__main__":

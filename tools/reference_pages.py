@@ -112,9 +112,8 @@ def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.
 
 
 def _options(parser: argparse.ArgumentParser) -> list[str]:
-    formatter = parser._get_formatter()
     return [
-        f"- `{_called(action, formatter)}`{_says(action)}"
+        f"- `{_called(action, parser._get_formatter())}`{_says(action)}"
         for action in parser._actions
         if not isinstance(action, argparse._SubParsersAction | argparse._HelpAction)
     ]

@@ -74,10 +74,6 @@ def time_s(seconds: float) -> np.ndarray:
     return STEP_S * np.arange(round(seconds / STEP_S))
 
 
-def zigzag(phase: np.ndarray) -> np.ndarray:
-    return 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * phase))
-
-
 def test_what_is_slower_than_the_carriages_is_followed_exactly() -> None:
     no_delay_N, foresight_N = errors_N(40.0 + 0.9 * SPEED_MM_S * time_s(0.5))
     assert no_delay_N <= 1e-3 * N_MM  # it starts from rest
@@ -176,7 +172,8 @@ def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag() 
 def test_the_fields_lag_takes_some_of_what_foresight_gains() -> None:
     plant = SAMPLES[2]
     brake, drive, along_s = brake_of(plant), drive_of(plant), time_s(1.2)
-    wanted = asked_of(brake, 1.55 + 0.15 * zigzag(along_s / 0.25), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
+    zigzag = 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * along_s / 0.25))
+    wanted = asked_of(brake, 1.55 + 0.15 * zigzag, most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
 
     def error_N(brake: Brake, gap_mm: np.ndarray) -> float:
         return rms(wanted.rendered_N(brake, gap_mm) - wanted.force_N)

@@ -105,8 +105,7 @@ def test_the_command_writes_model_and_training_data_or_nothing(sweeps, tmp_path,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all.csv", "few.csv"]
     assert main(["calibrate", str(all_of_them), *more]) == 0
     result = json.loads(capsys.readouterr().out)
-    metrics = load_model(out, element="torque", insert=INSERT).metadata.metrics
-    assert result["metrics"] == metrics
+    assert result["metrics"] == load_model(out, element="torque", insert=INSERT).metadata.metrics
     assert load_model(out, element="torque", insert=INSERT).metadata.training_data_sha256 == read_csv(data).sha256()
     assert main(["calibrate", str(all_of_them), "--insert", "MRE-99-99", *more[2:]]) == 2
     assert "MRE-99-99" in capsys.readouterr().err

@@ -129,6 +129,7 @@ REFUSED: list[tuple[tuple[str, ...], str, str]] = [
             ("given", GOOD, ("--law", "--element", "tactile"), "--law: allowed is --element torque"),
             ("given", GOOD, ("--law", "--insert", "MRE-99-99"), "MRE-99-99"),
             ("given", GOOD.replace(",5,", ",-5,"), ("--law",), "rate_mm_s = -5.0 is not allowed: magnitudes"),
+            ("given", re.sub(r",1\d\d,", ",300,", GOOD), ("--law",), "field_mT = 300"),
         )
     ),
 ]

@@ -334,8 +334,7 @@ def test_a_reproduction_that_is_stopped_writes_what_it_has(tmp_path: Path, monke
     monkeypatch.setattr(reproduction, "ProcessPoolExecutor", ThreadPoolExecutor)
     monkeypatch.setattr(reproduction, "chapter_4", dict)
     monkeypatch.setattr(reproduction, "step_test", Mock(side_effect=KeyboardInterrupt))
-    found = reproduction.run(Namespace(out=tmp_path, gap_speed=40.0, workers=1, seed=1))
-    assert found.exit_code == 130
+    assert reproduction.run(Namespace(out=tmp_path, gap_speed=40.0, workers=1, seed=1)).exit_code == 130
     written = (tmp_path / "reproduction.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (\w+ ?[\d.]*)", written, re.M) == [
         "Table 2.3",

@@ -1,74 +1,29 @@
-"""The force law's derivatives and its inverse, against 50 digits, and their domains."""
+"""The domains of the force law's derivatives and inverse; `judge.py numerics` holds them against 50 digits."""
 
 import math
-import random
-from collections.abc import Callable, Iterator
-from itertools import islice
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
-from digits import Batch, reference
+from digits import draw_batch
 
 from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 from tormagd.element.physics.errors import DomainError
-from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.element.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
+from tormagd.element.physics.field import PowerFieldLaw
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N, max_radial_moment_Tm
 
 STIFF = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
 
 
-class Case(NamedTuple):
-    moment: float
-    elastomer: Elastomer
-    geometry: Geometry
-
-
-def over_loads(seed: int) -> Iterator[Case]:
-    """Loads of materials and geometries out to the extremes: 1 kPa..10 MPa, mu_r 1..10, wall from 0.1 mm."""
-    rng = random.Random(seed)
-    while True:
-        inner = 10 ** rng.uniform(-3.0, -1.7)
-        wall = rng.choice((1e-4, 0.041, 10 ** rng.uniform(-4.0, -1.4)))
-        geometry = Geometry(inner, inner + wall, rng.choice((5e-4, 0.05)), 0.02)
-        elastomer = Elastomer(rng.choice((1e3, 1e7)), rng.uniform(1.0, 10.0), 0.2)
-        share = rng.choice((1.0, 10 ** rng.uniform(-6.0, 0.0)))
-        yield Case(share * max_radial_moment_Tm(elastomer, geometry), elastomer, geometry)
-
-
-def test_stretch_and_slope_agree_with_50_digits() -> None:
-    for case in islice(over_loads(1), 200):
-        truth = reference(Batch(case.elastomer, case.geometry, None, np.array([])), case.moment)
-        assert stretch_minus_one(*case) == pytest.approx(float(truth.values["stretch"]), rel=1e-12), case
-        assert d_force_d_moment(*case) == pytest.approx(float(truth.values["slope"]), rel=1e-11), case
-
-
-@pytest.mark.parametrize("law", [ThesisFieldLaw(), PowerFieldLaw()])
-@pytest.mark.parametrize("gap", [46.0, 55.0, 70.0, 90.0])
-def test_the_slope_over_the_gap_is_that_of_the_force(law: FieldLaw, gap: float) -> None:
-    slope = reference(Batch(STIFF, TORMAG, law, np.array([])), gap).values["slope"]
-    assert d_force_d_gap(gap, law, STIFF, TORMAG) == pytest.approx(float(slope), rel=1e-9)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_inverse_of_arrays(dtype: Any) -> None:
-    for _, elastomer, geometry in islice(over_loads(6), 50):
-        largest = max_radial_moment_Tm(elastomer, geometry)
-        moment = (largest * np.append(0.0, np.logspace(-6.0, -1e-3, 119))).astype(dtype).reshape(8, 15)
-        back = radial_moment_for_force_Tm(brake_force_N(moment, elastomer, geometry), elastomer, geometry)
-        assert back.dtype == dtype
-        np.testing.assert_allclose(back, moment, rtol=16 * np.finfo(dtype).eps)
-
-
-@pytest.mark.parametrize(("steps", "seed", "count", "rel"), [(None, 5, 1500, 4e-15), (10, 7, 500, 1e-14)])
-def test_the_inverse_returns_the_radial_moment_and_needs_few_steps(
-    monkeypatch: pytest.MonkeyPatch, steps: int | None, seed: int, count: int, rel: float
-) -> None:
-    if steps is not None:
-        monkeypatch.setattr("tormag_lab.design.force_law._NEWTON_STEPS", steps)
-    for case in islice(over_loads(seed), count):
-        force_N = brake_force_N(*case)
-        assert radial_moment_for_force_Tm(force_N, *case[1:]) == pytest.approx(case.moment, rel=rel)
+def test_the_inverse_needs_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tormag_lab.design.force_law._NEWTON_STEPS", 10)
+    rng = np.random.default_rng(7)
+    for _ in range(400):
+        elastomer, geometry, _, _ = draw_batch(rng, 1)
+        moment_Tm = rng.choice((1.0, 10 ** rng.uniform(-6.0, 0.0))) * max_radial_moment_Tm(elastomer, geometry)
+        force_N = brake_force_N(moment_Tm, elastomer, geometry)
+        assert radial_moment_for_force_Tm(force_N, elastomer, geometry) == pytest.approx(moment_Tm, rel=1e-14)
 
 
 @pytest.mark.parametrize("function", [stretch_minus_one, d_force_d_moment, radial_moment_for_force_Tm])
@@ -95,7 +50,7 @@ def test_what_is_out_of_the_domain_is_refused(bad: float) -> None:
             function(bad, STIFF, TORMAG)
 
 
-@pytest.mark.parametrize("function", [stretch_minus_one, d_force_d_moment])
+@pytest.mark.parametrize("function", [stretch_minus_one, d_force_d_moment, radial_moment_for_force_Tm])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_arrays_keep_type_and_shape_and_agree_with_floats(function: Callable[..., Any], dtype: Any) -> None:
     points = np.linspace(0.0, 0.9 * max_radial_moment_Tm(STIFF, TORMAG), 12).astype(dtype).reshape(3, 4)

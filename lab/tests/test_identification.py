@@ -89,10 +89,9 @@ def test_emps_is_within_the_published_values_and_drawn(recordings, capsys, tmp_p
 def compare(log: Log) -> dict:
     true = truth(load_plant("sample_3"), "left", 2e3 * log.position_m[fit.motion(log).sign != 0.0])
     result = command.identify(log, None if log.current_A is not None else true["gain_N_V"])
-    identified = {**(result["motor"] or {}), **result["parameters"]}
     return {
         name: {**found, "true": true[name], "inside": abs(found["value"] - true[name]) <= found["ci95"]}
-        for name, found in identified.items()
+        for name, found in {**(result["motor"] or {}), **result["parameters"]}.items()
         if found is not None
     }
 
@@ -234,8 +233,7 @@ def record(path: Path, plant: PlantParameters) -> None:
             made = Moment(loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, number).row()
             rows.append(msgspec.structs.replace(made, t_ns=round(sample.time_s * 1e9), monotonic_s=sample.time_s))
             if len(rows) == 20:
-                batch = {"v": VERSION, "columns": OF_TICK, "rows": rows}
-                writer.ticks(decode_ticks(msgspec.msgpack.encode(batch)))
+                writer.ticks(decode_ticks(msgspec.msgpack.encode({"v": VERSION, "columns": OF_TICK, "rows": rows})))
                 rows.clear()
 
 

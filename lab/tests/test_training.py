@@ -36,7 +36,6 @@ from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import build_core
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.records import Handle, Measured
-from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
 from tormagd.element.model.features import FIELD
 from tormagd.element.model.memory import NO_MEMORY, Memory
@@ -319,13 +318,6 @@ def test_a_law_becomes_a_network_that_rises_and_is_near_it() -> None:
     assert (model.output_weight > 0.0).all()
 
 
-def test_a_law_of_one_field_is_refused() -> None:
-    data = lawful(50)
-    data.features[:, FIELD] = 300.0
-    with pytest.raises(DomainError, match="field_mT = 300"):
-        fit_law_model(data, data, **OF_LAW)
-
-
 KINETIC_N, STIFFNESS_N_MM = 2.0, 8.0
 
 
@@ -526,29 +518,6 @@ def test_the_grey_box_sees_through_the_memory(grey: GreyBox, cycles: Dataset, ho
     )
     assert 5 * error < error_alone
     assert error < 3 * NOISE_N
-
-
-def test_the_memory_inverts_itself(grey: GreyBox) -> None:
-    model = grey.model
-    memory, told = GreyBoxMemory(grey, 0.5), GreyBoxMemory(grey, 0.5)
-    solver = NearestFieldSearch(field_grid((0.0, 300.0), 1.0))
-    last = None
-    for step in range(200):
-        field = 180 + 60 * np.sin(step / 9)
-        force = told.advance(3.5, 0.0, field, 45.0)
-        last = solver.solve(model.curve(3.5, 0.0, 45.0), memory.elastic_N(3.5, 0.0, force, 45.0), last).field_mT
-        assert last == pytest.approx(field, abs=0.1)
-        memory.advance(3.5, 0.0, last, 45.0)
-
-
-def test_steps_and_records_agree(grey: GreyBox) -> None:
-    fields = 150 + 100 * np.sin(np.arange(1, 41) / 5)
-    features = np.column_stack((np.full(40, 3.0), np.zeros(40), fields, np.full(40, 45.0)))
-    data = Dataset(features, np.zeros(40), None, np.arange(1, 41) * 0.25 - 0.25)
-    memory = GreyBoxMemory(grey, 0.25)
-    stepped = [memory.advance(3.0, 0.0, field, 45.0) for field in fields.tolist()]
-    # the record begins with a jump, the steps with a ramp, and the difference fades
-    assert grey.predict(data)[1:] == pytest.approx(stepped[1:], rel=5e-3)
 
 
 def test_a_memory_needs_times(grey: GreyBox, cycles: Dataset) -> None:

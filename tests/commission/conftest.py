@@ -25,7 +25,6 @@ from tormagd.simulation.plant import Truth
 
 CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
 PLACES = [OF_TICK.index(name) for name in COLUMNS]
-MONOTONIC = COLUMNS.index("monotonic_s")
 Altered = Callable[[float, Message], Message]
 
 

@@ -84,12 +84,6 @@ def slipping():
     return alters
 
 
-def sensing(changed):
-    return lambda now_s, message: (
-        message.replaced(force_N=changed(message.force_N)) if isinstance(message, Sense) else message
-    )
-
-
 def second_order(hz):
     """Return a low pass of a damping of 0.7."""
     value, rate, last_s = 0.0, 0.0, 0.0
@@ -100,18 +94,6 @@ def second_order(hz):
         for _ in range(round((now_s - last_s) / 5e-4)):
             rate += 5e-4 * (per_s**2 * (force_N - value) - 1.4 * per_s * rate)
             value += 5e-4 * rate
-        last_s = now_s
-        return value
-
-    return passes
-
-
-def first_order(hz):
-    value, last_s = 0.0, 0.0
-
-    def passes(now_s, force_N):
-        nonlocal value, last_s
-        value += (1.0 - math.exp(-2.0 * math.pi * hz * (now_s - last_s))) * (force_N - value)
         last_s = now_s
         return value
 
@@ -169,11 +151,11 @@ NOISE = random.Random(1)
         (("way back",), {"faults": ["clock=+2%"]}, "device's clock runs fast by"),
         ((), {"plant": with_part("electronics", supply_V=10.0)}, "supply"),
         ((), {"stall_ticks": 2}, "periods kept"),
-        (("sensor",), {"alters": sensing(lambda force_N: force_N + 0.2)}, "sensor's zero"),
-        (("sensor",), {"alters": sensing(lambda force_N: force_N + NOISE.gauss(0.0, 0.06))}, "sensor's noise"),
-        (("sensor",), {"alters": sensing(lambda force_N: 0.05 * round(force_N / 0.05))}, "sensor's resolution"),
-        (("sensor",), {"alters": through(first_order(3.0))}, "sensor's rise after the handle's turn"),
-        (("sensor",), {"alters": through(first_order(5.0))}, "sensor's rise after the handle's turn"),
+        (("sensor",), {"alters": through(lambda _now_s, force_N: force_N + 0.2)}, "sensor's zero"),
+        (("sensor",), {"alters": through(lambda _now_s, force_N: force_N + NOISE.gauss(0.0, 0.06))}, "sensor's noise"),
+        (("sensor",), {"alters": through(lambda _now_s, force_N: 0.05 * round(force_N / 0.05))}, "sensor's resolution"),
+        (("sensor",), {"alters": through(second_order(4.0))}, "sensor's rise after the handle's turn"),
+        (("sensor",), {"alters": through(second_order(5.0))}, "sensor's rise after the handle's turn"),
         (("steps",), {"alters": through(read_at(12.0))}, "sensor's readings apart"),
         (("force over gap",), {"alters": through(with_play(0.06))}, "force of a closing gap over an opening one's"),
         (("force over gap",), {"alters": through(bent(-0.1))}, "force's curve, of sensor or magnets"),
@@ -221,7 +203,7 @@ def test_a_handle_that_turns_seldom_makes_no_screw_rub(bench):
     [
         {"plant": with_part("field", coefficient=0.72 * SAMPLE.field.coefficient)},
         {"plant": with_insert(SAMPLE, "MRE-10-10")},
-        {"alters": sensing(lambda force_N: 0.55 * force_N)},
+        {"alters": through(lambda _now_s, force_N: 0.55 * force_N)},
     ],
     ids=["magnet", "insert", "gain"],
 )
@@ -258,8 +240,7 @@ def test_a_friction_that_differs_by_the_way_is_believed_from_the_beginning(bench
         share = 0.04 * math.cos(message.handle_position_mm / 20.0 + 0.7) + 0.03 * math.copysign(1.0, message.force_N)
         return message.replaced(force_N=message.force_N * (1.0 + share))
 
-    turned = bench(SAMPLE, hand=Turning(), alters=rippled)
-    found, stopped = turned.commission(chosen("force over gap", "memory"))
+    found, stopped = bench(SAMPLE, hand=Turning(), alters=rippled).commission(chosen("force over gap", "memory"))
     _, way, ripple = found["memory"]
     assert (way.value, ripple.value, stopped) == (pytest.approx(3.0, abs=0.6), pytest.approx(4.0, abs=0.8), None)
     file = tmp_path / "00000007.toml"

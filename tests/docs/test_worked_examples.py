@@ -2,7 +2,6 @@
 
 import re
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -30,13 +29,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def lines_of(page: str) -> Iterator[str]:
-    [block] = re.findall(r"^(?:### An|An) example.*?^```\n(.*?)^```", (GUIDES / page).read_text(), re.M | re.S)
-    return (line for line in block.splitlines() if not line.startswith(FETCHED))
-
-
 def run(page: str, *more: str) -> None:
-    lines = list(lines_of(page))
+    [block] = re.findall(r"^(?:### An|An) example.*?^```\n(.*?)^```", (GUIDES / page).read_text(), re.M | re.S)
+    lines = [line for line in block.splitlines() if not line.startswith(FETCHED)]
     for line in lines:
         words = line.split() + list(more if line is lines[-1] else ())
         if words[0] in ("tormagctl", "tormag-lab"):

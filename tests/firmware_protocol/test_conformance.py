@@ -7,25 +7,23 @@ fault of the simulator's own.
 import io
 import json
 import math
-import random
 import re
 import signal
 import subprocess
 import sys
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator, Sequence
-from itertools import product
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeGuard, TypeVar
 
 import msgspec
 import pytest
+from virtual_port import VirtualPort
 
 from firmware_protocol.codec import (
     FUNCTION,
     SCHEMA_HASH,
     Clear,
-    DecodeError,
     DeviceFault,
     DeviceMode,
     Drive,
@@ -40,7 +38,6 @@ from firmware_protocol.codec import (
     Status,
     Switches,
     crc8,
-    decode,
     encode,
 )
 from firmware_protocol.conformance import __main__ as command, examination, moving, telling
@@ -49,12 +46,11 @@ from firmware_protocol.conformance.examination import BY_HAND, CHECKS, checks_on
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 from firmware_protocol.conformance.rules import MODES, RULES, TAKES
-from firmware_protocol.conformance.taking import MISFITS, MISMATCHED, PLACES
-from firmware_protocol.framing import DELIMITER, Frame, FrameDecoder, cobs_decode, cobs_encode, encode_frame
+from firmware_protocol.framing import DELIMITER, FrameDecoder, cobs_decode, cobs_encode, encode_frame
 from tormagd.simulation.can_device import DEVICE, CanDevice
 from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.compiled_firmware import CompiledFirmware
-from tormagd.simulation.device import FirmwareKind, MessageDevice, VirtualDevice
+from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.firmware import Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import SteadyHand
@@ -80,35 +76,25 @@ def nothing(_device: object, *_what: object) -> None:
     """A hook that does nothing."""
 
 
-class Wire:
-    def __init__(self, device: Any) -> None:
-        self.device = device
-        self.time_s = 0.0
-
-    def now_s(self) -> float:
-        return self.time_s
-
+class Wire(VirtualPort):
     def write(self, data: bytes) -> None:
-        self.device.receive(self.time_s, self.down(data))
+        super().write(self.down(data))
 
     def read(self, until_s: float) -> list[tuple[float, bytes]]:
-        self.time_s = max(self.time_s, until_s)
-        return [(self.time_s, self.up(self.device.transmit(self.time_s)))]
-
-    def close(self) -> None:
-        pass
+        return [(time_s, self.up(data)) for time_s, data in super().read(until_s)]
 
     down = up = as_it_is
 
 
-class Bus(Wire):
+class Bus(VirtualPort):
     def write(self, identifier: int, data: bytes) -> None:  # type: ignore[override]
         self.device.receive(self.time_s, CanFrame(self.down(identifier), data))
 
     def read(self, until_s: float) -> list[tuple[float, int, bytes]]:  # type: ignore[override]
-        self.time_s = max(self.time_s, until_s)
-        delivered = self.device.transmit(self.time_s)
+        delivered: Any = super().read(until_s)[0][1]
         return [(self.time_s, frame.identifier, frame.data) for sender, frame, _ in delivered if sender == DEVICE]
+
+    down = as_it_is
 
 
 class WindingHand:
@@ -119,7 +105,7 @@ class WindingHand:
 
 
 def serial_line(
-    boot: FirmwareKind = Firmware,
+    boot: Callable[[PlantParameters], Any] = Firmware,
     wire: type[Wire] = Wire,
     faults: Sequence[str] = (),
     plant: PlantParameters = NEAR_HOME,
@@ -128,7 +114,7 @@ def serial_line(
 
 
 def can_line(bus: type[Bus] = Bus, plant: PlantParameters = NEAR_HOME) -> CanLine:
-    return CanLine(bus(CanDevice(MessageDevice(plant, WindingHand()))), 1)
+    return CanLine(bus(CanDevice(MessageDevice(plant, WindingHand()), node=3)), 3)
 
 
 # -- the right device ----------------------------------------------------------------------------------------------
@@ -172,8 +158,8 @@ def test_the_c_sources_pass(library: object) -> None:
 # -- wrong firmwares -----------------------------------------------------------------------------------------------
 
 
-class Rogue(CompiledFirmware):
-    """The Python firmware behind the interface that a device boots."""
+class Rogue:
+    """The Python firmware, with hooks; what has none is its own."""
 
     def __init__(self, plant: PlantParameters) -> None:
         self.plant = plant
@@ -217,20 +203,8 @@ class Rogue(CompiledFirmware):
         time_s += self.up_s
         return self.measures(time_s, self.real.measurement(time_s, self.senses(sensors)))
 
-    def identity(self) -> Identity:
-        return self.real.identity()
-
-    @property
-    def mode(self) -> DeviceMode:
-        return self.real.mode
-
-    @property
-    def faults(self) -> DeviceFault:
-        return self.real.faults
-
-    @property
-    def homed(self) -> bool:
-        return self.real.homed
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.real, name)
 
     @property
     def output(self) -> Output:
@@ -246,23 +220,32 @@ class Rogue(CompiledFirmware):
     senses = shows = measures = drives = as_it_is
 
 
-def is_running(device: Rogue) -> bool:
-    return device.real.mode is DeviceMode.RUN
+def in_mode(mode: DeviceMode) -> Callable[..., bool]:
+    return lambda device, *_message: device.mode is mode
 
 
-def is_idle(device: Rogue, _message: Message) -> bool:
-    return device.real.mode is DeviceMode.IDLE
-
-
-def is_latched(device: Rogue) -> bool:
-    return device.real.mode is DeviceMode.LATCHED
-
-
+is_running, is_latched = in_mode(DeviceMode.RUN), in_mode(DeviceMode.LATCHED)
 HASH_REVERSED = int.from_bytes(SCHEMA_HASH.to_bytes(4, "little"), "big")
+
+
+RIGHT = {"schema_hash": SCHEMA_HASH, "protocol_version": 1}
 
 
 def fitting(message: Message, **right: int) -> Message:
     return message.replaced(**right) if isinstance(message, Hello) else message
+
+
+def mends_misfits_in(mode: DeviceMode) -> Callable[[Rogue, Message], Message]:
+    return lambda device, message: fitting(message, **RIGHT) if device.mode is mode else message
+
+
+def drives_in(mode: DeviceMode) -> Callable[[Rogue, Output], Output]:
+    """Return a hook by which the duties of a Drive RUN act in another mode, too."""
+    return lambda device, output: (
+        Output(device.asked.left_duty, device.asked.right_duty, enabled=True)
+        if device.mode is mode and device.asked.mode is DriveMode.RUN
+        else output
+    )
 
 
 def keeps_nonce_at(kind: type[Message]) -> Callable[..., Answer]:
@@ -314,14 +297,20 @@ HOMES_FROM_ANYWHERE = sets(
 )
 
 
-def clear_ends_anything(device: Rogue, time_s: float, message: Message) -> None:
-    if isinstance(message, Clear) and device.real.output.enabled:
-        device.real._rest(time_s, DeviceMode.IDLE)
+def rests(when: Callable[..., bool], mode: DeviceMode = DeviceMode.IDLE) -> Callable[..., None]:
+    def hook(device: Rogue, time_s: float, *message: Message) -> None:
+        if when(device, *message):
+            device.real._rest(time_s, mode)
+
+    return hook
 
 
-def off_only_switches_off(device: Rogue, time_s: float, message: Message) -> None:
-    if is_running(device) and isinstance(message, Drive) and message.mode is DriveMode.OFF:
-        device.real._rest(time_s, DeviceMode.IDLE)
+CLEAR_ENDS_ANYTHING = rests(lambda device, message: isinstance(message, Clear) and device.real.output.enabled)
+OFF_ONLY_SWITCHES_OFF = rests(lambda device, message: is_running(device) and is_off(message))
+
+
+def is_off(message: Message) -> TypeGuard[Drive]:
+    return isinstance(message, Drive) and message.mode is DriveMode.OFF
 
 
 def hello_resets(device: Rogue, time_s: float, message: Message, sensors: Sensors) -> Answer:
@@ -347,9 +336,8 @@ def timeout_of(timeout_s: float) -> Callable[[Rogue, float], None]:
     return ticks
 
 
-def latches_without_opening(device: Rogue, time_s: float) -> None:
-    if device.real.mode is DeviceMode.RETRACTING and DeviceFault.COMMAND_TIMEOUT in device.real.faults:
-        device.real._rest(time_s, DeviceMode.LATCHED)
+def times_out_opening(device: Rogue) -> bool:
+    return device.real.mode is DeviceMode.RETRACTING and DeviceFault.COMMAND_TIMEOUT in device.real.faults
 
 
 def does_not_latch(device: Rogue, time_s: float) -> None:
@@ -413,10 +401,6 @@ def blind_while(blind: Callable[[Rogue, float], bool]) -> Callable[[Rogue, float
         device.real._drive_s = time_s if blind(device, time_s) else device.drive_s
 
     return ticks
-
-
-def every_20_ms(device: Rogue, time_s: float) -> bool:
-    return (device.real._ticks + 1) % 20 != 0
 
 
 def has_no_duty_yet(device: Rogue, time_s: float) -> bool:
@@ -533,7 +517,7 @@ def off_drives(mode: DeviceMode, lasts_s: float) -> dict[str, Callable[..., Any]
     """Return the hooks by which a Drive OFF's duties act in a mode, or some time on."""
 
     def before(device: Rogue, time_s: float, message: Message) -> None:
-        if isinstance(message, Drive) and message.mode is DriveMode.OFF and device.real.mode is mode:
+        if is_off(message) and device.real.mode is mode:
             device.since_s, device.off = time_s, message
 
     def drives(device: Rogue, output: Output) -> Output:
@@ -756,11 +740,12 @@ PLANTED = (
         "a misfit's nonce not shown",
         "misfitting_hello",
         receive=lambda device, time_s, message, sensors: (
-            keeps_nonce_at(Hello) if called(message) == MISFITS else Rogue.receive
+            keeps_nonce_at(Hello) if fitting(message, **RIGHT) != message else Rogue.receive
         )(device, time_s, message, sensors),
     ),
     rogue("ignores the version", "misfitting_hello", hears=lambda _, message: fitting(message, protocol_version=1)),
     rogue("Clear mends a mismatch", "misfitting_hello", before=sets(Clear, _compatible=True)),
+    rogue("Clear mends a mismatch", "latched_by_a_mismatch_stays", before=sets(Clear, _compatible=True)),
     rogue(
         "Clear is ignored",
         "misfitting_hello",
@@ -838,7 +823,6 @@ PLANTED = (
     wire("clamps duties", "idle_without_zero_stays", mended=mending(clamped)),
     wire("any mode is OFF", "idle_without_zero_stays", mended=mending(with_mode_off)),
     wire("any length", "idle_without_zero_stays", mended=mending(cut_to_length)),
-    wire("any length", "idle_without_zero_stays", mended=mending(cut_to_length)),
     wire("other functions are Drives", "idle_without_zero_stays", mended=mending(other_functions_are_drives)),
     wire("no CRC-16", "idle_stays", mended=without_crc_16),
     wire("takes what is cut off", "idle_stays", mended=completed),
@@ -846,20 +830,26 @@ PLANTED = (
     wire("takes a zero inside", "idle_stays", down=joined),
     wire("noise is a Drive", "idle_stays", mended=noise_is_a_drive),
     wire("deafened", "idle_stays", mended=deafened),
-    Planted("every node", "idle_stays", lambda: can_line(wrong(Bus, down=lambda _, identifier: identifier & ~0xF | 1))),
+    Planted("every node", "idle_stays", lambda: can_line(wrong(Bus, down=lambda _, identifier: identifier & ~0xF | 3))),
     rogue("Home is ignored", "home_homes", hears=only_acknowledges(Home)),
     fault("motor_reversed_left", "home_homes"),
     fault("encoder_reversed_left", "home_homes"),
     fault("switch_dead_left", "home_homes"),
+    rogue(
+        "homes only once",
+        "idle_home",
+        hears=lambda device, message: None if isinstance(message, Home) and device.homed else message,
+    ),
+    rogue("homing is not to be ended", "homing_retract", hears=only_acknowledges(Retract, in_mode(DeviceMode.HOMING))),
     rogue("Home keeps the origin", "home_homes", measures=home_keeps_origin),
     rogue("homed before zero", "home_homes", measures=homed_before_zero),
     rogue("obeys repetitions", "idle_stays", before=sets(Home, _nonce=-1)),
     rogue("Retract's nonce not shown", "idle_retract", receive=keeps_nonce_at(Retract)),
-    rogue("Clear ends anything", "homing_stays", before=clear_ends_anything),
+    rogue("Clear ends anything", "homing_stays", before=CLEAR_ENDS_ANYTHING),
     rogue("homes from anywhere", "retracting_stays", before=HOMES_FROM_ANYWHERE),
     rogue("homes from anywhere", "run_stays", before=HOMES_FROM_ANYWHERE),
     rogue("homes from anywhere", "latched_stays", before=HOMES_FROM_ANYWHERE),
-    rogue("Clear ends anything", "run_stays", before=clear_ends_anything),
+    rogue("Clear ends anything", "run_stays", before=CLEAR_ENDS_ANYTHING),
     rogue(
         "modes mixed up",
         "home_homes",
@@ -888,7 +878,7 @@ PLANTED = (
             Output(device.asked.left_duty, device.asked.right_duty, enabled=True) if is_running(device) else output
         ),
     ),
-    rogue("OFF only switches off", "run_drive_off", before=off_only_switches_off),
+    rogue("OFF only switches off", "run_drive_off", before=OFF_ONLY_SWITCHES_OFF),
     rogue("does not begin to open", "run_drive_off", drives=opens_with(0.0)),
     rogue("presses shut", "run_drive_off", drives=opens_with(-1.0)),
     rogue("opens too slowly", "run_retract", drives=opens_with(0.2)),
@@ -896,15 +886,19 @@ PLANTED = (
     rogue("Retract is ignored", "run_retract", hears=only_acknowledges(Retract)),
     rogue("needs no letting go", "let_go_after_all", before=sets(object, _may_run=True)),
     rogue("Hello resets", "run_stays", receive=hello_resets),
-    rogue(
-        "a mismatch in RUN passes",
-        "run_hello_misfit",
-        hears=lambda device, message: fitting(message, schema_hash=SCHEMA_HASH) if is_running(device) else message,
+    *(
+        rogue(f"a mismatch in {mode.name} passes", finds, hears=mends_misfits_in(mode))
+        for mode, finds in {
+            DeviceMode.IDLE: "idle_hello_misfit",
+            DeviceMode.HOMING: "homing_hello_misfit",
+            DeviceMode.RETRACTING: "retracting_hello_misfit",
+            DeviceMode.LATCHED: "latched_hello_misfit",
+        }.items()
     ),
     rogue("timeout of 35 ms", "silence_is_noticed", ticks=timeout_of(0.035)),
     rogue("timeout of 65 ms", "silence_is_noticed", ticks=timeout_of(0.065)),
     rogue("no timeout", "silence_is_noticed", ticks=extends),
-    rogue("latches without opening", "silence_is_noticed", ticked=latches_without_opening),
+    rogue("latches without opening", "silence_is_noticed", ticked=rests(times_out_opening, DeviceMode.LATCHED)),
     rogue("any message extends", "only_good_drives_extend", before=extends),
     rogue("a repetition extends", "only_good_drives_extend", before=repetition_extends),
     rogue("does not latch", "run_silence", ticked=does_not_latch),
@@ -920,7 +914,7 @@ PLANTED = (
     rogue(
         "Clear homes",
         "latched_clear",
-        after=sets(Clear, is_idle, homed=True),
+        after=sets(Clear, in_mode(DeviceMode.IDLE), homed=True),
     ),
     rogue("Clear lets go", "let_go_after_all", after=sets(Clear, _may_run=True)),
     fault("state_crc", "own_messages", "every_drive_answered"),
@@ -944,7 +938,11 @@ PLANTED = (
     rogue("timeout blind by its sign", "any_uptime", ticks=blind_while(lambda _, time_s: time_s % 65.536 > 32.768)),
     rogue("spurious timeout", "any_uptime", ticks=spurious),
     rogue("timeout not armed before a duty", "silence_is_noticed", ticks=blind_while(has_no_duty_yet)),
-    rogue("timeout judged with Status", "silence_is_noticed", ticks=blind_while(every_20_ms)),
+    rogue(
+        "timeout judged with Status",
+        "silence_is_noticed",
+        ticks=blind_while(lambda device, _: (device.real._ticks + 1) % 20 != 0),
+    ),
     rogue("opens half the way", "run_drive_off", ticked=stops_after(0.8)),
     rogue("opens at 5 mm/s", "run_drive_off", before=sets(object, _retract_mm_s=5.0)),
     rogue(
@@ -957,6 +955,7 @@ PLANTED = (
         ),
     ),
     rogue("opens half the way", "run_silence", ticked=stops_after(0.8)),
+    rogue("a mismatch unwatched", "run_hello_misfit", ticked=unwatched(DeviceFault.SCHEMA_MISMATCH)),
     rogue("skew unwatched", "skew_opens", ticked=unwatched(DeviceFault.SKEW)),
     rogue("end stops unwatched", "end_stop_opens", ticked=unwatched(DeviceFault.END_STOP)),
     rogue(
@@ -1017,13 +1016,6 @@ PLANTED = (
             status.replaced(faults=status.faults | DeviceFault.OVERCURRENT)
             if DeviceFault.COMMAND_TIMEOUT in status.faults
             else status
-        ),
-    ),
-    rogue(
-        "a mismatch while homing passes",
-        "homing_hello_misfit",
-        hears=lambda device, message: (
-            fitting(message, schema_hash=SCHEMA_HASH) if device.real.mode is DeviceMode.HOMING else message
         ),
     ),
     rogue(
@@ -1090,20 +1082,13 @@ PLANTED = (
             message.replaced(counter=message.counter % 128) if isinstance(message, Drive) else message
         ),
     ),
-    rogue(
-        "duties act while homing",
-        "homing_beside_run_stays",
-        drives=lambda device, output: (
-            Output(device.asked.left_duty, device.asked.right_duty, enabled=True)
-            if device.real.mode is DeviceMode.HOMING and device.asked.mode is DriveMode.RUN
-            else output
-        ),
-    ),
+    rogue("duties act while homing", "homing_beside_run_stays", drives=drives_in(DeviceMode.HOMING)),
+    rogue("duties act while opening", "retracting_beside_run_stays", drives=drives_in(DeviceMode.RETRACTING)),
     rogue(
         "never opens",
         "left_open",
         "run_drive_off",
-        before=off_only_switches_off,
+        before=OFF_ONLY_SWITCHES_OFF,
         hears=lambda _, message: None if isinstance(message, Retract) else message,
     ),
     # errors that two later kits did not see
@@ -1237,135 +1222,13 @@ def by_error(error: str) -> Line:
 
 @pytest.mark.parametrize("planted", PLANTED, ids=lambda planted: f"{planted.error}-{planted.finds}")
 def test_a_planted_error_is_found_by_name(planted: Planted) -> None:
-    checks = [named(name) for name in (*planted.first, planted.finds)]
-    result = run(hosted(planted.line()), checks)[-1]
+    result = run(hosted(planted.line()), [named(name) for name in (*planted.first, planted.finds)])[-1]
     assert (result.check.name, result.passed) == (planted.finds, False), result.seen
     assert SAID.get(planted.error, "") in result.seen
 
 
-# -- errors drawn from the table -----------------------------------------------------------------------------------
-
-
-class Mutant(NamedTuple):
-    """An error: in a mode, a message of the table (or any that is refused, None) has a wrong effect."""
-
-    mode: DeviceMode
-    message: str | None
-    effect: str
-    finds: tuple[str, ...]
-
-
-def changed(real: Firmware, time_s: float) -> dict[str, dict[str, Any]]:
-    """Return what a refused message may change, each with the state after it."""
-    return {
-        "timer": {"_drive_s": time_s},
-        "nonce": {"_nonce": (real._nonce + 1) % 256},
-        "latch": {"faults": DeviceFault(0), "mode": DeviceMode.IDLE},
-        "fault": {"faults": real.faults | DeviceFault.OVERCURRENT},
-        "HOMED": {"homed": not real.homed},
-        "let go": {"_may_run": True},
-        "zero": {"_left_zero_mm": real._left_zero_mm + 0.5},
-        "outputs": {"output": Output(-0.5, 0.0, enabled=True)},
-        "mode": {"mode": DeviceMode.LATCHED, "output": Output(0.0, 0.0, enabled=False)},
-        "counter": {"_drive_counter": ((real._drive_counter or 0) + 1) % 256},
-    }
-
-
-SEEN_IN = {
-    "timer": {"RUN"},
-    "latch": {"LATCHED", MISMATCHED},
-    "let go": {"IDLE, not let go"},
-    "mode": {"IDLE", "RUN", "HOMING", "RETRACTING"},
-    "outputs": {"IDLE", "RUN", "LATCHED"},
-    "zero": {"IDLE", "RUN", "LATCHED", "HOMING", "RETRACTING"},
-}
-"""Where a change is one at all; others are everywhere."""
-
-
-def drawn() -> Iterator[Mutant]:
-    """Yield a mutant for each thing that a refused message may not change in a place, and two a cell of the table."""
-    dice, stays = random.Random(70), defaultdict[str, list[str]](list)
-    for place in PLACES:
-        stay = f"{place.name.lower().replace(',', '').replace(' ', '_')}_stays"
-        stays[place.mode.name].append(stay)
-        effects = [each for each in changed(Firmware(SAMPLE), 0.0) if place.name in SEEN_IN.get(each, {place.name})]
-        yield from (Mutant(place.mode, None, each, (stay, "only_good_drives_extend")) for each in effects)
-    for (name, cells), (at, mode) in product(TAKES.items(), enumerate(MODES)):
-        acts = f"{mode}_{name}".lower().replace(" that does not", "_misfit").replace(" ", "_")
-        others = [each for each, other in zip(MODES, cells, strict=True) if other != cells[at]]
-        effects = ["dropped"] * (cells[at] != "refused") + dice.sample(others, min(len(others), 1))
-        yield from (Mutant(DeviceMode[mode], name, each, (acts, *stays[mode])) for each in effects)
-
-
-def called(message: Message) -> str:
-    """Return the table's name of a message."""
-    if isinstance(message, Drive):
-        return f"Drive {message.mode.name}"
-    fits = "fits" if fitting(message, schema_hash=SCHEMA_HASH, protocol_version=1) == message else "does not"
-    return f"Hello that {fits}" if isinstance(message, Hello) else type(message).__name__
-
-
-def is_refused(frame: Frame, real: Firmware) -> bool:
-    try:
-        message = decode(frame.function, frame.payload)
-    except DecodeError:
-        return True
-    return isinstance(message, Drive) and message.counter == real._drive_counter
-
-
-def mutated(mutant: Mutant) -> SerialLine:
-    """Return a device with a drawn error, which sees also what its decoder refuses."""
-    due, decoder = deque[bytes](maxlen=1), FrameDecoder()
-
-    def down(line: Wire, data: bytes) -> bytes:
-        real = line.device.messages.firmware.real
-        due.extend(data for frame in decoder.feed(data) if is_refused(frame, real))
-        return data
-
-    def ticks(device: Rogue, time_s: float) -> None:
-        if due and device.mode is mutant.mode and mutant.message is None:
-            for name, value in changed(device.real, time_s)[mutant.effect].items():
-                setattr(device.real, name, value)
-        due.clear()
-
-    def receive(device: Rogue, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if device.mode is not mutant.mode or called(message) != mutant.message:
-            return device.real.receive(time_s, message, sensors)
-        if mutant.effect == "dropped":
-            return Answer.NONE
-        was = device.real.mode = DeviceMode[mutant.effect]
-        motion = device.real._motion
-        answer = device.real.receive(time_s, message, sensors)
-        if (device.real.mode, device.real._motion) == (was, motion):
-            device.real.mode = mutant.mode
-        return answer
-
-    return serial_line(wrong(Rogue, receive=receive, ticks=ticks), wrong(Wire, down=down))
-
-
-DRAWN = list(drawn())
-
-
-def finder(mutant: Mutant) -> str:
-    """Return the name of the first of its checks that finds an error, or ""."""
-    checks = [one for one in CHECKS if one.name in mutant.finds]
-    return next((one.name for one in checks if run(hosted(mutated(mutant)), [one])[0].passed is False), "")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("latched_by_a_mismatch_stays", "idle_not_let_go_stays", "retracting_beside_run_stays", "idle_hello_misfit"),
-        *("idle_home", "homing_hello_misfit", "homing_retract", "retracting_hello_misfit", "latched_hello_misfit"),
-    ],
-)
-def test_an_error_drawn_from_the_table_is_found(name: str) -> None:
-    assert finder(next(mutant for mutant in DRAWN if name in mutant.finds))
-
-
 def test_every_check_finds_an_error() -> None:
-    finds = {planted.finds for planted in PLANTED} | {name for mutant in DRAWN for name in mutant.finds}
-    assert finds >= {one.name for one in CHECKS} - {one.name for one in BY_HAND}
+    assert {planted.finds for planted in PLANTED} == {one.name for one in CHECKS} - UNTESTED
 
 
 def test_a_device_that_cannot_be_met_is_not_moved() -> None:
@@ -1451,6 +1314,7 @@ def test_nothing_is_sent_before_somebody_agrees(
         (["tormagsim:/nonexistent/can", "--yes"], "cannot be opened"),
         ([], "PORT|CHANNEL"),
         (["x", "--node", "16"], "16"),
+        (["x", "--only", "clock_runs_off"], "clock_runs_on"),
     ],
 )
 def test_a_wrong_call_says_why_and_exits_with_2(
@@ -1459,12 +1323,6 @@ def test_a_wrong_call_says_why_and_exits_with_2(
     with pytest.raises(SystemExit, match="2"):
         sys.exit(command.main(arguments))
     assert said in capsys.readouterr().err
-
-
-def test_a_check_that_there_is_not_is_refused(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        ran(serial_line(), "--yes", "--only", "clock_runs_off")
-    assert "clock_runs_on" in capsys.readouterr().err
 
 
 class Interrupted(Wire):
@@ -1536,8 +1394,7 @@ def test_the_rules_are_the_pages() -> None:
     held = " ".join(finds for finds in RULES.values() if not finds.startswith("-")).split()
     assert set(held) == {one.name for one in CHECKS}
     rows = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("| ")]
-    table = {name: tuple(cells) for name, *cells in rows if name in TAKES}
-    assert table == TAKES
+    assert {name: tuple(cells) for name, *cells in rows if name in TAKES} == TAKES
     assert ["", *MODES] in [["", *cells] for cells in rows] or list(MODES) in rows
 
 

@@ -65,12 +65,6 @@ def wait_readable(backend: SerialPort | CanBackend) -> None:
     assert select.select([backend._fd], [], [], 5.0)[0]
 
 
-def next_of(backend: CanBackend) -> list[Message]:
-    while not (received := backend.receive()):
-        wait_readable(backend)
-    return received
-
-
 # -- on a serial line -------------------------------------------------------------------------------------------------
 
 
@@ -250,30 +244,6 @@ def test_an_adapter_that_cannot_be_opened_is_let_go(
     with pytest.raises(BackendError, match="another program" if isinstance(error, OSError) else "no answer"):
         opened(line.adapter)
     assert set(Path("/proc/self/fd").iterdir()) == before
-
-
-def test_lines_of_an_adapter_pass_both_ways(line: Line) -> None:
-    backend = opened(line.adapter)
-    backend.send(Home(7))
-    said = b""
-    while not said.endswith(b"t061107\r"):
-        said += os.read(line.far, 100)
-    assert said.startswith(b"C\rS8\r")
-    os.write(line.far, b"\rz\r\at%03X8%s\r" % (STATUS_FRAME.identifier, STATUS_FRAME.data.hex().encode()))
-    assert next_of(backend) == [STATUS]
-    backend.close()
-
-
-@pytest.mark.parametrize("damaged", [b"t07x8\r", b"t0718zz\r", b"t071\r", b"\xff\xfe071\r", b"t0719\r", b"tttt\r"])
-def test_a_damaged_line_is_counted_and_the_next_is_read(line: Line, damaged: bytes) -> None:
-    backend = opened(line.adapter)
-    os.write(line.far, damaged)
-    while not backend.statistics.corrupt:
-        wait_readable(backend)
-        assert backend.receive() == []
-    os.write(line.far, b"t0718%s\r" % STATUS_FRAME.data.hex().encode())
-    assert (next_of(backend), backend.statistics.resynchronisations) == ([STATUS], 1)
-    backend.close()
 
 
 # -- a bus that fails as told --------------------------------------------------------------------------------------

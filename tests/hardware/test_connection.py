@@ -35,7 +35,8 @@ from tormagd.record.journal import Journal
 from tormagd_client.messages import LinkReport
 
 TICK_S = 1e-3
-US = Identity(SCHEMA_HASH, 1, 0, 7)
+US, ANOTHER = Identity(SCHEMA_HASH, 1, 0, 7), Identity(0xBAD, 3, 1, 7)
+REFUSED = f"is 00000bad (firmware 3.1), this daemon's is {SCHEMA_HASH:08x}"
 COMMANDS = {Home: DeviceRequest.HOME, Retract: DeviceRequest.RETRACT, Clear: DeviceRequest.CLEAR}
 
 
@@ -200,7 +201,8 @@ def bench() -> Bench:
         (False, {"is_there": False}, 1, LinkState.BACK_OFF, "no such port", "plug"),
         (False, {"is_held": True}, 1, LinkState.BACK_OFF, "another process", "tormagctl ports"),
         (False, {"has_status": False}, 100, LinkState.RUNNING, "no Status yet", "wait a moment"),
-        (False, {"identity": Identity(0xBAD, 3, 1, 7)}, 60, LinkState.REFUSED, "00000bad", "same protocol schema"),
+        (False, {"identity": ANOTHER}, 60, LinkState.REFUSED, REFUSED, "same protocol schema"),
+        (True, {"identity": ANOTHER}, 1_100, LinkState.REFUSED, REFUSED, "same protocol schema"),
         (False, {"is_mute": True}, 1_010, LinkState.UNANSWERED, "it is silent", "rate"),
         (False, {"is_mute": True, "is_babbling": True}, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
         (True, {"is_there": False}, 1, LinkState.LOST, "unplugged", "cable"),

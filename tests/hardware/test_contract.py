@@ -56,7 +56,6 @@ from tormagd.simulation.slcan_port import SlcanPort
 CONFIG = Config()
 PATIENCE_S = 10.0
 "Only a failure waits so long."
-PERIOD_S = 1e-3
 MOVING_S = 0.3
 OPENING_S = 2.4
 "The slower of two openings, with the device's own timeout before it."
@@ -393,16 +392,6 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     assert [name for name in case.counted if getattr(line.backend.statistics, name) == 0] == []
     # at most what is on its way at the end
     assert [name for name in case.uncounted if getattr(line.backend.statistics, name) > 1] == []
-
-
-@pytest.mark.parametrize("transport", EVERY_TRANSPORT)
-def test_what_came_twice_is_one_repetition(transport: str, moving: ClosedLoop, lines: Callable[..., Line]) -> None:
-    line = lines(transport, moving.device, CASES["duplicates"])
-    moving.device = line  # type: ignore[assignment]
-    count = len(list(ticks(moving, 0.3)))
-    # on serial every frame has a number; on CAN only State has, and the link drops it
-    repeated = line.backend.statistics.repeated + (moving.connection.report().repeated or 0)
-    assert repeated / count == pytest.approx(2.05 if transport == "serial" else 1.0, abs=0.06)
 
 
 def check_safe(loop: ClosedLoop, faulted: Sample) -> None:

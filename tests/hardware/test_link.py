@@ -98,18 +98,6 @@ def test_hello_is_said_until_somebody_answers_and_then_now_and_again(unmet: Devi
     assert later[2][0] - later[1][0] == pytest.approx(HELLO_S, abs=2e-3)
 
 
-def test_another_schema_is_refused_with_both_hashes_and_the_firmwares_version(
-    unmet: DeviceLink, link: DeviceLink
-) -> None:
-    unmet.receive(0.0, Identity(0x1F00C0DE, 3, 9, 1))
-    assert unmet.state is LinkState.REFUSED
-    assert all(word in unmet.cause for word in ("1f00c0de", f"{SCHEMA_HASH:08x}", "3.9"))
-    unmet.request(0.0, DeviceRequest.HOME)
-    assert all(isinstance(message, Hello) for _, message in due(unmet, 0.0, 2.0))
-    link.receive(1.0, US.replaced(schema_hash=SCHEMA_HASH ^ 1))
-    assert link.state is LinkState.REFUSED, "also where it took another one's place"
-
-
 def test_a_device_that_turns_up_late_is_no_loss_and_asked_at_its_first_word(unmet: DeviceLink) -> None:
     due(unmet, 0.0, UNANSWERED_S, heard=False)
     assert unmet.state is LinkState.IDENTIFYING
@@ -128,6 +116,8 @@ def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
     assert [type(message) for message in link.due(0.021)] == [Hello]
     assert (link.state, link.measurement) == (LinkState.IDENTIFYING, None)
     assert "reset" in link.cause
+    told(link, 0.0215, status(), US.replaced(schema_hash=SCHEMA_HASH ^ 1))
+    assert link.due(0.0215) == [], "nothing is asked of a device that does not fit"
     told(link, 0.022, US, status(FIRST_NONCE), Sense(0.0, 0.0, 0.0, 0.0), State(5.0, 5.0, 0.0, 1))
     assert (link.state, link.measurement.left_mm) == (LinkState.RUNNING, 5.0)
     assert [type(message) for message in link.due(0.022)] == [Retract], "opening is still wanted"

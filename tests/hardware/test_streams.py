@@ -33,12 +33,6 @@ from tormagd.hardware.frame_stream import FrameStream
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 
 
-@pytest.mark.parametrize("pack", [FrameStream().pack, CanStream(1).pack])
-def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(pack) -> None:
-    with pytest.raises(EncodeError, match="left_duty"):
-        pack(Drive(float("nan"), 0.0, DriveMode.RUN, 0))
-
-
 def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:
     stream = FrameStream()
     for corrupt, frame in enumerate(

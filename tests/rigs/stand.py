@@ -51,7 +51,7 @@ class Stand:
             + "".join(f'{name} = "ipc://{self.folder}/{name}"\n' for name in ENDPOINTS)
         )
         self.endpoints = load_config(self.config).endpoints
-        # patient, because the host may be busy: timing is measured, not waited for
+        # patient: the host may be busy
         self.client = stack.enter_context(Client(self.endpoints, 10.0))
         self.start_daemon()
 

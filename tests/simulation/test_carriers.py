@@ -14,7 +14,6 @@ from firmware_protocol.codec import (
     DriveMode,
     Hello,
     Identity,
-    Message,
     Sense,
     State,
     Status,
@@ -25,7 +24,7 @@ from firmware_protocol.codec import (
 )
 from firmware_protocol.framing import FrameDecoder, encode_frame
 from tormagd.simulation.can_device import DEVICE, MAX_WAITING, CanDevice, Delivery
-from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, SocketFrame, from_socket, to_socket
+from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.device import MessageDevice, Packet, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -151,32 +150,11 @@ def test_next_event_is_never_behind_and_always_comes() -> None:
 # -- frames of a bus ------------------------------------------------------------------------------------------------
 
 
-def test_a_frame_survives_the_socket_and_what_is_none_is_refused() -> None:
-    frames = [
-        SocketFrame(CanFrame(0x7FF, b""), True, 0.0),
-        SocketFrame(CanFrame(0x021, b"1234567"), False, 1e9),
-        SocketFrame(CanFrame(ERROR_FLAG | 0x40, bytes(8)), False, 1e9),
-    ]
-    assert [from_socket(to_socket(*frame)) for frame in frames] == frames
-    none = ((0x21, 9, False, bytes(8), 0.0), (0x800, 0, False, b"", 0.0), (0x21, 0, False, b"", math.nan))
-    packets = (
-        b"",
-        bytes(SOCKET_FRAME.size - 1),
-        bytes(SOCKET_FRAME.size + 1),
-        *(SOCKET_FRAME.pack(*one) for one in none),
-    )
-    assert {from_socket(packet) for packet in packets} == {None}
+def a_bus(bitrate: int = 1_000_000) -> CanDevice:
+    return CanDevice(MessageDevice(SAMPLE_1, SteadyHand(), seed=1), bitrate)
 
 
-def a_bus(bitrate: int = 1_000_000, node: int = 1) -> CanDevice:
-    return CanDevice(MessageDevice(SAMPLE_1, SteadyHand(), seed=1), bitrate, node)
-
-
-def frame_of(message: Message, node: int = 1) -> CanFrame:
-    return CanFrame(can_identifier(FUNCTION[type(message)], node), encode(message))
-
-
-HELLO_FRAME = frame_of(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1))
+HELLO_FRAME = CanFrame(can_identifier(FUNCTION[Hello]), encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)))
 IDENTITY = can_identifier(FUNCTION[Identity])
 STATUS = can_identifier(FUNCTION[Status])
 
@@ -201,15 +179,6 @@ def test_the_lowest_identifier_goes_first_once_the_bus_is_free() -> None:
     seen = [(sender, frame) for sender, frame, _ in device.transmit(0.002) if sender != DEVICE]
     # the first is on the bus before the others come; equal identifiers go in the order they came
     assert seen == [(host, frames[host - 1]) for host in (1, 3, 5, 4, 2)]
-
-
-def test_only_its_own_node_reaches_the_device() -> None:
-    device = a_bus(node=2)
-    device.receive(0.0, HELLO_FRAME)
-    assert not any(delivery.sender == DEVICE for delivery in device.transmit(0.005))
-    device.receive(0.005, frame_of(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1), node=2))
-    answers = [delivery.frame for delivery in device.transmit(0.01) if delivery.sender == DEVICE]
-    assert [frame.identifier for frame in answers] == [can_identifier(FUNCTION[Identity], 2)]
 
 
 def test_what_the_controllers_cannot_hold_is_lost() -> None:

@@ -142,9 +142,7 @@ class Played:
 @pytest.mark.parametrize(("mode", "known_s"), [(LAW, 1.23), (FOUND, 1.31)])
 def test_the_process_feels_where_the_handle_was_and_says_it_later(mode: str, known_s: float) -> None:
     daemon, unit = Played(), Unit(Patient(wall_mm=10.0, stiffness_N_mm=0.5), mode, (0.1, 0.02, 0.1, 3.0))
-    over = lambda now_s: now_s >= 1.7  # noqa: E731
-    count = run(daemon, unit, over, daemon.clock_s, daemon.wait)
-    assert count == len(daemon.published) > 100
+    assert run(daemon, unit, lambda now_s: now_s >= 1.7, daemon.clock_s, daemon.wait) == len(daemon.published) > 100
     stamps = [stamp_ns for _, _, stamp_ns, _ in daemon.published]
     assert stamps == sorted(set(stamps))
     told = [(now_s, fields["contact"]) for now_s, _, _, fields in daemon.published if fields]

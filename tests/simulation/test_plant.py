@@ -8,6 +8,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
+from devices import SAMPLES
 from hypothesis import given, settings, strategies as st
 
 from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
@@ -19,8 +20,6 @@ from tormagd.simulation.plant import SUBSTEP_S, Plant
 from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.second_element import SecondElement
 from tormagd.simulation.static_laws import pull_of_magnets_N, radial_moment_Tm
-
-SAMPLES = ("sample_1", "sample_2", "sample_3")
 
 SAMPLE_1 = load_plant("sample_1")
 LEAD_M_RAD = 8e-3 / math.tau
@@ -69,8 +68,7 @@ def test_stall_torque_and_current_are_those_of_the_data_sheet() -> None:
     for step in range(steps(6.0)):
         axis.step(min(12.0, step * SUBSTEP_S * 3.0), 0.0)
     assert (axis.speed_rad_s, axis.current_A) == (0.0, pytest.approx(5.5, rel=0.05))
-    torque_Nm = axis.contact_N * (LEAD_M_RAD + axis.screw_friction_m)
-    assert torque_Nm == pytest.approx(2.65, rel=0.10)
+    assert axis.contact_N * (LEAD_M_RAD + axis.screw_friction_m) == pytest.approx(2.65, rel=0.10)
 
 
 @pytest.mark.parametrize(
@@ -318,20 +316,15 @@ def test_the_brake_gives_the_hand_no_energy_over_its_reversals(
     assert directions == {True, False}
 
 
-def readings(plant: Plant, milliseconds: int) -> list[float]:
-    values = []
-    for _ in range(milliseconds):
-        plant.advance(STEP_S)
-        values.append(plant.force_sensor.reading_N)
-    return values
-
-
 @pytest.mark.parametrize("name", SAMPLES)
 def test_force_sensor_noise_has_the_stated_spread_around_the_truth(name: str) -> None:
     parameters = load_plant(name)
     plant = Plant(parameters, SteadyHand(), seed=3)
-    values = readings(plant, 4000)[200:]
-    fresh = [after for before, after in itertools.pairwise(values) if after != before]
+    values = []
+    for _ in range(4000):
+        plant.advance(STEP_S)
+        values.append(plant.force_sensor.reading_N)
+    fresh = [after for before, after in itertools.pairwise(values[200:]) if after != before]
     assert len(fresh) == pytest.approx(3.8 * parameters.force_sensor.rate_Hz, abs=3)
     assert statistics.stdev(fresh) == pytest.approx(parameters.force_sensor.noise_mN * 1e-3, rel=0.08)
     assert statistics.fmean(fresh) == pytest.approx(plant.truth.force_N, abs=3e-3)
@@ -477,8 +470,7 @@ def test_a_step_creeps_with_the_logarithm_of_time_and_comes_to_an_end() -> None:
 
 def test_friction_grows_with_the_logarithm_of_speed_and_with_rest() -> None:
     quiet = second_of(creeping_share=0.0)
-    speeds = (1.0, 10.0, 100.0)
-    slow_N, middle_N, fast_N = (slid(60.0, quiet, 12.0 / speed, speed).force_N for speed in speeds)
+    slow_N, middle_N, fast_N = (slid(60.0, quiet, 12.0 / speed, speed).force_N for speed in (1.0, 10.0, 100.0))
     assert middle_N / slow_N == pytest.approx(fast_N / middle_N, rel=0.03)
     assert 1.02 < middle_N / slow_N < 1.06
     peaks_N = []

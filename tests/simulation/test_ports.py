@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import itertools
+import math
 import os
 import select
 import signal
@@ -86,10 +87,6 @@ def meet(device: Device) -> None:
             seen |= {type(message) for message in backend.receive()}
 
 
-def on_a_bus(channel: str) -> Device:
-    return Device(backend="can", options={"interface": "tormagsim"}, port=channel)
-
-
 def test_hosts_come_and_go_on_the_simulators_bus(start: Start) -> None:
     process = start("--can")
     path = channel(process)
@@ -98,24 +95,9 @@ def test_hosts_come_and_go_on_the_simulators_bus(start: Start) -> None:
     assert Path(path).is_socket()
     assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
     for _ in range(2):
-        meet(on_a_bus(path))
+        meet(Device(backend="can", options={"interface": "tormagsim"}, port=path))
     ended(process)
     assert not Path(path).exists()
-
-
-def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_not(start: Start, tmp_path: Path) -> None:
-    path = str(tmp_path / "can")
-    killed = start("--can", path)
-    assert channel(killed) == path
-    second = start("--can", path)
-    output, errors = second.communicate(timeout=LIMIT_S)
-    assert (second.returncode, output) == (2, "")
-    assert path in errors
-    killed.kill()
-    killed.wait()
-    assert Path(path).is_socket()
-    assert channel(start("--can", path)) == path
-    meet(on_a_bus(path))
 
 
 def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, tmp_path: Path) -> None:
@@ -196,10 +178,21 @@ def served(tmp_path: Path) -> Iterator[Served]:
         yield made
 
 
+def test_what_somebody_serves_stays_and_what_a_killed_simulator_left_is_replaced(served: Served) -> None:
+    path = Path(served.door.address)
+    with pytest.raises(OSError, match=f"{path}: cannot be served"):
+        CanPort(served.device, path)
+    served.door._listener.close()
+    with contextlib.closing(CanPort(served.device, path)) as second:
+        assert second.address == served.door.address
+
+
 def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
     good = served.host()
-    too_long = SOCKET_FRAME.pack(0x21, 9, False, bytes(8), 0.0)
-    for packet in (b"x", bytes(SOCKET_FRAME.size + 1), too_long, to_socket(CanFrame(ERROR_FLAG, b""))):
+    none = ((0x21, 9, False, bytes(8), 0.0), (0x800, 0, False, b"", 0.0), (0x21, 0, False, b"", math.nan))
+    lengths = (1, SOCKET_FRAME.size - 1, SOCKET_FRAME.size + 1)
+    packets = (*map(bytes, lengths), *(SOCKET_FRAME.pack(*one) for one in none), to_socket(CanFrame(ERROR_FLAG, b"")))
+    for packet in packets:
         bad = served.host()
         bad.send(packet)
         served.exchange(0.002)
@@ -233,8 +226,7 @@ def test_a_frame_carries_its_time_and_comes_back_where_its_sender_asks(
             with pytest.raises(can.CanOperationError, match="11-bit"):
                 one.send(can.Message(**refused))
         heard = {bus: list(iter(partial(bus.recv, 0), None)) for bus in (one, other, itself)}
-    said = [(message.arbitration_id, bytes(message.data), message.is_rx) for message in heard[itself]]
-    assert said == [
+    assert [(message.arbitration_id, bytes(message.data), message.is_rx) for message in heard[itself]] == [
         *[(0x300, b"123", True), (0x301, b"123", False)],
         *[(0x300, b"12345678", True), (0x301, b"12345678", False)],
     ]

@@ -221,8 +221,7 @@ def test_virtual_time_is_measured() -> None:
 def test_a_result_is_told_by_lines_and_tables() -> None:
     result = {"rate_hz": 999.26, "lateness_us": {"p50": 44.0, "p99": 900.0}, "against": {"ratio": {"p50": 1.5}}}
     rows = [{"name": "a", "p50_us": 1.25, "more": {}}, {"name": "long", "p50_us": 10.0, "more": {"RATE": 0.5}}]
-    told = [" ".join(line.split()) for line in lines(result | {"variants": rows, "cpus": [0, 1]})]
-    assert told == [
+    assert [" ".join(line.split()) for line in lines(result | {"variants": rows, "cpus": [0, 1]})] == [
         "rate_hz 999.3", "lateness_us p50 44, p99 900", "against ratio p50 1.5",
         "variants", "name p50_us more RATE", "a 1.25", "long 10 0.5", "cpus 0, 1",
     ]  # fmt: skip

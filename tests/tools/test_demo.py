@@ -173,8 +173,7 @@ def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_cod
     assert demo.judge(SCENE, ordered["thesis"])[1] in printed
     assert [case.label for case in demo.CASES if f"virtual time, {case.label}" not in printed] == []
     assert ("no verdict after 3 shows" in printed) == (exit_code == 3)
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert list(summary["touch"]) == list(live_touch.TOUCHES)
+    assert list(json.loads((tmp_path / "summary.json").read_text())["touch"]) == list(live_touch.TOUCHES)
 
 
 @pytest.fixture

@@ -36,30 +36,39 @@ def looked(time_s: float, **waited_s: float) -> host.Counters:
     return host.Counters(time_s, stolen=0, ticks=round(100 * time_s), waited_s=waited_s, blocked_s=0.0)
 
 
-def test_a_wait_that_led_to_a_fault_is_seen_by_the_look_after_it(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("looks", "times_s", "waited", "worst_ms"),
+    [
+        (
+            [
+                looked(1.0),
+                looked(1.2, device=0.010),
+                looked(1.4, device=0.014),
+                looked(1.6, device=0.134),  # 110 ms until 1.55: the fault is of 1.54
+                looked(1.8),
+            ],
+            (1.1, 1.54),
+            {"device": pytest.approx(0.134 / 0.6)},
+            100.0,
+        ),
+        (
+            [looked(1.0, worker=7.0), looked(1.2, worker=7.09, newer=9.0), looked(1.4, worker=7.09)],
+            (1.0, 1.4),
+            {},
+            70.0,
+        ),
+    ],
+    ids=["a process that faulted meanwhile", "a worker of the wire"],
+)
+def test_who_waited_is_told_and_much(tmp_path: Path, looks, times_s, waited, worst_ms) -> None:
     with (tmp_path / "log").open("w") as log, host.HostWatch(0, log) as watched:
         watched.wait_for("device", os.getpid())
         watched.end()
-        watched._looks = [
-            looked(1.0),
-            looked(1.2, device=0.010),
-            looked(1.4, device=0.014),
-            looked(1.6, device=0.134),  # 110 ms until 1.55: the fault is of 1.54, and the device was ended at 1.58
-            looked(1.8),
-        ]
-        found = watched.between(1.1, 1.54)
-    assert (found.waited, found.waited_worst_ms) == ({"device": pytest.approx(0.134 / 0.6)}, pytest.approx(100.0))
+        watched._looks = looks
+        found = watched.between(*times_s)
+    assert (found.waited, found.waited_worst_ms) == (waited, pytest.approx(worst_ms))
     assert found.took_much
-    assert "device waited" in str(found)
-
-
-def test_a_worker_of_the_wire_that_had_to_wait_was_held_up_by_the_host(tmp_path: Path):
-    with (tmp_path / "log").open("w") as log, host.HostWatch(0, log) as watched:
-        watched.end()
-        watched._looks = [looked(1.0, worker=7.0), looked(1.2, worker=7.09, newer=9.0), looked(1.4, worker=7.09)]
-        found = watched.between(1.0, 1.4)
-    assert (found.waited, found.waited_worst_ms) == ({}, pytest.approx(70.0))
-    assert found.took_much
+    assert ("device waited" in str(found)) is bool(waited)
 
 
 def test_a_timer_on_every_processor_and_a_process_that_waits(tmp_path: Path):

@@ -425,9 +425,10 @@ def mark_pareto(rows: list[dict[str, Any]]) -> None:
         )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="two small networks and few solves, for a test")
-    parser.add_argument("--write", action="store_true", help="also write docs/inverse_trade.md and its plot")
+OPTIONS = {
+    "--quick": {"action": "store_true", "help": "two small networks and few solves, for a test"},
+    "--write": {"action": "store_true", "help": "also write docs/inverse_trade.md and its plot"},
+}
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

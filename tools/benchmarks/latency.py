@@ -20,7 +20,7 @@ import numpy as np
 import zmq
 from machines.stream import received
 
-from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
+from benchmarks.loop import REALTIME, Stand, asked_for, daemon, quantiles, realtime_settings
 from tormag_lab.arrays import Array
 from tormagd.config import Config, RealTime
 from tormagd.ctl.record import listening
@@ -133,9 +133,7 @@ def receive(address: str, count: int, scheduling: tuple[int, int]) -> Array:
     return hops
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_realtime_arguments(parser)
-    parser.add_argument("--count", type=int, default=1_000, help="setpoints")
+OPTIONS = REALTIME | {"--count": {"type": int, "default": 1_000, "help": "setpoints"}}
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

@@ -129,9 +129,6 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
                 )
                 for name in SHARES
             },
-            "tick_mean_ratio": round(
-                statistics.median(float(one.exec_us.mean() / other.exec_us.mean()) for one, other in against), 3
-            ),
         }
     return result | asked_for(realtime)
 
@@ -236,8 +233,7 @@ def as_block(rows: list[list[Any]], control_hz: int) -> Block:
     lateness_us, exec_us, received_s = np.array([row[1:] for row in rows], dtype=np.float64).T
     spanned_s = (rows[-1][0] - rows[0][0]) * 1e-9
     merged = max(0, round(spanned_s * control_hz) + 1 - len(rows))
-    fresh = int(np.count_nonzero(np.diff(received_s) > 0.0))
-    return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
+    return Block(lateness_us, exec_us, len(rows), merged, spanned_s, int(np.count_nonzero(np.diff(received_s) > 0.0)))
 
 
 def reported(address: str) -> dict[str, Any]:
@@ -377,9 +373,10 @@ async def _bare(config: Config) -> None:
     await beat(1_000_000_000 // config.rates.control_hz, publish, asyncio.Event())
 
 
-def add_realtime_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of what is measured; 0 for none")
-    parser.add_argument("--keep-awake", action="store_true", help="idle processors do not sleep")
+REALTIME: dict[str, dict[str, Any]] = {
+    "--fifo": {"type": int, "default": 50, "help": "SCHED_FIFO priority of what is measured; 0 for none"},
+    "--keep-awake": {"action": "store_true", "help": "idle processors do not sleep"},
+}
 
 
 def realtime_settings(options: argparse.Namespace) -> RealTime:
@@ -387,27 +384,25 @@ def realtime_settings(options: argparse.Namespace) -> RealTime:
 
 
 def asked_for(realtime: RealTime) -> dict[str, Any]:
-    return {
-        "fifo_priority": realtime.fifo_priority,
-        "keep_awake": realtime.keep_awake,
-    }
+    return {"fifo_priority": realtime.fifo_priority, "keep_awake": realtime.keep_awake}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_realtime_arguments(parser)
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a block (%(default)s)")
-    parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind (%(default)s)")
-    parser.add_argument(
-        "--against", type=checkout, metavar="FOLDER", help="root of another checkout, measured in turns with this one"
-    )
-    parser.add_argument(
-        "--rates",
-        type=int,
-        nargs=2,
-        default=(CONTROL_HZ, CONTROL_HZ),
-        metavar=("CONTROL", "PLANS"),
-        help="Hz (1000 and 1000)",
-    )
+OPTIONS = REALTIME | {
+    "--seconds": {"type": float, "default": 10.0, "help": "length of a block (%(default)s)"},
+    "--pairs": {"type": int, "default": 3, "help": "blocks of each kind (%(default)s)"},
+    "--against": {
+        "type": checkout,
+        "metavar": "FOLDER",
+        "help": "root of another checkout, measured in turns with this one",
+    },
+    "--rates": {
+        "type": int,
+        "nargs": 2,
+        "default": (CONTROL_HZ, CONTROL_HZ),
+        "metavar": ("CONTROL", "PLANS"),
+        "help": "Hz (1000 and 1000)",
+    },
+}
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

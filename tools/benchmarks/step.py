@@ -88,7 +88,6 @@ def step(loop: ClosedLoop, target_mm: float) -> dict[str, float]:
         "overshoot": max(0.0, float(share.max()) - 1.0),
         "settling_5pct_s": float(time_s[outside[-1]]) if outside.size else 0.0,
         "steady_error_um": abs(float(gap[-1]) - target_mm) * 1e3,
-        "true_error_um": abs(samples[-1].truth.gap_mm - target_mm) * 1e3,
         "skew_um": max(abs(estimate.skew_mm) for estimate in estimates) * 1e3,
     }
 
@@ -172,8 +171,7 @@ def _at_rest(parameters: PlantParameters, gap_mm: float) -> PlantParameters:
     return msgspec.structs.replace(parameters, assumed=begun)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
+OPTIONS = {"--plant": {"default": "sample_1", "help": "plant file or the name of a committed sample"}}
 
 
 def drive(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:

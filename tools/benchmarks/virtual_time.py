@@ -108,8 +108,7 @@ def summary(found: Stretches, period_us: float) -> dict[str, Any]:
     }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seconds", type=float, default=10.0, help="virtual time of each loop")
+OPTIONS = {"--seconds": {"type": float, "default": 10.0, "help": "virtual time of each loop"}}
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

@@ -87,8 +87,7 @@ def _error(axes: Axes, scene: Scene, shown: Shown) -> None:
     pulse = shown.time_s >= PULSE_START_S
     result = tracking(shown.asked_N[pulse], shown.rendered_N[pulse])
     axes.axhline(0.0, color=QUIET, linewidth=0.8)
-    error_mN = (shown.rendered_N - shown.asked_N)[pulse] * 1e3
-    axes.plot(shown.time_s[pulse], error_mN, color=RENDERED, linewidth=0.9)
+    axes.plot(shown.time_s[pulse], (shown.rendered_N - shown.asked_N)[pulse] * 1e3, color=RENDERED, linewidth=0.9)
     title = (
         f"Error: RMS {result.rms_N * 1e3:.1f} mN (the scene allows {scene.force.tolerance_rms_N * 1e3:g}), "
         f"variance accounted for {result.variance_accounted_for:.3f}"

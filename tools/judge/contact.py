@@ -90,8 +90,6 @@ def judged(case: Case) -> Json:
         "withdrawal_held_ms": held_ms(run, waiting_N),
         "withdrawal_bound_ms": held_ms(bound if case.mode.startswith("force") else opened(case, core), waiting_N),
         "tip_depth_mm": float(run.depth_mm.max()),
-        "tip_depth_bound_mm": float(bound.depth_mm.max()),
-        "tip_depth_infinite_mm": float(infinite.depth_mm.max()),
         "early_N": early_N(run, waiting_N),
         "swings": swings(run),
         "energy_error": energy_error(run),
@@ -166,7 +164,6 @@ def kept(rows: list[Json]) -> Json:
             if row["onset_lag_ms"] is not None and row["onset_bound_ms"] is not None
         ]
         worse = [row["rms_N"] - WORSE * row["rms_bound_N"] - WORSE_N for row in of_mode]
-        held = [row["withdrawal_held_ms"] - row["withdrawal_bound_ms"] for row in of_mode]
         found[mode] = {
             "cases": len(of_mode),
             "counted": len(late),
@@ -174,7 +171,7 @@ def kept(rows: list[Json]) -> Json:
             "short": spread([row["onset_short"] for row in of_mode if row["onset_short"] is not None]),
             "rms_kept": float(np.mean([each <= 0.0 for each in worse])),
             "rms_over_N": float(np.quantile(worse, 0.95)),
-            "held_ms": spread(held),
+            "held_ms": spread([row["withdrawal_held_ms"] - row["withdrawal_bound_ms"] for row in of_mode]),
             "early_N": spread([row["early_N"] for row in of_mode]),
             "over_most_N": max(row["most_N_exceeded"] for row in of_mode),
             "swings": max(row["swings"] for row in of_mode),
@@ -209,8 +206,7 @@ def draw(picture: Path) -> None:
     figure.savefig(picture)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--picture", type=Path, metavar="FILE.png")
+OPTIONS = {"--picture": {"type": Path, "metavar": "FILE.png"}}
 
 
 def measure(options: argparse.Namespace) -> Json:

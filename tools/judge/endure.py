@@ -174,11 +174,14 @@ CASES = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    counts = ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items())
-    parser.add_argument("case", choices=CASES)
-    parser.add_argument("--count", type=whole(1, 10**9), help=f"default: {counts}")
-    parser.add_argument("--seed", type=int, default=1, help="of what is drawn (1)")
+OPTIONS = {
+    "case": {"choices": CASES},
+    "--count": {
+        "type": whole(1, 10**9),
+        "help": "default: " + ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items()),
+    },
+    "--seed": {"type": int, "default": 1, "help": "of what is drawn (1)"},
+}
 
 
 def measure(options: argparse.Namespace) -> Figures:
@@ -204,8 +207,7 @@ def _watched(run: Callable[..., Figures], times: int, seed: int) -> Figures:
     figures["held_against_host"] = []
     for fault, from_s, to_s in stand.latched:
         stood_ms = watch.between(from_s, to_s).bare_worst_ms
-        is_hosts = stood_ms >= HOST_SHARE * DEVICE_WAITS_MS
-        figures["held_against_host" if is_hosts else "failures"].append(
+        figures["held_against_host" if stood_ms >= HOST_SHARE * DEVICE_WAITS_MS else "failures"].append(
             f"fault {fault}, while a bare timer stood still for {stood_ms:.0f} ms"
         )
     return figures

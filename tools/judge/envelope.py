@@ -91,11 +91,9 @@ def run(case: Case) -> Json:
             newest[:] = [TimedSetpoint(force_N(now_s - start_s), now_s, VALID_S, case.displacement_mm, case.rate_mm_s)]
         return newest[-1]
 
-    lasts_s = min(sum(lasts for lasts, _ in levels), sum(lasts for lasts, _ in legs))
-    followed = follow(loop, publish, lasts_s, start_s)
+    followed = follow(loop, publish, min(sum(lasts for lasts, _ in levels), sum(lasts for lasts, _ in legs)), start_s)
     is_of_steps = (case.hand, case.forces) == ("42 mm/s", "steps")
-    steps_N = step_figures(followed) if is_of_steps else None
-    return judged(followed, brake_of(plant).open_N) | {"steps_N": steps_N}
+    return judged(followed, brake_of(plant).open_N) | {"steps_N": step_figures(followed) if is_of_steps else None}
 
 
 def step_figures(found: Followed) -> tuple[float, float, float] | None:
@@ -240,8 +238,7 @@ def picture(path: Path, result: Json, found: list[tuple[Case, Json]]) -> None:
     figure.savefig(path, dpi=130, metadata=stamp(result))
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")
+OPTIONS = {"--picture": {"type": Path, "help": "PNG of the force error over handle speed and asked force"}}
 
 
 def shown(figures: Json) -> Iterator[str]:

@@ -195,10 +195,11 @@ SHOWN = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
-    parser.add_argument("--only", default="", metavar="TEXT", help="faults with this in their name")
-    parser.add_argument("--firmware", choices=FIRMWARES, default="python", help="what the device runs")
+OPTIONS = {
+    "--plant": {"default": "sample_1", "help": "plant file or the name of a committed sample"},
+    "--only": {"default": "", "metavar": "TEXT", "help": "faults with this in their name"},
+    "--firmware": {"choices": FIRMWARES, "default": "python", "help": "what the device runs"},
+}
 
 
 def measure(options: argparse.Namespace) -> Json:

@@ -1,6 +1,6 @@
 """What judges and benchmarks share: their command line, many runs with their progress, and a table or a JSON object.
 
-A module's docstring is its `--help`; `add_arguments(parser)` has its options. `measure(options)` returns the figures,
+A module's docstring is its `--help`; `OPTIONS` has what `argparse` adds to it. `measure(options)` returns the figures,
 `shown(figures)` the lines of its table. The exit status is 1 if `passed` of the figures is false; `missed` says why.
 """
 
@@ -34,7 +34,8 @@ def parsed(
     module: Any = importlib.import_module(f"{room}.{name.replace('-', '_')}")
     of_name = argparse.ArgumentParser(f"{parser.prog} {name}", description=module.__doc__, formatter_class=text)
     of_name.add_argument("--json", action="store_true", help="print one JSON object")
-    getattr(module, "add_arguments", id)(of_name)
+    for option, of_it in getattr(module, "OPTIONS", {}).items():
+        of_name.add_argument(option, **of_it)
     return module, of_name.parse_args(given[1:])
 
 

@@ -1,18 +1,14 @@
-"""Hands at the handle: legs of even speed, and speeds that swing."""
+"""Hands at the handle: legs of even speed."""
 
 import math
 from collections.abc import Callable
 
 import numpy as np
 
-from tormagd.scenes.scene import Handle
 from tormagd.simulation.hand import Hand, RecordedHand
 
 Legs = list[tuple[float, float]]
 "How long, s, and how fast, mm/s."
-
-SWING_S, SWING_STEP_S, SWINGS_FOR_S = 5.3, 0.02, 90.0
-"A handle's speed swings between a scene's in this time, evenly in its logarithm."
 
 
 class WaitingHand:
@@ -26,13 +22,6 @@ class WaitingHand:
 
     def position_mm(self, time_s: float) -> float:
         return 0.0 if self._goes is None else self._goes.position_mm(time_s)
-
-
-def swinging(handle: Handle) -> Hand:
-    low, high = math.log(handle.least_mm_s), math.log(handle.most_mm_s)
-    time_s = np.arange(0.0, SWINGS_FOR_S, SWING_STEP_S)
-    speed_mm_s = np.exp((low + high) / 2.0 + (high - low) / 2.0 * np.sin(2.0 * math.pi * time_s / SWING_S))
-    return RecordedHand(tuple(time_s.tolist()), tuple((np.cumsum(speed_mm_s) * SWING_STEP_S).tolist()))
 
 
 def flicks() -> Legs:

@@ -56,17 +56,17 @@ def _row(path: Path, model: ForceModel) -> Json:
 
 def shown(figures: Json) -> list[str]:
     columns = ("insert", "full force, N", "model", "sample 1: mean", "judging: mean")
-    return table(columns, (_cells(row) for row in figures["rows"])).splitlines()
-
-
-def _cells(row: Json) -> list[str]:
-    return [
-        row["insert"],
-        f"{row['full_N']:.2f}",
-        f"`{row['model']}`",
-        f"{1e3 * row['sample_1']['mean_N']:.0f}",
-        f"{1e3 * row['mean_N']:.0f} ({100.0 * row['mean_N'] / row['full_N']:.1f}%)",
+    rows = [
+        [
+            row["insert"],
+            f"{row['full_N']:.2f}",
+            f"`{row['model']}`",
+            f"{1e3 * row['sample_1']['mean_N']:.0f}",
+            f"{1e3 * row['mean_N']:.0f} ({100.0 * row['mean_N'] / row['full_N']:.1f}%)",
+        ]
+        for row in figures["rows"]
     ]
+    return table(columns, rows).splitlines()
 
 
 def errors(model: ForceModel, fitted: Insert, plant: PlantParameters, rates_mm_s: Array = RATES_MM_S) -> Json:

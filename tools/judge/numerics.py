@@ -212,12 +212,13 @@ def of_physics(options: argparse.Namespace) -> Json:
     }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+OPTIONS = {
+    f"--{name}": {"type": whole(1, 10**9), "default": default, "help": f"{says} (%(default)s)"}
     for name, default, says in (
         ("cases", 1_000_000, "inputs of the physics, as arrays"),
         ("reference", 12_000, "of them, computed in 50 digits"),
         ("episodes", 1_000, "of hostile inputs to each stage"),
         ("seed", 1, "of what is drawn"),
         ("workers", 2, "processes"),
-    ):
-        parser.add_argument(f"--{name}", type=whole(1, 10**9), default=default, help=f"{says} (%(default)s)")
+    )
+}

@@ -172,8 +172,7 @@ class DaemonsBorder:
         wrong = self._wrong
         self._seq += 1
         force_N = {"nan": math.nan, "negative": -1.0, "huge": 1e3}.get(wrong, asked_N(now_s))
-        stamp_ns = realtime_ns + (CLOCK_STEP_S * 10**9 if wrong == "clock" else 0)
-        data = self._message("robot", force_N, stamp_ns)
+        data = self._message("robot", force_N, realtime_ns + (CLOCK_STEP_S * 10**9 if wrong == "clock" else 0))
         self._earlier.append(data)
         if wrong == "disordered":
             kept, self._kept = self._kept, data if self._kept is None else None

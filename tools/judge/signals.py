@@ -41,8 +41,7 @@ class Signal(NamedTuple):
 def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
     period_s = float(times_s[1] - times_s[0])
     ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
-    hold = np.full(round(hold_s / period_s), forces_N[0])
-    forces = np.concatenate([ramp, hold, forces_N])
+    forces = np.concatenate([ramp, np.full(round(hold_s / period_s), forces_N[0]), forces_N])
     return np.arange(len(forces), dtype=np.float64) * period_s, forces
 
 
@@ -96,5 +95,4 @@ def _haptic(path: Path) -> Signal:
     sent_s, first = np.unique(raw[:, 0], return_index=True)
     sent_s, sent_N = sent_s[sent_s <= HAPTIC_S], np.linalg.norm(raw[first, 1:4], axis=1)[sent_s <= HAPTIC_S]
     time_s = np.arange(0.0, sent_s[-1], 1.0 / RATE_HZ)
-    forces = np.interp(time_s, sent_s, scaled(sent_N, *SCALED_N))
-    return Signal(f"haptic scaled {path.stem}", time_s, forces)
+    return Signal(f"haptic scaled {path.stem}", time_s, np.interp(time_s, sent_s, scaled(sent_N, *SCALED_N)))

@@ -159,8 +159,7 @@ def stepper() -> Stepper:
     for tick in range(1, 4):
         draw = usual(BEGINS_S + tick * PERIOD_S)
         draw.steps = -tick
-        hold = Plan(1, draw.now_s, None, None, 0.0, None, 0.0, 80.0, 0.0, 1.0, ())
-        made.step(draw.now_s, measurement(draw), hold)
+        made.step(draw.now_s, measurement(draw), Plan(1, draw.now_s, None, None, 0.0, None, 0.0, 80.0, 0.0, 1.0, ()))
     made.command("enable", BEGINS_S + 0.01, READY)
     return made
 
@@ -237,10 +236,9 @@ def slow_friction(stage: SlowFriction, draw: Draw) -> object:
 
 def sensor_zero(stage: SensorZero, draw: Draw) -> object:
     stage.begin(draw.now_s)
-    direction = 1.0 if draw.steps // 4 % 2 else -1.0
     stage.update(
         draw.now_s,
-        direction,
+        1.0 if draw.steps // 4 % 2 else -1.0,
         draw(1.1),
         draw(1.1),
         abs(draw(42.0)),
@@ -259,8 +257,7 @@ def freshness(stage: Freshness, draw: Draw) -> object:
 
 def sensor(stage: SensorTrust, draw: Draw) -> object:
     dt_s = draw.positive(PLAN_S)
-    taught_N = stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), draw(1.1), abs(draw(0.02)), dt_s, learns=True)
-    return taught_N or 0.0
+    return stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), draw(1.1), abs(draw(0.02)), dt_s, learns=True) or 0.0
 
 
 def anchor(stage: Anchor, draw: Draw) -> object:
@@ -419,8 +416,7 @@ def homing(stage: Homing, draw: Draw) -> object:
 
 
 def opening(stage: Opening, draw: Draw) -> object:
-    mode = DeviceMode.RETRACTING if draw.steps % 4 else DeviceMode.IDLE
-    seen = measurement(draw).replaced(mode=mode)
+    seen = measurement(draw).replaced(mode=DeviceMode.RETRACTING if draw.steps % 4 else DeviceMode.IDLE)
     stage.update(seen, draw.steps % 3 > 0, draw.steps % 5 == 0, SafetyState().ask(DeviceRequest.RETRACT))
     return [*stage.faults, stage.left_late_s, stage.right_late_s, stage.waits_s]
 

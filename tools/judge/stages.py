@@ -117,8 +117,7 @@ def tried(stage: Stage, episodes: int, seed: int) -> dict[str, Any]:
                     _tell(counts, told, "nonfinite", f"{path} = {value}")
                     fed = stage.make()
                     break
-    counted = {name: counts[name] for name in COUNTED}
-    return {"stage": stage.name, "border": stage.border, **counted, "told": told}
+    return {"stage": stage.name, "border": stage.border, **{name: counts[name] for name in COUNTED}, "told": told}
 
 
 def _tell(counts: Counter[str], told: list[str], kind: str, what: str) -> None:

@@ -170,8 +170,7 @@ class Scenario:
 
     def touch(self, faults: tuple[str, ...] = ()) -> Touch:
         time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N = np.array(self._rows).reshape(-1, 6).T
-        limits = tuple(sorted(self._limits))
-        return Touch(time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N, faults, limits)
+        return Touch(time_s, depth_mm, speed_mm_s, kinetic_N, force_N, hand_N, faults, tuple(sorted(self._limits)))
 
 
 def rendered(case: Case, core: Core) -> Touch:
@@ -210,8 +209,7 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
     parameters = device_of(case.device)
     scenario = Scenario(case, core_of(case))
     plant = Plant(parameters, scenario.felt)
-    drive = drive_of(parameters) if has_motors else None
-    bound = Bound(scenario.core, brake_of(parameters), drive)
+    bound = Bound(scenario.core, brake_of(parameters), drive_of(parameters) if has_motors else None)
     put_gap(plant, scenario.core.scene.insert.gap_open_mm)
     plant.advance(PERIOD_S)
     for _ in scenario.begin(plant.time_s):

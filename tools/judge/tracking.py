@@ -138,8 +138,7 @@ def creep(name: str) -> Json:
         levels = [(lead_s + hold_s, CREEP_N[0]), *((hold_s, force_N) for force_N in CREEP_N[1:])]
         found = course(plant, [*lead, (RUNS_ON_S, CREEP_MM_S)], levels)
         ends_s = [lead_s + hold_s * (1 + place) for place in range(len(CREEP_N))]
-        worst_N = [found.worst_N(end_s - 2.0, end_s) for end_s in ends_s]
-        result[key] = {"worst_N": worst_N, "faults": found.faults}
+        result[key] = {"worst_N": [found.worst_N(end_s - 2.0, end_s) for end_s in ends_s], "faults": found.faults}
     return result
 
 
@@ -209,8 +208,7 @@ def sample(name: str, preview_s: float) -> Json:
 
 
 def samples() -> Json:
-    cases = product(judging(0), (PREVIEW_S, 0.0))
-    return {"rows": each(sample, "samples", *zip(*cases, strict=True))}
+    return {"rows": each(sample, "samples", *zip(*product(judging(0), (PREVIEW_S, 0.0)), strict=True))}
 
 
 def pulse(name: str) -> Json:
@@ -247,8 +245,7 @@ OF_SIGNALS = {"samples": samples, "signals": signals}
 CASES = (*OF_DEVICES, *OF_SIGNALS)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("cases", nargs="*", choices=(*CASES, "all"), default="all", help="default: all")
+OPTIONS = {"cases": {"nargs": "*", "choices": (*CASES, "all"), "default": "all", "help": "default: all"}}
 
 
 def measure(options: argparse.Namespace) -> Json:

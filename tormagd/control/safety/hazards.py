@@ -94,7 +94,7 @@ CAUSES: Final = (
         Hazard.OPENS,
         "an adapter or a driver damages Sense or Status, which carry no checksum of their own",
         "it is named as a fault of the device; no force is lost faster than in any fault",
-        "hardware/test_backends.py::test_a_damaged_line_is_counted_and_the_next_is_read",
+        "hardware/test_contract.py::test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name",
         "5% of the frames damaged",
     ),
     Cause(
