@@ -498,6 +498,17 @@ def test_where_no_socket_can_be_it_is_said_why_and_files_are_left_alone(
     assert {*tmp_path.glob("*/*")} <= {*before, folder / "setpoint.lock"}
 
 
+@pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM])
+def test_a_socket_is_replaced_once_its_program_has_ended(tmp_path: Path, kind: int) -> None:
+    with socket.socket(socket.AF_UNIX, kind) as other:
+        other.bind(str(tmp_path / "control"))
+        if kind == socket.SOCK_STREAM:
+            other.listen()
+        with pytest.raises(OSError, match=r"/control is the socket of another program"):
+            Rig(tmp_path)
+    Rig(tmp_path).close()
+
+
 def test_a_folder_as_tmp_is_may_be_written_to_by_others(tmp_path: Path) -> None:
     tmp_path.chmod(0o1777)
     Rig(tmp_path).close()

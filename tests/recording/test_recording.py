@@ -167,7 +167,7 @@ def test_losses_are_counted(tmp_path):
         writer.ticks(batch(*((tick, tick) for tick in (3, 4, 8, 0, 1)), columns=("t_ns", "tick")))
         for seq in (3, 4, 7, 8, 0, 1):  # 5 and 6 are lost; then the daemon restarts
             writer.telemetry(telemetry(seq, seq))
-    assert (writer.tick_count, writer.ticks_lost, writer.telemetry_lost) == (5, 3, 2)
+    assert (writer.tick_count, writer.ticks_lost, writer.restarts, writer.telemetry_lost) == (5, 3, 1, 2)
 
 
 def test_columns_may_change_while_recording(tmp_path):

@@ -69,7 +69,7 @@ class Flight:
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
         self._inference.foresee(beat)
-        record = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0).row()
+        record = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, self._ticks).row()
         self._journal.add(record)
         self._ticks += 1
         if self._ticks % PART_TICKS == 0:

@@ -158,10 +158,13 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     )
 
 
-def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
+def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile, tmp_path: Path) -> None:
     places = list(ticks_of(COLUMNS, box.entries))
-    done = again(core, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
-    assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
+    parts = box.entries[: places[3_100] + 1], box.entries[places[3_120] + 1 :]
+    write_black_box(tmp_path / "lost.mcap", box.header, map(msgspec.msgpack.encode, parts))
+    for entries in ([*parts[0], [MISSING], *parts[1]], read_black_box(tmp_path / "lost.mcap").entries):
+        done = again(core, entries)
+        assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
 
 
 @pytest.mark.parametrize(

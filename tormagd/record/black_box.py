@@ -106,10 +106,11 @@ class _Reading(Contents):
         if self.is_over:
             return
         columns = msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...])
-        numbers = [dict(zip(columns, each, strict=False)).get(NUMBER_COLUMN) for each in entries if is_tick(each)]
-        if numbers and self._tick is not None and numbers[0] != self._tick + 1:
+        ticks = [dict(zip(columns, each, strict=False)) for each in entries if is_tick(each)]
+        numbers = [number for each in ticks if isinstance(number := each.get(NUMBER_COLUMN), int)]
+        if numbers and self._tick is not None and not self._tick <= numbers[0] <= self._tick + 1:
             self.entries.append([MISSING])  # lost on the way, or another daemon's
-        self._tick = numbers[-1] if numbers and isinstance(numbers[-1], int) else self._tick
+        self._tick = numbers[-1] if numbers else self._tick
         self.entries.extend(entries)
         try:
             for topic, t_ns, number, shown in self._derived.of(columns, entries) if self.expected else ():
