@@ -393,9 +393,9 @@ def test_a_silence_of_the_device_is_put_down_to_a_host_that_kept_the_loop_waitin
     for at_ns in range(10_000_000_000, 11_000_000_000, 50_000_000):
         daemon._receive(Beat(at_ns - 1_000_000, at_ns, late_ms - 1))
     stepper.time_s = 10.95
-    causes.tell((Fault.LINK_LOST, Fault.SKEW), stepper, None)
+    causes.tell((Fault.STATUS_STALE, Fault.SKEW), stepper, None)
     told = [
-        *causes.of_faults(["LINK_LOST", "SKEW"]),
+        *causes.of_faults(["STATUS_STALE", "SKEW"]),
         *(row for now_s in (10.95, 12.0) for row in causes.of_limits(["DEVICE_SILENT"], "", {}, None, now_s)),
     ]
     assert [("160 ms of the last second, 8 ms at once; " in each.cause, "doctor" in each.remedy) for each in told] == [
@@ -683,6 +683,9 @@ def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming_and_o
     armed.port.is_plugged_in = False
     status = armed.until(lambda status: "LINK_LOST" in status["faults"], "the loss is named")
     assert (status["link"]["cause"], status["link"]["remedy"]) == ("no such port", "plug it in")
+    told = next(each for each in status["fault_details"] if each["code"] == "LINK_LOST")
+    assert told["cause"].endswith("disappeared: the port is gone")
+    assert told["remedy"] == "plug it in; then `tormagctl arm`"
     armed.tick(500)
     armed.port.is_plugged_in = True
     status = armed.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "back, open")

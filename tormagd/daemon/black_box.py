@@ -165,10 +165,7 @@ class BlackBox:
             self._refusal = answer.refusal
             self._requested.discard(answer.name)
             if answer.refusal:
-                log.error(
-                    "the black box %s was not written: %s; next: make room in [black_box] folder, or name another",
-                    *(answer.name, answer.refusal),
-                )
+                log.error("the black box %s was not written: %s", answer.name, answer.refusal)
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)

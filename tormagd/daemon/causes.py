@@ -17,7 +17,7 @@ from tormagd_client.messages import Explained, StallReport
 WAITED_SHARE = 0.1
 "If the host kept the control loop waiting for more of the last second, it caused the silence: not device or cable."
 SILENCES = {
-    *("LINK_LOST", "MEASUREMENT_STALE", "SENSE_STALE", "STATUS_STALE", "LINK_DEGRADED", "DEVICE_COMMAND_TIMEOUT"),
+    *("MEASUREMENT_STALE", "SENSE_STALE", "STATUS_STALE", "LINK_DEGRADED", "DEVICE_COMMAND_TIMEOUT"),
     *("DEVICE_SILENT", "CLOCK"),
 }
 
@@ -39,6 +39,11 @@ class Causes:
         sight, known, stall_ms = stepper.measure.sight, self.stall, round(stepper.measure.sight.stall_s * 1e3, 1)
         if sight.stalled_s == stepper.time_s and (known is None or known.ms != stall_ms):
             self.stall = StallReport(stall_ms, delay.culprit)
+
+    def note_loss(self, cause: str, remedy: str) -> None:
+        """Keep why the link was lost, as the connection has judged."""
+        fault = Fault.LINK_LOST
+        self._told[fault] = Explained(fault, f"{FAULTS[fault].cause}: {cause}", f"{remedy}; then `tormagctl arm`")
 
     def note_wait(self, now_s: float, wait_s: float) -> None:
         """Note that the control loop was not given the processor for the last `wait_s`, or since the last such wait."""
@@ -62,7 +67,8 @@ class Causes:
             f"{self._stood_still()}; the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
         )
         causes[Fault.PLAN_FAILED] = self.plan_failure
-        self._told |= {fault: _explained(fault, FAULTS, causes, hosts) for fault in faults}
+        of_others = [fault for fault in faults if fault is not Fault.LINK_LOST]
+        self._told |= {fault: _explained(fault, FAULTS, causes, hosts) for fault in of_others}
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 

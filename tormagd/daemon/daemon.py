@@ -71,7 +71,7 @@ class Daemon:
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
-        self._connection = Connection(config.device, open_backend, lambda: self._control.lose_link(), self._causes.host)
+        self._connection = Connection(config.device, open_backend, self._lose_link, self._causes.host)
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources, keys)
         self._endpoint.inbox.begin_scene(core.scene)
         self._keys = keys
@@ -196,6 +196,10 @@ class Daemon:
         # those that wait for a plan are cheaper together
         has_come = (is_every or self._inference.is_due(beat)) and self._endpoint.take_setpoints()
         self._inference.plan(beat, stepper.measured, is_asked=is_every and has_come, is_followed=stepper.is_followed)
+
+    def _lose_link(self) -> None:
+        self._causes.note_loss(self._connection.cause, self._connection.remedy)
+        self._control.lose_link()
 
     def _fail_plan(self, why: str) -> None:
         self._causes.plan_failure = why

@@ -218,7 +218,7 @@ class Keeper:
                 self._due.append((time.monotonic() + said.after_s, said))
                 self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
             case Write():
-                self._answer(Written(said.name, f"{said.name}: {MAX_DUE} others are still to be written"))
+                self._answer(Written(said.name, f"{MAX_DUE} others are still to be written"))
 
     def _begin(self, begun: Begin) -> None:
         """Begin the ring anew; write what a keeper that was killed has left, or go on with it for the same daemon."""
@@ -257,6 +257,8 @@ class Keeper:
                 old.unlink()
         except (OSError, ValueError, TypeError, KeyError, msgspec.MsgspecError) as error:
             refusal = f"{folder / write.name}: {getattr(error, 'strerror', None) or error!r}"
+            if isinstance(error, OSError):
+                refusal += "; next: make room there, or name another [black_box] folder"
             write_line(f"tormagd: no black box: {refusal}", sys.stderr)
         self._answer(Written(write.name, refusal))
 
