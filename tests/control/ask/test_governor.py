@@ -387,6 +387,17 @@ def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> 
     assert worst_N < share * extrapolated_N
 
 
+def test_what_is_foreseen_is_asked_for_as_fast_as_the_gap_goes() -> None:
+    following, steepest_N_s = governor(), []
+    fastest_N_s = GAP_SPEED_MM_S * (PORTRAIT.max_N - PORTRAIT.min_N) / (95.0 - 45.0)
+    for tick in range(1, 3_000):
+        now_s = tick / 500
+        asked = decide(following, now_s, at(lambda time_s: 3.0 * beats_N(time_s) - 2.8, now_s))
+        following.foresee()
+        steepest_N_s.append(np.max(np.abs(np.diff(path_N(asked))) / np.diff(PATH_S)))
+    assert np.median(steepest_N_s[2_000:]) < 1.1 * fastest_N_s
+
+
 def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> None:
     for tick in range(1, 1_000):
         now_s = 10.0 + tick * 1e-3
