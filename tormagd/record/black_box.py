@@ -106,14 +106,18 @@ class _Reading(Contents):
         if self.is_over:
             return
         columns = msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...])
-        ticks = [dict(zip(columns, each, strict=False)) for each in entries if is_tick(each)]
-        numbers = [number for each in ticks if isinstance(number := each.get(NUMBER_COLUMN), int)]
-        if numbers and self._tick is not None and not self._tick <= numbers[0] <= self._tick + 1:
-            self.entries.append([MISSING])  # lost on the way, or another daemon's
-        self._tick = numbers[-1] if numbers else self._tick
+        self._join(columns, entries)
         self.entries.extend(entries)
         try:
             for topic, t_ns, number, shown in self._derived.of(columns, entries) if self.expected else ():
                 self.expected[topic].append((number, t_ns, msgspec.json.encode(shown)))
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
             self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
+
+    def _join(self, columns: tuple[str, ...], entries: list[Any]) -> None:
+        """Note that entries are missing before these, which were lost on the way or are another daemon's."""
+        ticks = [dict(zip(columns, each, strict=False)) for each in entries if is_tick(each)]
+        numbers = [number for each in ticks if isinstance(number := each.get(NUMBER_COLUMN), int)]
+        if numbers and self._tick is not None and not self._tick <= numbers[0] <= self._tick + 1:
+            self.entries.append([MISSING])
+        self._tick = numbers[-1] if numbers else self._tick
