@@ -134,9 +134,7 @@ def parser() -> argparse.ArgumentParser:
         default="python",
         help="c: the firmware's C sources; qemu: the same on an emulated Cortex-M4; default python",
     )
-    made.add_argument(
-        "--truth", type=Path, metavar="FILE.csv", help="new file: the true state, 1000 rows a second"
-    )
+    made.add_argument("--truth", type=Path, metavar="FILE.csv", help="new file: the true state, 1000 rows a second")
     return made
 
 
