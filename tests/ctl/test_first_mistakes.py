@@ -122,7 +122,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene check pulse --tolerance 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene explain pulse --share 0.5", 2, "tormagctl scene check NAME with one of", {}),
-    ("tormagctl scene check pulse --share 0.5 --out a.toml", 2, "File exists: allowed is a new file", {"a.toml": ""}),
+    ("tormagctl scene check pulse --share 0.5 --out a.toml", 2, "allowed is a new file", {"a.toml": ""}),
     ("tormagctl scene new vein.toml", 2, "nobody to ask", {}),
     ("tormagctl scene check fast.toml", 1, "N/s at", {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")}),
     (

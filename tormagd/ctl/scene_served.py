@@ -33,8 +33,6 @@ def serve_scene(
             "--share, --tolerance and --out choose how a scene is served",
             "tormagctl scene check NAME with one of --share S and --tolerance N, and --out FILE.toml to write it",
         )
-    if out is not None and out.exists():
-        raise usage_error(f"{out}: File exists: {NEW_FILE}", "name another")
     scene = loaded(name)
     found, machine = measured_as(name, scene), machine_us()
     ways = [

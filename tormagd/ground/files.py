@@ -1,7 +1,6 @@
 """Files that anybody may have made, and files that a user names.
 
-Only a regular file is read, and never more than a given size. What is written replaces an earlier regular file in one
-step, or is a new file; where it could not be written whole, nothing of it is left.
+Only a regular file is read or replaced. What is written replaces it in one step, or is new, and is whole or not there.
 """
 
 import contextlib
@@ -23,17 +22,13 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     with os.fdopen(descriptor, "rb") as file:
         data = file.read(most_bytes + 1)
     if len(data) > most_bytes:  # a file that grows, or one of the kernel's without a size
-        raise OSError(
-            errno.EINVAL, f"allowed is a regular file of at most {most_bytes} bytes; this has more", str(path)
-        )
+        raise OSError(errno.EINVAL, f"allowed are at most {most_bytes} bytes; this has more", str(path))
     return data
 
 
 @contextlib.contextmanager
 def in_place_of(path: Path, *sources: Path) -> Iterator[Path]:
-    """Give a path beside `path` to write to, which replaces `path` at the end. Raises OSError where `path` is one of
-    `sources`, or is there and no regular file.
-    """
+    """Give a path beside `path` to write to, which replaces `path` at the end, but none of `sources`."""
     with contextlib.suppress(FileNotFoundError):
         found = require_regular(path)
         if any(os.path.samestat(found, source.stat()) for source in sources):
@@ -49,7 +44,7 @@ def in_place_of(path: Path, *sources: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Make the empty file `path`, to be written to. Raises FileExistsError where anything is there."""
+    """Make an empty file to write to. Raises FileExistsError."""
     path.open("xb").close()
     with _whole_or_gone(path, path):
         yield path
@@ -57,7 +52,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _whole_or_gone(written: Path, path: Path) -> Iterator[None]:
-    """Remove `written` after an error, and name `path` in one of writing it."""
+    """Remove `written` after an error, which then names `path`."""
     try:
         yield
     except BaseException as error:

@@ -14,9 +14,11 @@ import tempfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 from firmware_protocol.c.build import BuildError
 from tormagd.element.physics.errors import DomainError
+from tormagd.ground.files import new_file
 from tormagd.ground.scheduling import ask_for_fifo, ask_for_slices
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
@@ -29,7 +31,7 @@ from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
 from tormagd.simulation.parameters import PLANTS_INSERT, PlantError, load_plant, plant_names, with_insert
 from tormagd.simulation.pty_port import PtyPort
-from tormagd.simulation.real_time import Door, PacedDevice, serve
+from tormagd.simulation.real_time import TRUTH_HEADER, Door, PacedDevice, serve
 from tormagd.simulation.slcan_port import SlcanPort
 from tormagd_client.printable import printable
 
@@ -49,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             is_stopped = resources.enter_context(interrupted_by(signal.SIGTERM, signal.SIGINT))
             try:
                 device, door = _opened(options, resources)
-                truth = options.truth and resources.enter_context(options.truth.open("x", encoding="utf-8"))
+                truth = options.truth and resources.enter_context(_begun(options.truth))
             except FileExistsError as error:
                 command.error(printable(f"--truth {error.filename}: this exists; allowed is a new file"))
             except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
@@ -71,6 +73,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
     return 0
+
+
+def _begun(truth: Path) -> TextIO:
+    with new_file(truth):
+        truth.write_text(TRUTH_HEADER, encoding="utf-8")
+    return truth.open("a", encoding="utf-8")
 
 
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
