@@ -1,11 +1,14 @@
 """First mistakes without a daemon: each gets one sentence with its remedy, and its exit code."""
 
+import errno
 import json
 import shlex
+import shutil
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+import zmq.auth
 
 from tormagd.ctl import main as ctl
 from tormagd.daemon import main as daemon
@@ -66,6 +69,13 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
         "next: give files that tormagctl record has made",
         {"empty.mcap": ""},
     ),
+    (
+        "tormagctl report a.mcap -o a.mcap",
+        2,
+        "allowed is a name that ends with .html",
+        {"a.mcap": "precious"},
+    ),
+    ("tormagctl recordings export a.mcap --to a.mcap", 2, "a.mcap: File exists", {"a.mcap": "precious"}),
     ("tormagctl replay /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
     ("tormagctl dashboard /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
     ("tormagctl dashboard --port 70000", 2, "--port: 70000: allowed is 0..65535", {}),
@@ -116,7 +126,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene check pulse --tolerance 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene explain pulse --share 0.5", 2, "tormagctl scene check NAME with one of", {}),
-    ("tormagctl scene check pulse --share 0.5 --out a.toml", 2, "File exists: allowed is a new file", {"a.toml": ""}),
+    ("tormagctl scene check pulse --share 0.5 --out a.toml", 2, "allowed is a new file", {"a.toml": ""}),
     ("tormagctl scene new vein.toml", 2, "nobody to ask", {}),
     ("tormagctl scene check fast.toml", 1, "N/s at", {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")}),
     (
@@ -209,6 +219,54 @@ def test_with_json_it_is_one_object(command, code, says, files, tmp_path, monkey
     assert told["command"] in command
     assert told["error"]["message"] in err
     assert says in f"{told['error']['message']} next: {told['error']['hint']}"
+
+
+RECORDED = Path(__file__).parents[1] / "recording/sealed.mcap"
+
+
+def precious(folder: Path) -> dict[str, bytes]:
+    """Make two copies of a recording and a table in `folder`, and return what is there."""
+    for name in ("r.html", "r.png"):
+        shutil.copy(RECORDED, folder / name)
+    (folder / "f.csv").write_text(FORCES["f.csv"])
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("command", ["plot r.png -o r.png", "report r.html -o r.html", "report r.png r.html -o r.html"])
+def test_a_recording_is_not_replaced_by_what_is_made_of_it(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    files = precious(tmp_path)
+    assert ended(f"tormagctl {command}", {}) == 2
+    assert ": this is read here: allowed is another file" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("plot r.html -o a.png", "a.png"),
+        ("report r.html -o a.html", "a.html"),
+        ("recordings export r.html --to a.mcap", "a.mcap"),
+        (NEW.removeprefix("tormagctl "), "a.toml"),
+        (f"{NEW.removeprefix('tormagctl ')} --scale 1.1", "a.csv"),
+        ("scene check pulse --tolerance 0.5 --out a.toml", "a.toml"),
+        ("keys generate .", "."),
+    ],
+)
+def test_a_full_disk_is_no_mistake_and_nothing_stays_on_it(command, name, tmp_path, monkeypatch, capsys, checked_here):
+    def half(path: Path, *_: object, **__: object) -> None:
+        path.open("w").close()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.chdir(tmp_path)
+    files = precious(tmp_path)
+    monkeypatch.setattr(Path, "write_text", half)
+    monkeypatch.setattr(Path, "write_bytes", half)
+    monkeypatch.setattr(shutil, "copyfile", lambda _, target: half(target))
+    monkeypatch.setattr(zmq.auth, "create_certificates", lambda folder, key: half(Path(folder, key)))
+    assert ended(f"tormagctl {command}", {}) == 1
+    assert f": {name}: No space left on device\n  next: make room on its disk\n" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
 
 
 def test_who_may_not_enter_the_sockets_folder_is_told_the_group(monkeypatch):

@@ -15,6 +15,7 @@ import msgpack
 import pytest
 
 from tormagd.ctl import record
+from tormagd.record.folder import RecordingFolder
 from tormagd.record.reader import RecordingFile
 from tormagd_client.messages import encode
 
@@ -205,6 +206,20 @@ def test_a_full_disk_ends_a_recording_that_can_still_be_read(
     assert recording.overview.ticks <= received
     assert ("cut_by" in recording.metadata) == is_told
     assert is_told or recording.overview.ticks > 0
+
+
+def test_a_folder_that_is_moved_away_is_told_and_not_taken_for_a_full_disk(fake_daemon, tmp_path, ctl, monkeypatch):
+    folder, has_room = tmp_path / "a", RecordingFolder.room
+    folder.mkdir()
+
+    def moved(self: RecordingFolder, needed_bytes: int) -> str:
+        folder.rename(tmp_path / "b")
+        return has_room(self, needed_bytes)
+
+    monkeypatch.setattr(RecordingFolder, "room", moved)
+    error = ctl(*fake_daemon.at, "--json", "record", str(folder)).ended(1).error
+    assert (error["code"], "No such file or directory, after " in error["message"]) == ("not_written", True)
+    assert error["hint"].startswith(f"see that {folder} stays in place and takes files; what is in the file")
 
 
 def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, ctl, file):

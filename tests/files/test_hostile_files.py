@@ -3,6 +3,7 @@
 A reader must refuse each in one printable sentence, within a second of processor time, and without 100 MB of memory.
 """
 
+import errno
 import os
 import re
 import resource
@@ -20,7 +21,7 @@ from tormagd.control.believe.strength import device_bounds
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.element.model.model_file import ModelFileError, load_model
-from tormagd.ground.files import in_place_of, read_bounded
+from tormagd.ground.files import in_place_of, new_file, read_bounded
 from tormagd.ground.force_file import read_forces
 from tormagd.ground.table import TableError
 from tormagd.ground.toml_file import LONGEST_LINE, TomlError, toml_tables
@@ -276,6 +277,30 @@ def test_what_replaces_a_file_is_on_the_disk_before(tmp_path: Path, monkeypatch:
 def test_what_could_not_be_written_whole_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(UnicodeEncodeError), in_place_of(tmp_path / "a") as beside:
         beside.write_text("half of it\ud800", "utf-8")
-    with pytest.raises(IsADirectoryError, match="this is a folder"), in_place_of(tmp_path):
-        pass
+    with pytest.raises(OSError, match="No space") as full, new_file(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert full.value.filename == str(tmp_path / "a")
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (os.mkdir, "allowed is a regular file; this is a directory"),
+        (os.mkfifo, "allowed is a regular file; this is a pipe"),
+        (lambda path: path.symlink_to("pipe"), "this is a pipe"),
+        (lambda path: path.hardlink_to(path.with_name("source")), "this is read here: allowed is another file"),
+    ],
+    ids=["a directory", "a pipe", "a link to a pipe", "the source"],
+)
+def test_no_other_file_is_replaced(tmp_path: Path, make: Callable[[Path], object], said: str) -> None:
+    path, source = tmp_path / "a", tmp_path / "source"
+    os.mkfifo(tmp_path / "pipe")
+    source.write_text("precious")
+    make(path)
+    before = path.lstat()
+    with pytest.raises(OSError, match=said), in_place_of(path, source):
+        pass
+    with pytest.raises(FileExistsError), new_file(path):
+        pass
+    assert path.lstat() == before

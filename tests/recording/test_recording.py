@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -207,6 +208,13 @@ def test_the_picture_names_what_happened_and_a_line_that_lies_on_another_leaves_
     force, *others, _ = [axes.lines for axes in drawn.axes]
     assert [line.get_label() for line in force] == ["measured", "asked"]
     assert all(lower.get_linewidth() > 2.0 * upper.get_linewidth() for lower, upper, *_ in others)
+
+
+def test_of_a_recording_that_could_not_begin_nothing_is_left(tmp_path, monkeypatch):
+    monkeypatch.setattr("mcap.writer.Writer.start", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(OSError, match="No space"):
+        RecordingWriter(tmp_path / "a.mcap")
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("name", ["a.png", "new.png"])

@@ -64,7 +64,8 @@ class Stand:
 
     def plug_in(self, transport: str) -> None:
         """Start a device; a symbolic link to its line stands for udev's stable name."""
-        simulated = (DOORS[transport], "--seed", "1", "--truth", str(self.folder / "truth.csv"))
+        (truth := self.folder / "truth.csv").unlink(missing_ok=True)
+        simulated = (DOORS[transport], "--seed", "1", "--truth", str(truth))
         self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", *simulated))
         line, port = first_line(self.device), self.folder / "device"
         port.unlink(missing_ok=True)

@@ -131,6 +131,11 @@ def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, 
         (("--pty", "--plant", "pad_1", "--hand", "felt"), "pressing"),
         (("--pty", "--baud", "7"), "1200"),
         (("--pty", "--truth", "/proc/none/truth.csv"), "/proc/none"),
+        (("--pty", "--truth", "{there}"), "--truth {there}: this exists; allowed is a new file"),
+        (("--pty", "--truth", "{pipe}"), "allowed is a new file"),
+        (("--can", "{there}"), "{there}: cannot be served: it is there and not a socket"),
+        (("--can", "{pipe}"), "not a socket"),
+        (("--can", "{link}"), "not a socket"),
         (("--can", "--bitrate", "7"), "10000"),
         (("--can", "--node", "16"), "16"),
         (("--can", "/proc/none/can"), "/proc/none"),
@@ -139,13 +144,19 @@ def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, 
 )
 @pytest.mark.usefixtures("usual_slices")
 def test_a_wrong_call_says_what_is_right_and_exits_with_2(
-    arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+    arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    there = {name: tmp_path / name for name in ("there", "pipe", "link")}
+    there["there"].write_text("precious")
+    os.mkfifo(there["pipe"])
+    there["link"].symlink_to("there")
+    before = [each.lstat() for each in there.values()]
     with pytest.raises(SystemExit, match="2"):
-        main(arguments)
+        main([argument.format(**there) for argument in arguments])
     output, errors = capsys.readouterr()
     assert output == ""
-    assert said in errors
+    assert said.format(**there) in errors
+    assert before == [each.lstat() for each in there.values()]
 
 
 class Served:

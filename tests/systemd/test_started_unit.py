@@ -15,7 +15,7 @@ GUIDE = Path(__file__).parents[2] / "systemd/README.md"
 SIMULATOR = """
 [Service]
 Environment=PYTHONPATH={library}
-ExecStart=/bin/sh -c '{python} -P -m tormagd.simulation --pty --seed 1 --truth /tmp/%i.csv | \
+ExecStart=/bin/sh -c 'rm -f /tmp/%i.csv; {python} -P -m tormagd.simulation --pty --seed 1 --truth /tmp/%i.csv | \
     {{ read port; chgrp tormag $port; chmod 660 $port; ln -sfn $port /dev/%i; exec cat; }}'
 """
 LOG = "/tmp/tormagd.log"

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tormagd.ctl.operate import statuses
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
+from tormagd.ground.files import new_file
 from tormagd_client.blocking import Client
 
 LONGEST_S = 30.0
@@ -28,6 +29,6 @@ def black_box(client: Client, copy: Path | None) -> Outcome:
     if copy is None:
         return Outcome({"file": str(written)}, f"{written}\ntormagctl replay runs it again, tormagctl plot draws it")
     hint = f"it is {written} on the daemon's machine: fetch it from there"
-    with as_usage_error(OSError, hint=hint), written.open("rb") as source, copy.open("xb") as target:
-        shutil.copyfileobj(source, target)
+    with as_usage_error(OSError, hint=hint), new_file(copy):
+        shutil.copyfile(written, copy)
     return Outcome({"file": str(copy), "original": str(written)}, f"{copy} (also {written})")

@@ -15,10 +15,11 @@ from tormagd.config import Config
 from tormagd.ctl.calibrate_device import calibrate_device
 from tormagd.ctl.calibrate_motors import calibrate_motors
 from tormagd.ctl.calibrate_run import SOURCE, Range, Run, armed, known_of
-from tormagd.ctl.outcome import Outcome, as_usage_error, is_terminal, usage_error
+from tormagd.ctl.outcome import WRITABLE, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
+from tormagd.ground.files import new_file
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
@@ -78,8 +79,8 @@ def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> int:
         time_s, left_mm, right_mm, *others = ticks[np.isfinite(ticks).all(axis=1)][::EVERY].T
         rows.append(np.column_stack([time_s - start_s, np.full_like(time_s, number), left_mm + right_mm, *others]))
     table = np.concatenate(rows)
-    with path.open("x", encoding="utf-8") as file:
-        np.savetxt(file, table, "%.9g", ",", header=",".join(SWEEP_COLUMNS), comments="")
+    with as_usage_error(OSError, hint=WRITABLE), new_file(path):
+        np.savetxt(path, table, "%.9g", ",", header=",".join(SWEEP_COLUMNS), comments="")
     return len(table)
 
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from tormagd.commission.procedure import Columns
 from tormagd.ctl.calibrate_run import SOURCE, Range, armed, reach
-from tormagd.ctl.outcome import CommandError, Exit, Outcome
+from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_error
 from tormagd.ctl.waveform import Waveform, by_legs
+from tormagd.ground.files import new_file
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 
@@ -74,9 +75,9 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
             columns = run.play(waveform)
     log = motor_log(columns, side)
     rows = len(log["t_s"])
-    with path.open("x", encoding="utf-8") as file:
+    with as_usage_error(OSError, hint=WRITABLE), new_file(path):
         table = np.column_stack([log[name] for name in LOG_COLUMNS])
-        np.savetxt(file, table, "%.6f", ",", header=",".join(LOG_COLUMNS), comments="")
+        np.savetxt(path, table, "%.6f", ",", header=",".join(LOG_COLUMNS), comments="")
     result = {"file": str(path), "side": side, "rows": rows, "seconds": round(float(log["t_s"][-1]), 3)}
     text = f"{path}: {rows} rows of the {side} carriage. next: tormag-lab identify-motor {path}"
     return Outcome(result, text)

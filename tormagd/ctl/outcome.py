@@ -1,5 +1,6 @@
 """How a command ends: exit codes, the errors behind them, and what is printed."""
 
+import errno
 import os
 import re
 import shutil
@@ -20,6 +21,14 @@ from tormagd_client.printable import printable
 
 NARROWEST = 20
 LABEL = re.compile(r"\S{0,24} +")
+WRITABLE = "give another file's name, in a directory you may write to"
+ROOM = "make room on its disk"
+REMEDIES = {
+    errno.ENOSPC: ROOM,
+    errno.EDQUOT: ROOM,
+    errno.EFBIG: "take another disk, or allow larger files: ulimit -f",
+    errno.EIO: "check its disk",
+}
 
 
 class Exit(IntEnum):
@@ -57,8 +66,19 @@ def as_usage_error(*kinds: type[Exception], hint: str) -> Iterator[None]:
     try:
         yield
     except kinds as error:
-        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
-        raise usage_error(said, hint) from error
+        raise refused(error, hint) from error
+
+
+def refused(error: Exception, hint: str) -> CommandError:
+    """Return the CommandError for an exception: REFUSED where the disk is the cause, else USAGE with `hint`."""
+    said = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        said = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    # what an error of another kind was made of counts too
+    for each in (error, error.__cause__):
+        if isinstance(each, OSError) and each.errno in REMEDIES:
+            return CommandError(Exit.REFUSED, "not_written", said, REMEDIES[each.errno])
+    return usage_error(said, hint)
 
 
 class Outcome(msgspec.Struct, frozen=True):

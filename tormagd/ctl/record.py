@@ -11,7 +11,7 @@ import msgspec
 import zmq
 
 from tormagd.config import Config, Recordings
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, refused, usage_error
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.record.folder import Budget, RecordingFolder
 from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
@@ -56,7 +56,7 @@ def listening(
 
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
     """Record for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder."""
-    if path.suffix != ".mcap" and not path.is_dir():
+    if not (is_folder := path.is_dir()) and path.suffix != ".mcap":
         raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
     keys = keys_of(endpoints.curve)
     context = zmq.Context()
@@ -68,12 +68,13 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
             about = _about(endpoints, wait_s)
             try:
-                place = RecordingFolder(path, budget_of(config.recordings)) if path.is_dir() else path
+                place = RecordingFolder(path, budget_of(config.recordings)) if is_folder else path
                 writer = RecordingWriter(place, about, config.recordings.one_tick_of)
             except FileExistsError as error:
                 raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
             except OSError as error:
-                raise usage_error(f"{path}: {error.strerror}", "give a file in a directory you may write to") from error
+                error.filename = str(path)
+                raise refused(error, WRITABLE) from error
             try:
                 with writer:
                     outcome = _record(writer, telemetry, ticks, duration_s, is_interrupted)
@@ -81,12 +82,13 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
                         writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
                     return outcome
             except OSError as error:
+                remedy = refused(error, f"see that {writer.path.parent} stays in place and takes files").hint
                 raise CommandError(
                     Exit.REFUSED,
                     "not_written",
                     f"{writer.path}: {error.strerror}, after {writer.tick_count} ticks and {writer.telemetry_count} "
                     "snapshots",
-                    "make room; what is in the file, all but about the last second, reads like any other recording",
+                    f"{remedy}; what is in the file, all but about the last second, reads like any other recording",
                 ) from error
     finally:
         context.destroy(linger=0)

@@ -1,6 +1,5 @@
 """`tormagctl recordings` and `mark`: what a folder of recordings holds, and which of it stays."""
 
-import contextlib
 import hashlib
 import shutil
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 from tormagd.config import Config
 from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.record import budget_of
+from tormagd.ground.files import new_file
 from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
 from tormagd.record.reader import RecordingError, damage_in, summary_of
 from tormagd_client.blocking import Client
@@ -90,13 +90,8 @@ def _export(path: Path, target: Path | None) -> Outcome:
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target
-    with path.open("rb") as source, copy.open("xb") as made:
-        try:
-            shutil.copyfileobj(source, made)
-        except OSError:
-            with contextlib.suppress(OSError):
-                copy.unlink()  # half a copy is none
-            raise
+    with new_file(copy):
+        shutil.copyfile(path, copy)
     with copy.open("rb") as made:
         digest = hashlib.file_digest(made, "sha256").hexdigest()
         damage = damage_in(made)

@@ -3,13 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
+from tormagd.ctl.outcome import WRITABLE, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ground.files import in_place_of
 from tormagd.record.reader import RecordingFile
 from tormagd.view.plot import figure, save_plot
 from tormagd.view.report import report as page_of
-
-WRITABLE = "give a file in a directory you may write to"
 
 
 def opened(sources: list[Path]) -> list[RecordingFile]:
@@ -30,10 +28,12 @@ def report(sources: list[Path], target: Path) -> Outcome:
     if len(sources) > 2:
         said = f"{len(sources)} recordings: allowed are one or two"
         raise usage_error(said, "tormagctl report A.mcap B.mcap -o AB.html")
+    if target.suffix.lower() != ".html":
+        raise usage_error(f"-o {target}: allowed is a name that ends with .html", "give a page's name")
     of = opened(sources)
     with as_usage_error(ValueError, hint="give recordings with data"):
         page = page_of(of)
-    with as_usage_error(OSError, hint=WRITABLE), in_place_of(target) as unfinished:
+    with as_usage_error(OSError, hint=WRITABLE), in_place_of(target, *sources) as unfinished:
         unfinished.write_text(page, encoding="utf-8")
     return _outcome(of, target, {})
 
@@ -44,7 +44,7 @@ def plot(source: Path, target: Path) -> Outcome:
     with as_usage_error(ValueError, hint="give -o a picture's name, such as pulse.png, and a recording with data"):
         drawn = figure(overview, source.stem, recording.notes)
         with as_usage_error(OSError, hint=WRITABLE):
-            save_plot(drawn, target)
+            save_plot(drawn, target, source)
     result = {
         "ticks": overview.ticks,
         "telemetry": overview.snapshots,

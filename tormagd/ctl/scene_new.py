@@ -1,5 +1,6 @@
 """`tormagctl scene new`: make a scene file from a recorded force or from answers; the insert is found by trying."""
 
+import contextlib
 import math
 import os
 import sys
@@ -13,6 +14,7 @@ import msgspec
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene_check import NEW_FILE, as_toml, check_scene
+from tormagd.ground.files import new_file
 from tormagd.ground.force_file import read_column, read_forces, stated_columns
 from tormagd.ground.table import TableError
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Scene
@@ -51,13 +53,9 @@ class Recorded(NamedTuple):
 def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: {NEW_FILE}", "name another file")
-    force_file, told = _forces_of(out, recorded)
-    try:
+    with as_usage_error(OSError, hint=f"name another file: {NEW_FILE}"), contextlib.ExitStack() as files:
+        force_file, told = _forces_of(out, recorded, files)
         made = _proposed(out, force_file, recorded, config)
-    except CommandError:
-        if force_file is not None and force_file != recorded.force:
-            force_file.unlink()
-        raise
     if not told:
         return made
     text = f"{recorded.force}: {'; '.join(told)}\n{made.text}"
@@ -76,6 +74,11 @@ def _proposed(out: Path, force_file: Path | None, recorded: Recorded, config: Pa
         raise usage_error(
             f"no scene can be made of this: {error}", "tormagctl guide scenes says what each key asks"
         ) from error
+    with new_file(out):
+        return _chosen(out, tables, inserts, config)
+
+
+def _chosen(out: Path, tables: Tables, inserts: Sequence[str], config: Path | None) -> Outcome:
     insert, checked, unmet = _softest(out, tables, inserts, config)
     found = {"file": str(out), "insert": insert, "unmet": unmet, "unmet_if_weak": []}
     if checked is None:
@@ -100,8 +103,8 @@ def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
     return weak
 
 
-def _forces_of(out: Path, recorded: Recorded) -> tuple[Path | None, list[str]]:
-    """Return the file of the scene's forces, if need be a converted one, and what was converted."""
+def _forces_of(out: Path, recorded: Recorded, files: contextlib.ExitStack) -> tuple[Path | None, list[str]]:
+    """Return the file of the scene's forces, if need be a converted one, in `files`, and what was converted."""
     stated = stated_columns(recorded.column, recorded.time_column)
     is_converted = bool(stated) or (recorded.scale, recorded.offset_N) != (None, None)
     if recorded.force is None:
@@ -118,11 +121,11 @@ def _forces_of(out: Path, recorded: Recorded) -> tuple[Path | None, list[str]]:
     scale, offset_N = (1.0 if recorded.scale is None else recorded.scale), recorded.offset_N or 0.0
     rows = zip(table.values["time_s"], table.values["force_N"], strict=True)
     try:
-        with converted.open("x", encoding="utf-8") as file:
-            file.write("t_s,force_N\n")
-            file.writelines(f"{time_s:.6f},{offset_N + scale * value:.6g}\n" for time_s, value in rows)
+        files.enter_context(new_file(converted))
     except FileExistsError as error:
         raise usage_error(f"{converted} exists, where the scene's forces go", "give another FILE.toml") from error
+    lines = (f"{time_s:.6f},{offset_N + scale * value:.6g}\n" for time_s, value in rows)
+    converted.write_text(f"t_s,force_N\n{''.join(lines)}", encoding="utf-8")
     return converted, table.told
 
 
@@ -140,7 +143,6 @@ def _softest(
             reason = error.message.removeprefix(f"scene {tables['name']}: ")
             # a machine too busy to say, or an unknown insert or model
             if error.code not in ("refused", "budget") or reason.startswith("insert."):
-                out.unlink()
                 raise
             lacks[insert] = reason.split(AND_UNMET)
             continue

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.scene_check import NEW_FILE, as_toml, loaded, measured_as
+from tormagd.ground.files import new_file
 from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import OperatingPoint
 from tormagd.scenes.scene import load_scene, scene_path
@@ -32,8 +33,6 @@ def serve_scene(
             "--share, --tolerance and --out choose how a scene is served",
             "tormagctl scene check NAME with one of --share S and --tolerance N, and --out FILE.toml to write it",
         )
-    if out is not None and out.exists():
-        raise usage_error(f"{out}: File exists: {NEW_FILE}", "name another")
     scene = loaded(name)
     found, machine = measured_as(name, scene), machine_us()
     ways = [
@@ -84,8 +83,5 @@ def write_scene(name: str, way: OperatingPoint, out: Path) -> None:
     tables["force"] |= {"standby_N": way.standby_N} if way.standby_N else {}
     tables["insert"] |= {"gap_speed_mm_s": way.gap_speed_mm_s} if way.gap_speed_mm_s else {}
     tables |= {"signal": signal | {"is_known_ahead": way.ahead_ms > 0.0}} if signal else {}
-    try:
-        with out.open("x", encoding="utf-8") as file:
-            file.write(as_toml(tables) + "\n")
-    except OSError as error:
-        raise usage_error(f"{out}: {error.strerror}: {NEW_FILE}", "name another") from error
+    with as_usage_error(OSError, hint=f"name another: {NEW_FILE}"), new_file(out):
+        out.write_text(as_toml(tables) + "\n", encoding="utf-8")

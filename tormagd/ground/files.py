@@ -1,6 +1,6 @@
 """Files that anybody may have made, and files that a user names.
 
-Only a regular file is read, and never more than a given size. What is written replaces an earlier file in one step.
+Only a regular file is read or replaced. What is written replaces it in one step, or is new, and is whole or not there.
 """
 
 import contextlib
@@ -22,25 +22,46 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     with os.fdopen(descriptor, "rb") as file:
         data = file.read(most_bytes + 1)
     if len(data) > most_bytes:  # a file that grows, or one of the kernel's without a size
-        raise OSError(errno.EFBIG, f"allowed is a regular file of at most {most_bytes} bytes; this has more", str(path))
+        raise OSError(errno.EINVAL, f"allowed are at most {most_bytes} bytes; this has more", str(path))
     return data
 
 
 @contextlib.contextmanager
-def in_place_of(path: Path) -> Iterator[Path]:
-    """Give a path beside `path` to write to, which replaces `path` at the end."""
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, "this is a folder: allowed is a file's name", str(path))
+def in_place_of(path: Path, *sources: Path) -> Iterator[Path]:
+    """Give a path beside `path` to write to, which replaces `path` at the end, but none of `sources`."""
+    with contextlib.suppress(FileNotFoundError):
+        found = require_regular(path)
+        if any(os.path.samestat(found, source.stat()) for source in sources):
+            raise OSError(errno.EINVAL, "this is read here: allowed is another file", str(path))
     beside = path.with_name(f"{path.name}.part")
-    beside.unlink(missing_ok=True)
-    try:
+    with _whole_or_gone(beside, path):
+        beside.unlink(missing_ok=True)
         yield beside
         with beside.open("rb") as file:
             os.fsync(file.fileno())
         beside.replace(path)
-    except BaseException:
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Make an empty file to write to. Raises FileExistsError."""
+    path.open("xb").close()
+    with _whole_or_gone(path, path):
+        yield path
+
+
+@contextlib.contextmanager
+def _whole_or_gone(written: Path, path: Path) -> Iterator[None]:
+    """Remove `written` after an error, which then names `path`."""
+    try:
+        yield
+    except BaseException as error:
         with contextlib.suppress(OSError):
-            beside.unlink()
+            written.unlink()
+        ours = str(written)
+        # of a copy, the second name is what is written
+        if isinstance(error, OSError) and error.errno and ours in (error.filename or ours, error.filename2):
+            error.filename = str(path)
         raise
 
 

@@ -21,6 +21,7 @@ import msgspec
 from mcap.writer import Writer
 
 from tormagd import __version__
+from tormagd.ground.files import new_file
 from tormagd.record.folder import RecordingFolder
 from tormagd.record.overview import OverviewBuilder
 from tormagd.record.telemetry import COLUMNS, kind_of
@@ -126,14 +127,15 @@ class RecordingWriter:
     def _begin(self, path: Path) -> None:
         """Begin a new file, locked against pruning."""
         self.path = path
-        self._file = path.open("xb")
-        with contextlib.suppress(OSError):  # some file systems know no locks
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        self._overview, self._derived = OverviewBuilder(), Derived()
-        self._mcap = Writer(self._file, enable_data_crcs=True)
-        self._mcap.start(profile="", library=f"tormagd {__version__}")
-        self._mcap.add_metadata(ABOUT, self._about)
-        self._file.flush()
+        with new_file(path):
+            self._file = path.open("wb")
+            with contextlib.suppress(OSError):  # some file systems know no locks
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._overview, self._derived = OverviewBuilder(), Derived()
+            self._mcap = Writer(self._file, enable_data_crcs=True)
+            self._mcap.start(profile="", library=f"tormagd {__version__}")
+            self._mcap.add_metadata(ABOUT, self._about)
+            self._file.flush()
         self._channels: dict[tuple[str, bool], int] = {}
         self._channel_of(TELEMETRY_TOPIC, None)
         self._begin_ns = self._chunk_ns = 0
@@ -145,14 +147,14 @@ class RecordingWriter:
         try:
             path = folder.new()
         except OSError as error:
-            self._give_up(str(error.strerror))
+            self._give_up(str(error.strerror), error.errno)
         self._end()
         self._begin(path)
 
-    def _give_up(self, reason: str) -> NoReturn:
+    def _give_up(self, reason: str, number: int | None = errno.ENOSPC) -> NoReturn:
         self.describe({CUT: reason})
         self._end()
-        raise OSError(errno.ENOSPC, reason)
+        raise OSError(number, reason)
 
     def describe(self, metadata: dict[str, str]) -> None:
         """Write metadata, now and into every later file in the folder."""

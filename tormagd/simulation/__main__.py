@@ -14,9 +14,11 @@ import tempfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 from firmware_protocol.c.build import BuildError
 from tormagd.element.physics.errors import DomainError
+from tormagd.ground.files import new_file
 from tormagd.ground.scheduling import ask_for_fifo, ask_for_slices
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
@@ -29,7 +31,7 @@ from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
 from tormagd.simulation.parameters import PLANTS_INSERT, PlantError, load_plant, plant_names, with_insert
 from tormagd.simulation.pty_port import PtyPort
-from tormagd.simulation.real_time import Door, PacedDevice, serve
+from tormagd.simulation.real_time import TRUTH_HEADER, Door, PacedDevice, serve
 from tormagd.simulation.slcan_port import SlcanPort
 from tormagd_client.printable import printable
 
@@ -43,25 +45,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT; the first line on stdout names its port or channel."""
     command = parser()
     options = command.parse_args(arguments)
-    with contextlib.ExitStack() as resources:
-        # before anything is opened, so that all of it is closed again
-        is_stopped = resources.enter_context(interrupted_by(signal.SIGTERM, signal.SIGINT))
-        try:
-            device, door = _opened(options, resources)
-            truth = options.truth and resources.enter_context(options.truth.open("w", encoding="utf-8"))
-        except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
-            command.error(printable(str(error)))
-        if write_line(door.address, sys.stdout) is not None:
-            print(f"{command.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
-            return 1
-        if os.sched_getscheduler(0) == os.SCHED_OTHER:
-            ask_for_slices()
-            ask_for_fifo(FIFO)
-        try:
+    try:
+        with contextlib.ExitStack() as resources:
+            # before anything is opened, so that all of it is closed again
+            is_stopped = resources.enter_context(interrupted_by(signal.SIGTERM, signal.SIGINT))
+            try:
+                device, door = _opened(options, resources)
+                truth = options.truth and resources.enter_context(_begun(options.truth))
+            except FileExistsError as error:
+                command.error(printable(f"--truth {error.filename}: this exists; allowed is a new file"))
+            except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
+                command.error(printable(str(error)))
+            if write_line(door.address, sys.stdout) is not None:
+                print(f"{command.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
+                return 1
+            if os.sched_getscheduler(0) == os.SCHED_OTHER:
+                ask_for_slices()
+                ask_for_fifo(FIFO)
             punctuality = serve(device, door, is_stopped, truth)
-        except EmulationError as error:
-            print(f"{command.prog}: {printable(str(error))}", file=sys.stderr)
-            return 1
+    except (EmulationError, OSError) as error:  # such as a full disk under the truth
+        print(f"{command.prog}: {printable(str(error))}", file=sys.stderr)
+        return 1
     if punctuality.late:
         print(
             f"fell behind real time {punctuality.late} times, by {punctuality.worst_s * 1e3:.1f} ms at worst; "
@@ -69,6 +73,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
     return 0
+
+
+def _begun(truth: Path) -> TextIO:
+    with new_file(truth):
+        truth.write_text(TRUTH_HEADER, encoding="utf-8")
+    return truth.open("a", encoding="utf-8")
 
 
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
@@ -132,7 +142,7 @@ def parser() -> argparse.ArgumentParser:
         default="python",
         help="c: the firmware's C sources; qemu: the same on an emulated Cortex-M4; default python",
     )
-    made.add_argument("--truth", type=Path, metavar="FILE.csv", help="record the true state, 1000 rows a second")
+    made.add_argument("--truth", type=Path, metavar="FILE.csv", help="new file: the true state, 1000 rows a second")
     return made
 
 

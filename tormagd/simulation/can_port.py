@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+import stat
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -56,7 +57,8 @@ class CanPort:
         for descriptor in list(self._hosts):
             self._dismiss(descriptor)
         self._listener.close()
-        self._path.unlink(missing_ok=True)
+        if self._path.is_socket():
+            self._path.unlink()
 
     def _welcome(self) -> None:
         """Admit the host that connects, or disconnect one above MAX_HOSTS."""
@@ -97,8 +99,10 @@ class CanPort:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove the socket at `path` if nobody listens there."""
+    """Remove the socket at `path` if nobody listens there. Raises OSError for anything else there."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise OSError("it is there and not a socket; name another path")
         try:
             probe.connect(str(path))
         except ConnectionRefusedError:

@@ -66,8 +66,6 @@ def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: T
     realtime_ns = time.time_ns()
     late, worst_s, slipped_s = 0, 0.0, 0.0
     row_s = 0.0
-    if truth is not None:
-        truth.write(TRUTH_HEADER)
     while not stopped():
         due_s = device.next_event_s
         wait_s = due_s - (time.monotonic() - power_on_s)

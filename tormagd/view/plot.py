@@ -108,12 +108,12 @@ def picture(drawn: Figure, form: str) -> bytes:
     return made.getvalue()
 
 
-def save_plot(drawn: Figure, path: Path) -> None:
+def save_plot(drawn: Figure, path: Path, *sources: Path) -> None:
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
     data = picture(drawn, path.suffix[1:].lower())
     # on a full disk the old picture stays
-    with in_place_of(path) as unfinished:
+    with in_place_of(path, *sources) as unfinished:
         unfinished.write_bytes(data)
 
 

@@ -94,7 +94,7 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
         there = error.filename2 or error.filename  # a link's second path, or what is in the place of a folder
         raise ConfigError(f"{there} exists: keys are never overwritten; take another name or DIR") from error
     except OSError as error:
-        raise ConfigError(f"{error.filename2 or error.filename}: {error.strerror}") from error
+        raise ConfigError(f"{error.filename2 or error.filename or secret_in}: {error.strerror}") from error
     return secret_path, public_path
 
 

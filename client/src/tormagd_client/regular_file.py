@@ -3,6 +3,7 @@
 import errno
 import os
 import stat
+import sys
 from pathlib import Path
 
 _KINDS = {
@@ -14,7 +15,7 @@ _KINDS = {
 }
 
 
-def require_regular(path: Path, most_bytes: int) -> os.stat_result:
+def require_regular(path: Path, most_bytes: int = sys.maxsize) -> os.stat_result:
     """Return the status of a regular file of at most `most_bytes`. Raises OSError, whose `strerror` says what is
     allowed.
     """
@@ -26,4 +27,5 @@ def require_regular(path: Path, most_bytes: int) -> os.stat_result:
     if kind == stat.S_IFREG and found.st_size <= most_bytes:
         return found
     what = f"this has {found.st_size}" if kind == stat.S_IFREG else f"this is {_KINDS.get(kind, 'something else')}"
-    raise OSError(errno.EINVAL, f"allowed is a regular file of at most {most_bytes} bytes; {what}", str(path))
+    size = "" if most_bytes == sys.maxsize else f" of at most {most_bytes} bytes"
+    raise OSError(errno.EINVAL, f"allowed is a regular file{size}; {what}", str(path))

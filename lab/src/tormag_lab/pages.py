@@ -51,7 +51,7 @@ def draw_beside(
     above.set_title(title, loc="left")
     below.plot(time_s, finer * (measured - explained), color="#2a6f97", linewidth=0.8)
     below.set(xlabel="time, s", ylabel=labels[2])
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, format="png", dpi=110)
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:

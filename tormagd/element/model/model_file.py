@@ -204,12 +204,12 @@ class ForceModel:
         return np.asarray(falls / (1.0 + falls) ** 2 @ (output * weight[:, FIELD]), dtype=np.float64)
 
 
-def save_model(path: Path | str, model: ForceModel) -> None:
-    """Write `model` to `path`; equal models give equal bytes."""
+def save_model(path: Path | str, model: ForceModel, *sources: Path) -> None:
+    """Write `model` to `path`, which is none of `sources`; equal models give equal bytes."""
     tensors = _tensors(model)
     header = _header(model.metadata)
     header["checksum"] = _checksum(header, tensors)
-    with in_place_of(Path(path)) as unfinished:
+    with in_place_of(Path(path), *sources) as unfinished:
         unfinished.write_bytes(_canonical(safetensors.numpy.save(tensors, header)))
 
 

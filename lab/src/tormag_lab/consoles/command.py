@@ -98,6 +98,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
+    if (options.out or "").endswith(SUFFIX):
+        raise LabError(f"--out {options.out}: allowed is a name that does not end with {SUFFIX}: that is a recording")
     try:
         urls = files(options.recordings)
     except (ValueError, ImportError) as error:

@@ -21,6 +21,7 @@ from tormag_lab.motor.fit import THINNED_HZ, Estimate, Gearbox, Windings, fit_ge
 from tormag_lab.motor.log import Log, read_log
 from tormag_lab.pages import draw_beside
 from tormagd.config import Config, Motor, load_config
+from tormagd.ground.files import in_place_of, new_file
 
 VAGUE_SHARE = 0.5
 PARAMETERS = ("mass_kg", "viscous_N_s_m", "coulomb_N", "offset_N")
@@ -44,7 +45,8 @@ def run(options: argparse.Namespace) -> Found:
     if options.write_config:
         write_config(options.write_config, result, load_config(options.config))
     if options.plot:
-        draw(options.plot, log, result)
+        with in_place_of(options.plot, options.log) as beside:
+            draw(beside, log, result)
     return Found(result)
 
 
@@ -133,12 +135,12 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
         identified["inductance_mH"] = inductance["value"]
     kept = msgspec.to_builtins(config.motor)
     table = kept | {name: float(f"{value:.4g}") for name, value in identified.items()}
+    head = f"# identified by tormag-lab identify-motor: {', '.join(identified)}; the rest as configured"
+    lines = [head, "[motor]", *(f"{name} = {value!r}" for name, value in table.items())]
     try:
         msgspec.convert(table, Motor)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(f"# identified by tormag-lab identify-motor: {', '.join(identified)}; the rest as configured\n")
-            file.write("[motor]\n")
-            file.writelines(f"{name} = {value!r}\n" for name, value in table.items())
+        with new_file(path):
+            path.write_text("\n".join([*lines, ""]), encoding="utf-8")
     except msgspec.ValidationError as error:
         raise LabError(f"--write-config: {table}: {error}") from error
     except OSError as error:

@@ -30,6 +30,7 @@ from tormagd.control.nominal import FieldOfGap
 from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.physics.field import PowerFieldLaw
 from tormagd.element.physics.inserts import insert
+from tormagd.ground.files import in_place_of
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.closed_loop import ClosedLoop, gap_plan
 from tormagd.simulation.device import VirtualDevice
@@ -86,7 +87,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     data = record(options.plant, options.scene, options.insert, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    write_csv(options.out, data)
+    with in_place_of(options.out) as beside:
+        write_csv(beside, data)
     return Found({"out": str(options.out), "rows": len(data), "synthetic": True})
 
 

@@ -235,10 +235,10 @@ def run(options: argparse.Namespace) -> Found:
     data = training_rows(read_sweeps(options.sweeps), insert(options.insert))
     require_usable(data)
     model = fit(data, options.insert, datetime.date.today(), by_law=options.law)
-    with nullcontext() if options.csv is None else in_place_of(options.csv) as beside:
+    with nullcontext() if options.csv is None else in_place_of(options.csv, options.sweeps) as beside:
         if beside is not None:
             write_csv(beside, data)
-        save_model(options.out, model)
+        save_model(options.out, model, options.sweeps)
     figures = {"model": str(options.out), "insert": options.insert, "rows": len(data), "ranges": data.ranges()}
     metrics = model.metadata.metrics
     told = (

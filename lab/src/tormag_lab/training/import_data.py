@@ -21,6 +21,7 @@ from tormag_lab.pages import subplots
 from tormag_lab.tables import MAX_TABLE_BYTES
 from tormag_lab.training.dataset import ALLOWED, Dataset, records, write_csv
 from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.ground.files import in_place_of, new_file
 from tormagd.ground.table import MIN_ROWS, QUANTITIES, Table, Wanted, read_table
 
 NEEDED, MOTION = ("force_N", "field_mT"), ("rate_mm_s", "time_s", "displacement_mm")
@@ -76,9 +77,11 @@ def run(options: argparse.Namespace) -> Found:
     columns = [part.data.columns() for part in parts]
     data = Dataset.of({name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     missing = _missing(data)
-    write_csv(options.out, data)
+    with new_file(options.out):
+        write_csv(options.out, data)
     if options.picture is not None:
-        _draw(options.picture, data, missing)
+        with in_place_of(options.picture, *options.files) as beside:
+            _draw(beside, data, missing)
     return Found(
         {
             "out": str(options.out),
@@ -258,4 +261,4 @@ def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
     title = "\n".join(missing) or "fields and rates are covered"
     axes.set(xlabel="field, mT", ylabel="rate, mm/s", yscale="log", title=title)
     figure.colorbar(points, label="force, N")
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, format="png", dpi=90)

@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> Found:
     if options.law and (options.element is not Element.TORQUE or len(options.insert) > 1):
         raise LabError("--law: allowed is --element torque with one --insert: the law is of a brake")
     model, told = fit(options, read_csv(options.data))
-    save_model(options.out, model)
+    save_model(options.out, model, options.data)
     report = {"out": str(options.out), "data_sha256": model.metadata.training_data_sha256, **model.metadata.metrics}
     return Found(report | told)
 

@@ -23,6 +23,7 @@ from tormag_lab.twin.estimate import keys_of, value_at
 from tormag_lab.twin.excerpt import Excerpt, excerpt_of
 from tormag_lab.twin.fit import EXPLAINED_N, STANDS_FOR, Twin, twin_of
 from tormag_lab.twin.force import EXPONENT, PIVOT_MM, STRENGTH, along, fresh_along
+from tormagd.ground.files import in_place_of, new_file
 from tormagd.simulation.parameters import Assumed, PlantParameters, load_plant
 
 MAX_FILES = 10
@@ -82,7 +83,8 @@ def run(options: argparse.Namespace) -> Found:
     if options.out is not None:
         write_plant(options.out, twin, head)
     if options.plot is not None:
-        draw(options.plot, twin, ways[0])
+        with in_place_of(options.plot, *options.files) as beside:
+            draw(beside, twin, ways[0])
     return Found(figures, exit_code=0 if twin.is_explained else 1)
 
 
@@ -142,13 +144,12 @@ def motion_for(key: str) -> str:
 def write_plant(path: Path, twin: Twin, head: list[str]) -> None:
     text = "\n".join([*(f"# {line}" for line in head), *_lines(twin)]) + "\n"
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-        load_plant(path)
+        with new_file(path):
+            path.write_text(text, encoding="utf-8")
+            load_plant(path)
     except FileExistsError as error:
         raise LabError(f"{path} exists; allowed is a new file") from error
     except ValueError as error:
-        path.unlink()
         raise LabError(f"what fits best is no plant: {error}") from error
 
 
