@@ -1,7 +1,7 @@
 """The daemon as its users meet it: real processes, a real pty, real sockets.
 
 Its loops are tested in virtual time (tests/daemon/test_running_daemon.py, tests/closed_loop). Here processes are
-killed and started again, and another one reads what they leave.
+killed, unplugged and started again, and another one reads what they leave.
 """
 
 import json
@@ -25,10 +25,11 @@ pytestmark = pytest.mark.live
 README = Path(__file__).parents[2] / "README.md"
 
 
-def test_a_daemon_that_is_killed_and_ended(new_rig):
+def test_a_daemon_that_is_killed_unplugged_and_ended(new_rig):
     assert not new_rig.status()["profile"]["is_used"]
     killed_it_leaves_a_whole_recording(new_rig)
     started_again_it_says_why_the_device_has_opened(new_rig)
+    unplugged_it_names_the_loss_and_does_not_arm_again(new_rig)
     told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(new_rig)
 
 
@@ -79,6 +80,20 @@ def started_again_it_says_why_the_device_has_opened(rig) -> None:
     rig.client.request("clear-fault")
     rig.until(lambda status: status["faults"] == [], "cleared")
     assert rig.refused("enable") == "not_homed"
+
+
+def unplugged_it_names_the_loss_and_does_not_arm_again(rig) -> None:
+    rig.arm()
+    rig.ask(1.5)
+    rig.until(lambda status: (status["gap_mm"] or 95.0) < 85.0, "closing")
+    end(rig.device, signal.SIGKILL)
+    lost = rig.until(lambda status: "LINK_LOST" in status["faults"], "the loss is named")
+    assert lost["link"]["cause"]
+    rig.plug_in("serial")
+    back = rig.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "it has opened")
+    assert back["operating_state"] == "FAULT"
+    rig.client.request("clear-fault")
+    assert rig.status()["operating_state"] == "DISABLED"
 
 
 def told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(rig) -> None:
