@@ -16,7 +16,7 @@ import msgspec
 
 from tormagd.ground.terminal import write_answer, write_line
 from tormagd_client.errors import ClientError, InFaultError, SettingError, UnreachableError
-from tormagd_client.printable import printable
+from tormagd_client.printable import each_text, printable
 
 NARROWEST = 20
 LABEL = re.compile(r"\S{0,24} +")
@@ -88,7 +88,9 @@ def print_error(command: str, error: ClientError, as_json: bool) -> None:
 
 
 def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> str:
-    return msgspec.json.encode({"command": command, "ok": ok, "result": result, "error": error}).decode()
+    told = msgspec.to_builtins({"command": command, "ok": ok, "result": result, "error": error})
+    # JSON is UTF-8, and a file's name need not be
+    return msgspec.json.encode(each_text(told, lambda text: text.encode(errors="backslashreplace").decode())).decode()
 
 
 def folded(text: str) -> str:
