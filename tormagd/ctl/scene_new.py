@@ -13,6 +13,8 @@ import msgspec
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene_check import NEW_FILE, as_toml, check_scene
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.inserts import insert as known_insert
 from tormagd.ground.force_file import read_column, read_forces, stated_columns
 from tormagd.ground.table import TableError
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Scene
@@ -51,10 +53,12 @@ class Recorded(NamedTuple):
 def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: {NEW_FILE}", "name another file")
+    with as_usage_error(DomainError, hint="tormagctl scene new --help"):
+        known_insert(INSERTS[0] if recorded.insert is None else recorded.insert)
     force_file, told = _forces_of(out, recorded)
     try:
         made = _proposed(out, force_file, recorded, config)
-    except CommandError:
+    except Exception:
         if force_file is not None and force_file != recorded.force:
             force_file.unlink()
         raise
