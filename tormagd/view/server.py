@@ -103,7 +103,10 @@ def _admission(operating: Operating | None, origin: str | None) -> Callable[...,
 
     @web.middleware
     async def admission(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if request.url.host not in NAMES:
+        host = None
+        with contextlib.suppress(ValueError):  # of a port that there is not
+            host = request.url.host
+        if host not in NAMES:
             raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
         came_from = request.headers.getall("Origin", [])  # none where a browser gets from its own page
         if (came_from or request.method == "POST") and came_from not in ([f"http://{request.host}"], [origin]):
