@@ -483,11 +483,16 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
     core: dict[str, str] = {}
 
 
-class Request(msgspec.Struct, frozen=True, kw_only=True):
+class Numbered(msgspec.Struct, frozen=True, kw_only=True):
+    """What every request has, whatever else is wrong with it."""
+
+    id: int | str
+
+
+class Request(Numbered, frozen=True, kw_only=True):
     """A command to the daemon's control endpoint. Raises ValueError for another version, or too long a command."""
 
     v: int
-    id: int | str
     command: str
     args: dict[str, Any] = msgspec.field(default_factory=dict)
 
@@ -512,8 +517,10 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     error: ErrorReply | None = None
 
 
-M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Request, Reply)
+M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Numbered, Request, Reply)
 
+_MISSING = re.compile(r"Object missing required field `(.+?)`(?: - at `\$\.(.*)`)?")
+_TOO_MANY = re.compile(r"(\d+) exceeds max_(\w+)_len\((\d+)\)")
 _EXPECTED = re.compile(r"Expected `(.+?)`, got `(.+?)`(?: - at `\$\.?(.*)`)?")
 _REMEDIES = {
     ("int", "float"): "; pack a whole number (JavaScript: BigInt)",
@@ -547,6 +554,9 @@ def decode(data: bytes, message_type: type[M]) -> M:
     except MessageError:
         raise
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
+        if too_many := _TOO_MANY.fullmatch(str(error)):
+            count, kind, most = too_many.groups()
+            raise MessageError(f"message has a long {kind}, of {count}: allowed is {most}") from error
         raise MessageError(f"not a msgpack map: {type(error).__name__} {error}".strip()) from error
     try:
         return msgspec.convert(unpacked, message_type)
@@ -566,6 +576,8 @@ def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 
 def _in_words(text: str) -> str:
     """Return what msgspec found wrong as `field is a type: allowed is another`."""
+    if missing := _MISSING.fullmatch(text):
+        return f"{missing[2] + '.' if missing[2] else ''}{missing[1]} is missing"
     match = _EXPECTED.fullmatch(text)
     if match is None:
         return text
