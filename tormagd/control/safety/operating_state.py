@@ -294,6 +294,8 @@ ROWS: tuple[Transition | Refusal, ...] = (
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
 "A fault that is latched already is no event."
+BESIDE: Final = ("status", "describe", "arm", "take", "confirm", "mark", "blackbox")
+"Commands that the daemon carries out beside these."
 COMMANDS: tuple[str, ...] = tuple([str(event) for event in Event if event is not Event.FAULT])
 _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
@@ -323,7 +325,7 @@ def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
     """Return the state after the operator's command `name`. Raises RefusedError."""
     if name not in COMMANDS:
-        raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
+        raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(BESIDE + COMMANDS)}")
     event = Event(name)
     row = TRANSITIONS[event, state.operating_state]
     if isinstance(row, Refusal):
