@@ -209,6 +209,8 @@ def test_the_commands_of_tormagctl(path: Path, tmp_path: Path, capsys: pytest.Ca
     for arguments, ends, head, said in (
         (["replay", str(path), "--from", "3"], 0, exact, exact),
         (["--json", "replay", str(odd), "--from", "3"], 0, '{"command":"replay","ok":true', r"\\udcff.mcap"),
+        (["plot", str(odd), "-o", f"{tmp_path}/a.png"], 0, f"{tmp_path}/a.png", ""),
+        (["report", str(odd), "-o", f"{tmp_path}/a.html"], 0, f"{tmp_path}/a.html", ""),
         (["replay", str(damaged), "--from", "3"], 1, "altered: the CRC of its summary is wrong", exact),
         (
             ["--json", "replay", str(rubbish)],

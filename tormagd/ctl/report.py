@@ -34,7 +34,7 @@ def report(sources: list[Path], target: Path) -> Outcome:
     with as_usage_error(ValueError, hint="give recordings with data"):
         page = page_of(of)
     with as_usage_error(OSError, hint=WRITABLE), in_place_of(target) as unfinished:
-        unfinished.write_text(page, encoding="utf-8")
+        unfinished.write_text(page, encoding="utf-8", errors="backslashreplace")
     return _outcome(of, target, {})
 
 
