@@ -484,7 +484,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Numbered(msgspec.Struct, frozen=True, kw_only=True):
-    """What every request has, whatever else is wrong with it."""
+    """A request, even a wrong one."""
 
     id: int | str
 
@@ -519,8 +519,8 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Numbered, Request, Reply)
 
-_MISSING = re.compile(r"Object missing required field `(.+?)`(?: - at `\$\.(.*)`)?")
-_TOO_MANY = re.compile(r"(\d+) exceeds max_(\w+)_len\((\d+)\)")
+_MISSING = re.compile(r"Object missing required field `(.+?)`(?: - at `\$(\.?)(.*)`)?")
+_TOO_LONG = re.compile(r".* (\d+) exceeds max_(\w+)_len\((\d+)\)")
 _EXPECTED = re.compile(r"Expected `(.+?)`, got `(.+?)`(?: - at `\$\.?(.*)`)?")
 _REMEDIES = {
     ("int", "float"): "; pack a whole number (JavaScript: BigInt)",
@@ -554,10 +554,8 @@ def decode(data: bytes, message_type: type[M]) -> M:
     except MessageError:
         raise
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
-        if too_many := _TOO_MANY.fullmatch(str(error)):
-            count, kind, most = too_many.groups()
-            raise MessageError(f"message has a long {kind}, of {count}: allowed is {most}") from error
-        raise MessageError(f"not a msgpack map: {type(error).__name__} {error}".strip()) from error
+        said = f"not a msgpack map: {type(error).__name__} {error}".strip()
+        raise MessageError(_TOO_LONG.sub(r"message has a long \2, of \1: allowed is \3", said)) from error
     try:
         return msgspec.convert(unpacked, message_type)
     except msgspec.ValidationError as error:
@@ -576,11 +574,9 @@ def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 
 def _in_words(text: str) -> str:
     """Return what msgspec found wrong as `field is a type: allowed is another`."""
-    if missing := _MISSING.fullmatch(text):
-        return f"{missing[2] + '.' if missing[2] else ''}{missing[1]} is missing"
     match = _EXPECTED.fullmatch(text)
     if match is None:
-        return text
+        return _MISSING.sub(r"\3\2\1 is missing", text)
     expected, got = (_KINDS.get(kind, kind) for kind in match.groups()[:2])
     remedy = _REMEDIES.get((match[1], got), "")
     return f"{match[3] or 'message'} is {got}: allowed is {expected.replace(' | null', '')}{remedy}"

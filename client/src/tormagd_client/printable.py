@@ -15,7 +15,7 @@ def printable(text: str) -> str:
 
 
 def each_text(value: Any, change: Callable[[str], str]) -> Any:
-    """Return plain data with `change` made to every text in it."""
+    """Change every text in plain data."""
     if isinstance(value, str):
         return change(value)
     if isinstance(value, dict):
