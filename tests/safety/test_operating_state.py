@@ -6,7 +6,6 @@ from hypothesis import given, strategies as st
 from firmware_protocol.codec import DeviceFault
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit, Position, device_faults
 from tormagd.control.safety.operating_state import (
-    BESIDE,
     CLEARING_S,
     COMMANDS,
     LOST_POSITION,
@@ -141,7 +140,7 @@ def test_an_unknown_command_lists_the_known_ones() -> None:
     assert (refused.code, refused.message, refused.hint) == (
         "unknown_command",
         "no command 'detonate'",
-        f"commands: {', '.join(BESIDE + COMMANDS)}",
+        f"commands: status, describe, arm, take, confirm, mark, blackbox, {', '.join(COMMANDS)}",
     )
 
 

@@ -293,7 +293,10 @@ class Endpoint:
             request = decode(waiting.data, Request)
         except MessageError as error:
             why = ErrorReply("bad_request", str(error), "see the message table in the README")
-            return Reply(v=VERSION, id=_number_in(waiting.data), ok=False, error=why)
+            number: int | str | None = None
+            with contextlib.suppress(MessageError):
+                number = decode(waiting.data, Numbered).id
+            return Reply(v=VERSION, id=number, ok=False, error=why)
         return self._carried_out(request, waiting, answer)
 
     def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:
@@ -329,14 +332,6 @@ class Endpoint:
         # the client may have gone meanwhile
         with contextlib.suppress(zmq.ZMQError):
             self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
-
-
-def _number_in(data: bytes) -> int | str | None:
-    """Return a refused request's id, None where it cannot be read."""
-    try:
-        return decode(data, Numbered).id
-    except MessageError:
-        return None
 
 
 def _is_made(routing_id: bytes) -> bool:

@@ -294,8 +294,6 @@ ROWS: tuple[Transition | Refusal, ...] = (
 )
 TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
 "A fault that is latched already is no event."
-BESIDE: Final = ("status", "describe", "arm", "take", "confirm", "mark", "blackbox")
-"Commands that the daemon carries out beside these."
 COMMANDS: tuple[str, ...] = tuple([str(event) for event in Event if event is not Event.FAULT])
 _RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
 
@@ -325,7 +323,11 @@ def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
     """Return the state after the operator's command `name`. Raises RefusedError."""
     if name not in COMMANDS:
-        raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(BESIDE + COMMANDS)}")
+        raise RefusedError(
+            "unknown_command",
+            f"no command {name!r}",
+            f"commands: status, describe, arm, take, confirm, mark, blackbox, {', '.join(COMMANDS)}",
+        )
     event = Event(name)
     row = TRANSITIONS[event, state.operating_state]
     if isinstance(row, Refusal):
