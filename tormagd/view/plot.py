@@ -13,7 +13,6 @@ from tormagd.ground.files import in_place_of
 from tormagd.record.force_following import in_words
 from tormagd.record.overview import BREAK_S, Overview, Series
 from tormagd.view.drawing import Axes, Figure, rcParams
-from tormagd_client.printable import printable
 
 FORMATS = (".png", ".svg", ".pdf")
 
@@ -50,7 +49,7 @@ def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
     overview.require_messages()
     states, limits, faults = (overview.spans_s(kind) for kind in ("operating_state", "limits", "faults"))
     lanes = bool(states) + len(limits) + max(1, len(faults))
-    headline = _headline(overview, printable(title), notes)
+    headline = _headline(overview, title, notes)
     longest = max(
         map(len, ("state", *(f"limit {name} 100.0%" for name in limits), *(f"FAULT {name}" for name in faults)))
     )

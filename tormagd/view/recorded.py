@@ -15,7 +15,6 @@ from tormagd.record.reader import RecordingFile, Seen
 from tormagd.view.believed import as_said
 from tormagd.view.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
-from tormagd_client.printable import printable
 
 BELIEVED_S = 1.1
 "A black box has a snapshot a second."
@@ -88,7 +87,7 @@ class Recorded:
         file = self._file
         return {
             "kind": "recording",
-            "name": printable(file.path.name),
+            "name": file.name,
             "start_s": self._start_ns * 1e-9,
             "duration_s": self.duration_s,
             "notes": file.notes,
