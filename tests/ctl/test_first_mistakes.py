@@ -96,7 +96,6 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl keys generate", 2, "the following arguments are required: DIR|FILE", {}),
     ("tormagctl keys show /nowhere/a.key", 2, "/nowhere/a.key", {}),
     ("tormagctl keys show a.key", 2, "a.key", {"a.key": "no key"}),
-    ("tormagctl keys show a.key --observe b", 2, "clients are for keys generate", {}),
     ("tormagctl recordings list . --to b", 2, "--to: allowed only for recordings export", {}),
     ("tormagctl top", 2, "next: tormagctl status", {}),
     ("tormagctl --endpoint ipc:///nowhere/control status", 3, "start the daemon", {}),

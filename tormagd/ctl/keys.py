@@ -12,11 +12,7 @@ HINT = "tormagctl keys generate --help; the guide has the whole exchange"
 
 
 def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) -> Outcome:
-    if action == "generate":
-        return generate_keys(path, clients, client)
-    if client is not None or any(clients.values()):
-        raise usage_error("clients are for keys generate: allowed for keys show is DIR|FILE alone", HINT)
-    return show_keys(path)
+    return show_keys(path) if action == "show" else generate_keys(path, clients, client)
 
 
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:

@@ -89,8 +89,7 @@ def print_error(command: str, error: ClientError, as_json: bool) -> None:
 
 def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> str:
     told = msgspec.to_builtins({"command": command, "ok": ok, "result": result, "error": error})
-    # JSON is UTF-8, and a file's name need not be
-    return msgspec.json.encode(each_text(told, lambda text: text.encode(errors="backslashreplace").decode())).decode()
+    return msgspec.json.encode(each_text(told, lambda name: name.encode(errors="backslashreplace").decode())).decode()
 
 
 def folded(text: str) -> str:

@@ -55,7 +55,7 @@ def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = 
     if name in names:
         return Path(str(folder / f"{name}{ending}"))
     try:
-        # no message holds a name that is no UTF-8; a link that leads nowhere is for who reads it to tell
+        # a link to nowhere is for its reader to tell
         if name.encode() and ((beside / name).exists() or (beside / name).is_symlink()):
             return beside / name
     except (OSError, UnicodeEncodeError) as error:  # a name no file can have, or a directory that may not be entered
