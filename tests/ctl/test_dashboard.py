@@ -155,8 +155,14 @@ async def test_a_browser_that_does_not_read_misses_the_oldest_and_holds_nobody_u
 
 async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Recorded) -> None:
     async with served(recorded) as asks:
-        hosts = ("evil.example", "localhost", "127.0.0.1:8733")
-        assert [(await asks.get("/about", headers={"Host": host})).status for host in hosts] == [403, 200, 200]
+        hosts = ("evil.example", "127.0.0.1:99999", "127.0.0.1:abc", "localhost", "127.0.0.1:8733")
+        assert [(await asks.get("/about", headers={"Host": host})).status for host in hosts] == [
+            403,
+            403,
+            403,
+            200,
+            200,
+        ]
         ours = {"Origin": str(asks.make_url("/")).rstrip("/")}
         assert [(await asks.post(path, headers=ours)).status for path in ("/", "/about", "/frame")] == [405] * 3
         page = await asks.get("/")

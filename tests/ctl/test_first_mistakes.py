@@ -77,6 +77,13 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ),
     ("tormagctl recordings export a.mcap --to a.mcap", 2, "a.mcap: File exists", {"a.mcap": "precious"}),
     ("tormagctl replay /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
+    ("tormagctl replay \udcff.mcap", 2, "\\udcff.mcap", {}),
+    ("tormagctl replay a.mcap --plant sample_1", 2, "--plant: allowed only with --set or --fault", {}),
+    ("tormagctl replay a.mcap --from 1 --fault x", 2, "--from: allowed only without --set or --fault", {}),
+    *(
+        (f"tormagctl mark {text}", 2, "allowed are 1..200 printable characters", {})
+        for text in ("''", "'a\nb'", "x" * 201, "\udcff")
+    ),
     ("tormagctl dashboard /nowhere/a.mcap", 2, "/nowhere/a.mcap", {}),
     ("tormagctl dashboard --port 70000", 2, "--port: 70000: allowed is 0..65535", {}),
     *(
@@ -103,6 +110,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl keys generate", 2, "the following arguments are required: DIR|FILE", {}),
     ("tormagctl keys show /nowhere/a.key", 2, "/nowhere/a.key", {}),
     ("tormagctl keys show a.key", 2, "a.key", {"a.key": "no key"}),
+    ("tormagctl recordings list . --to b", 2, "--to: allowed only for recordings export", {}),
     ("tormagctl top", 2, "next: tormagctl status", {}),
     ("tormagctl --endpoint ipc:///nowhere/control status", 3, "start the daemon", {}),
     ("tormagctl --endpoint tcp://192.0.2.1:5555 status", 2, "CURVE", {}),
@@ -121,7 +129,11 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     (f"{NEW} --column torque_mNm", 2, "no column is called 'torque_mNm'", FORCES),
     (f"{NEW} --offset -2", 2, "force_N = -1: allowed is 0..1000 N", FORCES),
     (f"{NEW} --scale nan", 2, "--scale", FORCES),
-    (f"{NEW} --insert MRE-70-10", 1, "torque_mre_70", FORCES),
+    (f"{NEW} --insert nope", 2, "insert = 'nope' is not allowed: one of MRE-10-10, ", FORCES),
+    ("tormagctl scene new \udcff.toml --force f.csv", 2, "'\\udcff': allowed is UTF-8 text", FORCES),
+    ("tormagctl scene use \udcff", 2, "'\\udcff': allowed is UTF-8 text", {}),
+    ("tormagctl scene show \udcff", 2, "scene = '\\udcff': no UTF-8 text; allowed is a file", {}),
+    ("tormagctl scene list pulse", 2, "scene list pulse: allowed is no name", {}),
     ("tormagctl scene new f.toml --force f.csv --offset 0.1", 2, "f.csv exists, where the scene's forces go", FORCES),
     ("tormagctl scene check pulse --share 0.001", 1, "allowed is at least", {}),
     ("tormagctl scene check pulse --tolerance 0.001", 1, "allowed is at least", {}),

@@ -188,24 +188,25 @@ def test_a_command_is_answered_or_refused_with_code_message_and_hint(rig: Rig, k
 
 
 @pytest.mark.parametrize(
-    "data",
+    ("data", "number"),
     [
-        b"",
-        b"garbage",
-        b"\xff" * 1_000,
-        msgpack.packb([1, 2]),
-        msgpack.packb({"v": 1, "id": 1}),
-        msgpack.packb({"v": 9, "id": 1, "command": "stop"}),
-        msgpack.packb({"v": 1, "id": 1, "command": 7}),
-        msgpack.packb({"v": 1, "id": [], "command": "stop"}),
+        (b"", None),
+        (b"garbage", None),
+        (b"\xff" * 1_000, None),
+        (msgpack.packb([1, 2]), None),
+        (msgpack.packb({"v": 1, "id": 1}), 1),
+        (msgpack.packb({"v": 9, "id": 1, "command": "stop"}), 1),
+        (msgpack.packb({"v": 1, "id": "a", "command": 7}), "a"),
+        (msgpack.packb({"v": 1, "id": 1, "command": "status", "args": []}), 1),
+        (msgpack.packb({"v": 1, "id": [], "command": "stop"}), None),
     ],
-    ids=range(8),
+    ids=range(9),
 )
-def test_garbage_is_answered_with_bad_request(rig: Rig, data: bytes) -> None:
+def test_garbage_is_answered_with_bad_request(rig: Rig, data: bytes, number: int | str | None) -> None:
     client = rig.connect(zmq.DEALER, "control")
     client.send(data)
     reply = rig.reply(client)
-    assert (reply.id, reply.ok, reply.error.code, rig.answered) == (None, False, "bad_request", [])
+    assert (reply.id, reply.ok, reply.error.code, rig.answered) == (number, False, "bad_request", [])
     assert rig.is_answered()
 
 

@@ -137,6 +137,11 @@ def refusal(name: str, kind: str, folder: Path) -> str:
     return f"{name} as {kind}: not refused"
 
 
+def test_a_scene_that_is_a_link_to_itself_is_told_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="Too many levels of symbolic links"):
+        load_scene(str(make("a link to itself", tmp_path)))
+
+
 @pytest.mark.parametrize("kind", READERS)
 def test_each_is_refused_in_one_printable_sentence(tmp_path_factory: pytest.TempPathFactory, kind: str) -> None:
     wrong = [refusal(name, kind, tmp_path_factory.mktemp("hostile")) for name in HOSTILE]

@@ -173,6 +173,12 @@ def test_a_limit_that_was_too_narrow(fly: Any, tmp_path: Path, capsys: pytest.Ca
     assert "SKEW did not come in the simulation as configured then" in _instead(result)
 
 
+def test_another_scene_is_run(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_changed([str(path), "--set", "scene=cardiovascular"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert ["RANGE" in result[name]["limits"] for name in ("simulated", "instead")] == [False, True]
+
+
 def test_one_that_begins_in_the_middle_begins_with_a_device_that_is_driven(path: Path) -> None:
     box = read_black_box(path)
     known = recorded(box, path.parent)
@@ -206,12 +212,16 @@ def test_a_setting_that_is_no_toml_is_text(setting: str, scene: str) -> None:
 
 
 def test_the_commands_of_tormagctl(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    damaged, rubbish = tmp_path / "damaged.mcap", tmp_path / "rubbish.mcap"
+    damaged, rubbish, odd = tmp_path / "damaged.mcap", tmp_path / "rubbish.mcap", tmp_path / "\udcff.mcap"
+    odd.write_bytes(path.read_bytes())  # under a name that is no UTF-8
     damaged.write_bytes(path.read_bytes().replace(b"tormagd.Tick", b"tormagd.Tack"))  # of the summary
     rubbish.write_bytes(b"rubbish of no kind")
     exact = "bit-exact, 1,000 ticks from 3.000 to 3.999 s"
     for arguments, ends, head, said in (
         (["replay", str(path), "--from", "3"], 0, exact, exact),
+        (["--json", "replay", str(odd), "--from", "3"], 0, '{"command":"replay","ok":true', r"\\udcff.mcap"),
+        (["plot", str(odd), "-o", f"{tmp_path}/a.png"], 0, f"{tmp_path}/a.png", ""),
+        (["report", str(odd), "-o", f"{tmp_path}/a.html"], 0, f"{tmp_path}/a.html", ""),
         (["replay", str(damaged), "--from", "3"], 1, "altered: the CRC of its summary is wrong", exact),
         (
             ["--json", "replay", str(rubbish)],
@@ -231,6 +241,7 @@ def test_what_cannot_be_run_again_is_refused_in_one_line(
     for command, arguments in (
         (run, [str(path), "--from", "-1"]),
         (run_changed, [str(path), "--set", "limits.skew=1"]),
+        (run_changed, [str(path), "--set", "scene=nope"]),
         (run_changed, [str(path), "--fault", "nonsense"]),
         (run_changed, [str(path), "--fault", "no_sense", "--plant", "nowhere"]),
         (run, [str(path), "--config", "/nowhere"]),

@@ -140,7 +140,7 @@ def test_an_unknown_command_lists_the_known_ones() -> None:
     assert (refused.code, refused.message, refused.hint) == (
         "unknown_command",
         "no command 'detonate'",
-        f"commands: {', '.join(COMMANDS)}",
+        f"commands: status, describe, arm, take, confirm, mark, blackbox, {', '.join(COMMANDS)}",
     )
 
 

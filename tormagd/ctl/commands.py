@@ -48,10 +48,14 @@ def rates(text: str) -> tuple[float, ...]:
     return found
 
 
-def source(text: str) -> str:
-    if not 0 < len(text) <= 64 or not text.isprintable():
-        raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
+def words(text: str, most: int = 200) -> str:
+    if not 0 < len(text) <= most or not text.isprintable():
+        raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..{most} printable characters")
     return text
+
+
+def source(text: str) -> str:
+    return words(text, 64)
 
 
 def origin(text: str) -> str:
@@ -209,7 +213,7 @@ COMMANDS = {
         "put an event into telemetry and recordings; its segment is kept",
         "recordings.mark",
         ("client",),
-        (option("text", metavar="TEXT", help="1..200 characters"),),
+        (option("text", type=words, metavar="TEXT", help="1..200 printable characters"),),
     ),
     "recordings": Command(
         "list or prune a folder of recordings, mark one to keep, or export one with its SHA-256",
@@ -249,7 +253,7 @@ COMMANDS = {
                 metavar="KEY=VALUE",
                 help="change the configuration, as in limits.skew_fault_mm=2",
             ),
-            option("--plant", default="sample_1", metavar="P", help="simulated device (sample_1)"),
+            option("--plant", metavar="P", help="simulated device (sample_1)"),
             option(
                 "--fault",
                 dest="faults",

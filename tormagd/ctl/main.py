@@ -29,6 +29,7 @@ from tormagd.ground.command_line import Parser, UsageError
 from tormagd.ground.terminal import write_in_any_encoding, write_line
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.errors import ClientError
+from tormagd_client.printable import in_short
 
 EXTRAS = {
     "mcap": "record",
@@ -99,7 +100,12 @@ def _run(options: argparse.Namespace) -> Outcome:
         given = {name: value for name, value in vars(options).items() if name not in ("command", *USUAL)}
         module, _, name = command.function.partition(".")
         function: Callable[..., Outcome] = getattr(import_module(f"tormagd.ctl.{module}"), name)
-        return function(**given, **{need: known[need] for need in command.needs})
+        try:
+            return function(**given, **{need: known[need] for need in command.needs})
+        except UnicodeEncodeError as error:  # of an argument, into a message or a file
+            raise usage_error(
+                f"{in_short(error.object)}: allowed is UTF-8 text", "give another text or name"
+            ) from error
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:

@@ -17,7 +17,7 @@ import msgspec
 
 from tormagd.ground.terminal import write_answer, write_line
 from tormagd_client.errors import ClientError, InFaultError, SettingError, UnreachableError
-from tormagd_client.printable import printable
+from tormagd_client.printable import each_text, printable
 
 NARROWEST = 20
 LABEL = re.compile(r"\S{0,24} +")
@@ -108,7 +108,8 @@ def print_error(command: str, error: ClientError, as_json: bool) -> None:
 
 
 def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> str:
-    return msgspec.json.encode({"command": command, "ok": ok, "result": result, "error": error}).decode()
+    told = msgspec.to_builtins({"command": command, "ok": ok, "result": result, "error": error})
+    return msgspec.json.encode(each_text(told, lambda name: name.encode(errors="backslashreplace").decode())).decode()
 
 
 def folded(text: str) -> str:

@@ -22,6 +22,10 @@ def mark(client: Client, text: str) -> Outcome:
 
 def recordings(config: Config, action: str, path: Path | None, target: Path | None) -> Outcome:
     """List a folder, prune it to its budget, mark a recording so that it is kept, or copy it to `target`."""
+    if target is not None and action != "export":
+        raise usage_error(
+            "--to: allowed only for recordings export", "tormagctl recordings export FILE.mcap --to FOLDER"
+        )
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):
             folder = RecordingFolder(path or Path(config.recordings.folder), budget_of(config.recordings))

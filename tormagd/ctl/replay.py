@@ -3,11 +3,10 @@
 `tormagd.record.replay` does the one, `tormagd.simulation.rehearse` the other, in a process of its own.
 """
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-import msgspec
 
 from tormagd.ctl.outcome import Exit, Outcome, answer_of, usage_error
 
@@ -19,18 +18,22 @@ def replay(
     path: Path,
     from_s: float,
     settings: Sequence[str],
-    plant: str,
+    plant: str | None,
     faults: Sequence[str],
     config_file: Path | None,
 ) -> Outcome:
     """Replay a black box; with `settings` or `faults`, on the simulated `plant`."""
     module, arguments = "tormagd.record.replay", [f"--from={from_s!r}"]
-    if changes := [*(f"--set={setting}" for setting in settings), *(f"--fault={fault}" for fault in faults)]:
-        module, arguments = "tormagd.simulation.rehearse", [f"--plant={plant}", *changes]
+    changes = [*(f"--set={setting}" for setting in settings), *(f"--fault={fault}" for fault in faults)]
+    if from_s if changes else plant:
+        told = "--from: allowed only without" if changes else "--plant: allowed only with"
+        raise usage_error(f"{told} --set or --fault", "tormagctl replay --help")
+    if changes:
+        module, arguments = "tormagd.simulation.rehearse", [f"--plant={plant or 'sample_1'}", *changes]
     configured = [f"--config={config_file}"] if config_file else []
     try:
         answer = answer_of(module, [*arguments, *configured, "--", str(path)], LONGEST_S)
-        result: dict[str, Any] = msgspec.json.decode(answer)
+        result: dict[str, Any] = json.loads(answer)  # names in it need not be UTF-8
     except TimeoutError as error:
         raise usage_error(f"{path}: {error}", "is it a black box?") from error
     except ChildProcessError as error:

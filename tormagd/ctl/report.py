@@ -34,7 +34,7 @@ def report(sources: list[Path], target: Path) -> Outcome:
     with as_usage_error(ValueError, hint="give recordings with data"):
         page = page_of(of)
     with as_usage_error(OSError, hint=WRITABLE), in_place_of(target, *sources) as unfinished:
-        unfinished.write_text(page, encoding="utf-8")
+        unfinished.write_text(page, encoding="utf-8", errors="backslashreplace")
     return _outcome(of, target, {})
 
 
@@ -42,7 +42,7 @@ def plot(source: Path, target: Path) -> Outcome:
     (recording,) = of = opened([source])
     overview, following = recording.overview, recording.overview.following
     with as_usage_error(ValueError, hint="give -o a picture's name, such as pulse.png, and a recording with data"):
-        drawn = figure(overview, source.stem, recording.notes)
+        drawn = figure(overview, recording.name.removesuffix(".mcap"), recording.notes)
         with as_usage_error(OSError, hint=WRITABLE):
             save_plot(drawn, target, source)
     result = {

@@ -47,8 +47,10 @@ def scene(
 
         return serve_scene(action, named, share, tolerance_N, out, config.device.backend)
     match action:
-        case "list":
+        case "list" if name is None:
             return list_scenes()
+        case "list":
+            raise usage_error(f"scene list {name}: allowed is no name", f"tormagctl scene show {name}")
         case "show":
             return show_scene(named)
         case "check":
@@ -68,7 +70,11 @@ def scene(
 def use_scene(client: "Client", name: str) -> Outcome:
     from tormagd.ctl.operate import statuses
 
-    scene = str(Path(name).absolute()) if name not in shipped_scenes() and Path(name).exists() else name
+    scene = (
+        str(Path(name).absolute())
+        if name not in shipped_scenes() and (Path(name).exists() or Path(name).is_symlink())
+        else name
+    )
     client.request("use-scene", scene=scene)
     changes = ((state, state.scene_change) for _, state in statuses(client, LONGEST_S))
     state, change = next(((state, each) for state, each in changes if each and each.is_over), (None, None))

@@ -14,6 +14,8 @@ import msgspec
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.scene_check import NEW_FILE, as_toml, check_scene
+from tormagd.element.physics.errors import DomainError
+from tormagd.element.physics.inserts import insert as known_insert
 from tormagd.ground.files import new_file
 from tormagd.ground.force_file import read_column, read_forces, stated_columns
 from tormagd.ground.table import TableError
@@ -53,6 +55,8 @@ class Recorded(NamedTuple):
 def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: {NEW_FILE}", "name another file")
+    with as_usage_error(DomainError, hint="tormagctl scene new --help"):
+        known_insert(INSERTS[0] if recorded.insert is None else recorded.insert)
     with as_usage_error(OSError, hint=f"name another file: {NEW_FILE}"), contextlib.ExitStack() as files:
         force_file, told = _forces_of(out, recorded, files)
         made = _proposed(out, force_file, recorded, config)

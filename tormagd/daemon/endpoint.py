@@ -30,6 +30,7 @@ from tormagd_client.messages import (
     ErrorReply,
     MessageError,
     Motion,
+    Numbered,
     PeersReport,
     Reply,
     Request,
@@ -292,7 +293,10 @@ class Endpoint:
             request = decode(waiting.data, Request)
         except MessageError as error:
             why = ErrorReply("bad_request", str(error), "see the message table in the README")
-            return Reply(v=VERSION, id=None, ok=False, error=why)
+            number: int | str | None = None
+            with contextlib.suppress(MessageError):
+                number = decode(waiting.data, Numbered).id
+            return Reply(v=VERSION, id=number, ok=False, error=why)
         return self._carried_out(request, waiting, answer)
 
     def _carried_out(self, request: Request, waiting: Waiting, answer: Answer) -> Reply:

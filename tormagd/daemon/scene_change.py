@@ -10,7 +10,10 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import Explained, SceneReport
 
 LONGEST_NAME = 4_096
-NEXT = "tormagctl scene check says what the device can give; rates stay: state [rates], or start with that scene"
+NEXT = (
+    "name a scene that tormagctl scene check takes, as each of tormagctl scene list; rates stay: state [rates], or "
+    "start with that scene"
+)
 
 log = logging.getLogger(__name__)
 

@@ -76,10 +76,11 @@ def named(key: str, name: str, folder: Traversable, ending: str, beside: Path = 
     if name in names:
         return Path(str(folder / f"{name}{ending}"))
     try:
-        if name and (beside / name).exists():
+        # a link to nowhere is for its reader to tell
+        if name.encode() and ((beside / name).exists() or (beside / name).is_symlink()):
             return beside / name
-    except OSError as error:  # a name that no file can have, or a directory that may not be entered
-        reason = f"{error.strerror}; "
+    except (OSError, UnicodeEncodeError) as error:  # a name no file can have, or a directory that may not be entered
+        reason = f"{getattr(error, 'strerror', 'no UTF-8 text')}; "
     near = did_you_mean(name, names)
     raise ConfigError(f"{key} = {in_short(name)}: {reason}allowed is a file or one of {', '.join(names)}{near}")
 

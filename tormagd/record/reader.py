@@ -34,6 +34,7 @@ from zstandard import CONTENTSIZE_UNKNOWN, ZstdError, get_frame_parameters
 
 from tormagd.record.overview import Glance, Overview, OverviewBuilder, unpacked
 from tormagd.record.writer import CUT, OVERVIEW, TELEMETRY_TOPIC, THINNED, TICKS_TOPIC
+from tormagd_client.printable import printable
 from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
@@ -331,7 +332,7 @@ class RecordingFile:
     """A recording of any length on the disk."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.name = path, printable(path.name)
         with opened(path) as file:
             self.damage = damage_in(file)
         found = None if self.damage else summary_of(path)

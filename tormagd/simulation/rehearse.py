@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd.config import Config, checked
-from tormagd.control.assembly.build import Core
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.ground.plain_values import InexactError
@@ -202,10 +202,10 @@ def main(arguments: list[str] | None = None) -> int:
     def run(known: Recorded, box: BlackBoxFile) -> dict[str, Any]:
         todo = script(known.columns, box.entries)
         config = changed(known.config, options.settings)
+        # a file keeps its own scene only: another one is this machine's
+        core = rebuilt(known, config) if config.scene == known.config.scene else build_core(config)
         simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
-        instead = None
-        if options.settings:
-            instead = rehearse(rebuilt(known, config), config, todo, options.plant, options.faults)
+        instead = rehearse(core, config, todo, options.plant, options.faults) if options.settings else None
         return {
             "plant": options.plant,
             "faults": options.faults,

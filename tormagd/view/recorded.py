@@ -87,7 +87,7 @@ class Recorded:
         file = self._file
         return {
             "kind": "recording",
-            "name": file.path.name,
+            "name": file.name,
             "start_s": self._start_ns * 1e-9,
             "duration_s": self.duration_s,
             "notes": file.notes,

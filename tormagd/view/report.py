@@ -24,7 +24,7 @@ MAX_TOLD = 20
 
 def report(of: Sequence[RecordingFile]) -> str:
     """Return one HTML page on these recordings, with its pictures within."""
-    names = [each.path.name for each in of]
+    names = [each.name for each in of]
     parts = [
         f"<h1>{escape(' and '.join(names))}</h1>",
         *(_notes(each) for each in of if each.notes),
@@ -46,7 +46,7 @@ def report(of: Sequence[RecordingFile]) -> str:
 
 def _notes(of: RecordingFile) -> str:
     kind = ' class="bad"' if of.damage else ""
-    return f"<p{kind}>{escape('. '.join([f'{of.path.name}: {of.notes[0]}', *of.notes[1:]]))}.</p>"
+    return f"<p{kind}>{escape('. '.join([f'{of.name}: {of.notes[0]}', *of.notes[1:]]))}.</p>"
 
 
 def _figures(of: Sequence[RecordingFile]) -> list[list[str]]:
@@ -82,7 +82,7 @@ def _range(of: RecordingFile, name: str) -> str:
 
 
 def _picture(of: RecordingFile) -> str:
-    name = of.path.stem
+    name = of.name.removesuffix(".mcap")
     png = base64.b64encode(picture(figure(of.overview, name, of.notes), "png")).decode()
     alt = f"force, gap, duty, limits and faults of {escape(name)}"
     return f'<p class="wide" tabindex="0"><img alt="{alt}" src="data:image/png;base64,{png}"></p>'
@@ -100,7 +100,7 @@ def _codes(
         why = texts.get(code)
         when = ["" if codes is None else told(codes, lasts_s) for codes, lasts_s in known]
         rows.append([code, *when, why.cause if why else "", why.remedy if why else ""])
-    return table(["code", *(each.path.name for each in of), "why", "what to do"], rows)
+    return table(["code", *(each.name for each in of), "why", "what to do"], rows)
 
 
 def _held(codes: Codes, lasts_s: float) -> str:

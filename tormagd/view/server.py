@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import hmac
 import math
+import re
 import signal
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -26,7 +27,7 @@ from tormagd.view.recorded import Recorded
 from tormagd_client.errors import ClientError
 
 LOOPBACK = "127.0.0.1"
-NAMES = (LOOPBACK, "localhost")
+OWN = re.compile(r"(127\.0\.0\.1|localhost)(:[1-6]?[0-9]{1,4})?", re.IGNORECASE)
 "By another name for this address, a foreign page could read the answers."
 MAX_BROWSERS = 32
 MAX_BODY_BYTES = 256
@@ -103,8 +104,8 @@ def _admission(operating: Operating | None, origin: str | None) -> Callable[...,
 
     @web.middleware
     async def admission(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if request.url.host not in NAMES:
-            raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
+        if not OWN.fullmatch(request.host):
+            raise web.HTTPForbidden(text=f"allowed hosts are {LOOPBACK} and localhost")
         came_from = request.headers.getall("Origin", [])  # none where a browser gets from its own page
         if (came_from or request.method == "POST") and came_from not in ([f"http://{request.host}"], [origin]):
             raise web.HTTPForbidden(text="allowed is a page of tormagctl dashboard itself, or of its --origin")

@@ -483,11 +483,16 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
     core: dict[str, str] = {}
 
 
-class Request(msgspec.Struct, frozen=True, kw_only=True):
+class Numbered(msgspec.Struct, frozen=True, kw_only=True):
+    """A request, even a wrong one."""
+
+    id: int | str
+
+
+class Request(Numbered, frozen=True, kw_only=True):
     """A command to the daemon's control endpoint. Raises ValueError for another version, or too long a command."""
 
     v: int
-    id: int | str
     command: str
     args: dict[str, Any] = msgspec.field(default_factory=dict)
 
@@ -512,8 +517,10 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     error: ErrorReply | None = None
 
 
-M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Request, Reply)
+M = TypeVar("M", Setpoint, Telemetry, Motion, Verdict, Numbered, Request, Reply)
 
+_MISSING = re.compile(r"Object missing required field `(.+?)`(?: - at `\$(\.?)(.*)`)?")
+_TOO_LONG = re.compile(r".* (\d+) exceeds max_(\w+)_len\((\d+)\)")
 _EXPECTED = re.compile(r"Expected `(.+?)`, got `(.+?)`(?: - at `\$\.?(.*)`)?")
 _REMEDIES = {
     ("int", "float"): "; pack a whole number (JavaScript: BigInt)",
@@ -547,7 +554,8 @@ def decode(data: bytes, message_type: type[M]) -> M:
     except MessageError:
         raise
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
-        raise MessageError(f"not a msgpack map: {type(error).__name__} {error}".strip()) from error
+        said = f"not a msgpack map: {type(error).__name__} {error}".strip()
+        raise MessageError(_TOO_LONG.sub(r"message has a long \2, of \1: allowed is \3", said)) from error
     try:
         return msgspec.convert(unpacked, message_type)
     except msgspec.ValidationError as error:
@@ -568,7 +576,7 @@ def _in_words(text: str) -> str:
     """Return what msgspec found wrong as `field is a type: allowed is another`."""
     match = _EXPECTED.fullmatch(text)
     if match is None:
-        return text
+        return _MISSING.sub(r"\3\2\1 is missing", text)
     expected, got = (_KINDS.get(kind, kind) for kind in match.groups()[:2])
     remedy = _REMEDIES.get((match[1], got), "")
     return f"{match[3] or 'message'} is {got}: allowed is {expected.replace(' | null', '')}{remedy}"

@@ -1,6 +1,8 @@
 """Text of a file, a device or another process, made fit to be shown to a person."""
 
 import json
+from collections.abc import Callable
+from typing import Any
 
 LONGEST_SHOWN = 80
 
@@ -10,6 +12,15 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else json.dumps(each)[1:-1] for each in text)
+
+
+def each_text(value: Any, change: Callable[[str], str]) -> Any:
+    """Change every text in plain data."""
+    if isinstance(value, str):
+        return change(value)
+    if isinstance(value, dict):
+        return {each_text(key, change): each_text(inner, change) for key, inner in value.items()}
+    return [each_text(inner, change) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def in_short(value: object) -> str:

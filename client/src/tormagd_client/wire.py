@@ -30,7 +30,7 @@ from tormagd_client.messages import (
     decode,
     encode,
 )
-from tormagd_client.printable import printable
+from tormagd_client.printable import each_text, printable
 
 T = TypeVar("T", Status, Description, ArmReport)
 Told = TypeVar("Told", Telemetry, Motion, Verdict)
@@ -143,7 +143,7 @@ def understood(result: dict[str, Any], kind: type[T]) -> T:
     Raises UnreachableError, naming the daemon's version, if a field is missing or of another type.
     """
     try:
-        return msgspec.convert(_printable(result), kind)
+        return msgspec.convert(each_text(result, printable), kind)
     except (msgspec.ValidationError, RecursionError) as error:
         raise UnreachableError(
             "unintelligible",
@@ -170,14 +170,6 @@ def armed(report: ArmReport) -> tuple[str, ...]:
 def refused(command: str, code: str, message: str, hint: str) -> RefusedError:
     kind = InFaultError if code in FAULT_CODES else RefusedError
     return kind(command, code, message, hint)
-
-
-def _printable(value: Any) -> Any:
-    if isinstance(value, str):
-        return printable(value)
-    if isinstance(value, dict):
-        return {_printable(key): _printable(inner) for key, inner in value.items()}
-    return [_printable(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _contact(fields: Mapping[str, float]) -> Contact:

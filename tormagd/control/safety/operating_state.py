@@ -323,7 +323,11 @@ def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
     """Return the state after the operator's command `name`. Raises RefusedError."""
     if name not in COMMANDS:
-        raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
+        raise RefusedError(
+            "unknown_command",
+            f"no command {name!r}",
+            f"commands: status, describe, arm, take, confirm, mark, blackbox, {', '.join(COMMANDS)}",
+        )
     event = Event(name)
     row = TRANSITIONS[event, state.operating_state]
     if isinstance(row, Refusal):
