@@ -47,7 +47,7 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
         raise CommandError(
             Exit.REFUSED,
             "out_of_range",
-            f"{least_N}..{most_N} N is asked: allowed is {allowed[0]}..{allowed[1]} N "
+            f"{least_N:.12g}..{most_N:.12g} N is asked: allowed is {allowed[0]:.12g}..{allowed[1]:.12g} N "
             f"in scene {known.scene.get('name', '-')}; nothing was sent",
             "ask within the range, or let the daemon run another scene",
         )

@@ -31,10 +31,10 @@ class _Attributes(ctypes.Structure):
     )
 
 
-def ask_for_fifo(priority: int, pid: int = 0) -> None:
-    """Ask the kernel to let a process, or this one, go before all ordinary ones, as if on a machine of its own."""
+def ask_for_fifo(priority: int) -> None:
+    """Ask the kernel to let this process go before all ordinary ones, as if on a machine of its own."""
     with contextlib.suppress(PermissionError):
-        os.sched_setscheduler(pid, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
 def ask_for_slices(slice_ns: int = SHORTEST_NS) -> None:
