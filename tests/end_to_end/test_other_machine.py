@@ -61,7 +61,7 @@ class Machines:
         self.close()
         self.folder, self.keys = folder, folder / "keys"
         self._within = self._stack.enter_context(two_machines())
-        clients = ("--publish", "robot", "--operate", "console")
+        clients = ("--publish", "robot", "--operate", "console", "--observe", "screen")
         subprocess.run([*CTL, "keys", "generate", str(self.keys), *clients], check=True, capture_output=True)
         addresses = "".join(f'{name} = "tcp://{HERE}:{5_555 + n}"\n' for n, name in enumerate(ENDPOINTS))
         simulator = self.start(0, sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "1")
@@ -71,7 +71,7 @@ class Machines:
             f'scene = "coronary"\n[realtime]\nfifo_priority = 50\n[device]\nport = "{port}"\n[endpoints]\n{addresses}'
             f'[endpoints.curve]\nserver_secret = "{self.keys}/server.key_secret"\n'
         )
-        for name in ("robot", "console"):
+        for name in ("robot", "console", "screen"):
             (folder / f"{name}.toml").write_text(
                 f'scene = "coronary"\n[endpoints]\n{addresses}[endpoints.curve]\n'
                 f'client_secret = "{self.keys}/{name}.key_secret"\nserver_public = "{self.keys}/server.key"\n'
@@ -90,7 +90,12 @@ class Machines:
         return made
 
     def ctl(self, who: str, *arguments: str) -> dict[str, Any]:
-        asked = self.start(1, *CTL, "--json", "--config", str(self.folder / f"{who}.toml"), *arguments)
+        return self.answer(self.asked(who, *arguments))
+
+    def asked(self, who: str, *arguments: str) -> "subprocess.Popen[str]":
+        return self.start(1, *CTL, "--json", "--config", str(self.folder / f"{who}.toml"), *arguments)
+
+    def answer(self, asked: "subprocess.Popen[str]") -> dict[str, Any]:
         printed, _ = asked.communicate(timeout=PATIENCE_S)
         answer: dict[str, Any] = json.loads(printed)
         return answer
@@ -116,9 +121,9 @@ class Machines:
         self._stack.close()
 
 
-@pytest.fixture
-def machines(tmp_path: Path) -> Iterator[Machines]:
-    with contextlib.closing(Machines(tmp_path)) as made:
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+    with contextlib.closing(Machines(tmp_path_factory.mktemp("machines"))) as made:
         yield made
 
 
@@ -134,3 +139,15 @@ def test_a_publisher_on_another_machine_drives_the_brake(machines: Machines) -> 
     assert status["operating_state"] == "FAULT"
     assert status["setpoints"]["newest_source"] == "tormagctl"
     assert status["peers"]["refused"] == 0
+
+
+def test_nobody_else_is_let_in_from_there_and_each_is_counted(machines: Machines) -> None:
+    # the publisher's key neither commands nor looks, the screen's only looks
+    for asked in [machines.asked("robot", command) for command in ("stop", "enable", "status")]:
+        assert machines.answer(asked)["error"]["code"] == "unreachable"
+    assert machines.ctl("screen", "status")["result"]["version"] == machines.status()["version"]
+    assert machines.ctl("screen", "stop")["error"]["code"] == "forbidden"
+    peers = machines.status()["peers"]
+    assert (peers["refused"], peers["refusals"][0]["count"]) == (3, 3)
+    assert {each["address"] for each in peers["refusals"]} <= {THERE, "gone before it was seen"}
+    assert peers["drops"][0]["reason"] == "command not allowed"
