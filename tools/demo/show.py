@@ -148,7 +148,8 @@ def staged(played: Callable[[HostWatch], Found]) -> Found | Aborted:
         except ShowError as error:
             watched.end()
             until_s, spacing_s = early_end(began_s, error.time_s)
-            return Aborted(error, watched.between(max(began_s, until_s - BEFORE_FAULT_S), until_s), spacing_s)
+            host = watched.between(max(began_s, until_s - BEFORE_FAULT_S), until_s)
+            return Aborted(error, host, spacing_s)
 
 
 class Rig(NamedTuple):

@@ -207,7 +207,8 @@ def _watched(run: Callable[..., Figures], times: int, seed: int) -> Figures:
     figures["held_against_host"] = []
     for fault, from_s, to_s in stand.latched:
         stood_ms = watch.between(from_s, to_s).bare_worst_ms
-        figures["held_against_host" if stood_ms >= HOST_SHARE * DEVICE_WAITS_MS else "failures"].append(
+        is_hosts = stood_ms >= HOST_SHARE * DEVICE_WAITS_MS
+        figures["held_against_host" if is_hosts else "failures"].append(
             f"fault {fault}, while a bare timer stood still for {stood_ms:.0f} ms"
         )
     return figures

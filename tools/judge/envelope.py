@@ -91,7 +91,8 @@ def run(case: Case) -> Json:
             newest[:] = [TimedSetpoint(force_N(now_s - start_s), now_s, VALID_S, case.displacement_mm, case.rate_mm_s)]
         return newest[-1]
 
-    followed = follow(loop, publish, min(sum(lasts for lasts, _ in levels), sum(lasts for lasts, _ in legs)), start_s)
+    lasts_s = min(sum(lasts for lasts, _ in levels), sum(lasts for lasts, _ in legs))
+    followed = follow(loop, publish, lasts_s, start_s)
     is_of_steps = (case.hand, case.forces) == ("42 mm/s", "steps")
     return judged(followed, brake_of(plant).open_N) | {"steps_N": step_figures(followed) if is_of_steps else None}
 

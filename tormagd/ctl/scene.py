@@ -1,5 +1,6 @@
 """`tormagctl scene`: which scenes there are, what one asks for, whether this configuration can give it, and how."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,11 +71,7 @@ def scene(
 def use_scene(client: "Client", name: str) -> Outcome:
     from tormagd.ctl.operate import statuses
 
-    scene = (
-        str(Path(name).absolute())
-        if name not in shipped_scenes() and (Path(name).exists() or Path(name).is_symlink())
-        else name
-    )
+    scene = str(Path(name).absolute()) if name not in shipped_scenes() and os.path.lexists(name) else name
     client.request("use-scene", scene=scene)
     changes = ((state, state.scene_change) for _, state in statuses(client, LONGEST_S))
     state, change = next(((state, each) for state, each in changes if each and each.is_over), (None, None))

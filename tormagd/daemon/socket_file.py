@@ -1,7 +1,6 @@
 """The file of an `ipc://` socket: one process at a time has it, and only a left socket is ever replaced."""
 
 import contextlib
-import errno
 import fcntl
 import os
 import socket
@@ -9,6 +8,7 @@ import stat
 from pathlib import Path
 
 from tormagd.ground.access_keys import require_own
+from tormagd.ground.files import is_left_socket
 
 
 class SocketFile:
@@ -104,7 +104,7 @@ def _listening(path: Path) -> socket.socket:
     if _identity(path) is not None:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
-        if not _is_left(path):
+        if not is_left_socket(path):
             raise OSError(f"{path} is the socket of another program that runs; it is left alone: name another path")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
@@ -115,12 +115,6 @@ def _listening(path: Path) -> socket.socket:
         made.close()
         raise OSError(f"{path} cannot be bound: {error.strerror or error}; name another path") from error
     return made
-
-
-def _is_left(path: Path) -> bool:
-    """Tell whether nobody has the socket open: the kernel then refuses a connection, of whatever type it was."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
-        return probe.connect_ex(str(path)) in (errno.ECONNREFUSED, errno.ENOENT)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

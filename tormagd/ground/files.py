@@ -6,6 +6,7 @@ Only a regular file is read or replaced. What is written replaces it in one step
 import contextlib
 import errno
 import os
+import socket
 from collections.abc import Iterable, Iterator
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -48,6 +49,12 @@ def new_file(path: Path) -> Iterator[Path]:
     path.open("xb").close()
     with _whole_or_gone(path, path):
         yield path
+
+
+def is_left_socket(path: Path) -> bool:
+    """Tell whether nobody has the socket open: the kernel then refuses a connection, of whatever type it was."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+        return probe.connect_ex(str(path)) in (errno.ECONNREFUSED, errno.ENOENT)
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from tormagd.ground.files import is_left_socket
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, from_socket, to_socket
 
@@ -100,10 +101,8 @@ class CanPort:
 
 def _remove_abandoned(path: Path) -> None:
     """Remove the socket at `path` if nobody listens there. Raises OSError for anything else there."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe, contextlib.suppress(FileNotFoundError):
+    with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise OSError("it is there and not a socket; name another path")
-        try:
-            probe.connect(str(path))
-        except ConnectionRefusedError:
+        if is_left_socket(path):
             path.unlink()

@@ -34,7 +34,6 @@ def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Fi
 
 
 def draw_beside(
-    path: Path,
     time_s: Array,
     measured: Array,
     explained: Array,
@@ -42,7 +41,7 @@ def draw_beside(
     labels: tuple[str, str, str],
     title: str,
     finer: float = 1.0,
-) -> None:
+) -> "Figure":
     figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
     above.plot(time_s, measured, color="#222222", linewidth=0.8, label="measured")
     above.plot(time_s, explained, color="#d1495b", linewidth=0.8, label=labels[0])
@@ -51,7 +50,7 @@ def draw_beside(
     above.set_title(title, loc="left")
     below.plot(time_s, finer * (measured - explained), color="#2a6f97", linewidth=0.8)
     below.set(xlabel="time, s", ylabel=labels[2])
-    figure.savefig(path, format="png", dpi=110)
+    return figure
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:

@@ -10,7 +10,7 @@ The first half of the log is fitted and the second half judged; the parameters c
 import argparse
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -21,7 +21,10 @@ from tormag_lab.motor.fit import THINNED_HZ, Estimate, Gearbox, Windings, fit_ge
 from tormag_lab.motor.log import Log, read_log
 from tormag_lab.pages import draw_beside
 from tormagd.config import Config, Motor, load_config
-from tormagd.ground.files import in_place_of, new_file
+from tormagd.ground.files import new_file
+
+if TYPE_CHECKING:
+    from tormagd.view.drawing import Figure
 
 VAGUE_SHARE = 0.5
 PARAMETERS = ("mass_kg", "viscous_N_s_m", "coulomb_N", "offset_N")
@@ -45,8 +48,9 @@ def run(options: argparse.Namespace) -> Found:
     if options.write_config:
         write_config(options.write_config, result, load_config(options.config))
     if options.plot:
-        with in_place_of(options.plot, options.log) as beside:
-            draw(beside, log, result)
+        from tormagd.view.plot import save_plot
+
+        save_plot(drawn(log, result), options.plot, options.log)
     return Found(result)
 
 
@@ -147,12 +151,11 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
         raise LabError(f"{path}: {error.strerror}") from error
 
 
-def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
+def drawn(log: Log, result: dict[str, Any]) -> "Figure":
     half = len(log.t_s) // 2
     fitted = fit_volts(log.part(slice(None, half)))
     time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))
-    draw_beside(
-        path,
+    return draw_beside(
         time_s,
         measured,
         predicted,

@@ -10,7 +10,7 @@ up to 2 mm.
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,11 @@ from tormag_lab.pages import subplots
 from tormag_lab.tables import MAX_TABLE_BYTES
 from tormag_lab.training.dataset import ALLOWED, Dataset, records, write_csv
 from tormagd.element.model.displacement import MOBILISED_MM
-from tormagd.ground.files import in_place_of, new_file
+from tormagd.ground.files import new_file
 from tormagd.ground.table import MIN_ROWS, QUANTITIES, Table, Wanted, read_table
+
+if TYPE_CHECKING:
+    from tormagd.view.drawing import Figure
 
 NEEDED, MOTION = ("force_N", "field_mT"), ("rate_mm_s", "time_s", "displacement_mm")
 SIGN_SHARE = 0.95
@@ -80,8 +83,9 @@ def run(options: argparse.Namespace) -> Found:
     with new_file(options.out):
         write_csv(options.out, data)
     if options.picture is not None:
-        with in_place_of(options.picture, *options.files) as beside:
-            _draw(beside, data, missing)
+        from tormagd.view.plot import save_plot
+
+        save_plot(_drawn(data, missing), options.picture, *options.files)
     return Found(
         {
             "out": str(options.out),
@@ -255,10 +259,10 @@ def _missing(data: Dataset) -> list[str]:
     return missing
 
 
-def _draw(path: Path, data: Dataset, missing: list[str]) -> None:
+def _drawn(data: Dataset, missing: list[str]) -> "Figure":
     figure, axes = subplots((8.0, 5.0))
     points = axes.scatter(data.features[:, 2], data.features[:, 1], c=data.force_N, s=6)
     title = "\n".join(missing) or "fields and rates are covered"
     axes.set(xlabel="field, mT", ylabel="rate, mm/s", yscale="log", title=title)
     figure.colorbar(points, label="force, N")
-    figure.savefig(path, format="png", dpi=90)
+    return figure

@@ -12,7 +12,7 @@ not explain is the model error. Exit code 1 means that it is too large for the p
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -23,8 +23,11 @@ from tormag_lab.twin.estimate import keys_of, value_at
 from tormag_lab.twin.excerpt import Excerpt, excerpt_of
 from tormag_lab.twin.fit import EXPLAINED_N, STANDS_FOR, Twin, twin_of
 from tormag_lab.twin.force import EXPONENT, PIVOT_MM, STRENGTH, along, fresh_along
-from tormagd.ground.files import in_place_of, new_file
+from tormagd.ground.files import new_file
 from tormagd.simulation.parameters import Assumed, PlantParameters, load_plant
+
+if TYPE_CHECKING:
+    from tormagd.view.drawing import Figure
 
 MAX_FILES = 10
 BELIEVED = 0.4
@@ -83,8 +86,9 @@ def run(options: argparse.Namespace) -> Found:
     if options.out is not None:
         write_plant(options.out, twin, head)
     if options.plot is not None:
-        with in_place_of(options.plot, *options.files) as beside:
-            draw(beside, twin, ways[0])
+        from tormagd.view.plot import save_plot
+
+        save_plot(drawn(twin, ways[0]), options.plot, *options.files)
     return Found(figures, exit_code=0 if twin.is_explained else 1)
 
 
@@ -122,11 +126,10 @@ def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> d
     }
 
 
-def draw(path: Path, twin: Twin, way: Excerpt) -> None:
+def drawn(twin: Twin, way: Excerpt) -> "Figure":
     zero_N = 1e-3 * (twin.force.zeros[0]["zero_mN"] + twin.force.zeros[0]["drift_mN_min"] * way.minute)
     explained_N = along(twin.plant, way, twin.force.memory_N, fresh_along(twin.plant, way)) + zero_N
-    draw_beside(
-        path,
+    return draw_beside(
         way.time_s,
         way.force_N,
         explained_N,
