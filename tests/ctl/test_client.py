@@ -1,20 +1,25 @@
 """`tormagd_client`, blocking and for asyncio, at a daemon made of sockets."""
 
 import asyncio
+import math
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from decimal import Decimal
 from functools import partialmethod
 from itertools import repeat
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from tormagd_client import Client, ClientError, InFaultError, RefusedError, SettingError, UnreachableError
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import ConfigError, Curve, Endpoints, in_folder
-from tormagd_client.messages import Contact, Motion
+from tormagd_client.messages import Contact, Motion, Setpoint, decode
+from tormagd_client.wire import Numbering
 
 PATIENCE_S = 20.0
 
@@ -222,3 +227,54 @@ def test_settings_that_cannot_be_used_are_named(tmp_path):
     with pytest.raises(SettingError, match=r"robot\.key_secret"):
         Client(Endpoints(curve=Curve(client_secret=str(tmp_path / "robot.key_secret"), server_public="server.key")))
     assert issubclass(SettingError, ClientError)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"force_N": Decimal(1)}, "servo_cf is str"),
+        ({"force_N": True}, "servo_cf is bool"),
+        ({"force_N": None}, "servo_cf is missing"),
+        ({"force_N": "1"}, "servo_cf is str"),
+        ({"force_N": 2**70}, "message: allowed are"),
+        ({"force_N": 1j}, "1j is none of them"),
+        ({"valid_for_ms": True}, "valid_for_ms is bool"),
+        ({"stamp_ns": 1e18}, "stamp_ns is float"),
+        ({"preview_N": {}, "preview_dt_ms": 10.0}, "preview_N is map"),
+    ],
+)
+def test_what_the_daemon_would_refuse_is_not_sent(changed: dict[str, Any], words: str) -> None:
+    numbering = Numbering("me")
+    with pytest.raises(ValueError, match=words):
+        numbering.setpoint(**{"force_N": 1.0, "valid_for_ms": 100.0} | changed)
+    assert numbering.sent == 0
+
+
+def test_numbers_and_arrays_of_numpy_are_sent() -> None:
+    data = Numbering("me").setpoint(np.float32(1.0), np.int64(50), preview_N=np.ones(2), preview_dt_ms=np.float64(10.0))
+    sent = decode(data, Setpoint)
+    assert (sent.servo_cf, sent.valid_for_ms, sent.preview_N, sent.preview_dt_ms) == (1.0, 50.0, (1.0, 1.0), 10.0)
+
+
+def test_threads_do_not_take_each_others_answers(fake_daemon) -> None:
+    with Client.local(str(fake_daemon.directory), PATIENCE_S) as client, ThreadPoolExecutor(4) as threads:
+        assert all(status.is_homed for status in threads.map(lambda _: client.status(), range(40)))
+
+
+def test_a_client_that_was_closed_or_made_before_a_fork_says_so(fake_daemon, monkeypatch) -> None:
+    client = Client.local(str(fake_daemon.directory), PATIENCE_S)
+    client.status()
+    with monkeypatch.context() as forked:
+        forked.setattr("os.getpid", lambda: 0)
+        with pytest.raises(ClientError, match="another process"):
+            client.status()
+    client.close()
+    with pytest.raises(ClientError, match="closed"):
+        client.status()
+
+
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+@pytest.mark.parametrize("wait_s", [math.inf, math.nan, -1.0])
+def test_a_time_to_wait_is_a_number_of_seconds(run_dir, kind, wait_s: float) -> None:
+    with pytest.raises(ValueError, match="wait_s"):
+        kind.local(str(run_dir), wait_s)

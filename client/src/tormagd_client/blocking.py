@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
@@ -9,6 +10,7 @@ from typing import Any, Self
 
 import zmq
 
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, RefusedError
 from tormagd_client.messages import (
     MOTION_TOPIC,
@@ -38,16 +40,22 @@ RETRY_S = 0.1
 
 
 class Client(Connections["zmq.Socket[bytes]"]):
-    """Blocking client of the daemon at `endpoints`: commands, setpoints, telemetry."""
+    """Blocking client of the daemon at `endpoints`: commands, setpoints, telemetry. Several threads may command and
+    publish; one may read a topic.
+    """
 
     _made = zmq.Context
+
+    def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
+        super().__init__(endpoints, wait_s, source)
+        self._commanding, self._publishing = threading.Lock(), threading.Lock()
 
     def request(self, command: str, **args: Any) -> dict[str, Any]:
         """Give `command` and return its result.
 
         Raises UnreachableError without an answer in time, RefusedError, InFaultError.
         """
-        return self._result(self.ask(command, **args), self._wait_s)
+        return self._result(command, args, self._wait_s)
 
     def ask(self, command: str, **args: Any) -> Pending:
         """Send `command` without waiting, and return what `answer` takes."""
@@ -73,7 +81,7 @@ class Client(Connections["zmq.Socket[bytes]"]):
 
     def status(self, wait_s: float = math.inf) -> Status:
         """Return what the daemon is doing, waiting at most `wait_s`. Raises as `request`."""
-        return understood(self._result(self.ask("status"), min(wait_s, self._wait_s)), Status)
+        return understood(self._result("status", {}, min(wait_s, self._wait_s)), Status)
 
     def describe(self) -> Description:
         """Return what the daemon runs: configuration, scene, model, device. Raises as `request`."""
@@ -106,7 +114,8 @@ class Client(Connections["zmq.Socket[bytes]"]):
         Raises ValueError for a value that is not allowed, TypeError for an unknown field, and UnreachableError if
         nobody takes setpoints within `wait_s`.
         """
-        self.require_taken().send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
+        with self._publishing:
+            self.require_taken().send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def require_taken(self) -> "zmq.Socket[bytes]":
         """Wait until the daemon takes setpoints, and return the socket for them. Raises UnreachableError."""
@@ -147,8 +156,9 @@ class Client(Connections["zmq.Socket[bytes]"]):
     ) -> None:
         self.close()
 
-    def _result(self, pending: Pending, wait_s: float) -> dict[str, Any]:
-        result = self.answer(pending, wait_s)
+    def _result(self, command: str, args: dict[str, Any], wait_s: float) -> dict[str, Any]:
+        with self._commanding:
+            result = self.answer(self.ask(command, **args), wait_s)
         if result is None:
             raise self._unanswered(wait_s)
         return result

@@ -582,8 +582,18 @@ def _in_words(text: str) -> str:
     return f"{match[3] or 'message'} is {got}: allowed is {expected.replace(' | null', '')}{remedy}"
 
 
-def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply) -> bytes:
-    return _ENCODER.encode(message)
+def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply | dict[str, Any]) -> bytes:
+    """Return the message as bytes; numbers and arrays of NumPy go as numbers and lists. Raises MessageError."""
+    try:
+        return _ENCODER.encode(message)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MessageError(f"message: allowed are numbers, texts, lists and maps: {error}") from error
 
 
-_ENCODER = msgspec.msgpack.Encoder()
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{in_short(value)} is none of them")
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)

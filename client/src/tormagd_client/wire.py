@@ -1,6 +1,8 @@
 """What both clients share: addresses and keys, requests and their answers, setpoints."""
 
 import itertools
+import math
+import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,7 +13,7 @@ import zmq
 
 from tormagd_client import __version__
 from tormagd_client.endpoints import ConfigError, Curve, Endpoints, in_folder
-from tormagd_client.errors import InFaultError, RefusedError, SettingError, UnreachableError, unreachable
+from tormagd_client.errors import ClientError, InFaultError, RefusedError, SettingError, UnreachableError, unreachable
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
@@ -30,7 +32,7 @@ from tormagd_client.messages import (
     decode,
     encode,
 )
-from tormagd_client.printable import each_text, printable
+from tormagd_client.printable import each_text, printable, require
 
 T = TypeVar("T", Status, Description, ArmReport)
 Told = TypeVar("Told", Telemetry, Motion, Verdict)
@@ -200,18 +202,21 @@ class Numbering:
         """Return the next setpoint as bytes; `stamp_ns` is when the force is meant, None for now. Raises ValueError for
         a value that is not allowed, and TypeError for an unknown field; neither uses up a number.
         """
-        made = Setpoint(
-            v=VERSION,
-            source=self.source,
-            seq=self.sent,
-            session=self.session,
-            stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
-            servo_cf=force_N,
-            valid_for_ms=valid_for_ms,
-            withdraw_cf=withdraw_cf,
-            contact=contact if contact is None or isinstance(contact, Contact) else _contact(contact),
-            **fields,
-        )
+        given = {
+            "v": VERSION,
+            "source": self.source,
+            "seq": self.sent,
+            "session": self.session,
+            "stamp_ns": time.time_ns() if stamp_ns is None else stamp_ns,
+            "servo_cf": force_N,
+            "valid_for_ms": valid_for_ms,
+            "withdraw_cf": withdraw_cf,
+            "contact": contact if contact is None or isinstance(contact, Contact) else _contact(contact),
+        }
+        if unknown := sorted(fields.keys() - (set(Setpoint.__struct_fields__) - given.keys())):
+            raise TypeError(f"{unknown[0]}: allowed are the fields of a setpoint, as docs/messages.md lists them")
+        # as the daemon reads it
+        made = decode(encode({name: value for name, value in (given | fields).items() if value is not None}), Setpoint)
         self.sent += 1
         return encode(made)
 
@@ -223,7 +228,8 @@ class Connections(Generic[SocketT]):
     "Makes the ZeroMQ context of the sockets."
 
     def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
-        self._endpoints, self._wait_s = endpoints, wait_s
+        require(0.0 <= wait_s < math.inf, "wait_s", wait_s, "a finite number of seconds, 0 or more")
+        self._endpoints, self._wait_s, self._process = endpoints, wait_s, os.getpid()
         self._keys = keys_of(endpoints.curve)
         self._numbering = Numbering(source)
         self._context = type(self)._made()
@@ -238,11 +244,15 @@ class Connections(Generic[SocketT]):
 
     def close(self) -> None:
         """Close the connections; pending setpoints get 0.2 s."""
+        if self._process != os.getpid():  # the sockets are those of the process before a fork
+            return
         for socket in self._sockets.values():
             socket.close()
         self._context.term()
 
     def _socket(self, kind: int, address: str, topic: bytes = b"") -> SocketT:
+        if self._context.closed or self._process != os.getpid():
+            raise ClientError("closed", "this client was closed, or made in another process", "make one for each")
         if (kind, topic) not in self._sockets:
             self._sockets[kind, topic] = opened(self._context.socket(kind), address, self._keys, topic)
         return self._sockets[kind, topic]
