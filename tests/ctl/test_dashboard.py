@@ -5,6 +5,7 @@ import contextlib
 import importlib.resources
 import itertools
 import json
+import logging
 import math
 import re
 import shutil
@@ -20,6 +21,7 @@ import msgspec
 import pytest
 import zmq
 from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType, WSServerHandshakeError, web
+from aiohttp.http_exceptions import BadHttpMessage
 from aiohttp.test_utils import TestClient, TestServer
 from hypothesis import given, settings, strategies as st
 
@@ -32,7 +34,7 @@ from tormagd.view.frame import SHOWN_S, Frame, late_counts
 from tormagd.view.live import WAITING, Live
 from tormagd.view.recorded import Recorded
 from tormagd.view.report import report
-from tormagd.view.server import Operating, application
+from tormagd.view.server import Operating, application, is_own
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import in_folder
 from tormagd_client.errors import RefusedError
@@ -628,3 +630,11 @@ async def test_the_example_shows_the_stream(fake_daemon: Any, tmp_path: Path) ->
                 await page.until("stream.readyState === WebSocket.OPEN || stream.readyState === WebSocket.CLOSED")
                 await page.until(f"document.body.textContent.includes({json.dumps(shows)})")
                 await page.ask("stream.close()")
+
+
+@pytest.mark.parametrize(
+    ("error", "is_told"), [(BadHttpMessage("no method"), False), (KeyError("a"), True), (None, True)]
+)
+def test_a_malformed_request_is_answered_and_no_error_of_this_program(error: Exception | None, is_told: bool) -> None:
+    found = None if error is None else (type(error), error, None)
+    assert is_own(logging.makeLogRecord({"exc_info": found})) is is_told

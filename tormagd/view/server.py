@@ -7,6 +7,7 @@ rebinding by Host. The secret travels in headers, because addresses get into log
 import asyncio
 import contextlib
 import hmac
+import logging
 import math
 import re
 import signal
@@ -17,6 +18,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.typedefs import Handler
 
 from tormagd.record.overview import LATE_US
@@ -88,6 +90,7 @@ def application(
 async def serve(made: web.Application, port: int, ready: Callable[[str], None]) -> None:
     """Serve on LOOPBACK until SIGINT or SIGTERM; `port` 0 takes a free one."""
     over = asyncio.Event()
+    logging.getLogger("aiohttp.server").addFilter(is_own)
     runner = web.AppRunner(made, access_log=None, shutdown_timeout=0.5)
     await runner.setup()
     try:
@@ -98,6 +101,11 @@ async def serve(made: web.Application, port: int, ready: Callable[[str], None]) 
         await over.wait()
     finally:
         await runner.cleanup()
+
+
+def is_own(record: logging.LogRecord) -> bool:
+    """Tell whether an error is no malformed request's, which is answered."""
+    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 
 def _admission(operating: Operating | None, origin: str | None) -> Callable[..., Awaitable[web.StreamResponse]]:
