@@ -331,6 +331,15 @@ def _both_ways(position: object) -> None:
         position.setdefault("closing_mm_s", position["gap_speed_mm_s"])
 
 
+class _Addressed(msgspec.Struct, frozen=True):
+    endpoints: Endpoints = msgspec.field(default_factory=Endpoints)
+
+
+def load_endpoints(path: Path | None) -> Endpoints:
+    """Read the endpoints alone of a configuration file: who stops a daemon needs no more of it."""
+    return Endpoints() if path is None else convert(path, _Addressed).endpoints
+
+
 def load_config(path: Path | None) -> Config:
     """Read the configuration file `path`; None: take the defaults."""
     stated: set[str] = set()

@@ -13,6 +13,7 @@ from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import firmware_text, status_text
 from tormagd.scenes.measured import ENDING, MeasuredScene, OperatingPoint, Served
 from tormagd.scenes.scene import load_scene, scene_path
+from tormagd_client.endpoints import ENDPOINTS
 from tormagd_client.messages import LinkReport, Status
 
 SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply, then tormagctl arm"}
@@ -128,6 +129,17 @@ def test_a_refusal_tells_code_message_and_hint(fake_daemon, ctl, code, expected)
     assert refused.error == {"code": code, "message": "cannot enable", "hint": "do this first"}
     captured = ctl(*fake_daemon.at, "enable").ended(expected)
     assert (captured.out, captured.err) == ("", "tormagctl enable: cannot enable\n  next: do this first\n")
+
+
+@pytest.mark.parametrize("command", ["stop", "disable", "status"])
+def test_a_daemon_is_stopped_although_its_configuration_was_spoilt_since(fake_daemon, ctl, tmp_path, command):
+    addresses = "\n".join(f'{name} = "ipc://{fake_daemon.directory}/{name}"' for name in ENDPOINTS)
+    spoilt = tmp_path / "tormagd.toml"
+    spoilt.write_text(f"[endpoints]\n{addresses}\n[limits]\nskew_fault_mm = 0.0001\n[typo]\n")
+    ctl("--config", str(spoilt), "--wait", "5", command)
+    assert fake_daemon.commands[0] == command
+    spoilt.write_text("x = [")
+    assert "or give --endpoint" in ctl("--config", str(spoilt), command).ended(2).err
 
 
 def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_daemon, ctl):

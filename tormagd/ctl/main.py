@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from tormagd import __version__
-from tormagd.config import Config, load_config
+from tormagd.config import Config, load_config, load_endpoints
 from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL, Option
 from tormagd.ctl.outcome import (
     Outcome,
@@ -87,10 +87,13 @@ def _run(options: argparse.Namespace) -> Outcome:
     with contextlib.ExitStack() as stack:
         if command.has_daemon:
             with as_usage_error(
-                ConfigError, hint="correct the file; tormagd --check --config FILE shows what is in force"
+                ConfigError,
+                hint="correct the file (tormagd --check --config FILE), or give --endpoint ADDRESS in its place",
             ):
-                known["config"] = load_config(file)
-            known["endpoints"] = _endpoints(known["config"].endpoints, options)
+                if "config" in command.needs:
+                    known["config"] = load_config(file)
+                endpoints = load_endpoints(file)
+            known["endpoints"] = _endpoints(endpoints, options)
         else:
             known["parser"] = parser()
         if "client" in command.needs:

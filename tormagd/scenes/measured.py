@@ -21,8 +21,8 @@ WORSE = 0.2
 ENDING = ".measured.json"
 LONGEST = 100_000
 SERIAL_SAVES = 0.15e-6
-"""A tick on a serial line takes so many `machine_us` less than on CAN, by which scenes are measured: 0.11 to 0.22 in two
-scenes with 83 and 500 setpoints a second."""
+"""A tick on a serial line takes so many `machine_us` less than on CAN, by which scenes are measured: 0.11 to 0.22 us in
+two scenes with 83 and 500 setpoints a second."""
 AHEAD_MS = 400.0
 "How far ahead a publisher says what comes, if it does."
 GIVEN = {
