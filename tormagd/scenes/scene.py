@@ -15,12 +15,15 @@ from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ground.files import named, shipped
 from tormagd.ground.toml_file import convert
 from tormagd_client.endpoints import Strict
+from tormagd_client.printable import require
 
 AUTO = "auto"
 MIN_SETPOINT_HZ = 12.0
 "Setpoints a tenth of a second apart are no stream any more."
 MIN_CONTROL_HZ = 500
 "Safety is watched in every control tick."
+LONGEST_RELEASE_S = 30.0
+"By then a publisher that is lost has let go of the whole force."
 AND_UNMET = "; and "
 "Between what a device does not give of a scene."
 ENDING = ".toml"
@@ -143,10 +146,10 @@ class Insert(Strict, frozen=True):
     "A safetensors file (relative to the scene file), or the name of a shipped model."
     gap_closed_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 45.0
     gap_open_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 95.0
-    inner_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 4.0
-    outer_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 11.0
-    thickness_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
-    roller_radius_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
+    inner_radius_mm: Annotated[float, Meta(ge=0.01, le=100.0)] = 4.0
+    outer_radius_mm: Annotated[float, Meta(ge=0.01, le=100.0)] = 11.0
+    thickness_mm: Annotated[float, Meta(ge=0.01, le=200.0)] = 20.0
+    roller_radius_mm: Annotated[float, Meta(ge=0.01, le=200.0)] = 20.0
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] | UnsetType = UNSET
     "The fastest that the task lets the gap move."
 
@@ -165,6 +168,10 @@ class Solver(Strict, frozen=True):
             value = getattr(self, key)
             if self.name == AUTO and value is not UNSET:
                 raise ValueError(f"solver.{key} = {value}: allowed only beside a solver.name other than {AUTO}")
+
+
+def is_plain(text: str, besides: str) -> bool:
+    return all(each.isprintable() or each in besides for each in text)
 
 
 class Scene(Strict, frozen=True):
@@ -197,6 +204,16 @@ class Scene(Strict, frozen=True):
                 "insert.outer_radius_mm",
                 self.insert.outer_radius_mm,
             ),
+        )
+        require(is_plain(self.name, ""), "name", self.name, "printable characters")
+        require(is_plain(self.description, "\n\t"), "description", self.description, "printable characters and lines")
+        least_N_s = self.force.most_N / LONGEST_RELEASE_S
+        is_let_go = self.force.release_N_s >= least_N_s
+        require(
+            is_let_go,
+            "force.release_N_s",
+            self.force.release_N_s,
+            f"at least force.most_N / {LONGEST_RELEASE_S:g} s, {least_N_s:.2g}",
         )
         for low_name, low, high_name, high in pairs:
             if not low < high:
