@@ -128,8 +128,8 @@ class Client(Connections["zmq.Socket[bytes]"]):
         return setpoints
 
     def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
-        """Return the telemetry since the last call, oldest first; wait up to `wait_s` for the first message. Raises
-        MessageError for an invalid one.
+        """Return the telemetry since the last call, oldest first; wait up to `wait_s` for the first message. Of more
+        than 1,000 that wait the newest are lost: call it every second. Raises MessageError for an invalid one.
         """
         return self._arrived(TELEMETRY_TOPIC, Telemetry, wait_s)
 
