@@ -47,6 +47,8 @@ class Device(Strict, frozen=True):
     def __post_init__(self) -> None:
         is_usable = self.port.isprintable() and self.port != ""
         require(is_usable, "device.port", self.port, "at least one printable character")
+        for key in ("profiles", "calibrations"):
+            require(getattr(self, key).isprintable(), f"device.{key}", getattr(self, key), "printable characters")
 
 
 class Sources(Strict, frozen=True):

@@ -299,7 +299,7 @@ def test_a_bad_configuration_ends_with_two_and_says_why_on_stderr(write, capsys,
 @pytest.mark.parametrize(
     ("force", "is_served"),
     [
-        ("least_N = 900.0\nmost_N = 1000.0", False),
+        ("least_N = 50.0\nmost_N = 60.0", False),
         ("least_N = 0.5\nmost_N = 6.0", False),
         ("least_N = 0.0\nmost_N = 0.5", False),
         ("least_N = 0.0\nmost_N = 4.8", True),

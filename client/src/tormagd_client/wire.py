@@ -213,8 +213,9 @@ class Numbering:
             "withdraw_cf": withdraw_cf,
             "contact": contact if contact is None or isinstance(contact, Contact) else _contact(contact),
         }
-        if unknown := sorted(fields.keys() - (set(Setpoint.__struct_fields__) - given.keys())):
-            raise TypeError(f"{unknown[0]}: allowed are the fields of a setpoint, as docs/messages.md lists them")
+        others = [name for name in Setpoint.__struct_fields__ if name not in given]
+        if unknown := sorted(fields.keys() - set(others)):
+            raise TypeError(f"{unknown[0]}: allowed are {', '.join(others)}")
         # as the daemon reads it
         made = decode(encode({name: value for name, value in (given | fields).items() if value is not None}), Setpoint)
         self.sent += 1
@@ -229,6 +230,7 @@ class Connections(Generic[SocketT]):
 
     def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
         require(0.0 <= wait_s < math.inf, "wait_s", wait_s, "a finite number of seconds, 0 or more")
+        require(isinstance(source, str), "source", source, "a text")
         self._endpoints, self._wait_s, self._process = endpoints, wait_s, os.getpid()
         self._keys = keys_of(endpoints.curve)
         self._numbering = Numbering(source)

@@ -206,8 +206,8 @@ def _stable_margins(config: Config) -> Margins:
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
     if stability.phase_margin_deg < MIN_PHASE_MARGIN_DEG or stability.gain_margin_dB < MIN_GAIN_MARGIN_DB:
         raise ConfigError(
-            f"position: these gains leave a phase margin of {stability.phase_margin_deg:.0f} degrees and a gain margin "
-            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {MIN_PHASE_MARGIN_DEG:g} and "
+            f"position: these gains leave a phase margin of {stability.phase_margin_deg:.2f} degrees and a gain margin "
+            f"of {stability.gain_margin_dB:.2f} dB: allowed is at least {MIN_PHASE_MARGIN_DEG:g} and "
             f"{MIN_GAIN_MARGIN_DB:g}"
         )
     return stability
