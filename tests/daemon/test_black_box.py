@@ -4,7 +4,6 @@ import contextlib
 import socket
 import time
 import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock, patch
 
@@ -22,7 +21,7 @@ from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.record.journal import MAX_ENTRIES, PLAN, STEP, TEACH, Journal
-from tormagd.record.keeper import Begin, End, Part, Said, Write, Written
+from tormagd.record.keeper import Begin, End, Part, Ring, Write, Written
 from tormagd.record.telemetry import Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -43,13 +42,14 @@ class Rig:
         self.process = Mock()
         self.stepper, self.planner = core.stepper(), core.planner()
         self.output = self.stepper.step(1.0, None, self.planner.planned)
-        with patch("tormagd.daemon.child_process.start_child", self.start):
+        nowhere = patch("tormagd.record.keeper.SHARED_MEMORY", "/nowhere")
+        with nowhere, patch("tormagd.daemon.child_process.start_child", self.start):
             self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000)
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
         self.box.begin(self.stepper, self.planner, connection)
 
-    def start(self, _module: str, its: socket.socket):
-        self.its = its.dup()
+    def start(self, _module: str, its: socket.socket, file: int):
+        self.its, self.ring = its.dup(), Ring(file)
         self.its.setblocking(False)
         return self.process
 
@@ -60,12 +60,15 @@ class Rig:
                 Moment(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
             )
 
-    def heard(self) -> list[Said]:
-        said: list[Said] = []
+    def heard(self) -> list[Write | End]:
+        said: list[Write | End] = []
         with contextlib.suppress(BlockingIOError):
             while data := self.its.recv(4_000_000):
-                said.append(msgspec.msgpack.decode(data, type=Said))
+                said.append(msgspec.msgpack.decode(data, type=Write | End))
         return said
+
+    def parts(self) -> list[Part]:
+        return [part for _, part in self.ring.kept()]
 
 
 @pytest.fixture
@@ -83,16 +86,16 @@ def names(part: Part) -> list[str]:
 def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) -> None:
     rig.tick(PART_TICKS // 2 - 1)
     rig.box.journal.note(PLAN, 1.0, TimedSetpoint(1.5, 1.0, 0.1))
-    first, *parts = rig.heard()
-    for _ in range(302):
-        rig.tick(10)
-        parts += rig.heard()
-    assert (first, {type(part) for part in parts}) == (Begin("/boxes", {"format": "1"}), {Part})
+    rig.tick(3_020)
+    parts = rig.parts()
+    assert [begun for begun, _ in rig.ring.kept()] == [Begin("/boxes", {"format": "1"})] * len(parts)
     assert (names(parts[0])[:3], names(parts[0])[-3:]) == (["state", "step", "tick"], ["plan", "step", "tick"])
     assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 100, 200, 300]
     assert [each for part in parts for each in names(part)].count("tick") == 3_015
     rig.box.begin_scene({"format": "2"}, rig.stepper, rig.planner)
-    assert rig.heard()[-1] == Begin("/boxes", {"format": "2"})
+    rig.tick(PART_TICKS)
+    begun, part = rig.ring.kept()[-1]
+    assert (begun, names(part)[:3]) == (Begin("/boxes", {"format": "2"}), ["missing", "state", "step"])
 
 
 def test_nothing_stays_of_what_was_handed_over(rig: Rig) -> None:
@@ -100,7 +103,6 @@ def test_nothing_stays_of_what_was_handed_over(rig: Rig) -> None:
     tracemalloc.start()
     for part in range(100):
         rig.tick(PART_TICKS)
-        rig.heard()
         if part in (49, 99):
             stays_bytes.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
@@ -113,7 +115,7 @@ def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) 
     for _ in range(PART_TICKS):
         loop.tick()
         rig.tick()
-    _, part = rig.heard()
+    (part,) = rig.parts()
     assert names(part)[:6] == ["state", "wrote", "step", "tick", "read", "wrote"]
     state, (_, time_s, sent, unsent), *_ = msgspec.msgpack.decode(part.entries)
     assert (state[3]["stream"], time_s, sent, unsent) == (
@@ -124,24 +126,26 @@ def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) 
     )
 
 
-def test_what_the_other_process_does_not_take_is_counted_and_control_goes_on(rig: Rig) -> None:
-    while not rig.box.report().dropped:
-        rig.tick(PART_TICKS)
-    rig.heard()
-    rig.tick(2 * PART_TICKS)
-    after = rig.heard()
-    assert names(after[0])[:2] == ["missing", "state"]
-    assert "state" not in names(after[1])
+def test_what_finds_no_room_is_counted_and_control_goes_on(rig: Rig) -> None:
+    with patch("os.pwrite", side_effect=OSError(28, "No space left on device")):
+        rig.tick(2 * PART_TICKS)
+    assert (rig.box.report().dropped, "No space" in rig.box.report().refusal, rig.parts()) == (2, True, [])
+    rig.tick(3 * PART_TICKS)
+    after = [names(part) for part in rig.parts()]
+    assert [told[0] for told in after] == ["missing", "state", "step"]
+    assert [told.count("state") for told in after] == [0, 1, 0]
 
 
 def test_a_request_waits_for_a_process_that_is_held_up(rig: Rig) -> None:
-    while not rig.box.report().dropped:
-        rig.tick(PART_TICKS)
+    while rig.box._beside.send(b"x"):
+        pass
     path = rig.box.write("SKEW", 2.0, {"firmware": "1.0"})
     assert path.match("/boxes/*Z-SKEW.mcap")
-    assert not any(isinstance(said, Write) for said in rig.heard())
+    with contextlib.suppress(BlockingIOError):
+        while rig.its.recv(1_000) == b"x":
+            pass
     rig.box.look()
-    assert rig.heard() == [Write(path.name, "SKEW", 2.0, {"firmware": "1.0"})]
+    assert rig.heard() == [Write(str(path), "SKEW", 2.0, {"format": "1", "firmware": "1.0"})]
     for written in (Written(path.name), Written("b.mcap", "No space left on device")):
         rig.its.send(msgspec.msgpack.encode(written))
         rig.box.look()
@@ -161,25 +165,16 @@ def test_requests_take_no_place_of_a_fault(rig: Rig, monkeypatch: pytest.MonkeyP
     rig.box.write("REQUEST", 0.0, {})
 
 
-@pytest.mark.parametrize(
-    "notices", [lambda rig: rig.box.look(), lambda rig: rig.tick(PART_TICKS), lambda rig: rig.box.close()]
-)
-def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: Callable[[Rig], None]) -> None:
+@pytest.mark.parametrize("is_noticed", [True, False])
+def test_a_process_that_ends_is_named_and_harms_no_end(rig: Rig, is_noticed: bool) -> None:
     rig.its.close()
-    notices(rig)
-    assert "ended" in rig.box.report().refusal
-    rig.tick(100)
-    assert rig.box.journal.take() == []
-    with pytest.raises(RefusedError, match="has ended"):
-        rig.box.write("REQUEST", 0.0, {})
+    if is_noticed:
+        rig.box.look()
+        assert "ended" in rig.box.report().refusal
     rig.box.close()
 
 
-@pytest.mark.parametrize("is_heard", [False, True])
-def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch, is_heard: bool
-) -> None:
-    rig.box.is_heard = is_heard
+def test_a_keeper_that_ended_is_replaced_and_no_tick_is_lost(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tormagd.daemon.child_process.start_child", rig.start)
     waits: list[float] = []
     for _ in range(4):
@@ -187,23 +182,20 @@ def test_a_keeper_that_ended_is_replaced_and_keeps_on_from_a_state(
         ended_s = time.monotonic()
         rig.box.look()
         waits.append(round(rig.box._due_s - ended_s))
-        rig.tick(3)
+        rig.tick(PART_TICKS)
         monkeypatch.setattr(rig.box, "_due_s", ended_s)
         rig.box.look()
-    assert (waits, rig.box.report().refusal) == ([1] * 4, "")
-    rig.tick(PART_TICKS + 1)
-    begun, part = rig.heard()
-    assert begun == Begin("/boxes", {"format": "1"}, is_again=True)
-    assert isinstance(part, Part)
-    assert names(part)[:4] == ["missing", "state", "step", "tick"]
+    assert (waits, rig.box.report().refusal, rig.box.report().dropped) == ([1] * 4, "", 0)
+    told = [name for part in rig.parts() for name in names(part)]
+    assert (told.count("tick"), told.count("missing")) == (4 * PART_TICKS - PART_TICKS // 2, 0)
     rig.its.close()
     rig.box.look()
-    path = rig.box.write("SKEW", 0.0, {})
+    paths = [rig.box.write(reason, 0.0, {}) for reason in ("SKEW", "REQUEST")]
     monkeypatch.setattr(rig.box, "_due_s", ended_s)
     assert rig.box.is_missing
     rig.box.look()
     rig.box.look()
-    assert (rig.heard()[1:], rig.box.is_missing) == ([Write(path.name, "SKEW", 0.0, {})], False)
+    assert ([said.path for said in rig.heard()], rig.box.is_missing) == ([*map(str, paths)], False)
 
 
 def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) -> None:
@@ -211,6 +203,7 @@ def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) 
     rig.tick(PART_TICKS)
     assert "cannot be written" in rig.box.report().refusal
     rig.tick(100)
+    assert len(rig.parts()) == 10
 
 
 def test_it_says_when_it_ends(rig: Rig) -> None:
@@ -249,7 +242,7 @@ def test_what_is_not_there_is_named_and_no_reason_not_to_run(
 ) -> None:
     monkeypatch.setattr(name, fails)
     box = BlackBox(Path("/boxes"), {}, 1_000)
-    assert (says in box.report().refusal, box.journal.is_kept) == (True, False)
+    assert says in box.report().refusal
     box.close()
 
 

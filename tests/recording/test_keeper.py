@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -25,30 +26,33 @@ from tormagd.record.keeper import (
     End,
     Part,
     Ring,
-    Said,
     Write,
     Written,
-    ring_paths,
+    in_shared_memory,
 )
 from tormagd.record.writer import is_tick
 
 PATIENCE_S = 60.0
-HEADER = {"format": "0", "columns": json.dumps(["t_ns", "x"])}
+HEADER = {"format": "0", "scene": "a", "columns": json.dumps(["t_ns", "x"])}
 
 
 def part(time_s: float, size: int = 100) -> Part:
     return Part(time_s, bytes(size))
 
 
+def parts_in(ring: Ring) -> list[Part]:
+    return [each for _, each in ring.kept()]
+
+
 def kept(ring: Ring) -> int:
-    return sum(len(each.entries) for each in ring.parts())
+    return sum(len(each.entries) for each in parts_in(ring))
 
 
 def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
     ring = Ring()
     for number in range(10_000):
         ring.put(part(0.02 * number))
-    parts = ring.parts()
+    parts = parts_in(ring)
     assert parts[-1].time_s - parts[0].time_s == pytest.approx(KEPT_S, abs=0.021)
 
 
@@ -59,7 +63,8 @@ def test_the_ring_holds_no_more_bytes_than_it_may() -> None:
         if number % 40 == 39:
             assert MAX_BYTES // 2 - 1_000_000 <= kept(ring) <= MAX_BYTES or number < 60
     ring.put(part(1.0, MAX_BYTES + 1))
-    assert ring.parts()[-1].time_s == 1.0  # the newest is always there
+    assert parts_in(ring)[-1].time_s == 1.0  # the newest is always there
+    assert os.fstat(ring.file).st_blocks * 512 < 2 * MAX_BYTES + 2_000_000
 
 
 @settings(max_examples=30)
@@ -69,10 +74,19 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
     for step_s, size in steps:
         now_s += step_s
         ring.put(part(now_s, size))
-        parts = ring.parts()
+        parts = parts_in(ring)
         assert kept(ring) <= 200
         assert parts[-1].time_s - parts[0].time_s <= 5.0
         assert parts[-1].time_s == now_s
+
+
+def test_a_ring_that_broke_off_within_a_part_has_those_before() -> None:
+    ring, scenes = Ring(), [Begin("/boxes", {"scene": name}) for name in "ab"]
+    for number, begun in enumerate(scenes):
+        ring.begin(begun)
+        ring.put(part(float(number)))
+        os.pwrite(ring.file, b"\xc1" * 50, ring._at + 4)
+    assert [(begun, each.time_s) for begun, each in Ring(ring.file).kept()] == [(scenes[0], 0.0), (scenes[1], 1.0)]
 
 
 def test_a_list_that_begins_with_a_number_is_a_tick() -> None:
@@ -83,34 +97,54 @@ def test_a_list_that_begins_with_a_number_is_a_tick() -> None:
 
 
 class Process:
-    def __init__(self) -> None:
+    """A keeper, and what a daemon does: parts go into the ring, words to the keeper."""
+
+    def __init__(self, folder: Path, ring: Ring | None = None) -> None:
         self.ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.ours.settimeout(PATIENCE_S)
+        self.ring = ring or Ring(in_shared_memory(str(folder)))
+        self.ring_path = self.ring.path
         with its:
-            number = its.fileno()
+            files = its.fileno(), self.ring.file
             self.child = subprocess.Popen(
-                [sys.executable, "-P", "-m", KEEPER, str(number)],
-                pass_fds=(number,),
+                [sys.executable, "-P", "-m", KEEPER, *map(str, files)],
+                pass_fds=files,
                 stderr=subprocess.PIPE,
                 text=True,
             )
 
-    def say(self, *words: Said) -> None:
+    def say(self, *words: Begin | Part | Write | End) -> None:
         for word in words:
-            self.ours.send(msgspec.msgpack.encode(word))
+            if isinstance(word, Begin):
+                self.ring.begin(word)
+            elif isinstance(word, Part):
+                self.ring.put(word)
+            else:
+                self.ours.send(msgspec.msgpack.encode(word))
 
     def heard(self) -> Written:
         return msgspec.msgpack.decode(self.ours.recv(65_536), type=Written)
 
+    def die(self) -> None:
+        """End as a daemon that is killed does."""
+        self.ours.close()
+        os.close(self.ring.file)
+
 
 @pytest.fixture
-def process() -> Iterator[Process]:
-    made = Process()
+def process(tmp_path: Path) -> Iterator[Process]:
+    made = Process(tmp_path)
     yield made
     made.ours.close()
     if made.child.poll() is None:
         made.child.kill()
     made.child.communicate()
+    made.ring_path.unlink(missing_ok=True)
+
+
+def written(folder: Path, name: str, after_s: float = 0.0, **header: str) -> Write:
+    reason = name.removesuffix(".mcap").rpartition("-")[2]
+    return Write(str(folder / name), reason, after_s, HEADER | header)
 
 
 def ticks(first: int, count: int) -> Part:
@@ -125,38 +159,39 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
         (folder / f"20400101T0000{number:02d}.000Z-OLD.mcap").touch()  # by a clock that was ahead
         (folder / f"20200101T0000{number:02d}.000Z-REQUEST.mcap").touch()
     process.say(Begin(str(folder), HEADER), ticks(1, 20), ticks(21, 20))
-    process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {"firmware": "1.2"}))
+    process.say(written(folder, "20300101T000000.000Z-SKEW.mcap", firmware="1.2"))
     assert process.heard() == Written("20300101T000000.000Z-SKEW.mcap")
     box = read_black_box(folder / "20300101T000000.000Z-SKEW.mcap")
     assert (box.header["reason"], box.header["firmware"], box.is_complete) == ("SKEW", "1.2", True)
     assert [entry[0] for entry in box.entries if entry != "step"] == list(range(1, 41))
     assert len(list(folder.iterdir())) == 2 * MAX_FILES + 3
-    process.say(Write("20300101T000000.000Z-REQUEST.mcap", "REQUEST", 0.0, {}))
+    process.say(written(folder, "20300101T000000.000Z-REQUEST.mcap"))
     assert (process.heard().refusal, len(list(folder.iterdir()))) == ("", 2 * MAX_FILES)
     # a name that is taken, or a folder that is none, says so
-    process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {}))
+    process.say(written(folder, "20300101T000000.000Z-SKEW.mcap"))
     assert "exists" in process.heard().refusal
-    process.say(Write("20300102T000000.000Z-DUE.mcap", "DUE", 3_600.0, {}))
-    process.say(Begin(str(folder / "20300101T000000.000Z-SKEW.mcap"), HEADER))
-    assert process.heard() == Written("20300102T000000.000Z-DUE.mcap")
-    process.say(Write("x.mcap", "SKEW", 0.0, {}))
-    assert "x.mcap" in process.heard().refusal
+    process.say(written(folder / "20300101T000000.000Z-SKEW.mcap", "x-SKEW.mcap"))
+    assert "x-SKEW.mcap" in process.heard().refusal
+    # what is due later is of the scene of which it was asked for
+    process.say(written(folder, "20300102T000000.000Z-DUE.mcap", after_s=3_600.0))
+    process.say(Begin(str(folder), HEADER | {"scene": "b"}), Part(0.05, b"\xc1"))
     # so does a part that is none
-    process.say(Begin(str(folder), HEADER), Part(0.0, b"\xc1"), Write("y.mcap", "SKEW", 0.0, {}))
-    assert process.heard().refusal.startswith(f"{folder}/y.mcap: DecodeError")
+    process.say(written(folder, "y-SKEW.mcap", scene="b"))
+    assert process.heard().refusal.startswith(f"{folder}/y-SKEW.mcap: DecodeError")
     # no word, no daemon: it was killed. Each beginning is of another scene, and keeps nothing of the one before
-    process.say(Begin(str(folder), HEADER), ticks(41, 20), Write("2031Z-LATER.mcap", "LATER", 3_600.0, {}))
-    process.ours.close()
+    process.say(Begin(str(folder), HEADER | {"scene": "c"}), ticks(61, 20))
+    process.say(written(folder, "2031Z-LATER.mcap", 3_600.0, scene="c"))
+    process.die()
     assert process.child.wait(PATIENCE_S) == 0
     (left,) = folder.glob(f"*{DIED}.mcap")
-    assert [entry[0] for entry in read_black_box(left).entries if entry != "step"] == list(range(41, 61))
-    assert (folder / "2031Z-LATER.mcap").is_file()  # what was still due was written too
+    for path, first in ((left, 61), (folder / "20300102T000000.000Z-DUE.mcap", 1), (folder / "2031Z-LATER.mcap", 61)):
+        assert next(entry[0] for entry in read_black_box(path).entries if entry != "step") == first, path
+    assert not process.ring_path.exists()
 
 
 def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Process, tmp_path: Path) -> None:
     process.say(Begin(str(tmp_path), HEADER), ticks(1, 20))
-    asked = [Write(f"{number}Z-X.mcap", "X" if number % 2 else "REQUEST", 3_600.0, {}) for number in range(MAX_DUE + 1)]
-    process.say(*asked)
+    process.say(*[written(tmp_path, f"{n}Z-{'X' if n % 2 else 'REQUEST'}.mcap", 3_600.0) for n in range(MAX_DUE + 1)])
     assert "others are still to be written" in process.heard().refusal
     process.say(End())
     assert process.child.wait(PATIENCE_S) == 0
@@ -164,42 +199,49 @@ def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Proc
     assert len(list(tmp_path.iterdir())) == MAX_DUE
 
 
-@pytest.mark.parametrize("is_again", [False, True], ids=["both were killed", "the keeper was killed"])
-def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: Path, is_again: bool) -> None:
-    process.say(Begin(str(tmp_path), HEADER), ticks(1, 20), Write("1Z-X.mcap", "X", 0.0, {}))
-    process.heard()  # so it has taken all that
+@pytest.mark.parametrize("is_daemon_killed", [True, False], ids=["both were killed", "the keeper was killed"])
+def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: Path, is_daemon_killed: bool) -> None:
+    process.say(Begin(str(tmp_path), HEADER), ticks(1, 20))
     process.child.kill()
     process.child.wait()
-    after = Process()
-    after.say(Begin(str(tmp_path), HEADER, is_again), ticks(21, 20), Write("2Z-Y.mcap", "Y", 0.0, {}))
+    if is_daemon_killed:
+        process.die()
+        after = Process(tmp_path)
+        after.say(Begin(str(tmp_path), HEADER))
+    else:
+        after = Process(tmp_path, process.ring)
+    after.say(ticks(21, 20), written(tmp_path, "2Z-Y.mcap"))
     while after.heard().name != "2Z-Y.mcap":
         pass
     after.say(End())
     assert after.child.wait(PATIENCE_S) == 0
-    after.ours.close()
+    after.die()
     after.child.communicate()
     boxes = {path.name.partition("Z-")[2]: read_black_box(path).entries for path in tmp_path.iterdir()}
     firsts = {name: (entries[1][0], entries[-1][0]) for name, entries in boxes.items()}
-    assert firsts.pop("X.mcap") == (1, 20)
-    assert firsts == ({"Y.mcap": (1, 40)} if is_again else {"Y.mcap": (21, 40), f"{DIED}.mcap": (1, 20)})
-    assert not any(path.exists() for path in ring_paths(str(tmp_path)))
+    both = {"Y.mcap": (21, 40), f"{DIED}.mcap": (1, 20)}
+    assert firsts == (both if is_daemon_killed else {"Y.mcap": (1, 40)})
+    assert not any(each.ring_path.exists() for each in (process, after))
 
 
 def test_another_s_files_are_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keeper, "SHARED_MEMORY", str(tmp_path))
-    ours, first = os.getuid(), keeper.in_shared_memory("/boxes")
-    assert (len(first), keeper.in_shared_memory("/boxes")) == (2, [])  # another keeper has them
-    for file in first:
+    files = [in_shared_memory(folder) for folder in ("/boxes", "/boxes", "/others")]
+    ours, *_ = map(Ring, files)
+    os.mkfifo(f"{ours.path}-fifo")
+    assert list(ours.left()) == []  # their daemons run
+    for file in files[1:]:
         os.close(file)
-    monkeypatch.setattr("os.getuid", lambda: 12_345)
-    for path in tmp_path.iterdir():
-        path.rename(tmp_path / path.name.replace(f"tormagd-{ours}", "tormagd-12345"))
-    assert keeper.in_shared_memory("/boxes") == []
+    with monkeypatch.context() as another:
+        another.setattr("os.getuid", lambda: 12_345)
+        assert list(ours.left()) == []
+    assert len(list(ours.left())) == 1
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.parametrize("words", [(), (ticks(1, 20), End())], ids=["gone before it kept anything", "ended in order"])
-def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path, words: tuple[Said, ...]) -> None:
+def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path, words: tuple[Any, ...]) -> None:
     process.say(Begin(str(tmp_path / "boxes"), HEADER), *words)
-    process.ours.close()
+    process.die()
     assert process.child.communicate(timeout=PATIENCE_S) == (None, "")
     assert not (tmp_path / "boxes").exists()

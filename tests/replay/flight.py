@@ -151,7 +151,7 @@ class Flight:
         write_black_box(
             path,
             {**header(self.config, self.core), "reason": "TEST", **changes},
-            [each.entries for each in self.ring.parts()],
+            [part.entries for _, part in self.ring.kept()],
         )
         return path
 

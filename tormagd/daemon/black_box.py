@@ -1,8 +1,8 @@
-"""The stream: all inputs of the core, and all traffic with the device, for the black box's process and for recorders.
+"""The stream: all inputs of the core, and all traffic with the device, for the black box and for recorders.
 
-The control thread writes references into a journal, and encodes those of PART_TICKS at once. They go to recorders by
-ZeroMQ, and into a socket to the process that keeps the newest. It never waits: what the socket does not take is lost
-and counted. That process writes the files, and outlives the daemon, however the daemon ends.
+The control thread writes references and encoded ticks into a journal, and hands on PART_TICKS at once: to recorders by
+ZeroMQ, and into a ring in shared memory. Another process writes the ring to files, and outlives the daemon, however the
+daemon ends.
 """
 
 import contextlib
@@ -10,7 +10,6 @@ import hashlib
 import importlib.util
 import logging
 import math
-import socket
 import subprocess
 import time
 from collections import deque
@@ -27,14 +26,13 @@ from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
-from tormagd.record.journal import FORMAT, Journal, core_hash, packed
-from tormagd.record.keeper import REQUEST, Begin, End, Part, Said, Write, Written
+from tormagd.record.journal import FORMAT, MISSING, Journal, core_hash, packed
+from tormagd.record.keeper import REQUEST, Begin, End, Part, Ring, Write, Written, box_path, in_shared_memory
 from tormagd.record.telemetry import COLUMNS, Moment
-from tormagd.record.ticks import MISSING
 from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
-"The keeper's main module, with its socket's descriptor as the argument."
+"The keeper's main module, with the descriptors of its socket and of the ring as arguments."
 PART_TICKS = 10
 "Control periods that are handed over at once; at 1000 and 50 Hz between two telemetry messages."
 OF_CORE = (
@@ -52,8 +50,6 @@ SNAPSHOT_S = 1.0
 "Time between snapshots: a replay may begin at each."
 AFTER_FAULT_S = 2.0
 "How long a black box goes on after its fault: the gap opens."
-BUFFER_BYTES = 4_000_000
-"Socket buffer asked of the kernel, for a keeper that is held up. It may grant less: a third of a second."
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
 MAX_REQUESTED, MAX_ASKED = 8, 28
@@ -83,22 +79,24 @@ def header(config: Config, core: Core) -> dict[str, str]:
 
 
 class BlackBox:
-    """Hands the core's journal to the keeper, a process that writes black boxes into `folder`."""
+    """Keeps the core's journal in a ring, from which the keeper, another process, writes black boxes into `folder`."""
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
         self._folder, self.begun = folder, Begin(str(folder), header)
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
+        self._ring: Ring | None = None
         self._due_s, self.is_heard = math.inf, False
-        self.journal = Journal(is_kept=False)
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
             self._refusal = "mcap is not installed: pip install 'tormagd[record]'"
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
-            self._start(self.begun)
-        self.journal.is_kept = not self._refusal
+            self._ring = Ring(in_shared_memory(str(folder)))
+            self._ring.begin(self.begun)
+            self._start(self._ring)
+        self.journal = Journal(is_kept=self._ring is not None)
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._connection: Connection | None = None
@@ -114,43 +112,59 @@ class BlackBox:
         """Begin anew with the core of another scene, from a snapshot of these states."""
         self.journal.take()
         self.begun = Begin(str(self._folder), header)
-        self._send(self.begun)
+        if self._ring is not None:
+            self._ring.begin(self.begun)
+        self.journal.note(MISSING)
         self._snapshot(stepper, planner)
 
     def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
         """Add a tick to the journal; when there are PART_TICKS, return all entries and the ticks, encoded."""
-        was_kept, self.journal.is_kept = self.journal.is_kept, self._beside is not None or self.is_heard
+        was_kept, self.journal.is_kept = self.journal.is_kept, self._ring is not None or self.is_heard
         if not (was_kept and self.journal.is_kept):  # from the end of this period
             self.journal.take()
             self._ticks = 0
             self.journal.note(MISSING)
             self._snapshot(stepper, planner)
             return None
-        self.journal.add(moment)
-        self._ticks += 1
-        return None if self._ticks % PART_TICKS else self._hand_over(moment.time_s, stepper, planner)
+        part: tuple[bytes, list[Any]] | None = None
+        try:
+            self.journal.add(msgspec.Raw(packed(moment.row())))
+            self._ticks += 1
+            if self._ticks % PART_TICKS == 0:
+                entries = self.journal.take()
+                part = packed(entries), [each for each in entries if isinstance(each, msgspec.Raw)]
+                if self._ring is not None:
+                    self._ring.put(Part(moment.time_s, part[0]))
+        except (TypeError, ValueError, OverflowError, OSError) as error:  # control goes on, whatever is in it
+            if not self._dropped:
+                log.error("some ticks are in no black box: %s; next: report that", error)
+            self._refusal, self._dropped = f"an entry that cannot be written: {error}", self._dropped + 1
+            self.journal.take()
+            self.journal.note(MISSING)
+            self._ticks = -PART_TICKS  # a snapshot follows the next part
+        if self._ticks % self._ticks_per_snapshot == 0:
+            self._snapshot(stepper, planner)
+        return part
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
-        """Ask the keeper to write a black box, and return the path that it will have: FOLDER/UTC-REASON.mcap, UTC to
-        the ms."""
-        if self._folder is None or (self._beside is None and (reason == REQUEST or not self.is_missing)):
+        """Ask the keeper to write a black box, and return the path that it will have."""
+        if self._ring is None:
             raise RefusedError(
                 "no_black_box",
                 f"there is no black box: {self._refusal}",
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
-        now_ms = time.time_ns() // 1_000_000
-        name = time.strftime(f"%Y%m%dT%H%M%S.{now_ms % 1_000:03d}Z-{reason}.mcap", time.gmtime(now_ms // 1_000))
+        path = box_path(str(self._folder), reason)
         if reason == REQUEST:
             if len(self._requested) >= MAX_REQUESTED:
                 raise RefusedError(
                     "busy", f"{MAX_REQUESTED} black boxes are still to be written", "ask again in a few seconds"
                 )
-            self._requested.add(name)
+            self._requested.add(path.name)
         self._refusal = ""
-        self._asked.append(Write(name, reason, after_s, details))
+        self._asked.append(Write(str(path), reason, after_s, self.begun.header | details))
         self._send_requests()
-        return self._folder / name
+        return path
 
     @property
     def is_missing(self) -> bool:
@@ -169,9 +183,10 @@ class BlackBox:
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
-        self._stop_if_gone()
-        if time.monotonic() >= self._due_s:
-            self._start(msgspec.structs.replace(self.begun, is_again=True))
+        if self._beside is not None and self._beside.is_gone:
+            self._stop("the process that writes it has ended")
+        if self._ring is not None and time.monotonic() >= self._due_s:
+            self._start(self._ring)
 
     def report(self) -> BlackBoxReport:
         """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since
@@ -186,29 +201,14 @@ class BlackBox:
     def close(self) -> None:
         """Tell the keeper to end once it has written what it was asked for; wait LEAVING_S at most, and
         leave it then."""
+        if self._ring is not None:
+            self._ring.path.unlink(missing_ok=True)
         if (beside := self._beside) is not None:
             self._send(End())
             self._beside, self._due_s = None, math.inf
             beside.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
-
-    def _hand_over(self, time_s: float, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
-        try:
-            entries = [
-                msgspec.Raw(packed(each.row())) if isinstance(each, Moment) else each for each in self.journal.take()
-            ]
-            part = packed(entries)
-        except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
-            self._stop(f"an entry that cannot be written: {error}")
-            return None
-        is_taken = self._beside is None or self._send(Part(time_s, part))
-        if not is_taken:
-            self._dropped += 1
-            self.journal.note(MISSING)
-        if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
-            self._snapshot(stepper, planner)
-        return part, [each for each in entries if isinstance(each, msgspec.Raw)]
 
     def _send_requests(self) -> None:
         while self._asked and self._send(self._asked[0]):
@@ -219,33 +219,22 @@ class BlackBox:
             memory = None if self._connection is None else self._connection.memory()
             self.journal.snapshot(stepper, planner, memory, self.begun.header.get("core_sha256", ""))
 
-    def _send(self, what: Said) -> bool:
+    def _send(self, what: Write | End) -> bool:
         """Send one message to the keeper, and return whether the socket took it."""
-        is_taken = self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
-        self._stop_if_gone()
-        return is_taken
+        return self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
 
-    def _stop_if_gone(self) -> None:
-        if self._beside is not None and self._beside.is_gone:
-            self._stop("the process that keeps it has ended")
-
-    def _start(self, begun: Begin) -> None:
+    def _start(self, ring: Ring) -> None:
         """Start the keeper; where that fails, it is tried again."""
-        self._due_s, self._refusal, self.journal.is_kept = math.inf, "", False
+        self._due_s, self._refusal = math.inf, ""
         try:
-            self._beside = ChildProcess(KEEPER)
+            self._beside = ChildProcess(KEEPER, ring.file)
         except OSError as error:
-            self._stop(f"the process that keeps it did not start: {error.strerror}")
-            return
-        self._beside.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        self._send(begun)
+            self._stop(f"the process that writes it did not start: {error.strerror}")
 
     def _stop(self, reason: str) -> None:
-        """Close the socket, stop the journal, drop its entries, and start another keeper soon."""
-        log.error("no black box is kept: %s; another one starts in %g s", reason, AGAIN_S)
+        """Close the socket, and start another keeper soon."""
+        log.error("no black box is written: %s; another one starts in %g s", reason, AGAIN_S)
         self._refusal, self._due_s = reason, time.monotonic() + AGAIN_S
         if self._beside is not None:
             self._beside.close()
         self._beside = None
-        self.journal.is_kept = False
-        self.journal.take()

@@ -8,22 +8,22 @@ import sys
 MAX_PACKET = 65_536
 
 
-def start_child(module: str, its_end: socket.socket) -> "subprocess.Popen[bytes]":
-    """Start `python -m module DESCRIPTOR` with `its_end` as that descriptor."""
-    number = its_end.fileno()
-    command = [sys.executable, "-P", "-m", module, str(number)]
+def start_child(module: str, its_end: socket.socket, *files: int) -> "subprocess.Popen[bytes]":
+    """Start `python -m module DESCRIPTOR...` with the descriptors of `its_end` and of `files`."""
+    numbers = its_end.fileno(), *files
+    command = [sys.executable, "-P", "-m", module, *map(str, numbers)]
     # a session of its own: signals to our process group must not end it before us
-    return subprocess.Popen(command, pass_fds=(number,), stdin=subprocess.DEVNULL, start_new_session=True)
+    return subprocess.Popen(command, pass_fds=numbers, stdin=subprocess.DEVNULL, start_new_session=True)
 
 
 class ChildProcess:
-    """Our end of a process that runs `module`, and of the packet socket to it."""
+    """Our end of a process that runs `module`, with these `files` open, and of the packet socket to it."""
 
-    def __init__(self, module: str) -> None:
+    def __init__(self, module: str, *files: int) -> None:
         self.socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.socket.setblocking(False)
         with its:
-            self.process = start_child(module, its)
+            self.process = start_child(module, its, *files)
         self.is_gone = False
 
     def send(self, data: bytes) -> bool:

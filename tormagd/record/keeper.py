@@ -1,7 +1,7 @@
-"""The process that keeps a daemon's black box: `python -m tormagd.record.keeper DESCRIPTOR`.
+"""The process that writes a daemon's black boxes: `python -m tormagd.record.keeper DESCRIPTOR RING`.
 
-It holds the newest half minute in shared memory and writes it to a file when the daemon says so. It also writes it when
-the daemon is gone without having said that it ends; where both were killed, the next keeper does.
+The daemon itself keeps the newest half minute, in shared memory that outlives it. This process writes that to a file
+when the daemon says so, or is gone without having said that it ends. Where both were killed, the next keeper does.
 """
 
 import contextlib
@@ -12,11 +12,13 @@ import os
 import select
 import signal
 import socket
+import stat
 import struct
 import sys
-import threading
+import tempfile
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -28,25 +30,27 @@ REQUEST = "REQUEST"
 KEPT_S = 30.0
 MAX_BYTES = 48_000_000
 "The ring's bounds; half a minute at 1 kHz is 18 MB."
+HALVES = 0, 1 << 30
+"Where each half of a ring begins; what is between was never written and takes no memory."
 MAX_FILES = 20
 "Of faults, and of requests; the oldest goes."
-MAX_PACKET = 4_000_000
+MAX_PACKET = 1_000_000
 MAX_DUE = 28
 "Files that wait to be written."
 LOOK_S = 0.05
 DIED = "DAEMON-DIED"
 SHARED_MEMORY = "/dev/shm"
 LENGTH = struct.Struct("<I")
-"Of what follows it in a file of the ring."
+"Of what follows it in a ring."
+END = LENGTH.pack(0)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
-    """First message: the folder for black boxes, and the header of each; `is_again` where a keeper has ended before."""
+    """What begins a half of a ring, and a scene in it: the folder for black boxes, and the header of each."""
 
     folder: str
     header: dict[str, str]
-    is_again: bool = False
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
@@ -57,12 +61,12 @@ class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
 
 
 class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
-    """Request to write the kept entries, and those of the next `after_s`, to the file `name`."""
+    """Request to write what the ring has in `after_s` to a file, which gets this header: more than its scene's."""
 
-    name: str
+    path: str
     reason: str
     after_s: float
-    details: dict[str, str]
+    header: dict[str, str]
 
 
 class End(msgspec.Struct, frozen=True, array_like=True, tag="end"):
@@ -76,121 +80,114 @@ class Written(msgspec.Struct, frozen=True, array_like=True, tag="written"):
     refusal: str = ""
 
 
-Said = Begin | Part | Write | End
+def box_path(folder: str, reason: str) -> Path:
+    """Return the path of a black box of now: FOLDER/UTC-REASON.mcap, UTC to the ms."""
+    now_ms = time.time_ns() // 1_000_000
+    utc = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ms // 1_000))
+    return Path(folder, f"{utc}.{now_ms % 1_000:03d}Z-{reason}.mcap")
 
 
-def in_shared_memory(folder: str) -> list[int]:
-    """Open the two files of the ring for `folder`; none where another keeps them, or they are not ours."""
-    files: list[int] = []
+def in_shared_memory(folder: str) -> int | None:
+    """Open a new file for a ring, locked until all who hold it have ended; None where there is no such place."""
+    name = f"tormagd-{os.getuid()}-{hashlib.sha256(folder.encode()).hexdigest()[:16]}-"
     try:
-        for path in ring_paths(folder):
-            files.append(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
-            if os.fstat(files[-1]).st_uid != os.getuid():
-                raise PermissionError(path)
-            fcntl.flock(files[-1], fcntl.LOCK_EX | fcntl.LOCK_NB)
+        file, _ = tempfile.mkstemp(prefix=name, dir=SHARED_MEMORY)
     except OSError:
-        for file in files:
-            os.close(file)
-        return []
-    return files
-
-
-def ring_paths(folder: str) -> list[Path]:
-    name = hashlib.sha256(folder.encode()).hexdigest()[:16]
-    return [Path(SHARED_MEMORY, f"tormagd-{os.getuid()}-{name}-{number}") for number in range(2)]
+        return None
+    fcntl.flock(file, fcntl.LOCK_EX)
+    return file
 
 
 class Ring:
-    """The newest parts of a black box, after their Begin, in two files of which the older is written over.
+    """The newest parts of a black box in a file, of which the older half is written over: one writes, others read."""
 
-    The files outlive their writer; `parts` gives none over `kept_s` older than the last, and always the last.
-    """
-
-    def __init__(self, files: list[int] | None = None, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
-        self._files = files or [os.memfd_create("tormagd", os.MFD_CLOEXEC) for _ in range(2)]
+    def __init__(self, file: int | None = None, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
+        self.file = os.memfd_create("tormagd", os.MFD_CLOEXEC) if file is None else file
         self._kept_s, self._most_bytes = kept_s, most_bytes // 2
         self._begun = Begin("", {})
-        self._first_s, self._bytes = -math.inf, 0
+        self._half = self._at = self._bytes = 0
+        self._first_s = math.inf
 
     def begin(self, begun: Begin) -> None:
-        """Forget what is kept."""
+        """Begin a scene: parts belong to the newest one before them."""
         self._begun = begun
-        for file in self._files:
-            os.ftruncate(file, 0)
-        self._turn(-math.inf)
+        self._append(begun)
 
     def put(self, part: Part) -> None:
         """Add a part, which comes later than those before."""
+        self._first_s = min(self._first_s, part.time_s)
         if part.time_s - self._first_s > self._kept_s or self._bytes + len(part.entries) > self._most_bytes:
-            self._turn(part.time_s)
+            self._half = 1 - self._half
+            self._at = HALVES[self._half]
+            os.pwrite(self.file, END, self._at)
+            self._first_s, self._bytes = part.time_s, 0
+            self._append(self._begun)
         self._append(part)
         self._bytes += len(part.entries)
 
-    def said(self) -> list[Begin | Part]:
-        """List what both files hold, as far as they were written."""
-        found: list[Begin | Part] = []
-        for file in self._files:
-            data, at = os.pread(file, os.fstat(file).st_size, 0), LENGTH.size
-            with contextlib.suppress(msgspec.MsgspecError, struct.error):
-                while at <= len(data):
-                    end = at + LENGTH.unpack_from(data, at - LENGTH.size)[0]
-                    found.append(msgspec.msgpack.decode(data[at:end], type=Begin | Part))
-                    at = end + LENGTH.size
-        return found
+    def kept(self) -> list[tuple[Begin, Part]]:
+        """List what is kept, the oldest first, each part with what began it: none over `kept_s` older than the last."""
+        found: list[tuple[Begin, Part]] = []
+        for at in HALVES:
+            begun = Begin("", {})
+            with contextlib.suppress(msgspec.MsgspecError, struct.error):  # it was killed in the midst of a part
+                while length := LENGTH.unpack(os.pread(self.file, LENGTH.size, at))[0]:
+                    said = msgspec.msgpack.decode(os.pread(self.file, length, at + LENGTH.size), type=Begin | Part)
+                    at += LENGTH.size + length
+                    if isinstance(said, Begin):
+                        begun = said
+                    else:
+                        found.append((begun, said))
+        found.sort(key=lambda each: each[1].time_s)
+        return [each for each in found if found[-1][1].time_s - each[1].time_s <= self._kept_s]
 
-    def parts(self) -> list[Part]:
-        """List what is kept, the oldest first."""
-        parts = sorted((each for each in self.said() if isinstance(each, Part)), key=lambda part: part.time_s)
-        return [each for each in parts if parts[-1].time_s - each.time_s <= self._kept_s]
+    @property
+    def path(self) -> Path:
+        return Path(f"/proc/self/fd/{self.file}").readlink()
 
-    def _turn(self, first_s: float) -> None:
-        """Write over the older file."""
-        self._files.reverse()
-        os.ftruncate(self._files[0], 0)
-        self._first_s, self._bytes = first_s, 0
-        self._append(self._begun)
+    def left(self) -> "Iterator[Ring]":
+        """Yield the ring of each daemon with this folder that was killed with its keeper, and remove it then."""
+        for path in self.path.parent.glob(f"{self.path.name.rpartition('-')[0]}-*"):
+            with contextlib.suppress(OSError), contextlib.ExitStack() as opened:
+                file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+                opened.callback(os.close, file)
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                known = os.fstat(file)
+                if known.st_uid == os.getuid() and stat.S_ISREG(known.st_mode):
+                    yield Ring(file)
+                    path.unlink()
 
     def _append(self, what: Begin | Part) -> None:
         data = msgspec.msgpack.encode(what)
-        os.pwrite(self._files[0], LENGTH.pack(len(data)) + data, os.fstat(self._files[0]).st_size)
+        # whoever reads meanwhile finds the end before it, or all of it
+        os.pwrite(self.file, data + END, self._at + LENGTH.size)
+        os.pwrite(self.file, LENGTH.pack(len(data)), self._at)
+        self._at += LENGTH.size + len(data)
 
 
 class Keeper:
-    """Keeps the black box of the daemon at the other end of the socket `its`, and writes it to files."""
+    """Writes the black boxes of the daemon at the other end of the socket `its`, from its `ring`."""
 
-    def __init__(self, its: socket.socket) -> None:
-        self._socket = its
-        self._ring, self._begun, self._is_named = Ring(), Begin("", {}), False
+    def __init__(self, its: socket.socket, ring: Ring) -> None:
+        self._socket, self._ring = its, ring
         self._due: list[tuple[float, Write]] = []
-        self._writing: threading.Thread | None = None
         self._written: deque[str] = deque(maxlen=2 * MAX_FILES)
 
     def run(self) -> None:
-        """Keep and write black boxes until the daemon ends, then write all that is still due, and return."""
+        """Write black boxes until the daemon ends, then all that are still due, and return."""
+        for left in self._ring.left():
+            self._write_of_a_dead(left)
         while self._hear():
-            if self._writing is not None and self._writing.is_alive():
-                continue  # one at a time
             due = next((each for each in self._due if each[0] <= time.monotonic()), None)
             if due is not None:
                 self._due.remove(due)
-                # in a thread of its own: what the daemon says meanwhile is kept
-                self._writing = threading.Thread(target=self._write, args=(due[1], self._begun, self._ring.parts()))
-                self._writing.start()
-        self._write_due()
-        if self._is_named:
-            for path in ring_paths(self._begun.folder):
-                path.unlink(missing_ok=True)
-
-    def _write_due(self) -> None:
-        """Write all black boxes that are still due, without waiting for what should have come into them."""
-        if self._writing is not None:
-            self._writing.join()
+                self._write(due[1], self._ring)
         for _, write in self._due:
-            self._write(write, self._begun, self._ring.parts())
-        self._due.clear()
+            self._write(write, self._ring)
+        self._ring.path.unlink(missing_ok=True)
 
     def _hear(self) -> bool:
-        """Wait for one packet from the daemon and take it; return whether the daemon goes on."""
+        """Wait for a word of the daemon and take it; return whether the daemon goes on."""
         ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
         if not ready:
             return True
@@ -199,84 +196,59 @@ class Keeper:
         except OSError:
             data = b""
         if not data:
-            if self._ring.parts():
-                self._due.append((0.0, died()))
+            self._write_of_a_dead(self._ring)
             return False
-        said: Said = msgspec.msgpack.decode(data, type=Said)
-        self._take(said)
+        said = msgspec.msgpack.decode(data, type=Write | End)
+        if isinstance(said, Write) and len(self._due) < MAX_DUE:
+            self._due.append((time.monotonic() + said.after_s, said))
+            self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
+        elif isinstance(said, Write):
+            self._answer(Written(Path(said.path).name, f"{MAX_DUE} others are still to be written"))
         return not isinstance(said, End)
 
-    def _take(self, said: Said) -> None:
-        """Take what the daemon said: keep a Part, begin anew for a Begin, or make the file of a Write due."""
-        match said:
-            case Part():
-                self._ring.put(said)
-            case Begin():
-                self._write_due()  # they are of the scene that ends
-                self._begin(said)
-            case Write() if len(self._due) < MAX_DUE:
-                self._due.append((time.monotonic() + said.after_s, said))
-                self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
-            case Write():
-                self._answer(Written(said.name, f"{MAX_DUE} others are still to be written"))
+    def _write_of_a_dead(self, ring: Ring) -> None:
+        """Write what the ring of a daemon has that did not say that it ends."""
+        if kept := ring.kept():
+            begun, _ = kept[-1]
+            self._write(Write(str(box_path(begun.folder, DIED)), DIED, 0.0, begun.header), ring)
 
-    def _begin(self, begun: Begin) -> None:
-        """Begin the ring anew; write what a keeper that was killed has left, or go on with it for the same daemon."""
-        parts: list[Part] = []
-        if not self._begun.folder:
-            files = in_shared_memory(begun.folder)
-            self._ring, self._is_named = Ring(files), bool(files)
-            parts = self._ring.parts()
-            left = next((each for each in self._ring.said() if isinstance(each, Begin)), None)
-            if left is not None and parts and not begun.is_again:
-                self._write(died(), left, parts)
-                parts = []
-        self._begun = begun
-        self._ring.begin(begun)
-        for part in parts:
-            self._ring.put(part)
-
-    def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
-        """Write one black box of `parts`, delete the oldest of its kind beyond MAX_FILES, and answer the daemon."""
+    def _write(self, write: Write, ring: Ring) -> None:
+        """Write one black box, delete the oldest of its kind beyond MAX_FILES, and answer the daemon."""
         from tormagd.record.black_box import write_black_box
 
-        with contextlib.suppress(OSError):
-            os.nice(5)  # of this thread alone
-        folder, refusal = Path(begun.folder), ""
+        path, refusal = Path(write.path), ""
         try:
+            parts = [part.entries for begun, part in ring.kept() if begun.header.items() <= write.header.items()]
             if not parts:
                 raise OSError(0, "nothing is kept yet")
-            folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-            details = {**begun.header, **write.details, "reason": write.reason}
-            write_black_box(folder / write.name, details, [part.entries for part in parts])
+            path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
+            write_black_box(path, {**write.header, "reason": write.reason}, parts)
             # a name is a clock's word: what this daemon has written is newer than the rest
-            self._written.append(write.name)
-            known = sorted(folder.glob("*Z-*.mcap"), key=lambda each: (each.name in self._written, each.name))
+            self._written.append(path.name)
+            known = sorted(path.parent.glob("*Z-*.mcap"), key=lambda each: (each.name in self._written, each.name))
             alike = [each for each in known if each.match(f"*-{REQUEST}.mcap") is (write.reason == REQUEST)]
             for old in alike[:-MAX_FILES]:
                 old.unlink()
         except (OSError, ValueError, TypeError, KeyError, msgspec.MsgspecError) as error:
-            refusal = f"{folder / write.name}: {getattr(error, 'strerror', None) or error!r}"
+            refusal = f"{path}: {getattr(error, 'strerror', None) or error!r}"
             if isinstance(error, OSError):
                 refusal += "; next: make room there, or name another [black_box] folder"
             write_line(f"tormagd: no black box: {refusal}", sys.stderr)
-        self._answer(Written(write.name, refusal))
+        self._answer(Written(path.name, refusal))
 
     def _answer(self, answer: Written) -> None:
         with contextlib.suppress(OSError):  # there may be nobody any more
             self._socket.send(msgspec.msgpack.encode(answer), socket.MSG_DONTWAIT)
 
 
-def died() -> Write:
-    return Write(time.strftime(f"%Y%m%dT%H%M%S.000Z-{DIED}.mcap", time.gmtime()), DIED, 0.0, {})
-
-
 def main() -> None:
     """Keep the black box until the daemon ends that holds the other end of the socket descriptor in `sys.argv[1]`."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # it ends after the daemon, not with it
+    with contextlib.suppress(OSError):  # where it may not
+        os.nice(5)
     with socket.socket(fileno=int(sys.argv[1])) as its:
-        Keeper(its).run()
+        Keeper(its, Ring(int(sys.argv[2]))).run()
 
 
 if __name__ == "__main__":

@@ -572,7 +572,7 @@ LIMITS: dict[Limit, Explanation] = {
         "over some seconds",
     ),
     Limit.NO_BLACK_BOX: Explanation(
-        "the process that keeps the black box has ended, and another one begins; nothing is held back",
+        "the process that writes black boxes has ended, and another one begins; nothing is held back",
         "see the daemon's log if it stays",
         Reaction.HELD,
         200.0,
