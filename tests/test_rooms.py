@@ -35,11 +35,11 @@ MAY_IMPORT = {
 MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"headroom"}
 """Nothing imports the laboratory."""
 MAY_START = {
-    "ctl": {"headroom", "record", "simulation", "daemon"},
+    "ctl": {"headroom", "simulation", "daemon"},
     "daemon": {"record"},
     "view": {"firmware_protocol"},
 }
-"""`python -m` of another room: replay, rehearsal, headroom, a scene's check; the keeper; a command that is told."""
+"""`python -m` of another room: rehearsal, headroom, a scene's check; the keeper; a command that is told."""
 PACKAGES = {
     "tormagd_client": ROOT / "client/src/tormagd_client",
     "firmware_protocol": ROOT / "firmware_protocol",

@@ -120,8 +120,8 @@ def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
     rig.client.request("stop")
     rig.until(lambda status: status["black_box"]["newest"].endswith("-STOPPED.mcap"), "written")
     box = rig.status()["black_box"]
-    command = [sys.executable, "-m", "tormagd.record.replay", str(rig.folder / "boxes" / box["newest"])]
-    result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0).stdout)
+    replay = [sys.executable, "-m", "tormagd.ctl.main", "--json", "replay", str(rig.folder / "boxes" / box["newest"])]
+    result = json.loads(subprocess.check_output(replay, text=True, timeout=120.0))["result"]
     assert (result["reason"], result["differences"]) == ("STOPPED", [])
     assert result["rerun"]["difference"] is None
     # one piece read and one frame written in nearly every period

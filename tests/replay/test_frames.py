@@ -20,7 +20,6 @@ from tormagd.control.safety.codes import Fault
 from tormagd.ctl.main import main
 from tormagd.ctl.replay import _instead
 from tormagd.record.black_box import BlackBoxFile, read_black_box
-from tormagd.record.replay.__main__ import main as run
 from tormagd.record.replay.rebuild import ReplayError, rebuilt, recorded
 from tormagd.record.replay.rerun import ticks_of
 from tormagd.simulation.rehearse import changed, main as run_changed, rehearse, script
@@ -238,18 +237,18 @@ def test_the_commands_of_tormagctl(path: Path, tmp_path: Path, capsys: pytest.Ca
 def test_what_cannot_be_run_again_is_refused_in_one_line(
     path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for command, arguments in (
-        (run, [str(path), "--from", "-1"]),
-        (run_changed, [str(path), "--set", "limits.skew=1"]),
-        (run_changed, [str(path), "--set", "scene=nope"]),
-        (run_changed, [str(path), "--fault", "nonsense"]),
-        (run_changed, [str(path), "--fault", "no_sense", "--plant", "nowhere"]),
-        (run, [str(path), "--config", "/nowhere"]),
-        (run, [str(path.parent)]),
+    for command, arguments, lines in (
+        (main, ["replay", str(path), "--from", "-1"], 2),
+        (run_changed, [str(path), "--set", "limits.skew=1"], 1),
+        (run_changed, [str(path), "--set", "scene=nope"], 1),
+        (run_changed, [str(path), "--fault", "nonsense"], 1),
+        (run_changed, [str(path), "--fault", "no_sense", "--plant", "nowhere"], 1),
+        (main, ["--config", "/nowhere", "replay", str(path)], 2),
+        (main, ["replay", str(path.parent)], 2),
     ):
         assert command(arguments) == 2
         captured = capsys.readouterr()
-        assert (captured.out, captured.err.count("\n")) == ("", 1)
+        assert (captured.out, captured.err.count("\n")) == ("", lines)
 
 
 def test_a_setpoint_of_a_value_that_there_is_not_is_refused_for_a_rehearsal(box: BlackBoxFile) -> None:

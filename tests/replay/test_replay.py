@@ -22,11 +22,10 @@ from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.record.black_box import BlackBoxFile, read_black_box, write_black_box
-from tormagd.record.journal import ANSWER, CONFIRM, FORMAT
+from tormagd.record.journal import ANSWER, CONFIRM, FORMAT, MISSING
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd.record.replay.rebuild import ReplayError, differences, rebuilt, recorded
 from tormagd.record.replay.rerun import rerun, ticks_of
-from tormagd.record.ticks import MISSING
 from tormagd.record.writer import Derived
 
 CHANGED_TICK = 3_210
@@ -119,9 +118,9 @@ def test_the_other_build_replays_them_to_the_bit(fly: Any, path: Path, tmp_path:
     switch = "0" if settle().is_compiled else "1"
     stalled = fly(until_s=2.8, silent_s=0.083).write(tmp_path / "stalled.mcap")
     for box, from_s, ticks in ((path, 3.0, TICKS - 3_000), (stalled, 0.0, 3_000)):
-        command = [sys.executable, "-P", "-m", "tormagd.record.replay", str(box), "--from", str(from_s)]
+        command = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--json", "replay", str(box), "--from", str(from_s)]
         environment = os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}
-        result = json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+        result = json.loads(subprocess.check_output(command, env=environment, text=True))["result"]
         assert (result["rerun"]["difference"], result["rerun"]["ticks"]) == (None, ticks)
         assert switch == "1" or result["build"].startswith("interpreted")
 

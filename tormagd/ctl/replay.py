@@ -1,17 +1,26 @@
 """`tormagctl replay`: run a black box again, bit for bit, or with the simulator in place of the device.
 
-`tormagd.record.replay` does the one, `tormagd.simulation.rehearse` the other, in a process of its own.
+`tormagd.simulation.rehearse` does the other, in a process of its own.
 """
 
 import json
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tormagd.ctl.outcome import Exit, Outcome, answer_of, usage_error
+import msgspec
+
+from tormagd.ctl.outcome import Exit, Outcome, answer_of, as_usage_error, usage_error
+from tormagd.record.black_box import BlackBoxFile
+from tormagd.record.reader import RecordingError
+from tormagd.record.replay.rebuild import Recorded, ReplayError, rebuilt, told
+from tormagd.record.replay.rerun import rerun
+from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 900.0
-"Half a minute takes some seconds, interpreted and simulated twice some minutes."
+"Half a minute, interpreted and simulated twice, takes some minutes."
+HINT = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
 
 
 def replay(
@@ -23,22 +32,12 @@ def replay(
     config_file: Path | None,
 ) -> Outcome:
     """Replay a black box; with `settings` or `faults`, on the simulated `plant`."""
-    module, arguments = "tormagd.record.replay", [f"--from={from_s!r}"]
     changes = [*(f"--set={setting}" for setting in settings), *(f"--fault={fault}" for fault in faults)]
     if from_s if changes else plant:
-        told = "--from: allowed only without" if changes else "--plant: allowed only with"
-        raise usage_error(f"{told} --set or --fault", "tormagctl replay --help")
-    if changes:
-        module, arguments = "tormagd.simulation.rehearse", [f"--plant={plant or 'sample_1'}", *changes]
-    configured = [f"--config={config_file}"] if config_file else []
-    try:
-        answer = answer_of(module, [*arguments, *configured, "--", str(path)], LONGEST_S)
-        result: dict[str, Any] = json.loads(answer)  # names in it need not be UTF-8
-    except TimeoutError as error:
-        raise usage_error(f"{path}: {error}", "is it a black box?") from error
-    except ChildProcessError as error:
-        hint = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
-        raise usage_error(str(error), hint) from error
+        said = "--from: allowed only without" if changes else "--plant: allowed only with"
+        raise usage_error(f"{said} --set or --fault", "tormagctl replay --help")
+    rehearsed = [f"--plant={plant or 'sample_1'}", *changes]
+    result = _rehearsed(path, config_file, rehearsed) if changes else _again(path, config_file, from_s)
     head = f"altered: {result['odd']}\n" if result["odd"] else ""
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
     notes += "" if result["is_complete"] else "\nthe file is cut short"
@@ -46,6 +45,29 @@ def replay(
         return Outcome(result, head + _instead(result) + notes, Exit.REFUSED if result["odd"] else Exit.DONE)
     text, is_exact = _rerun(result["rerun"])
     return Outcome(result, head + text + notes, Exit.DONE if is_exact and not result["odd"] else Exit.REFUSED)
+
+
+def _again(path: Path, config_file: Path | None, from_s: float) -> dict[str, Any]:
+    """Run the same core over the recorded inputs."""
+    logging.getLogger("tormagd").addHandler(logging.NullHandler())  # a replayed connection has no news
+
+    def run(known: Recorded, box: BlackBoxFile) -> dict[str, Any]:
+        return {"rerun": msgspec.to_builtins(rerun(rebuilt(known), known.columns, box.entries, from_s))}
+
+    with as_usage_error(ConfigError, RecordingError, ReplayError, OSError, hint=HINT):
+        return told(path, config_file, run)
+
+
+def _rehearsed(path: Path, config_file: Path | None, arguments: list[str]) -> dict[str, Any]:
+    configured = [f"--config={config_file}"] if config_file else []
+    try:
+        answer = answer_of("tormagd.simulation.rehearse", [*arguments, *configured, "--", str(path)], LONGEST_S)
+    except TimeoutError as error:
+        raise usage_error(f"{path}: {error}", "is it a black box?") from error
+    except ChildProcessError as error:
+        raise usage_error(str(error), HINT) from error
+    result: dict[str, Any] = json.loads(answer)  # names in it need not be UTF-8
+    return result
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:

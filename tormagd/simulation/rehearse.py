@@ -4,11 +4,14 @@ Setpoints, commands and the handle's motion are a black box's; the configuration
 the recorded device, so it runs with the recorded configuration too, to compare with.
 """
 
+import argparse
+import json
 import logging
 import sys
 import tomllib
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -18,10 +21,11 @@ from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.ground.plain_values import InexactError
+from tormagd.ground.terminal import write_line
 from tormagd.record import journal
 from tormagd.record.black_box import BlackBoxFile
-from tormagd.record.replay.__main__ import answered, asked
-from tormagd.record.replay.rebuild import Recorded, ReplayError, rebuilt
+from tormagd.record.reader import RecordingError
+from tormagd.record.replay.rebuild import Recorded, ReplayError, rebuilt, told
 from tormagd.record.replay.rerun import name_of, planned_for, ticks_of
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -193,7 +197,9 @@ def _hand(ticks: list[Any]) -> RecordedHand:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = asked(__doc__ or "")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--config", type=Path)
     parser.add_argument("--set", dest="settings", action="append", default=[])
     parser.add_argument("--plant", default="sample_1")
     parser.add_argument("--fault", dest="faults", action="append", default=[])
@@ -215,7 +221,12 @@ def main(arguments: list[str] | None = None) -> int:
             "instead": msgspec.to_builtins(instead),
         }
 
-    return answered(options, run)
+    try:
+        result = told(options.file, options.config, run)
+    except (ConfigError, RecordingError, ReplayError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0 if write_line(json.dumps(result), sys.stdout) is None else 1
 
 
 if __name__ == "__main__":

@@ -1,15 +1,17 @@
-"""Rebuilds a black box's core from the file, and lists what differs between its origin and here."""
+"""Rebuilds a black box's core from the file, and tells what differs between its origin and here."""
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
+from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import Config, checked
+from tormagd.config import Config, checked, load_config
 from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
-from tormagd.record.black_box import BlackBoxFile
+from tormagd.record.black_box import BlackBoxFile, read_black_box
 from tormagd.record.journal import FORMAT
 from tormagd.record.telemetry import COLUMNS
 from tormagd.scenes.scene import Scene, load_scene
@@ -34,6 +36,30 @@ class Recorded(NamedTuple):
     model_folders: tuple[Path, ...]
     columns: tuple[str, ...]
     header: dict[str, str]
+
+
+def told(
+    path: Path, config_file: Path | None, run: Callable[[Recorded, BlackBoxFile], dict[str, Any]]
+) -> dict[str, Any]:
+    """Return what a black box is, what differs here, and what `run` gives for it."""
+    configured = None if config_file is None else load_config(config_file)
+    box = read_black_box(path)
+    try:
+        known = recorded(box, path.absolute().parent)
+        return {
+            "file": str(path),
+            "odd": box.odd,
+            "version": known.header["version"],
+            "reason": box.header.get("reason", ""),
+            "build": str(settle()),
+            "is_complete": box.is_complete,
+            "differences": differences(known, configured),
+            **run(known, box),
+        }
+    except ReplayError as error:
+        other = box.header.get("sources_sha256", "") not in ("", sources_hash())
+        hint = "; another tormagd wrote it: replay it with that one" if other else ""
+        raise ReplayError(f"{path}: {error}{hint}") from error
 
 
 def recorded(box: BlackBoxFile, beside: Path) -> Recorded:

@@ -15,7 +15,7 @@ from tormagd.control.safety.operating_state import RefusedError
 from tormagd.element.inverse.solution import Answer
 from tormagd.ground.plain_values import packed, plain, restore, restored
 from tormagd.hardware.measurement import Measurement
-from tormagd.record import journal, ticks
+from tormagd.record import journal
 from tormagd.record.journal import KNOWN, core_hash
 from tormagd.record.replay.conversation import Conversation, Found, differing
 from tormagd.record.replay.rebuild import ReplayError
@@ -137,16 +137,16 @@ class _Running:
     def take(self, entry: Any, record: Any) -> Found | None:
         """Take one entry that is no tick, and return the first difference."""
         name = name_of(entry)
-        if name == ticks.TOLD:
+        if name == journal.TOLD:
             return None
         self.conversation.frame += len(frames_in(entry))
         if name == journal.STATE:
             return self._begin(entry)
-        if name == ticks.MISSING:
+        if name == journal.MISSING:
             self.gaps += self.is_known
             self.is_known = False
             self.conversation.begin(None)
-        elif name == ticks.READ:
+        elif name == journal.READ:
             self.conversation.read(entry)
         elif name == journal.CONNECTED:
             self.conversation.begin(entry[1])
@@ -162,7 +162,7 @@ class _Running:
                 self._of_frames = self.conversation.compare(self._measurement)
                 self._used = self._planner.planned
                 self._output = self._stepper.step(record.monotonic_s, self._measurement, self._used)
-            case ticks.WROTE:
+            case journal.WROTE:
                 if self._output is None:
                     raise ValueError("something written without a step")
                 self._of_frames = self._of_frames or self.conversation.wrote(entry, self._output)
@@ -173,7 +173,7 @@ class _Running:
                 except PLAN_ERRORS as error:
                     self._failure = error
             case journal.FORESEE:
-                self._planner.foresee()
+                self._planner.foresee(is_whole=False)
             case journal.AFRESH:
                 self._failure = None
                 self._planner.afresh(msgspec.convert(entry[1], float))
