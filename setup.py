@@ -36,9 +36,9 @@ COMPILED = {
         *("pressed_pad", "hand", "plant", "motion", "firmware", "device", "closed_loop", "ideal_actuator"),
     ),
     "tormagd/daemon": (
-        *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay", "topics"),
+        *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay"),
         *("control_loop", "inference_loop", "black_box", "commands", "telemetry_loop", "answers"),
-        *("endpoint", "listeners", "daemon"),
+        *("endpoint", "daemon"),
     ),
 }
 WHOLE = [f"tormagd/control/{room}" for room in ("believe", "ask", "aim", "move")]

@@ -21,8 +21,7 @@ from served import MOST, NAMES, Served, command, setpoint
 
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
-from tormagd.daemon.listeners import PEERS as MOST_LISTENERS, TOPICS, Listeners
-from tormagd.daemon.peers import PEERS, Allowance, Peer
+from tormagd.daemon.peers import LISTENERS, PEERS, TOPICS, Allowance, Listeners, Peer
 from tormagd.daemon.requests import FIRST, WAITING, WAITING_PER_CLIENT, Requests, Waiting, may_go_first
 from tormagd.record.ticks import encode_ticks
 from tormagd_client.endpoints import Endpoints
@@ -610,4 +609,4 @@ def test_however_many_come_and_go_what_is_kept_is_bounded_and_none_is_left() -> 
             here.append(number)
             listeners.hear(ON + MOTION_TOPIC, Peer(f"peer {number}"))
         assert listeners.has(MOTION_TOPIC) == bool(here)
-        assert len(listeners._asked[MOTION_TOPIC]) <= MOST_LISTENERS + 1
+        assert len(listeners._asked[MOTION_TOPIC]) <= LISTENERS + 1

@@ -62,7 +62,10 @@ def telemetry(
     stepper.move.reference = reference
     tick = Moment(stepper, OUTPUT, PLAN, measurement, 20.0, 150.0).row()
     is_homed = stepper.measured is not None and stepper.measured.is_homed
-    return decode(encode(snapshot(tick, 3, is_homed, is_busy, 0.012, BELIEF)), Telemetry)
+    return decode(
+        encode(snapshot(tick, seq=3, is_homed=is_homed, is_busy=is_busy, setpoint_age_ms=12.0, belief=BELIEF)),
+        Telemetry,
+    )
 
 
 NOT_KNOWN = {"gap_mm": None, "measured_jp": None, "skew_mm": None, "gap_setpoint_mm": None}

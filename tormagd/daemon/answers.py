@@ -1,8 +1,13 @@
-"""Answers requests: status, description, and what a command has done."""
+"""Answers requests: status, description, and what a command has done.
+
+A status takes several beats: each makes some reports anew, or the status, or sends answers.
+"""
 
 import math
 import os
 import time
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -55,18 +60,38 @@ class Answers:
         self._status = msgspec.Raw(b"")
         self._said: Telemetry | None = None
         "The snapshot of which `_status` is made."
+        self._reports: dict[str, Any] = {}
+        self._steps: deque[Callable[[], None]] = deque()
+        "What is left to do for the requests that wait."
         self.reset()
         self._reported_state = commands.connection.state
 
     def reset(self) -> None:
         self._said, self._reported_s = None, -math.inf
-        self._reports: dict[str, Any] = {}
 
     def serve(self, _beat: Beat) -> bool:
+        """Take the next step of what is asked for: prepare a status, or send answers."""
+        if self._telemetry.waiting and not self._steps:
+            self._prepare()
+        if not self._steps:
+            return False
+        self._steps.popleft()()
+        return True
+
+    def _prepare(self) -> None:
+        """List the steps to answers with the newest snapshot."""
+        now_s, state = time.monotonic(), self._commands.connection.state
+        if now_s - self._reported_s >= REPORTED_S or state is not self._reported_state:
+            self._reported_s, self._reported_state = now_s, state
+            self._steps.extend([self._report_device, self._report_peers, self._report_loops])
+        if self._said is not self._telemetry.newest:
+            self._steps.append(self._tell)
+        self._steps.append(self._send)
+
+    def _send(self) -> None:
         telemetry = self._telemetry
         answered = self._endpoint.serve(self._answer, telemetry.waiting)
         telemetry.waiting = telemetry.waiting - answered if answered else 0
-        return answered > 0
 
     def command(self, request: Request) -> dict[str, Any]:
         self.reset()
@@ -74,11 +99,15 @@ class Answers:
 
     def _answer(self, request: Request) -> Any:
         if request.command == "status":
-            if self._said is not self._telemetry.newest:
-                self._said = self._telemetry.newest
-                self._status = msgspec.Raw(msgspec.msgpack.encode(self.status()))
+            self._tell()
             return self._status
         return self._describe() if request.command == "describe" else self.command(request)
+
+    def _tell(self) -> None:
+        """Make the status of the newest snapshot, if it is not there yet."""
+        if self._said is not self._telemetry.newest:
+            self._said = self._telemetry.newest
+            self._status = msgspec.Raw(msgspec.msgpack.encode(self.status()))
 
     def _describe(self) -> Description:
         core, link = self._telemetry.core, self._commands.connection.report()
@@ -115,10 +144,14 @@ class Answers:
             "faults": safety.faults,
         }
         now_s = time.monotonic()
+        if self._reported_s == -math.inf:  # a command may have changed all
+            self._reported_s = now_s
+            for report in (self._report_device, self._report_peers, self._report_loops):
+                report()
         outside = ", ".join(f"{it.quantity} {it.asked:.4g} asked, {it.used:.4g} used" for it in plan.outside)
         return Status(
             **known,
-            **self._slowly_changing(now_s),
+            **self._reports,
             version=__version__,
             build=str(settle()),
             scene=core.scene.name,
@@ -163,26 +196,27 @@ class Answers:
         ended = None if why is None else Explained(why.code, why.message, why.hint)
         return ArmReport(given=arming.given, is_over=arming.is_over, error=ended)
 
-    def _slowly_changing(self, now_s: float) -> dict[str, Any]:
-        """Return the reports that take most of the time; made anew every REPORTED_S."""
+    def _report_device(self) -> None:
         commands, telemetry = self._commands, self._telemetry
-        connection = commands.connection
-        if now_s - self._reported_s >= REPORTED_S or connection.state is not self._reported_state:
-            self._reported_s, self._reported_state = now_s, connection.state
-            link = connection.report()
-            device_us = None if link.round_trip_us is None else link.round_trip_us.p50
-            self._reports = {
-                "link": link,
-                "profile": commands.profiles.report(),
-                "calibration": commands.calibrations.report(),
-                "setpoints": self._endpoint.inbox.report(now_s),
-                "peers": self._endpoint.report(),
-                "rates": {group.name: group.report() for group in telemetry.groups},
-                "phases_us": {name: spent.report for name, spent in self._phases.spent.items()},
-                "late_ticks_by": dict(self._phases.blamed),
-                "way": telemetry.way.report(
-                    device_us, self._inference.planner.believe.carriages.lag_s, telemetry.core.scene.budget
-                ),
-                "black_box": commands.box.report(),
-            }
-        return self._reports
+        link, lag_s = commands.connection.report(), self._inference.planner.believe.carriages.lag_s
+        device_us = None if link.round_trip_us is None else link.round_trip_us.p50
+        self._reports |= {
+            "link": link,
+            "way": telemetry.way.report(device_us, lag_s, telemetry.core.scene.budget),
+            "profile": commands.profiles.report(),
+            "calibration": commands.calibrations.report(),
+        }
+
+    def _report_peers(self) -> None:
+        self._reports |= {
+            "setpoints": self._endpoint.inbox.report(time.monotonic()),
+            "peers": self._endpoint.report(),
+            "black_box": self._commands.box.report(),
+        }
+
+    def _report_loops(self) -> None:
+        self._reports |= {
+            "rates": {group.name: group.report() for group in self._telemetry.groups},
+            "phases_us": {name: spent.report for name, spent in self._phases.spent.items()},
+            "late_ticks_by": dict(self._phases.blamed),
+        }

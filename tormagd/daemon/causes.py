@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from tormagd.config import Device
@@ -78,12 +78,14 @@ class Causes:
 
     def of_limits(
         self,
-        limits: Iterable[str],
+        limits: Collection[str],
         replaced: str,
         of_sources: Mapping[Limit, Explanation],
         measurement: Measurement | None,
         now_s: float,
     ) -> tuple[Explained, ...]:
+        if not limits:
+            return ()
         told = {
             Limit.HOST_STALL: f"{self._stood_still()}; the gap was held until the device answered",
             Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}",

@@ -126,8 +126,8 @@ class Daemon:
                 ("plan", self._plan),
                 ("drive", self._drive),
                 ("record", telemetry.record),
-                ("topics", telemetry.topics.publish),
-                ("telemetry", self._publish),
+                ("topics", telemetry.publish_topics),
+                ("telemetry", telemetry.publish),
             ],
             [
                 ("forecast", self._inference.foresee),
@@ -217,13 +217,6 @@ class Daemon:
             self._causes.tell(faults, control.stepper, control.measurement)
             with contextlib.suppress(RefusedError):
                 self._commands.keep(str(faults[0]), AFTER_FAULT_S)
-
-    def _publish(self, beat: Beat) -> bool:
-        if not self._telemetry.publish(beat):
-            return False
-        # before the next plan learns from a new device
-        self._commands.look_at_device()
-        return True
 
     def _tell(self, _beat: Beat) -> bool:
         """Feed log, systemd and black box, and continue an arming; return False if it is not time."""

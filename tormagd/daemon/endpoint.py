@@ -18,8 +18,7 @@ from tormagd.config import Sources
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.admission import CONNECTIONS, MAY, Admission
 from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
-from tormagd.daemon.listeners import Listeners
-from tormagd.daemon.peers import Allowance, Peer, Tally
+from tormagd.daemon.peers import Allowance, Listeners, Peer, Tally
 from tormagd.daemon.requests import FIRST, Arrivals, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.ground.access_keys import KeyRing
@@ -59,8 +58,8 @@ HOPS, LONGEST_ROUTING_ID = 16, 255
 "Parts of an envelope, and bytes of each, at most."
 FIRSTS_PER_S, FIRST_BURST = 100.0, 100.0
 "How often a peer may say `stop` or `disable`. With one more, which is carried out, its connection is cut off."
-ANSWERS_NS = 300_000
-"For how long requests are answered in one beat."
+ANSWERS_NS = 150_000
+"For how long requests are answered in one beat; one that has begun is ended."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."

@@ -73,9 +73,9 @@ class InferenceLoop:
         self._due_ns = period_ns + (self._due_ns if is_regular else beat.due_ns)
 
     def foresee(self, _beat: Beat) -> bool:
-        """Make the forecast for the next plans; return False if none is due."""
+        """Make the next half of the forecast for the next plans; return False if none is due."""
         try:
-            is_made = self.planner.foresee()
+            is_made = self.planner.foresee(is_whole=False)
         except PLAN_ERRORS as error:
             self._begin_afresh(self._clock_ns() * 1e-9, error)
             return True

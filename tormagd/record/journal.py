@@ -26,10 +26,9 @@ from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.ticks import MISSING, READ, WROTE
 from tormagd.scenes.scene import Scene
 
-FORMAT = 20
+FORMAT = 21
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
@@ -46,7 +45,10 @@ TEACH, CONFIRM, ANSWER = "teach", "confirm", "answer"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 "`[COMMAND, name, now_s, is_refused, conditions]`, `[LATCH, fault]`, `[LOSE_LINK]`."
 CONNECTED = "connected"
-"`[CONNECTED, memory]`: a conversation began, or with None is over. READ and WROTE are in `ticks`."
+"`[CONNECTED, memory]`: a conversation began, or with None is over."
+READ, WROTE, TOLD, MISSING = "read", "wrote", "told", "missing"
+"""No inputs of the core: what passed between daemon and device, as `[READ, time_s, raw]`, a snapshot as published, and
+that other entries were lost."""
 STATE = "state"
 MAX_ENTRIES = 4_096
 "When this many entries were not taken, MISSING takes their place."

@@ -21,7 +21,7 @@ from tormagd.control.records import Duty, Plan
 from tormagd.control.safety.operating_state import SafetyState
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd_client.messages import VERSION, BeliefReport, Mark, Telemetry, Tick, Verdict
+from tormagd_client.messages import VERSION, Telemetry, Tick
 
 TIME_COLUMN = "t_ns"
 
@@ -143,27 +143,13 @@ def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...
 _SHARED = tuple([name for name in Telemetry.__struct_fields__ if name in COLUMNS])
 
 
-def snapshot(
-    tick: Any,
-    sequence: int,
-    is_homed: bool,
-    is_busy: bool,
-    age_s: float | None,
-    belief: dict[str, BeliefReport],
-    handle: tuple[float, float] | None = None,
-    verdict: Verdict | None = None,
-    mark: Mark | None = None,
-    beside: tuple[str, ...] = (),
-) -> Telemetry:
-    """Return the telemetry message of a tick."""
+def snapshot(tick: Any, **told: Any) -> Telemetry:
+    """Return the telemetry message of a tick; `told` are fields that are not in it, or are told in another way."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
     fields: dict[str, Any] = {name: getattr(tick, name) for name in _SHARED}
     fields |= {
         "v": VERSION,
-        "seq": sequence,
-        "is_homed": is_homed,
-        "is_busy": is_busy,
         # no field is planned for a gap that is open or opening
         "field_mT": None if tick.governed_cf is None else tick.field_mT,
         "gap_mm": left + right if known else None,
@@ -171,14 +157,7 @@ def snapshot(
         "measured_jp": (left, right) if known else None,
         "skew_mm": left - right if known else None,
         "duty": (tick.left_duty, tick.right_duty),
-        "limits": tick.limits + beside,
-        "setpoint_age_ms": None if age_s is None else age_s * 1e3,
         "tick": Tick(lateness_us=tick.lateness_us, exec_us=tick.exec_us),
-        "belief": belief,
         "search_age_ms": tick.search_age_s * 1e3,
-        "handle_mm": None if handle is None else handle[0],
-        "handle_mm_s": None if handle is None else handle[1],
-        "verdict": verdict,
-        "mark": mark,
     }
-    return Telemetry(**fields)
+    return Telemetry(**(fields | told))

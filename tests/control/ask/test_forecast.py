@@ -1,5 +1,6 @@
 """What comes next: foreseen where a force repeats itself, and believed only where that was earned. All synthetic."""
 
+import copy
 import math
 from typing import NamedTuple
 
@@ -235,6 +236,17 @@ def test_a_forecast_is_looked_for_once_for_every_few_points_of_the_grid(learned:
     assert learned.changes_N == changes_N
     assert learned.foresee(0.0)
     assert learned.from_s == learned.time_s
+
+
+def test_where_the_grid_goes_on_between_two_embeddings_the_forecast_is_of_the_first(learned: Forecast) -> None:
+    learned.update(learned.time_s + (EVERY + 0.5) * GRID_S, 1.5)
+    other = copy.deepcopy(learned)
+    assert (learned.foresee(0.0), other.foresee(0.0, is_whole=False), other.from_s < learned.from_s) == (True,) * 3
+    for each in (learned, other):
+        each.update(each.time_s + 1.5 * GRID_S, 1.52)
+    assert other.foresee(0.0, is_whole=False)
+    assert (other.from_s, other.changes_N) == (learned.from_s, learned.changes_N)
+    assert [each is None for each in other.awaited] == [each is None for each in learned.awaited]
 
 
 def by_regression(history: Array, of: tuple[int, ...]) -> tuple[Array, float]:

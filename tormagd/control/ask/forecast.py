@@ -64,7 +64,7 @@ HORIZON: Final = 8
 "A plan looks 30 ms ahead, and further by the carriages' lag."
 HORIZON_S: Final = HORIZON * GRID_S
 EVERY: Final = 2
-"A forecast takes several times as long as a plan."
+"A forecast takes several times as long as a plan, so each embedding has a beat of its own."
 JUDGED: Final = 4
 "Forecasts are judged in the middle of what a plan looks at."
 MAX_STEP_S: Final = 0.1
@@ -86,7 +86,7 @@ _BYTES: Final = 8
 "Of each point of the history."
 
 
-def embedding(delays: tuple[int, ...]) -> Array:
+def embedding(delays: tuple[int, ...]) -> npt.NDArray[np.intp]:
     """Return the places of all stretches in a full history, as indices from its end."""
     rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
     ends = np.arange(-1 - HORIZON, BEAT_DELAYS[-1] - HISTORY - 1, -STRIDE)
@@ -127,6 +127,13 @@ class Forecast:
     "The point of the grid from which the forecast was made; -inf without one."
     changes_N: list[float]
     "The forecast changes of force from that point to itself and to the points ahead."
+    sought: bytes
+    "The history that is searched with one embedding after the other; empty between two forecasts."
+    sought_s: float
+    "Its newest point."
+    rise_N: list[float]
+    rise_unlike: float
+    "What RISE_DELAYS found in it: changes of force, N, and their distance, N²."
     awaited: tuple[Guess | None, ...]
     "Guesses for the next points of the grid; None where none was made."
     long: Skill
@@ -148,6 +155,7 @@ class Forecast:
         """Begin with one setpoint, or with none."""
         self.stamp_s, self.force_N, self.time_s, self.history = stamp_s, force_N, stamp_s, history
         self.from_s, self.changes_N, self.awaited = -math.inf, [], NOTHING_SAID
+        self.sought, self.sought_s, self.rise_N, self.rise_unlike = b"", -math.inf, [], math.inf
         self.long, self.short = Skill(0.0, DOUBT_N * DOUBT_N), Skill(0.0, 0.0)
         self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
 
@@ -164,27 +172,38 @@ class Forecast:
             self._advance(stamp_s, force_N, count)
         self.stamp_s, self.force_N = stamp_s, force_N
 
-    def foresee(self, slope_N_s: float) -> bool:
-        """Make a forecast from the newest point of the grid, and return whether one was due."""
-        if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < MIN_HISTORY * _BYTES:
-            return False
-        (rise, rise_unlike), (beat, beat_unlike) = _search(np.frombuffer(self.history))
-        changes: list[float] = []
-        said: Guess | None = None
-        if rise or beat:
-            # where one embedding finds nothing alike, the other's forecast is taken
-            rise, beat = rise or beat, beat or rise
-            rise_weight = (self.rise_missed + rise_unlike) ** -2
-            share = rise_weight / (rise_weight + (self.beat_missed + beat_unlike) ** -2)
-            changes = [beat[place] + share * (rise[place] - beat[place]) for place in range(len(rise))]
-            since = (self.stamp_s - self.time_s) / GRID_S
-            ahead_N = [self.force_N + each[JUDGED] - each[1] * since for each in (rise, beat, changes)]
-            said = Guess(ahead_N[0], ahead_N[1], ahead_N[2], self.force_N + slope_N_s * GRID_S * (JUDGED - since))
-        else:
-            self.short = LOST
-        self.from_s, self.changes_N = self.time_s, changes
-        self.awaited = (*self.awaited[:-1], said)
+    def foresee(self, slope_N_s: float, *, is_whole: bool = True) -> bool:
+        """Make a forecast from the newest point of the grid, or in the next call if not `is_whole`; return whether one
+        was due."""
+        if not self.sought:
+            if self.time_s - self.from_s < (EVERY - 0.5) * GRID_S or len(self.history) < MIN_HISTORY * _BYTES:
+                return False
+            self.sought, self.sought_s = self.history, self.time_s
+            self.rise_N, self.rise_unlike = _search(np.frombuffer(self.sought), 0)
+            if not is_whole:
+                return True
+        beat, beat_unlike = _search(np.frombuffer(self.sought), 1)
+        self.sought, self.from_s = b"", self.sought_s
+        # the grid may have gone on since the search began
+        place = JUDGED - 1 - round((self.time_s - self.from_s) / GRID_S)
+        said = self._mix(self.rise_N, beat, beat_unlike, slope_N_s)
+        if place >= 0:
+            self.awaited = (*self.awaited[:place], said, *self.awaited[place + 1 :])
         return True
+
+    def _mix(self, rise: list[float], beat: list[float], beat_unlike: float, slope_N_s: float) -> Guess | None:
+        """Weigh what the embeddings found, and return what is forecast; None where neither found anything alike."""
+        if not (rise or beat):
+            self.short, self.changes_N = LOST, []
+            return None
+        # where one embedding finds nothing alike, the other's forecast is taken
+        rise, beat = rise or beat, beat or rise
+        rise_weight = (self.rise_missed + self.rise_unlike) ** -2
+        share = rise_weight / (rise_weight + (self.beat_missed + beat_unlike) ** -2)
+        changes = self.changes_N = [beat[place] + share * (rise[place] - beat[place]) for place in range(len(rise))]
+        since = (self.stamp_s - self.from_s) / GRID_S
+        ahead_N = [self.force_N + each[JUDGED] - at_step(since, each) for each in (rise, beat, changes)]
+        return Guess(ahead_N[0], ahead_N[1], ahead_N[2], self.force_N + slope_N_s * GRID_S * (JUDGED - since))
 
     def forces_N(self, begins_after_s: float, after_s: list[float]) -> list[float]:
         """Return the forecast forces at `begins_after_s` + `after_s` after the newest setpoint's stamp."""
@@ -219,22 +238,21 @@ class Forecast:
         self.beat_missed += _LONG_SHARE * (beat_error_N * beat_error_N - self.beat_missed)
 
 
-def _search(history: Array) -> list[tuple[list[float], float]]:
-    """Forecast with each embedding: return the changes of force, N, and the distance, N², of each."""
-    # both at once: most of the time goes into the calls, not into their numbers
-    changes = history[EMBEDDINGS[:, :, : (len(history) - BEAT_DELAYS[-1] - 1 - HORIZON) // STRIDE + 2]]
-    changes -= changes[:, TAPS : TAPS + 1]
-    before = changes[:, :TAPS]
-    before -= before[:, :, :1].copy()
-    apart = (before * before).sum(axis=1) + TAPS * SAME_N**2
-    apart[:, 0] = math.inf
-    unlike: list[float] = (apart.min(axis=1) / TAPS).tolist()
+def _search(history: Array, number: int) -> tuple[list[float], float]:
+    """Forecast with one of EMBEDDINGS: return the changes of force, N, and their distance, N²."""
+    places = EMBEDDINGS[number, :, : (len(history) - BEAT_DELAYS[-1] - 1 - HORIZON) // STRIDE + 2]
+    changes = history.take(places, mode="wrap")
+    changes -= changes[TAPS]
+    before = changes[:TAPS]
+    before -= before[:, :1].copy()
+    apart = (before * before).sum(axis=0) + TAPS * SAME_N**2
+    apart[0] = math.inf
+    unlike = float(apart.min()) / TAPS
+    if unlike > UNLIKE_N * UNLIKE_N:
+        return [], unlike
+    changes[TAPS] = 1.0
     weight = 1.0 / (apart * apart)
-    changes[:, TAPS] = 1.0
-    sums = ((changes[:, : TAPS + 1] * weight[:, None]) @ changes.transpose(0, 2, 1)).tolist()
-    return [
-        ([] if each > UNLIKE_N * UNLIKE_N else _constants(rows), each) for rows, each in zip(sums, unlike, strict=True)
-    ]
+    return _constants(((changes[: TAPS + 1] * weight) @ changes.T).tolist()), unlike
 
 
 def _constants(rows: list[list[float]]) -> list[float]:

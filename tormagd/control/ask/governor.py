@@ -85,8 +85,8 @@ class Governor:
         self._forget()
         self.is_passing = False
 
-    def foresee(self) -> bool:
-        return self._has_forecast and self.forecast.foresee(self.slope_N_s)
+    def foresee(self, *, is_whole: bool = True) -> bool:
+        return self._has_forecast and self.forecast.foresee(self.slope_N_s, is_whole=is_whole)
 
     def update(
         self,
