@@ -15,14 +15,13 @@ from mcap.writer import MCAP0_MAGIC
 from sent import START_NS, batch, telemetry
 
 from tormagd.config import Recordings
-from tormagd.ctl.record import budget_of
-from tormagd.record.folder import Budget, RecordingFolder, mark, segment_of
+from tormagd.record.folder import RecordingFolder, mark, segment_of
 from tormagd.record.reader import RecordingFile, damage_in
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.messages import Mark
 
 DAY_S = 86_400.0
-BUDGET = Budget(segment_bytes=40_000, segment_s=3_600.0, most_bytes=1_000_000, most_s=30 * DAY_S, free_bytes=1_000_000)
+BUDGET = Recordings(segment_MB=0.04, segment_minutes=60.0, most_MB=1.08, most_days=30.0, free_MB=1.0)
 SETTINGS = Recordings(segment_MB=0.1, segment_minutes=60.0, most_MB=2.0, most_days=30.0, free_MB=1.0)
 
 
@@ -64,7 +63,7 @@ def test_no_clock_takes_a_recording_away(tmp_path: Path, wrong_days: int) -> Non
     made = [*of_days(tmp_path, now_s, *range(-29, 0)), *of_days(tmp_path, wrong_s, 0.1, 0.2, 0.3)]
     dated(folder.new(), now_s)  # begun by that clock, and written until it was set
     assert folder.prune() == []
-    made[3].write_bytes(bytes(BUDGET.most_bytes))
+    made[3].write_bytes(bytes(1_080_000))
     assert made[0] in [each.path for each in folder.prune(1)]
 
 
@@ -83,7 +82,7 @@ def test_the_oldest_unmarked_go_first_and_nothing_else_goes(tmp_path: Path) -> N
     for _ in range(40):
         clock.now_s += 3_600.0
         made.append(write(folder, clock))
-        assert sum(each.bytes for each in folder.segments()) <= BUDGET.most_bytes
+        assert sum(each.bytes for each in folder.segments()) <= 1_080_000
     left = {each.path for each in folder.segments()}
     kept = [path for path in made if path in left]
     assert kept == made[-len(kept) :]
@@ -108,7 +107,7 @@ def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, 
     folder = RecordingFolder(tmp_path, BUDGET)
     for day in range(1, 7):
         (tmp_path / f"2026-11-0{day}T00-00-00.marked.mcap").write_bytes(bytes(100_000))
-    with pytest.raises(OSError, match=r"up to 0\.5 come, its budget is 1\.0, and nothing unmarked is left"):
+    with pytest.raises(OSError, match=r"up to 0\.5 come, its budget is 1\.1, and nothing unmarked is left"):
         folder.new()
     assert len(folder.segments()) == 6
     # what stays free is for black boxes
@@ -134,7 +133,7 @@ def test_a_name_says_when_it_began_also_in_the_former_form(tmp_path: Path, fract
 
 def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Path) -> None:
     clock = Clock()
-    recorder = RecordingWriter(RecordingFolder(tmp_path, budget_of(SETTINGS), clock))
+    recorder = RecordingWriter(RecordingFolder(tmp_path, SETTINGS, clock))
     mark(recorder.path)  # by somebody else: the recorder goes on
     (tmp_path / "another.mcap").write_bytes(b"x" * 1_900_000)
     newest = Mark(t_ns=START_NS + 10, text="here")
@@ -148,7 +147,7 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
 
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
     told, newest = [], None
-    with RecordingWriter(RecordingFolder(path, budget_of(SETTINGS), clock)) as recorder:
+    with RecordingWriter(RecordingFolder(path, SETTINGS, clock)) as recorder:
         for number in range(hours * 20):
             clock.now_s += 180.0
             ms = (clock.now_s - START_NS * 1e-9) * 1e3
@@ -169,10 +168,10 @@ def test_a_year_of_recording_never_outgrows_its_budget_and_keeps_its_marks(tmp_p
     clock, rng = Clock(), random.Random(1)
     marks, written_bytes = [], 0
     for _ in range(12):
-        before = {each.path for each in RecordingFolder(tmp_path, budget_of(SETTINGS), clock).segments()}
+        before = {each.path for each in RecordingFolder(tmp_path, SETTINGS, clock).segments()}
         marks += record(tmp_path, clock, 12, rng)
         clock.now_s += 30 * DAY_S
-        segments = RecordingFolder(tmp_path, budget_of(SETTINGS), clock).segments()
+        segments = RecordingFolder(tmp_path, SETTINGS, clock).segments()
         assert sum(each.bytes for each in segments) <= 2_000_000
         written_bytes += sum(each.bytes for each in segments if each.path not in before)
     assert written_bytes > 3_000_000

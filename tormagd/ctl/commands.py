@@ -227,7 +227,7 @@ COMMANDS = {
     ),
     "blackbox": Command(
         "have the daemon write the last half minute, as on a fault",
-        "black_box.black_box",
+        "operate.black_box",
         ("client",),
         (option("copy", type=Path, nargs="?", metavar="FILE.mcap", help="copy it to this file"),),
     ),

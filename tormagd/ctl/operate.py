@@ -1,11 +1,14 @@
 """The commands that change what the device does."""
 
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
+from tormagd.ground.files import new_file
 from tormagd.ground.terminal import write_line
 from tormagd_client.blocking import Client
 from tormagd_client.messages import Explained, Status
@@ -35,6 +38,8 @@ IS_OPEN = {
 STAYED_SHUT = ("NOT_OPENING", "DEVICE_RETRACT_FAILED")
 COMES_BACK_S = 0.6
 "The daemon waits this long for the device to drop a cleared fault (CLEARING_S), then latches it again."
+LONGEST_WRITE_S = 30.0
+"Longest wait for a black box; writing takes a second or two, at low priority."
 
 
 def arm(client: Client, timeout_s: float) -> Outcome:
@@ -149,6 +154,28 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
         f"still homing after {timeout_s:g} s",
         "it goes on by itself; tormagctl status shows how far, tormagctl stop ends it",
     )
+
+
+def black_box(client: Client, copy: Path | None) -> Outcome:
+    """Have the daemon write its black box, wait until the file is on the disk, and copy it to the new file `copy`."""
+    if copy is not None and copy.exists():
+        raise usage_error(f"{copy} exists", "give another name; nothing is overwritten")
+    written = Path(client.request("blackbox")["file"])
+    boxes = (state.black_box for _, state in statuses(client, LONGEST_WRITE_S))
+    box = next((each for each in boxes if each.newest == written.name or each.refusal), None)
+    if box is None or box.newest != written.name:
+        raise CommandError(
+            Exit.REFUSED,
+            "not_written",
+            f"{written} was not written within {LONGEST_WRITE_S:g} s" if box is None else box.refusal,
+            "make room in [black_box] folder, or name another; the daemon's log says more",
+        )
+    if copy is None:
+        return Outcome({"file": str(written)}, f"{written}\ntormagctl replay runs it again, tormagctl plot draws it")
+    hint = f"it is {written} on the daemon's machine: fetch it from there"
+    with as_usage_error(OSError, hint=hint), new_file(copy):
+        shutil.copyfile(written, copy)
+    return Outcome({"file": str(copy), "original": str(written)}, f"{copy} (also {written})")
 
 
 def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tuple[float, Status]]:

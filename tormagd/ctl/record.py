@@ -10,10 +10,10 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from tormagd.config import Config, Recordings
+from tormagd.config import Config
 from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, refused, usage_error
 from tormagd.ground.terminal import interrupted_by, write_line
-from tormagd.record.folder import Budget, RecordingFolder
+from tormagd.record.folder import RecordingFolder
 from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
@@ -29,17 +29,6 @@ POLL_MS = 100
 LONGEST_END_S = 60.0
 SILENT_S = 1.0
 "After this silence at the end, the daemon has gone."
-
-
-def budget_of(settings: Recordings) -> Budget:
-    """Return the budget of a folder of recordings; 1 MB is 1e6 bytes, a day 86400 s."""
-    return Budget(
-        segment_bytes=round(settings.segment_MB * 1e6),
-        segment_s=settings.segment_minutes * 60.0,
-        most_bytes=round(settings.most_MB * 1e6),
-        most_s=settings.most_days * 86_400.0,
-        free_bytes=round(settings.free_MB * 1e6),
-    )
 
 
 def listening(
@@ -68,7 +57,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
             about = _about(endpoints, wait_s)
             try:
-                place = RecordingFolder(path, budget_of(config.recordings)) if is_folder else path
+                place = RecordingFolder(path, config.recordings) if is_folder else path
                 writer = RecordingWriter(place, about, config.recordings.one_tick_of)
             except FileExistsError as error:
                 raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error

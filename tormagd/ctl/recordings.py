@@ -7,7 +7,6 @@ from typing import Any
 
 from tormagd.config import Config
 from tormagd.ctl.outcome import Exit, Outcome, as_usage_error, usage_error
-from tormagd.ctl.record import budget_of
 from tormagd.ground.files import new_file
 from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
 from tormagd.record.reader import RecordingError, damage_in, summary_of
@@ -28,7 +27,7 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
         )
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):
-            folder = RecordingFolder(path or Path(config.recordings.folder), budget_of(config.recordings))
+            folder = RecordingFolder(path or Path(config.recordings.folder), config.recordings)
             if not folder.path.is_dir():
                 raise usage_error(f"{folder.path}: no such folder", "name the folder, or set [recordings] folder")
             return _list(folder) if action == "list" else _prune(folder)
@@ -50,7 +49,7 @@ def _list(folder: RecordingFolder) -> Outcome:
         for row in rows
     ]
     count = f"{len(rows)} recording{'s' * (len(rows) != 1)}"
-    total = f"{count}, {size_MB:.1f} of {folder.budget.most_bytes / 1e6:.1f} MB in {folder.path}"
+    total = f"{count}, {size_MB:.1f} of {folder.budget.most_MB:.1f} MB in {folder.path}"
     return Outcome({"folder": str(folder.path), "recordings": rows, "MB": size_MB}, "\n".join([*lines, total]))
 
 

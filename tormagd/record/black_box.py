@@ -13,8 +13,8 @@ import msgspec
 from mcap.records import Message
 
 from tormagd.ground.files import in_place_of
+from tormagd.record.journal import MISSING, TOLD
 from tormagd.record.reader import Contents, RecordingError, damage_in, opened, scan
-from tormagd.record.ticks import MISSING, TOLD
 from tormagd.record.writer import (
     CORE_TOPIC,
     FRAMES_TOPIC,
@@ -59,7 +59,7 @@ def read_black_box(path: Path) -> BlackBoxFile:
     """Read the black box in `path`; one that was cut short is returned as far as it reads, with `is_complete` False."""
     found = _Reading(str(path))
     with opened(path) as file:
-        is_complete = scan(file, str(path), found.take, found.message, found.lose) and not found.is_over
+        is_complete = scan(file, str(path), found) and not found.is_over
         damage = damage_in(file)
     if not found.entries:
         raise RecordingError(f"{path}: {NO_BLACK_BOX}")
@@ -96,7 +96,7 @@ class _Reading(Contents):
 
     def lose(self, what: str) -> None:
         """Note that entries are missing; what is derived from them is compared no more."""
-        self.lost.append(what)
+        super().lose(what)
         self.entries.append([MISSING])
         self.expected.clear()
 

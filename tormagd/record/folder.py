@@ -16,29 +16,20 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from tormagd.config import Recordings
 from tormagd_client.printable import require
 
+MB, DAY_S = 1e6, 86_400.0
 END_BYTES = 500_000
 "What a segment may grow by once it is due: last chunk, overview and index."
 MARKED = ".marked"
 "Follows the time in a marked segment's name. Black boxes have another form: their keeper deletes them."
 BEFORE_MARK_S = 60.0
 "A segment younger than this is marked together with the one before."
-LONGEST_PAUSE_S = 3 * 86_400.0
+LONGEST_PAUSE_S = 3 * DAY_S
 """Where a segment seems to last longer, or to follow the one before later, a clock may have been set."""
 _NAME = re.compile(rf"(\d{{4}}-\d\d-\d\dT\d\d-\d\d-\d\d)(\.\d{{3}}Z)?({re.escape(MARKED)})?\.mcap")
 _FORM = "%Y-%m-%dT%H-%M-%S"
-
-
-class Budget(NamedTuple):
-    """How large and long one segment gets, how much and how old a folder may hold, and how much stays free on its
-    disk."""
-
-    segment_bytes: int
-    segment_s: float
-    most_bytes: int
-    most_s: float
-    free_bytes: int
 
 
 class Segment(NamedTuple):
@@ -83,7 +74,7 @@ def mark(path: Path) -> Path:
 class RecordingFolder:
     """Recordings in the folder `path` within `budget`; `clock` is in seconds since 1970."""
 
-    def __init__(self, path: Path, budget: Budget, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, path: Path, budget: Recordings, clock: Callable[[], float] = time.time) -> None:
         self.path, self.budget, self._clock = path, budget, clock
 
     def segments(self) -> list[Segment]:
@@ -93,7 +84,7 @@ class RecordingFolder:
 
     def new(self) -> Path:
         """Prune until a whole segment has room, and return the path for a new one, named by the present time."""
-        reason = self.make_room(self.budget.segment_bytes + END_BYTES)
+        reason = self.make_room(self.budget.segment_MB * MB + END_BYTES)
         if reason:
             raise OSError(errno.ENOSPC, reason)
         now = datetime.fromtimestamp(self._clock(), UTC)
@@ -101,22 +92,22 @@ class RecordingFolder:
 
     def is_due(self, size: int, lasted_s: float) -> bool:
         """Return whether a segment of this size (bytes) and length is to end."""
-        return size >= self.budget.segment_bytes or lasted_s >= self.budget.segment_s
+        return size >= self.budget.segment_MB * MB or lasted_s >= self.budget.segment_minutes * 60.0
 
     def room(self, needed_bytes: int) -> str:
         """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty
         where there is."""
-        if shutil.disk_usage(self.path).free >= self.budget.free_bytes + needed_bytes:
+        if shutil.disk_usage(self.path).free >= self.budget.free_MB * MB + needed_bytes:
             return ""
         return self.make_room(needed_bytes)
 
-    def make_room(self, coming_bytes: int) -> str:
+    def make_room(self, coming_bytes: float) -> str:
         """Prune for `coming_bytes` more within the budget, and return why they do not fit; empty where they do."""
         self.prune(coming_bytes)
         over = self._over(self.segments(), coming_bytes)
         return f"No space left on device: {over}, and nothing unmarked is left to take away" if over else ""
 
-    def prune(self, coming_bytes: int = 0) -> list[Segment]:
+    def prune(self, coming_bytes: float = 0.0) -> list[Segment]:
         """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return
         those deleted."""
         left, gone = self.segments(), []
@@ -134,7 +125,7 @@ class RecordingFolder:
             began_s = later.began_s or 0.0
             if max(abs(began_s - segment.ended_s), abs(later.ended_s - began_s)) > LONGEST_PAUSE_S:
                 return
-            if segments[-1].ended_s - segment.ended_s > self.budget.most_s:
+            if segments[-1].ended_s - segment.ended_s > self.budget.most_days * DAY_S:
                 yield segment
 
     def mark_around(self, segment: Path) -> Path:
@@ -148,15 +139,16 @@ class RecordingFolder:
                 mark(known[place - 1].path)
         return marked
 
-    def _over(self, left: list[Segment], coming_bytes: int) -> str:
+    def _over(self, left: list[Segment], coming_bytes: float) -> str:
         """Say why `coming_bytes` beside the segments `left` break the budget or the disk's reserve; empty where they do
         not."""
-        size, free = sum(each.bytes for each in left), shutil.disk_usage(self.path).free
-        if size + coming_bytes > self.budget.most_bytes:
-            over = f"{size / 1e6:.1f} MB are in {self.path}, up to {coming_bytes / 1e6:.1f} come"
-            return f"{over}, its budget is {self.budget.most_bytes / 1e6:.1f}"
-        if free < self.budget.free_bytes + coming_bytes:
-            return f"{free / 1e6:.1f} MB are free, and {self.budget.free_bytes / 1e6:.1f} stay so for black boxes"
+        coming_MB, free_MB = coming_bytes / MB, shutil.disk_usage(self.path).free / MB
+        size_MB = sum(each.bytes for each in left) / MB
+        if size_MB + coming_MB > self.budget.most_MB:
+            over = f"{size_MB:.1f} MB are in {self.path}, up to {coming_MB:.1f} come"
+            return f"{over}, its budget is {self.budget.most_MB:.1f}"
+        if free_MB < self.budget.free_MB + coming_MB:
+            return f"{free_MB:.1f} MB are free, and {self.budget.free_MB:.1f} stay so for black boxes"
         return ""
 
     def _delete(self, segment: Segment) -> bool:

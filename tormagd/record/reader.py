@@ -127,41 +127,29 @@ def _within(chunk: Chunk) -> list[McapRecord]:
     return breakup_chunk(chunk, validate_crc=True)
 
 
-def scan(
-    file: BinaryIO,
-    name: str,
-    take: Callable[[McapRecord, int], None],
-    message: Callable[[Message], None],
-    lost: Callable[[str], None],
-) -> bool:
-    """Read an MCAP file: each message goes to `message`, other records and where they begin to `take`.
+def scan(file: BinaryIO, name: str, found: "Contents") -> bool:
+    """Read an MCAP file into `found`; return False for one that was cut short.
 
-    Damage goes to `lost`, and reading goes on with the next chunk. Returns False for a file that was cut short.
+    After damage, reading goes on with the next chunk.
     """
-    size, damage, is_whole = 0, "", True
-
-    def note(text: str) -> None:
-        nonlocal damage
-        damage = damage or text
-        lost(text)
-
+    size, is_whole = 0, True
     with readable(name):
         try:
-            for at, record, within in _intact(file, note):
+            for at, record, within in _intact(file, found.lose):
                 if isinstance(record, Chunk):
-                    take(record, at)
+                    found.take(record, at)
                     size += record.uncompressed_size
                     if size > MAX_RATIO * file.tell() + FREE_BYTES:
                         raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
                 for each in within:
                     if isinstance(each, Message):
-                        message(each)
+                        found.message(each)
                     else:
-                        take(each, at)
+                        found.take(each, at)
         except EOFError:
             is_whole = False
-        if damage and not size:
-            raise ValueError(damage)
+        if found.lost and not size:
+            raise ValueError(found.lost[0])
         if is_whole and file.read(1):
             raise ValueError("it does not end as MCAP does")
     return is_whole
@@ -187,7 +175,7 @@ def _intact(file: BinaryIO, lost: Callable[[str], None]) -> Iterator[tuple[int, 
             lost(f"byte {at}: {str(error)[:80] or repr(error)}")
             end = file.tell()
             if chunks is None:
-                chunks = sorted(each.chunk_start_offset for each in _indexed(file))
+                chunks = _indexed(file)
             following = bisect_right(chunks, at)
             if following == len(chunks) and record is None:
                 raise EOFError from error
@@ -198,14 +186,14 @@ def _intact(file: BinaryIO, lost: Callable[[str], None]) -> Iterator[tuple[int, 
             at = file.tell()
 
 
-def _indexed(file: BinaryIO) -> list[ChunkIndex]:
-    """List the chunks that the file's summary names; none where it is not there."""
-    found: list[ChunkIndex] = []
+def _indexed(file: BinaryIO) -> list[int]:
+    """List where the chunks begin that the file's summary names; none where it is not there."""
+    found = Contents()
     with contextlib.suppress(*UNREADABLE):
         for record in _summary(file):
-            if isinstance(record, ChunkIndex) and len(found) < MAX_INDEX:
-                found.append(record)
-    return found
+            if isinstance(record, ChunkIndex):
+                found.place(record, record.chunk_start_offset)
+    return sorted(place.at for place in found.places)
 
 
 def _summary(file: BinaryIO) -> Iterator[McapRecord]:
@@ -241,10 +229,10 @@ def damage_in(file: BinaryIO) -> str:
         data_crc = _at(file, data_end_at, DataEnd).data_section_crc
         if not data_crc:
             file.seek(0)
-            lost: list[str] = []
-            scan(file, file.name, lambda record, at: None, lambda message: None, lost.append)
-            if lost:
-                return lost[0]
+            found = Contents()
+            scan(file, file.name, found)
+            if found.lost:
+                return found.lost[0]
         elif data_crc != _crc(file, 0, data_end_at):
             return "the CRC of its data is wrong"
         if footer.summary_crc not in (0, _crc(file, footer.summary_start, at + FOOTER_SIZE - 4)):
@@ -271,7 +259,7 @@ class Place(NamedTuple):
 
 
 class Contents:
-    """Collects topics, metadata, and places of chunks, in the file's order."""
+    """Collects topics, metadata, places of chunks, and damage, in the file's order. Messages are passed over."""
 
     def __init__(self) -> None:
         self.topics: dict[int, str] = {}
@@ -286,25 +274,26 @@ class Contents:
             self.topics[record.id] = record.topic
         elif isinstance(record, Metadata):
             self.metadata.update(record.metadata)
-        elif isinstance(record, Chunk) and len(self.places) < MAX_INDEX:
-            self.places.append(Place(record.message_start_time, record.message_end_time, at))
+        elif isinstance(record, Chunk):
+            self.place(record, at)
 
-    def reading(self, wanted: Any, each: Callable[[Seen], None]) -> Callable[[Message], None]:
-        """Return a function that hands each tick and snapshot to `each`, decoded as `wanted`."""
-        decoder = msgspec.json.Decoder(wanted)
+    def place(self, chunk: Chunk | ChunkIndex, at: int) -> None:
+        if len(self.places) < MAX_INDEX:
+            self.places.append(Place(chunk.message_start_time, chunk.message_end_time, at))
 
-        def message(sent: Message) -> None:
-            topic = self.topics.get(sent.channel_id)
-            if topic in TOPICS:
-                each(Seen(sent.log_time, topic == TICKS_TOPIC, decoder.decode(sent.data)))
+    def message(self, sent: Message) -> None:
+        pass
 
-        return message
+    def lose(self, what: str) -> None:
+        self.lost.append(what)
 
-    def require(self, name: str) -> None:
+    def end(self, name: str, *, is_whole: bool) -> None:
+        """Note whether all was read. Raises RecordingError where the file `name` is no recording."""
         if set(self.topics.values()).isdisjoint(TOPICS):
             raise RecordingError(
                 f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
             )
+        self.is_complete = is_whole and CUT not in self.metadata
 
     def described(self, name: str, kind: Any) -> Any:
         try:
@@ -313,12 +302,23 @@ class Contents:
             return None
 
 
+class Recording(Contents):
+    """Hands each tick and snapshot to `each`, decoded as `wanted`."""
+
+    def __init__(self, wanted: Any, each: Callable[[Seen], None]) -> None:
+        super().__init__()
+        self._decode, self._each = msgspec.json.Decoder(wanted).decode, each
+
+    def message(self, sent: Message) -> None:
+        topic = self.topics.get(sent.channel_id)
+        if topic in TOPICS:
+            self._each(Seen(sent.log_time, topic == TICKS_TOPIC, self._decode(sent.data)))
+
+
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
     """Read an open recording: each tick and snapshot goes to `each`."""
-    found = Contents()
-    is_whole = scan(file, name, found.take, found.reading(wanted, each), found.lost.append)
-    found.require(name)
-    found.is_complete = is_whole and CUT not in found.metadata
+    found = Recording(wanted, each)
+    found.end(name, is_whole=scan(file, name, found))
     return found
 
 
@@ -365,13 +365,14 @@ class RecordingFile:
                 if len(found) > MAX_SEEN:
                     raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
 
-        message = self._contents.reading(wanted, keep)
+        reading = Recording(wanted, keep)
+        reading.topics = self._contents.topics
         with opened(self.path) as file, readable(str(self.path)):
             for place in self._contents.places:
                 if place.from_ns <= to_ns and place.to_ns >= from_ns:
                     for each in _within(_at(file, place.at, Chunk)):
                         if isinstance(each, Message):
-                            message(each)
+                            reading.message(each)
         return found
 
 
@@ -380,19 +381,17 @@ def summary_of(path: Path) -> tuple[Contents, Overview] | None:
     found, told, overview_at = Contents(), [], 0
     with opened(path) as file, readable(str(path)):
         for record in _summary(file):
-            if isinstance(record, ChunkIndex) and len(found.places) < MAX_INDEX:
-                place = Place(record.message_start_time, record.message_end_time, record.chunk_start_offset)
-                found.places.append(place)
+            if isinstance(record, ChunkIndex):
+                found.place(record, record.chunk_start_offset)
             elif isinstance(record, MetadataIndex):
                 told.append(record.offset)
             elif isinstance(record, AttachmentIndex) and record.name == OVERVIEW:
                 overview_at = record.offset
-            elif isinstance(record, Channel):
+            else:
                 found.take(record, 0)
         if not overview_at:
             return None
         for at in told:
             found.take(_at(file, at, Metadata), at)
-        found.require(str(path))
-        found.is_complete = CUT not in found.metadata
+        found.end(str(path), is_whole=True)
         return found, unpacked(_at(file, overview_at, Attachment).data)

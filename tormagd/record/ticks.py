@@ -12,10 +12,6 @@ from tormagd_client.printable import require
 MAX_BATCH_BYTES = 4_000_000  # 10 ticks with a snapshot of the core are under 0.1 MB
 MAX_COLUMNS = 256
 MAX_TIME_NS = 2**63
-READ, WROTE, TOLD, MISSING = "read", "wrote", "told", "missing"
-"""Entries of `core` that are no inputs of the core: what passed between daemon and device, as `[READ, time_s, raw]`, a
-snapshot as published, and that others were lost."""
-
 Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 
 

@@ -11,11 +11,12 @@ import fcntl
 import math
 import os
 import shutil
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import msgspec
 from mcap.writer import Writer
@@ -23,10 +24,10 @@ from mcap.writer import Writer
 from tormagd import __version__
 from tormagd.ground.files import new_file
 from tormagd.record.folder import RecordingFolder
+from tormagd.record.journal import READ, WROTE
 from tormagd.record.overview import OverviewBuilder
 from tormagd.record.telemetry import COLUMNS, kind_of
-from tormagd.record.thinning import AROUND_S, Shown, Thinning
-from tormagd.record.ticks import READ, WROTE, Axis, TickBatch, Value
+from tormagd.record.ticks import Axis, TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry
 
 ABOUT = "tormagd"
@@ -45,6 +46,8 @@ CHUNK_NS = 500_000_000
 MIN_FREE_BYTES = 16_000_000
 "A recording ends before the disk is full: the last chunk and the index need room."
 INDEX_SHARE = 64
+AROUND_S = 10.0
+AROUND_NS = round(AROUND_S * 1e9)
 
 
 def disk_room(path: Path, needed_bytes: int) -> str:
@@ -79,6 +82,55 @@ def frames_in(entry: Any) -> list[Frame]:
 def is_tick(entry: Any) -> bool:
     """Return whether an entry is a tick: a list that begins with an integer."""
     return isinstance(entry, list) and bool(entry) and type(entry[0]) is int
+
+
+class Shown(NamedTuple):
+    """A message of a recording: topic, time in ns since 1970, number within the topic and file."""
+
+    topic: str
+    t_ns: int
+    sequence: int
+    message: Any
+
+
+class Thinning:
+    """Keeps one tick of `every` where nothing happens, and all within AROUND_S of a fault or a mark."""
+
+    def __init__(self, every: int) -> None:
+        self.every = every
+        self._waiting: deque[Shown] = deque()
+        self._count = 0
+        self._full_to_ns = 0
+        self._faults: Any = ()
+
+    def happened(self, t_ns: int) -> None:
+        self._full_to_ns = max(self._full_to_ns, t_ns + AROUND_NS)
+
+    def take(self, tick: Shown) -> list[Shown]:
+        """Add a tick, and return the ticks to be written now, often none."""
+        if self.every == 1:
+            return [tick]
+        t_ns, faults = tick.t_ns, tick.message.get("faults", ())
+        if faults != self._faults and faults:
+            self.happened(t_ns)
+        self._faults = faults
+        self._waiting.append(tick)
+        if t_ns <= self._full_to_ns:
+            return self.rest(1)
+        given = []
+        while self._waiting and self._waiting[0].t_ns < t_ns - AROUND_NS:
+            given += self._thinned(self._waiting.popleft(), self.every)
+        return given
+
+    def rest(self, every: int) -> list[Shown]:
+        """Return one of `every` waiting ticks, and forget them all."""
+        given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
+        self._waiting.clear()
+        return given
+
+    def _thinned(self, tick: Shown, every: int) -> list[Shown]:
+        self._count += 1
+        return [] if self._count % every else [tick]
 
 
 class Derived:
