@@ -1,6 +1,7 @@
 """The daemon's side of the black box: it waits for nobody, and what is lost is said."""
 
 import contextlib
+import os
 import socket
 import time
 import tracemalloc
@@ -21,7 +22,7 @@ from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.record.journal import MAX_ENTRIES, PLAN, STEP, TEACH, Journal
-from tormagd.record.keeper import Begin, End, Part, Ring, Write, Written
+from tormagd.record.keeper import Begin, End, Part, Ring, Write, Written, in_shared_memory
 from tormagd.record.telemetry import Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -252,3 +253,19 @@ def test_a_journal_that_nobody_takes_is_bounded_and_says_so() -> None:
         journal.note(STEP)
     entries = journal.take()
     assert (entries[0], len(entries) < MAX_ENTRIES) == (("missing",), True)
+
+
+def test_a_black_box_without_room_in_memory_keeps_no_daemon_from_starting(core: Core, tmp_path: Path) -> None:
+    (tmp_path / "full").touch()
+    full = os.open(tmp_path / "full", os.O_RDONLY)
+    with patch("tempfile.mkstemp", return_value=(full, "")):
+        rig = Rig(core)
+    rig.tick(PART_TICKS)
+    assert rig.box.report().dropped > 0
+    rig.box.close()
+    os.close(full)
+
+
+def test_a_ring_without_a_name_looks_for_no_other(tmp_path: Path) -> None:
+    with patch("tormagd.record.keeper.SHARED_MEMORY", str(tmp_path / "nowhere")):
+        assert list(Ring(in_shared_memory("/boxes")).left()) == []

@@ -94,7 +94,7 @@ class BlackBox:
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
             self._ring = Ring(in_shared_memory(str(folder)))
-            self._ring.begin(self.begun)
+            self._begin_ring(self._ring)
             self._start(self._ring)
         self.journal = Journal(is_kept=self._ring is not None)
         self._ticks = PART_TICKS // 2
@@ -113,7 +113,7 @@ class BlackBox:
         self.journal.take()
         self.begun = Begin(str(self._folder), header)
         if self._ring is not None:
-            self._ring.begin(self.begun)
+            self._begin_ring(self._ring)
         self.journal.note(MISSING)
         self._snapshot(stepper, planner)
 
@@ -222,6 +222,13 @@ class BlackBox:
     def _send(self, what: Write | End) -> bool:
         """Send one message to the keeper, and return whether the socket took it."""
         return self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
+
+    def _begin_ring(self, ring: Ring) -> None:
+        try:
+            ring.begin(self.begun)
+        except OSError as error:  # control goes on
+            self._refusal = f"no room in shared memory: {error.strerror}"
+            log.error("black boxes may be without what comes now: %s; next: make room there", self._refusal)
 
     def _start(self, ring: Ring) -> None:
         """Start the keeper; where that fails, it is tried again."""

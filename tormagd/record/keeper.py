@@ -147,6 +147,8 @@ class Ring:
 
     def left(self) -> "Iterator[Ring]":
         """Yield the ring of each daemon with this folder that was killed with its keeper, and remove it then."""
+        if self.path.parent != Path(SHARED_MEMORY):
+            return
         for path in self.path.parent.glob(f"{self.path.name.rpartition('-')[0]}-*"):
             with contextlib.suppress(OSError), contextlib.ExitStack() as opened:
                 file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
