@@ -20,10 +20,10 @@ from tormagd.control.assembly.profile import (
 )
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
-from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit, device_bounds
+from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
 
 OF = {"serial_number": 7, "insert": "MRE-50-40", "model": "ab" * 32}
-BOUNDS = device_bounds(Config().trim)
+BOUNDS = Config().trim
 KNOWN = Learned(DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4), 1.1, 0.6, 0.07, 0.012)
 KEPT = profile_of(KNOWN, saved_ns=10**18, **OF)  # type: ignore[arg-type]
 

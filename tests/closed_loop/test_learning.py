@@ -69,7 +69,7 @@ def test_a_weak_device_that_was_slid_at_speed_is_known_as_such_and_right_at_once
     assert max(forces_N) < 2.0 + 0.06
     assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)
     told = beliefs(loop.planner, loop.stepper, loop.now_s, EVERY_TERM)
-    assert told["scale"].value == loop.planner.believe.strength.fit.scale < 0.95
+    assert told["scale"].value == loop.planner.believe.fit.scale < 0.95
     assert told["scale"].sd is not None
     assert 0.0 < told["scale"].sd < 0.1
     assert told["relaxed"].value > 0.0

@@ -11,11 +11,11 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.assembly.profile import ProfileError, profile_of
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
-from tormagd.control.believe.strength import DeviceFit, device_bounds
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.daemon.profiles import ProfileFolder, Profiles
 
 MODEL = "ab" * 32
-BOUNDS = device_bounds(Config().trim)
+BOUNDS = Config().trim
 STRONG = Learned(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)
 
 

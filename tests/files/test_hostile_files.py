@@ -17,7 +17,6 @@ import pytest
 
 from tormagd.config import Config, load_calibration, load_config
 from tormagd.control.assembly.profile import ProfileError
-from tormagd.control.believe.strength import device_bounds
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.element.model.model_file import ModelFileError, load_model
@@ -89,7 +88,7 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
 
 
 def _profile(path: Path) -> None:
-    folder = ProfileFolder(path.parent, "MRE-50-40", "ab" * 32, device_bounds(Config().trim))
+    folder = ProfileFolder(path.parent, "MRE-50-40", "ab" * 32, Config().trim)
     path.rename(folder.path(7))
     if folder.read(7) is None:
         raise ProfileError("No such file")

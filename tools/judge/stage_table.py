@@ -34,7 +34,7 @@ from tormagd.control.believe.ripple import Ripple
 from tormagd.control.believe.sensor import SensorTrust
 from tormagd.control.believe.sensor_zero import SensorZero
 from tormagd.control.believe.slow_friction import SlowFriction
-from tormagd.control.believe.strength import UNSEEN, Strength, device_bounds
+from tormagd.control.believe.strength import UNSEEN, DeviceFit, adapting_s, observe
 from tormagd.control.contact import Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.interpolation import Rising, at_step, interpolated, low_pass
@@ -65,7 +65,7 @@ PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
 "Periods of a tick and of a plan, and the longest tick of `Stepper`."
 BEGINS_S = 9.9
 CONFIG = Config(scene="coronary")
-BOUNDS = device_bounds(CONFIG.trim)
+BOUNDS = CONFIG.trim
 READY = Conditions(True, True, True, False, False)
 OWN, MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
     "",
@@ -220,9 +220,12 @@ def believing(stage: Believe, draw: Draw) -> object:
     return [belief, stage.learned(), stage.min_N]
 
 
-def strength(stage: Strength, draw: Draw) -> object:
-    stage.update(draw(1.1), draw(1.2), draw.positive(PLAN_S))
-    fit = stage.fit
+def strength(stages: list[DeviceFit], draw: Draw) -> object:
+    adapts_in_s = adapting_s(0.5, draw(0.1))
+    stages[0], _ = observe(
+        stages[0], draw(1.1), draw(1.2), draw.positive(PLAN_S), adapts_in_s=adapts_in_s, bounds=BOUNDS
+    )
+    fit = stages[0]
     return [fit.force_N(1.1), fit.model_N(1.1), fit.deviation_N(1.1), fit.surely_within_N(2.5, BOUNDS)]
 
 
@@ -235,7 +238,6 @@ def slow_friction(stage: SlowFriction, draw: Draw) -> object:
 
 
 def sensor_zero(stage: SensorZero, draw: Draw) -> object:
-    stage.begin(draw.now_s)
     stage.update(
         draw.now_s,
         1.0 if draw.steps // 4 % 2 else -1.0,
@@ -243,8 +245,8 @@ def sensor_zero(stage: SensorZero, draw: Draw) -> object:
         draw(1.1),
         abs(draw(42.0)),
         draw.positive(0.2),
-        1.0,
-        0.1,
+        UNSEEN,
+        learns=True,
         is_disputed=draw.steps % 2 > 0,
     )
     return [stage.sd_N(draw.now_s), stage.way]
@@ -522,13 +524,13 @@ def stages() -> list[Stage]:
         Stage("plausible", lambda: None, plausible, MEASUREMENT, PERIOD_S),
         Stage("sight", lambda: Sight(PERIOD_S), sight, MEASUREMENT, PERIOD_S),
         Stage("believe/believe", lambda: planner().believe, believing, MEASUREMENT, PLAN_S),
-        Stage("believe/strength", lambda: Strength(0.5, BOUNDS, (True, True)), strength, MEASUREMENT),
+        Stage("believe/strength", lambda: [UNSEEN], strength, MEASUREMENT),
         Stage("believe/slow_friction", partial(SlowFriction, BOUNDS), slow_friction, MEASUREMENT),
         Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT, PLAN_S),
         Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
         Stage("believe/anchor", partial(Anchor, UNSEEN), anchor, MEASUREMENT),
         Stage("believe/ripple", Ripple, ripple, MEASUREMENT),
-        Stage("believe/sensor", partial(SensorTrust, BOUNDS, 0.08), sensor, MEASUREMENT),
+        Stage("believe/sensor", partial(SensorTrust, BOUNDS), sensor, MEASUREMENT),
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT, PLAN_S),
         Stage("believe/memory", lambda: planner().believe.memory, memory, MEASUREMENT, PLAN_S),

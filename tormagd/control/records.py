@@ -243,7 +243,7 @@ class Belief(Value):
         predicted_N: float | None,
         limits: tuple[Limit, ...],
         sensor_doubted_s: float,
-        anchor_N: float | None = None,
+        anchor_N: float = math.inf,
     ) -> None:
         self.device: Final = device
         self.at_speed: Final = at_speed

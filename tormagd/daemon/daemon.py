@@ -13,7 +13,6 @@ import msgspec
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.assembly.profile import gains_of
-from tormagd.control.believe.strength import device_bounds
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.daemon.answers import Answers
@@ -139,7 +138,7 @@ class Daemon:
         self._ended = asyncio.Event()
 
     def _profiles_of(self, core: Core) -> Profiles:
-        folder, bounds = state_folder(core.config.device.profiles, "profiles"), device_bounds(core.config.trim)
+        folder, bounds = state_folder(core.config.device.profiles, "profiles"), core.config.trim
         known = core.scene.insert.name, core.model, bounds, gains_of(core.config)
         of_insert = None if folder is None else ProfileFolder(folder, *known)
         return Profiles(of_insert, self._inference.planner.believe, self._inference.teach)

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import msgspec
 
+from tormagd.config import Trim
 from tormagd.control.assembly.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
-from tormagd.control.believe.strength import UNSEEN, DeviceBounds
+from tormagd.control.believe.strength import UNSEEN
 from tormagd.ground.files import in_place_of, read_bounded
 from tormagd_client.messages import ProfileReport
 
@@ -31,7 +32,7 @@ def state_folder(configured: str, name: str) -> Path | None:
 class ProfileFolder:
     """The profile files of one scene's insert and model: one file for each device, by its serial number."""
 
-    def __init__(self, folder: Path, insert: str, model: str, bounds: DeviceBounds, gains: str = "") -> None:
+    def __init__(self, folder: Path, insert: str, model: str, bounds: Trim, gains: str = "") -> None:
         self.folder, self.insert, self.model, self.gains, self._bounds = folder, insert, model, gains, bounds
 
     def path(self, serial_number: int) -> Path:
@@ -148,7 +149,7 @@ class Profiles:
             log.warning("the device's profile is not used: %s; next: tormagctl calibrate --device", error)
             return
         # another device is connected by now, or this one has shown itself meanwhile
-        if profile is None or profile.serial_number != self._serial_number or self._believe.strength.fit is not UNSEEN:
+        if profile is None or profile.serial_number != self._serial_number or self._believe.fit is not UNSEEN:
             return
         assert self._folder is not None, "it was read from one"
         now_ns = time.time_ns()

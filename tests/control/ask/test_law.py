@@ -81,7 +81,7 @@ def test_the_less_sure_a_wall_is_the_sooner_the_gap_sets_out_to_it() -> None:
 def test_what_is_learned_on_the_way_leaves_the_gap_where_it_is(following: Following, learned_N_s: float) -> None:
     gaps_mm = []
     for place_mm in np.arange(9.0, 15.0, 30.0 * PERIOD_S).tolist():
-        device = UNSEEN.shifted(learned_N_s * following.now_s)
+        device = DeviceFit(offset_N=learned_N_s * following.now_s)
         ask = following.ask(Travel(place_mm, 30.0), device=device, wall=Wall(10.0, 1.0, 0.6))
         gaps_mm.append(PORTRAIT.gap_mm_at(device.model_N(ask.path_N[0])))
     assert np.diff(gaps_mm[-20:]) == pytest.approx(-38.0 * PERIOD_S, rel=0.02)

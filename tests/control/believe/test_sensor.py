@@ -10,8 +10,9 @@ from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.freshness import FROZEN_S
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.sensor import (
-    INSIDE_S,
+    DOUBTED_S,
     KNOWN_N,
+    NAMED_S,
     SLACK_N,
     WRONG_S,
 )
@@ -78,6 +79,11 @@ def test_readings_that_rise_are_followed_at_once(known, hear, moving) -> None:
     assert Limit.DEVICE_OR_SENSOR in known.planned.limits
 
 
+def test_a_small_surprise_is_followed_as_soon_and_noise_is_none(known, hear, moving) -> None:
+    assert force_N(hear(known, 0.15, moving(force_N=MODEL_N + 0.1)).believe) > MODEL_N + 0.08
+    assert force_N(hear(known, 10.0, moving(), 0.01).believe) == pytest.approx(MODEL_N, abs=2e-3)
+
+
 def test_readings_of_no_device_open_nothing_and_name_the_sensor(known, hear, moving) -> None:
     believe = hear(known, 2.0 * WRONG_S, moving(force_N=10.0 * MODEL_N)).believe
     assert Limit.SENSOR in known.planned.limits
@@ -88,7 +94,7 @@ def test_readings_of_no_device_open_nothing_and_name_the_sensor(known, hear, mov
 @pytest.mark.parametrize("share", [0.0, 0.7, 1.3, 10.0])
 def test_readings_that_come_back_end_it_and_the_device_is_what_it_was(known, hear, moving, share: float) -> None:
     hear(known, 0.2, moving(force_N=share * MODEL_N))
-    believe = hear(known, 0.1 + (6.0 if share in (0.0, 10.0) else 1.2) * INSIDE_S, moving()).believe
+    believe = hear(known, 0.1 + (1.2 * DOUBTED_S if share in (0.0, 10.0) else 2.4 * NAMED_S), moving()).believe
     assert (known.planned.limits, believe.sensor.is_disputed) == ((), False)
     assert force_N(believe) == pytest.approx(MODEL_N, abs=5e-3)
 

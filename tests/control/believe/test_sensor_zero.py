@@ -16,8 +16,21 @@ from tormagd.control.believe.sensor_zero import (
     Level,
     SensorZero,
 )
+from tormagd.control.believe.strength import DeviceFit
 
 PERIOD_S = 0.004
+
+
+def heard(
+    zero: SensorZero,
+    now_s: float,
+    direction: float,
+    reading_N: float,
+    model_N: float,
+    rate_mm_s: float,
+    fit: DeviceFit,
+) -> None:
+    zero.update(now_s, direction, reading_N, model_N, rate_mm_s, PERIOD_S, fit, learns=True, is_disputed=False)
 
 
 def strokes(
@@ -45,10 +58,7 @@ def strokes(
         for noise_N in random.normal(0.0, 0.01, round(stroke_s / PERIOD_S)).tolist():
             now_s += PERIOD_S
             reading_N = scale * force_N * (1.0 + way * direction) + direction * off_N + noise_N
-            zero.begin(now_s)
-            zero.update(
-                now_s, direction, reading_N, force_N, rate_mm_s[stroke % 2], PERIOD_S, scale, 0.02, is_disputed=False
-            )
+            heard(zero, now_s, direction, reading_N, force_N, rate_mm_s[stroke % 2], DeviceFit(scale, 0.0, 0.02**2))
         now_s += rest_s
     return zero, now_s
 
@@ -123,7 +133,7 @@ def test_a_level_is_a_mean_that_forgets() -> None:
 def test_a_level_takes_its_time() -> None:
     zero, now_s = strokes(0.3, is_tared=False, number=1)
     for reading in range(1, 50):
-        zero.update(now_s + reading * PERIOD_S, -1.0, 1.2, 1.5, 42.0, PERIOD_S, 1.0, 0.02, is_disputed=False)
+        heard(zero, now_s + reading * PERIOD_S, -1.0, 1.2, 1.5, 42.0, DeviceFit(1.0, 0.0, 0.02**2))
         assert (zero.zero_N > 0.2) is (reading * PERIOD_S > LEVEL_S)
 
 

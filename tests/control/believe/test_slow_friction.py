@@ -17,13 +17,13 @@ from tormagd.control.believe.slow_friction import (
     believable,
     factor_bounds,
 )
-from tormagd.control.believe.strength import MAX_RELAXED, UNSEEN, DeviceFit, device_bounds
+from tormagd.control.believe.strength import MAX_RELAXED, UNSEEN, DeviceFit
 from tormagd.ground.plain_values import plain
 
 PERIOD_S = 0.003
-BOUNDS = device_bounds(Config().trim)
+BOUNDS = Config().trim
 MIN_FACTOR, MAX_FACTOR = factor_bounds(BOUNDS)
-MIN_SHARE = BOUNDS.min_scale * (1.0 - MAX_RELAXED)
+MIN_SHARE = BOUNDS.least * (1.0 - MAX_RELAXED)
 KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
 
 

@@ -2,9 +2,11 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
+from tormagd.config import Trim
 from tormagd.control.believe.strength import (
     ERROR_N2_S,
     OFFSET_SD_N,
@@ -12,24 +14,29 @@ from tormagd.control.believe.strength import (
     SCALE_SD,
     SURE,
     UNSEEN,
-    DeviceBounds,
     DeviceFit,
-    Strength,
+    adapting_s,
     forgotten,
     observe,
 )
 
 PERIOD_S = 0.004
-BOUNDS = DeviceBounds(0.6, 1.6, -0.2, 0.3)
+BOUNDS = Trim(time_s=0.5, least=0.6, most=1.6, least_offset_N=-0.2, most_offset_N=0.3)
 
 
-def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = UNSEEN) -> DeviceFit:
+def shown(
+    levels: list[tuple[float, float]],
+    scale: float,
+    offset_N: float,
+    fit: DeviceFit = UNSEEN,
+    adapts_in_s: float = 0.5,
+) -> DeviceFit:
     """The fit after a device of that scale and offset was held at these model forces, with noise."""
     random = np.random.default_rng(1)
     for seconds, model_N in levels:
         for noise_N in random.normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
             measured_N = scale * model_N + offset_N + noise_N
-            fit, _ = observe(fit, model_N, measured_N, PERIOD_S, adapts_in_s=0.5, bounds=BOUNDS)
+            fit, _ = observe(fit, model_N, measured_N, PERIOD_S, adapts_in_s=adapts_in_s, bounds=BOUNDS)
     return fit
 
 
@@ -56,9 +63,12 @@ def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
 
 
 def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
-    fit, is_held = observe(DeviceFit(1.0, 0.05), 2.0, 6.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
-    assert (is_held, fit.scale) == (True, BOUNDS.max_scale)
+    by_offset = msgspec.structs.replace(BOUNDS, most_offset_N=2.9)
+    fit, is_held = observe(DeviceFit(1.0, 0.05), 2.0, 6.0, 1.0, adapts_in_s=0.5, bounds=by_offset)
+    assert (is_held, fit.scale) == (True, BOUNDS.most)
     assert fit.force_N(2.0) == pytest.approx(6.0, abs=0.1), "the offset takes what is left"
+    held, is_held = observe(DeviceFit(1.0, 0.05), 2.0, 6.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
+    assert (is_held, held.scale, held.offset_N) == (True, BOUNDS.most, BOUNDS.most_offset_N)
 
 
 def test_force_and_model_are_each_others_inverse() -> None:
@@ -71,13 +81,13 @@ STRONGEST = 1.53
 
 
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
-@pytest.mark.parametrize("scale", [BOUNDS.min_scale, 0.8, 1.0, 1.2, STRONGEST])
+@pytest.mark.parametrize("scale", [BOUNDS.least, 0.8, 1.0, 1.2, STRONGEST])
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
     most_N = 2.5
     model_N = shown(levels, scale, 0.0).surely_within_N(most_N, BOUNDS)
     allowed_N = most_N if levels else most_N * STRONGEST / (1.0 + SURE * SCALE_SD)
     assert scale * model_N <= 1.03 * allowed_N
-    assert most_N / BOUNDS.max_scale <= model_N <= most_N / BOUNDS.min_scale
+    assert most_N / BOUNDS.most <= model_N <= most_N / BOUNDS.least
 
 
 def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
@@ -86,12 +96,12 @@ def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
 
 
 def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
-    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5, BOUNDS) == 2.5 / BOUNDS.max_scale
+    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5, BOUNDS) == 2.5 / BOUNDS.most
 
 
 def test_where_stronger_devices_are_allowed_the_ceiling_holds_for_them() -> None:
     strong = DeviceFit(3.0, scale_variance=0.0, offset_variance_N2=0.0)
-    assert strong.force_N(strong.surely_within_N(2.5, DeviceBounds(0.6, 4.0, -0.2, 0.3))) == pytest.approx(2.5)
+    assert strong.force_N(strong.surely_within_N(2.5, Trim(most=4.0))) == pytest.approx(2.5)
 
 
 @pytest.mark.parametrize("relaxed_N", [0.0, 0.1, 0.25])
@@ -151,26 +161,9 @@ def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns: tupl
 KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)
 
 
-def heard(off_N: float, seconds: float) -> Strength:
-    strength = Strength(0.5, BOUNDS, (True, True))
-    strength.forget(KNOWN)
-    for noise_N in np.random.default_rng(2).normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
-        strength.update(1.5, 1.5 + off_N + noise_N, PERIOD_S)
-    return strength
-
-
 def test_a_surprise_is_learned_sooner_and_noise_is_none() -> None:
-    assert heard(0.1, 0.15).fit.force_N(1.5) > 1.58
+    soon_s = adapting_s(0.5, 0.1)
+    assert adapting_s(0.5, 0.0) == 0.5
+    assert shown([(0.15, 1.5)], 1.0, 0.1, KNOWN, soon_s).force_N(1.5) > 1.58
     assert shown([(0.15, 1.5)], 1.0, 0.1, KNOWN).force_N(1.5) < 1.52
-    assert heard(0.0, 10.0).fit.force_N(1.5) == pytest.approx(1.5, abs=5e-4)
-
-
-def test_a_pause_ends_a_surprise_and_what_was_held_and_leaves_the_fit() -> None:
-    strength = Strength(0.5, BOUNDS, (True, True))
-    strength.update(1.5, 4.5, 1.0)
-    known = strength.fit
-    assert (known.scale, strength.is_held, strength.surprise_N > 1.0) == (BOUNDS.max_scale, True, True)
-    strength.settle()
-    assert (strength.fit, strength.surprise_N, strength.is_held) == (known, 0.0, False)
-    strength.forget()
-    assert strength.fit == UNSEEN
+    assert shown([(10.0, 1.5)], 1.0, 0.0, KNOWN, adapting_s(0.5, 0.003)).force_N(1.5) == pytest.approx(1.5, abs=1e-3)

@@ -15,7 +15,7 @@ from tormagd.config import Config
 from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, lawful_mT, least_mm
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.strength import DeviceFit, device_bounds
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.move.motor import gap_speeds
 from tormagd.control.nominal import FieldOfGap, Nominal
 from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
@@ -67,7 +67,7 @@ class Aim:
         self._portrait: Final = element.portrait
         self._range_mm: Final = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
         self._ceiling_N: Final = CEILING * scene.force.most_N
-        self._bounds: Final = device_bounds(config.trim)
+        self._bounds: Final = config.trim
         self._speeds: Final = gap_speeds(config)
         self._max_mm_s2: Final = config.position.gap_acceleration_mm_s2
         self._low_confidence: Final = config.limits.low_confidence

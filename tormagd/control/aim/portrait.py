@@ -5,7 +5,8 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.control.believe.strength import DeviceBounds, DeviceFit
+from tormagd.config import Trim
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.interpolation import Rising, at_step, interpolated, interpolated_before
 from tormagd.control.nominal import FieldOfGap
 from tormagd.control.records import Belief
@@ -114,17 +115,15 @@ LAW_SHARE: Final = 0.12
 "On sample 1 the search's field differs from the force law's by 1 to 11%."
 
 
-def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
+def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Trim) -> float:
     """Return the least gap allowed for the believed device, and for an unseen one where there is one."""
-    known_mm = ceiling_mm(portrait, belief.device, ceiling_N, bounds)
-    if belief.anchor_N is not None:
-        known_mm = max(known_mm, portrait.gap_mm_at(belief.anchor_N))
+    known_mm = max(ceiling_mm(portrait, belief.device, ceiling_N, bounds), portrait.gap_mm_at(belief.anchor_N))
     if belief.unseen is None:
         return known_mm
     return max(known_mm, ceiling_mm(portrait, belief.unseen, ceiling_N, bounds))
 
 
-def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
+def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: Trim) -> float:
     """Return the least gap at which the device surely gives no more than `ceiling_N`."""
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
 

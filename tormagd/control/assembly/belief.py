@@ -11,8 +11,8 @@ from tormagd_client.messages import BeliefReport
 def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> dict[str, BeliefReport]:
     """Return each thing believed of the device at `now_s`, by name, and whether it acts."""
     believe, plan = planner.believe, planner.planned
-    fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
-    ripple = believe.ripple.trust * max(believe.ripple.shares)
+    fit, memory, zero_sd_N = believe.fit, believe.memory, believe.zero.sd_N(now_s)
+    ripple = max(believe.ripple.shares)
     is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust
     return {
         "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),

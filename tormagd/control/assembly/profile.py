@@ -11,12 +11,12 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from tormagd.config import Config
+from tormagd.config import Config, Trim
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
 from tormagd.control.believe.sensor_zero import MAX_ZERO_N
 from tormagd.control.believe.slow_friction import factor_bounds
-from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceBounds, DeviceFit
+from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
 
 VERSION = 1
 MAX_BYTES = 4_096
@@ -84,7 +84,7 @@ def profile_of(
     )
 
 
-def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: DeviceBounds) -> Profile:
+def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: Trim) -> Profile:
     """Return the profile in `data`. Raises ProfileError where it is damaged or another device's."""
     try:
         profile = msgspec.json.decode(data, type=Profile)
@@ -100,8 +100,8 @@ def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bo
                 f"{name} = {kept!r}: it is of another {name.removesuffix('_number')}, here is {present!r}"
             )
     for name, value, (least, most) in (
-        ("scale", profile.scale, (bounds.min_scale, bounds.max_scale)),
-        ("offset_N", profile.offset_N, (bounds.min_offset_N, bounds.max_offset_N)),
+        ("scale", profile.scale, (bounds.least, bounds.most)),
+        ("offset_N", profile.offset_N, (bounds.least_offset_N, bounds.most_offset_N)),
         ("slow_factor", profile.slow_factor, factor_bounds(bounds)),
     ):
         if not least <= value <= most:

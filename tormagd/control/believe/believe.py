@@ -12,14 +12,14 @@ from typing import Final, final
 from firmware_protocol.value import Value
 from tormagd.config import Config
 from tormagd.control.believe.anchor import MIDDLE_N, Anchor
-from tormagd.control.believe.carriage_lag import CarriageLag
+from tormagd.control.believe.carriage_lag import MAX_DT_S, CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.ripple import Ripple
-from tormagd.control.believe.sensor import KNOWN_N, SLACK_N, Disputed, SensorTrust
-from tormagd.control.believe.sensor_zero import LEVEL_S, UNKNOWN_SD_N, SensorZero
+from tormagd.control.believe.sensor import DOUBTED_S, KNOWN_N, NAMED_S, SLACK_N, Disputed, SensorTrust
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
-from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, Strength, device_bounds
+from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, adapting_s, observe
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Belief, Measured
 from tormagd.control.safety.codes import Limit
@@ -28,7 +28,6 @@ from tormagd.element.model.displacement import MOVING_MM_S
 from tormagd.scenes.scene import Scene
 
 MIN_DT_S: Final = 0.003
-MAX_DT_S: Final = 0.02
 "Readings teach every MIN_DT_S at most; a gap between readings counts as MAX_DT_S at most."
 CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
 STOPPING_MM_S: Final = 0.5 * MOVING_MM_S
@@ -77,43 +76,46 @@ NOTHING_LEARNED: Final = Learned()
 class Believe:
     """The stage that learns one device from its readings: it updates the estimators, and says what is believed."""
 
-    read: int = -1
+    fit: DeviceFit
+    "Scale and offset of the device at speed, with nothing relaxed."
+    slow: SlowFriction
+    zero: SensorZero
+    sensor: SensorTrust
+    ripple: Ripple
+    carriages: CarriageLag
+    handle: HandleWatch
+    read: int
     "Number of the newest measurement that taught; -1 before the first."
     read_s: float
     "When that measurement taught; -inf before the first."
-    limits: tuple[Limit, ...] = ()
+    limits: tuple[Limit, ...]
     "What is wrong with the sensor or with the fit, as the newest reading at speed shows."
-    is_prior: bool = False
+    is_prior: bool
     "Whether a fit from another day was taught, and no reading has contradicted it."
-    is_contradicted: bool = False
+    is_contradicted: bool
     "Whether the first slide has shown another device than the one taught."
 
     def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
         """Begin with an unseen device."""
-        terms = scene.terms
-        trim = config.trim
-        self.memory, self.handle = memory, HandleWatch()
-        self._bounds: Final = device_bounds(trim)
-        self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
-        self._trim: Final = trim
-        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(trim.way)
-        self.sensor, self.carriages = SensorTrust(self._bounds, trim.leash), CarriageLag()
-        self.ripple = Ripple()
+        terms, slides = scene.terms, nominal.contact.slides
+        self.memory = memory
+        self.learns = terms.learning
+        self._trim: Final = config.trim
+        self._learned_terms: Final = (terms.scale, terms.offset)
         self._radius_mm: Final = scene.insert.roller_radius_mm
         self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self.read_s, self.learns = -math.inf, terms.learning
         self._has_lag: Final = terms.motor
-        self._slides: Final = nominal.contact.slides
-        self._has_creep: Final = terms.creep and nominal.contact.slides
-        self._fits: Final = terms.scale or terms.offset
+        self._slides: Final = slides
+        self._has_creep: Final = terms.creep and slides
+        self.forget()
 
     @property
     def device(self) -> DeviceFit:
-        return self.strength.fit.relaxed(self.memory.relaxed_N)
+        return self.fit.relaxed(self.memory.relaxed_N)
 
     @property
     def min_N(self) -> float:
@@ -126,14 +128,13 @@ class Believe:
     def learned(self) -> Learned:
         """Return what is known of this device now, to `teach` on another day."""
         slow = self.slow
-        return Learned(self.strength.fit, slow.factor_at(0.0), slow.learned, self.zero.zero_N, self.carriages.lag_s)
+        return Learned(self.fit, slow.factor_at(0.0), slow.learned, self.zero.zero_N, self.carriages.lag_s)
 
     def teach(self, learned: Learned) -> None:
         """Replace all that is known of the device by `learned`, and begin its estimators anew."""
-        self.strength.forget(learned.device)
-        self.slow, self.zero = SlowFriction(self._bounds), SensorZero(self._trim.way)
-        self.sensor, self.carriages = SensorTrust(self._bounds, self._trim.leash, learned.device), CarriageLag()
-        self.ripple = Ripple()
+        self.fit = learned.device
+        self.slow, self.zero, self.ripple = SlowFriction(self._trim), SensorZero(self._trim.way), Ripple()
+        self.sensor, self.carriages = SensorTrust(self._trim, learned.device), CarriageLag()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
@@ -161,13 +162,10 @@ class Believe:
 
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan."""
-        if not (self.learns and self._has_lag):
-            return
-        if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:
-            self.carriages.update(dt_s, None, 0.0, 0.0, self._top_speed_mm_s)
-        else:
+        if self.learns and self._has_lag and measured is not None:
+            is_ahead = measured.is_homed and foresight >= MIN_FORESIGHT
             gap_mm, speed_mm_s = measured.gap_mm, measured.gap_speed_mm_s
-            self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
+            self.carriages.update(dt_s, planned_mm if is_ahead else None, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
         at_speed = self.device
@@ -176,15 +174,18 @@ class Believe:
             ripple = self._ripple(measured)
             if slid_N is not None and self._nominal.contact.is_known(measured):
                 now_slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-                predicted_N = self.strength.fit.force_N(slid_N) * now_slow * ripple
-        unseen = UNSEEN.relaxed(self.memory.relaxed_N) if self.is_prior and not has_slid else None
+                predicted_N = self.fit.force_N(slid_N) * now_slow * ripple
         slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
-        anchor_N = self._anchor_N(slow * max(ripple, 1.0)) if has_slid else None
-        device = at_speed.times(slow * ripple)
-        lag_s = self.carriages.lag_s if self._has_lag else 0.0
-        limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
-        doubted_s = self.sensor.doubted_s
-        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, doubted_s, anchor_N)
+        return Belief(
+            device=at_speed.times(slow * ripple),
+            at_speed=at_speed,
+            unseen=UNSEEN.relaxed(self.memory.relaxed_N) if self.is_prior and not has_slid else None,
+            lag_s=self.carriages.lag_s if self._has_lag else 0.0,
+            predicted_N=predicted_N,
+            limits=(*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits,
+            sensor_doubted_s=self.sensor.doubted_s,
+            anchor_N=self._anchor_N(slow * max(ripple, 1.0)) if has_slid else math.inf,
+        )
 
     def _anchor_N(self, factor: float) -> float:
         """Return the model's force, N, of the ceiling on the anchor."""
@@ -209,7 +210,7 @@ class Believe:
         reading_N = (measured.force_N - measured.handle.turn.direction * self.zero.zero_N) / self._ripple(measured)
         is_mobilised = self._nominal.contact.is_known(measured)
         # a hand that meets a wall stops within 10 ms
-        is_low = reading_N < self.strength.fit.force_N(model_N) - STUCK_N
+        is_low = reading_N < self.fit.force_N(model_N) - STUCK_N
         is_stuck = is_low and abs(measured.handle.quick_mm_s) < STOPPING_MM_S
         if is_mobilised and not (
             self._slides and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
@@ -221,49 +222,45 @@ class Believe:
     def _hear_at_creep(
         self, now_s: float, measured: Measured, reading_N: float, dt_s: float, is_mobilised: bool
     ) -> None:
-        """Learn slow friction from one reading of a handle that creeps, and forget the fit's surprise."""
-        self.strength.settle()
+        """Learn slow friction from one reading of a handle that creeps."""
         rate_mm_s = abs(measured.handle.rate_mm_s)
         is_creep = measured.handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
         is_creep = is_creep and SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S
-        if not (self._has_creep and self.learns and is_creep) or self.sensor.is_disputed:
+        if not (self._has_creep and self.learns and is_creep):
             return
-        expected_N = self.strength.fit.force_N(self.slow.followed_N)
+        expected_N = self.fit.force_N(self.slow.followed_N)
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
         is_lesson = self.knows_zero(now_s) and (is_mobilised or reading_N > expected_N)
         if expected_N > MIN_EXPECTED_N and is_lesson:
-            self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
+            self.slow.update(self.fit, rate_mm_s, reading_N, dt_s)
 
     def _hear_at_speed(self, now_s: float, measured: Measured, reading_N: float, model_N: float, dt_s: float) -> None:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit."""
-        direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
-        zero, fit, sensor = self.zero, self.strength.fit, self.sensor
-        angle, zero_sd_N = measured.handle_mm / self._radius_mm, zero.sd_N(now_s)
-        zero.begin(now_s)
-        if self.learns:
-            # an anchor that was learned one way only was misread
-            sensor.anchor.values[1] += zero.update(
-                now_s,
-                direction,
-                measured.force_N / (1.0 + self.ripple.share(angle)),
-                model_N,
-                rate_mm_s,
-                dt_s,
-                fit.scale,
-                fit.scale_sd,
-                is_disputed=sensor.is_doubted or sensor.outside_s > 2.0 * LEVEL_S,
-            )
+        rate_mm_s, angle = abs(measured.handle.rate_mm_s), measured.handle_mm / self._radius_mm
+        zero, fit, sensor = self.zero, self.fit, self.sensor
+        zero_sd_N = zero.sd_N(now_s)
+        # an anchor that was learned one way only was misread
+        sensor.anchor.values[1] += zero.update(
+            now_s,
+            measured.handle.turn.direction,
+            measured.force_N / (1.0 + self.ripple.share(angle)),
+            model_N,
+            rate_mm_s,
+            dt_s,
+            fit,
+            learns=self.learns,
+            is_disputed=sensor.wrong_s + sensor.outside_s > 2.0 * NAMED_S,
+        )
         learns = self.learns and zero_sd_N <= UNKNOWN_SD_N
         taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns)
         unknown_N = self._unknown_N(zero_sd_N)
         least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
-        if taught_N is None or (unknown_N > 0.0 and reading_N < least_N):
-            self.strength.settle()
+        if taught_N is None or not self.learns or (unknown_N > 0.0 and reading_N < least_N):
             return
-        if self._slides and not self.strength.is_held:
-            anchor_N = max(sensor.anchor.force_N(model_N), MIN_EXPECTED_N)
+        anchor_N = max(sensor.anchor.force_N(model_N), MIN_EXPECTED_N)
+        self._fit(model_N, rate_mm_s, taught_N - unknown_N, anchor_N + sensor.off_N, dt_s)
+        if self._slides and Limit.TRIM not in self.limits:
             self.ripple.update(angle, measured.handle.rate_mm_s, anchor_N, reading_N)
-        self._fit(model_N, rate_mm_s, taught_N - unknown_N, dt_s)
 
     def _unknown_N(self, zero_sd_N: float) -> float:
         """Update `limits`, and return what a zero that is known to within `zero_sd_N` may explain, if that is much."""
@@ -276,30 +273,34 @@ class Believe:
             return SURE * zero_sd_N + SLACK_N
         return 0.0
 
-    def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Learn the fit's scale and offset from one reading; a reading that may be old or wrong teaches nothing."""
-        if not (self.learns and self._fits):
-            return
-        before_N = self.strength.fit.force_N(model_N)
+    def _fit(self, model_N: float, rate_mm_s: float, reading_N: float, mean_N: float, dt_s: float) -> None:
+        """Learn the fit's scale and offset from one reading, the sooner the more the readings' mean is off."""
+        before_N = self.fit.force_N(model_N)
         if self.is_prior and not self.sensor.has_slid and abs(reading_N - before_N) > CONTRADICTED_N:
             self.is_prior, self.is_contradicted = False, True
-            self.strength.forget()
-            self.sensor.anchor = Anchor(UNSEEN)
-        self.strength.update(model_N, reading_N, dt_s)
-        after_N = self.strength.fit.force_N(model_N)
-        # the force at a slower creep stays while scale and offset are learned
-        self.slow.rescale(before_N, after_N, rate_mm_s)
-        if self.strength.is_held:
+            self.fit, self.sensor.anchor = UNSEEN, Anchor(UNSEEN)
+        self.fit, is_held = observe(
+            self.fit,
+            model_N,
+            reading_N,
+            dt_s,
+            adapts_in_s=adapting_s(self._trim.time_s, mean_N - before_N),
+            bounds=self._trim,
+            learns=self._learned_terms,
+        )
+        if is_held:
             self.limits = (Limit.TRIM, *self.limits)
+        # the force at a slower creep stays while scale and offset are learned
+        self.slow.rescale(before_N, self.fit.force_N(model_N), rate_mm_s)
 
     def confirm(self, wrong: Disputed) -> None:
         """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
         if not self.sensor.is_disputed:
             return
-        fit = self.strength.fit
+        scale, offset_N = self.fit.scale, self.fit.offset_N
         if wrong == "device":
-            self.sensor = SensorTrust(self._bounds, self._trim.leash)
+            self.sensor = SensorTrust(self._trim)
         else:
-            fit = fit.shifted(self.sensor.anchor.force_N(MIDDLE_N) - fit.force_N(MIDDLE_N))
-            self.sensor.is_doubted = True
-        self.strength.forget(fit.unsure())
+            offset_N = self.sensor.anchor.force_N(MIDDLE_N) - scale * MIDDLE_N
+            self.sensor.wrong_s = DOUBTED_S
+        self.fit = DeviceFit(scale, offset_N)

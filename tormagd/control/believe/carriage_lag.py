@@ -21,7 +21,7 @@ PRIOR_MM2_S: Final = 50.0
 SETTLED_MM: Final = 0.1
 "After a jump the error is of use again once it is this small."
 MAX_DT_S: Final = 0.02
-"A longer pause between plans counts as this."
+"A longer pause between plans, or between readings, counts as this."
 AGE_S: Final = 0.0015
 "The carriages were measured so long before the plan."
 

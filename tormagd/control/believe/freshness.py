@@ -28,10 +28,8 @@ HEARD: Final = 100
 class Freshness:
     """Judge of whether one force sensor still shows new values."""
 
-    has_heard: bool = False
-    "Whether a first reading has come."
-    reading_N: float = 0.0
-    "The newest reading."
+    reading_N: float = math.inf
+    "The newest reading; inf before the first."
     still_s: float = 0.0
     "How long the reading has been the same."
     stood_N: float = 0.0
@@ -68,15 +66,12 @@ class Freshness:
 
     def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> None:
         """Take one reading, which stands for `dt_s` > 0, and update `is_stale` and `is_frozen`."""
-        if not self.has_heard:
-            self.has_heard, self.stood_N = True, model_N
-        elif reading_N == self.reading_N:
+        if reading_N == self.reading_N:
             self.still_s += dt_s
         else:
-            if learns:
+            if learns and self.reading_N != math.inf:
                 self._take_run(reading_N - self.reading_N, self.still_s + dt_s)
-            self.still_s, self.stood_N = 0.0, model_N
-        self.reading_N = reading_N
+            self.reading_N, self.still_s, self.stood_N = reading_N, 0.0, model_N
         self.changed_N = scale * abs(model_N - self.stood_N)
 
     def _take_run(self, change_N: float, run_s: float) -> None:

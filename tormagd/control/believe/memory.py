@@ -47,12 +47,10 @@ class ElementMemory:
         self._added: Final = memory.added
         self._width_mT: Final = memory.lag_mT
         self._turn_mT: Final = memory.turn_mT
-        self._relaxes: Final = len(memory.fractions) > 0
         self._nominal: Final = nominal
         self._field: Final = field
         self._least_mm: Final = gap_range_mm[0] - BEYOND_MM
         self._open_mm: Final = gap_range_mm[1]
-        self._only_free_N: Final = self._force_N(nominal.only, 0.0)
         self._open_mT: Final = field.field_mT(gap_range_mm[1])
 
     def lag_at_mT(self, field_mT: float) -> float:
@@ -76,13 +74,12 @@ class ElementMemory:
         slides = self._nominal.contact.slides
         if slides and not measured.is_homed:
             # before homing, positions count from where the carriages were at switching on, as if that were the open gap
-            if self.time_s == -math.inf:
-                self.opened_mm = max(measured.gap_mm - self._open_mm, self.opened_mm)
+            self.opened_mm = max(measured.gap_mm - self._open_mm, self.opened_mm)
             return
         gap_mm = max(measured.gap_mm, self._least_mm) if measured.is_homed else self._open_mm
         field_mT = self._field.field_mT(gap_mm)
         curve = self._nominal.only if slides else self._nominal.now(measured)
-        free_N = self._only_free_N if slides else self._force_N(curve, 0.0)
+        free_N = self._force_N(curve, 0.0)
         if self.time_s == -math.inf:
             self._begin(curve, gap_mm, free_N, now_s)
         self._follow(curve, free_N, field_mT, now_s)
@@ -93,19 +90,17 @@ class ElementMemory:
         found_mm = gap_mm - self.opened_mm if slides else gap_mm
         is_known = self._least_mm <= found_mm <= self._open_mm + BEYOND_MM
         self.field_mT = self._field.field_mT(found_mm if is_known else gap_mm)
-        self.lag_mT, self.relaxed_N, self.opened_mm, self.time_s = 0.0, 0.0, 0.0, now_s
-        self.free, self.added = self._free.relaxed(0.0), self._added.relaxed(0.0)
-        if slides:
-            added_N = self._force_N(curve, self.field_mT) - free_N
-            self.free, self.added = self._free.relaxed(free_N), self._added.relaxed(added_N)
-            self._follow(curve, free_N, self.field_mT, now_s)
+        self.time_s = now_s
+        added_N = self._force_N(curve, self.field_mT) - free_N
+        self.free = self._free.relaxed(free_N if slides else 0.0)
+        self.added = self._added.relaxed(added_N if slides else 0.0)
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
         """Follow a straight change of the gap's field to `field_mT` at `now_s`."""
         self.lag_mT = self.lag_at_mT(field_mT)
         dt_s = max(now_s - self.time_s, 0.0)
         self.field_mT, self.time_s = field_mT, now_s
-        if not self._relaxes:
+        if not self._free.fractions:
             return
         added_N = self._force_N(curve, field_mT - self.lag_mT) - free_N
         step = self._free.discretise(dt_s)

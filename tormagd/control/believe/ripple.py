@@ -32,9 +32,7 @@ class Ripple:
     """Estimator of the friction's share over the handle's angle."""
 
     shares: list[float]
-    "At each place, by which share friction is greater than its mean."
-    trust: float = 0.0
-    "How much of that acts."
+    "At each place, by which share friction is greater than its mean, as far as that is trusted."
     slopes: list[float]
     before: list[float]
     "What the newest pass of each place had left to teach."
@@ -70,7 +68,7 @@ class Ripple:
         corner = angle * PLACES / TURN - 0.5
         at = math.floor(corner)
         here, there = self.shares[at % PLACES], self.shares[(at + 1) % PLACES]
-        return self.trust * (here + (corner - at) * (there - here))
+        return here + (corner - at) * (there - here)
 
     def update(self, angle: float, rate_mm_s: float, force_N: float, reading_N: float) -> None:
         """Take a reading at the handle's `angle`, the known ripple taken off, beside the anchor's `force_N` > 0."""
@@ -92,7 +90,7 @@ class Ripple:
         else:
             self.passes += 1
         if self.passes > 0:
-            rise = way * rose - self.shares[(at + 1) % PLACES] + self.shares[at]
+            rise = way * rose - self.slopes[at]
             self.risen += way * rise
             if self.passes == PLACES:
                 self.fade, self.passes, self.risen = self.risen / PLACES, 0, 0.0
@@ -112,5 +110,5 @@ class Ripple:
         shares = [0.0, *accumulate(rises[:-1])]
         seen = [share for share, (_, is_seen) in zip(shares, places, strict=True) if is_seen]
         mean = sum(seen) / max(len(seen), 1)
-        self.shares = [share - mean for share in shares]
-        self.trust = 1.0 - (QUIET / max(QUIET, *map(abs, self.shares))) ** 2
+        trust = 1.0 - (QUIET / max(QUIET, *[abs(share - mean) for share in shares])) ** 2
+        self.shares = [trust * (share - mean) for share in shares]

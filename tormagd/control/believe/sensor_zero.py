@@ -12,7 +12,7 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.control.believe.strength import SURE
+from tormagd.control.believe.strength import SURE, DeviceFit
 
 TARED_VARIANCE_N2: Final = 0.02 * 0.02
 "Variance of a sensor that begins: it is taken for tared."
@@ -64,6 +64,10 @@ class Level(Value):
         )
 
 
+UNHEARD: Final = Level(0.0, 0.0, 0.0, 0.0, 0.0)
+"Before the first reading."
+
+
 @final
 class SensorZero:
     """Estimator of one sensor's zero, `zero_N`, with its variance."""
@@ -79,23 +83,19 @@ class SensorZero:
     "When the variance was told: at the first reading, or the newest reversal; inf before."
     direction: float = 0.0
     "The way the handle goes, 1 or -1; 0 before the first reading."
-    level: Level | None = None
-    "Level of the present way; None before the first reading."
+    level: Level
+    "Level of the present way."
     before: Level | None = None
     "Level of the way before, until the two have been compared; None without one."
 
     def __init__(self, way: float = 0.0) -> None:
-        self.way = way
+        self.way, self.level = way, UNHEARD
 
     def sd_N(self, now_s: float) -> float:
         """Return the zero's standard deviation at `now_s`, N, at most MAX_SD_N."""
         since_s = max(now_s - self.told_s, 0.0)
         drifted_N2 = DRIFT_N2_S * since_s * max(since_s / WANDERS_S, 1.0)
         return math.sqrt(min(self.variance_N2 + drifted_N2, MAX_SD_N * MAX_SD_N))
-
-    def begin(self, now_s: float) -> None:
-        """Note the first reading at `now_s`: from then on the variance grows."""
-        self.told_s = min(self.told_s, now_s)
 
     def update(
         self,
@@ -105,46 +105,38 @@ class SensorZero:
         model_N: float,
         rate_mm_s: float,
         dt_s: float,
-        scale: float,
-        scale_sd: float,
+        fit: DeviceFit,
         *,
+        learns: bool,
         is_disputed: bool,
     ) -> float:
         """Take one reading, and return by how much those of the way before the first reversal were too small."""
-        level = self.level
-        if level is None or direction != self.direction:
+        self.told_s = min(self.told_s, now_s)
+        if direction != self.direction:
             # a mean over too short a time is no level
-            self.before = level if level is not None and level.heard_s >= LEVEL_S else None
-            self.level, self.direction = Level(reading_N, model_N, rate_mm_s, dt_s, now_s), direction
+            self.before = self.level if self.level.heard_s >= LEVEL_S else None
+            self.level, self.direction = UNHEARD, direction
+        began_s, before = now_s - self.level.heard_s, self.before
+        level = self.level = self.level.heard(reading_N, model_N, rate_mm_s, dt_s, now_s)
+        if before is None or level.heard_s < LEVEL_S or not learns:
             return 0.0
-        began_s = now_s - level.heard_s
-        level = self.level = level.heard(reading_N, model_N, rate_mm_s, dt_s, now_s)
-        if self.before is None or level.heard_s < LEVEL_S:
-            return 0.0
-        before, self.before = self.before, None
-        return self._compare(now_s, before, level, began_s - before.until_s, scale, scale_sd, is_disputed)
+        self.before = None
+        return self._compare(now_s, before, level, began_s - before.until_s, fit, is_disputed)
 
     def _compare(
-        self,
-        now_s: float,
-        before: Level,
-        level: Level,
-        between_s: float,
-        scale: float,
-        scale_sd: float,
-        is_disputed: bool,
+        self, now_s: float, before: Level, level: Level, between_s: float, fit: DeviceFit, is_disputed: bool
     ) -> float:
         """Learn zero and way from the levels before and after a reversal."""
         by_model_N = level.model_N - before.model_N
-        found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - scale * by_model_N)
+        found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - fit.scale * by_model_N)
         if between_s > LONGEST_TURN_S or abs(found_N) > MAX_ZERO_N:
             return 0.0
-        by_scale_N = 0.5 * scale_sd * by_model_N
+        by_scale_N = 0.5 * fit.scale_sd * by_model_N
         by_speed_N = 0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s)
         by_time_N = 0.5 * RELAXES_N_S * between_s
         read_N2 = READ_SD_N * READ_SD_N + by_scale_N * by_scale_N + by_speed_N * by_speed_N + by_time_N * by_time_N
         # at one force a friction that differs by the way looks like a zero
-        force_N, zero_N2 = 0.5 * scale * (level.model_N + before.model_N), self.sd_N(now_s) ** 2
+        force_N, zero_N2 = 0.5 * fit.scale * (level.model_N + before.model_N), self.sd_N(now_s) ** 2
         error_N, way_N2 = found_N - self.zero_N - force_N * self.way, force_N * force_N * self.way_variance
         if error_N * error_N > SURE * SURE * (zero_N2 + way_N2 + read_N2):
             zero_N2 = MAX_SD_N * MAX_SD_N  # neither a drift nor a way explains it

@@ -11,7 +11,8 @@ and by how uncertain the fit (s, o) is.
 import math
 from typing import Final, final
 
-from tormagd.control.believe.strength import MAX_RELAXED, DeviceBounds, DeviceFit
+from tormagd.config import Trim
+from tormagd.control.believe.strength import MAX_RELAXED, DeviceFit
 from tormagd.control.interpolation import low_pass
 from tormagd.element.model.force_curve import within
 
@@ -56,13 +57,12 @@ class SlowFriction:
     slid_s: float = 0.0
     "When `creep_mm_s` was last updated."
 
-    def __init__(self, bounds: DeviceBounds) -> None:
+    def __init__(self, bounds: Trim) -> None:
         self._bounds: Final = bounds
-        self._factors: Final = factor_bounds(bounds)
 
     def factor_at(self, rate_mm_s: float) -> float:
         """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
-        return 1.0 + _slowness(rate_mm_s) * (within(self.factor, self._factors) - 1.0)
+        return 1.0 + _slowness(rate_mm_s) * (within(self.factor, factor_bounds(self._bounds)) - 1.0)
 
     def slide(self, now_s: float, sliding_mm_s: float) -> None:
         """Update `creep_mm_s` with the level of rate that friction has, `sliding_mm_s` >= 0, at `now_s`."""
@@ -85,12 +85,12 @@ class SlowFriction:
         if before_N > 0.0 and after_N > 0.0:
             kept = self.learned * max(1.0 - _slowness(rate_mm_s) / self.slowness, 0.0)
             at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
-            self.factor = 1.0 + (within(at_creep, self._factors) - 1.0) / self.slowness
+            self.factor = 1.0 + (within(at_creep, factor_bounds(self._bounds)) - 1.0) / self.slowness
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within
         `believable`."""
-        if reading_N < self._bounds.min_scale * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
+        if reading_N < self._bounds.least * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
         share = slowness * dt_s / (LEARNED_S + dt_s)
@@ -101,12 +101,12 @@ class SlowFriction:
         self.slowness += share * (slowness - self.slowness)
 
 
-def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
+def factor_bounds(bounds: Trim) -> tuple[float, float]:
     """Return the least and the greatest k of any device: MIN_STATIC at its least scale, MAX_STATIC at its greatest."""
-    return bounds.min_scale * MIN_STATIC, bounds.max_scale * MAX_STATIC
+    return bounds.least * MIN_STATIC, bounds.most * MAX_STATIC
 
 
-def believable(fit: DeviceFit, model_N: float, bounds: DeviceBounds) -> tuple[float, float]:
+def believable(fit: DeviceFit, model_N: float, bounds: Trim) -> tuple[float, float]:
     """Return the least and the greatest k of a device with this `fit`, where the model's force is `model_N`."""
     unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
     least, most = factor_bounds(bounds)

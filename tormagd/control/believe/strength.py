@@ -3,6 +3,7 @@
     model    F = s m + o + v           m model's force, N; F measured force, N; s scale; o offset, N
     predict  s, o forget towards their spread with time constants SCALE_LASTS_S and one that gives `adapts_in_s`
     update   Kalman filter of (s, o), with v of density ERROR_N2_S; what is not learned keeps its value (Schmidt)
+    adapt    the sooner, the more the mean of the readings is off
 
 Friction, field and elastomer differ from device to device by a factor. A relaxed elastomer shifts the force.
 """
@@ -12,7 +13,7 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.config import Trim
-from tormagd.control.interpolation import low_pass
+from tormagd.element.model.force_curve import within
 
 SCALE_SD: Final = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
@@ -29,27 +30,10 @@ SCALE_VARIANCE: Final = SCALE_SD * SCALE_SD
 OFFSET_VARIANCE_N2: Final = OFFSET_SD_N * OFFSET_SD_N
 SURE: Final = 2.0
 "Standard deviations within which a force is taken to lie."
-SURPRISE_S: Final = 0.03
 SURPRISE_N: Final = 0.01
-"""A mean error over SURPRISE_S of more than SURPRISE_N is the device's own."""
+"A mean error of more than this is the device's own."
 MIN_ADAPTS_IN_S: Final = 0.04
 "However great the surprise, the offset is learned no sooner than in this time."
-
-
-@final
-class DeviceBounds(Value):
-    """What a device may be: bounds of its scale, 1 for the model's own device, and of its offset at speed, N."""
-
-    def __init__(self, min_scale: float, max_scale: float, min_offset_N: float, max_offset_N: float) -> None:
-        self.min_scale: Final = min_scale
-        self.max_scale: Final = max_scale
-        self.min_offset_N: Final = min_offset_N
-        self.max_offset_N: Final = max_offset_N
-
-
-def device_bounds(trim: Trim) -> DeviceBounds:
-    """Return the bounds that the configuration states."""
-    return DeviceBounds(trim.least, trim.most, trim.least_offset_N, trim.most_offset_N)
 
 
 @final
@@ -102,16 +86,6 @@ class DeviceFit(Value):
             square * self.offset_variance_N2,
         )
 
-    def shifted(self, by_N: float) -> "DeviceFit":
-        """Return the fit of a device with `by_N` more force, and the same variances."""
-        return DeviceFit(
-            self.scale, self.offset_N + by_N, self.scale_variance, self.covariance_N, self.offset_variance_N2
-        )
-
-    def unsure(self) -> "DeviceFit":
-        """Return the same scale and offset with the variances of a device not yet seen."""
-        return DeviceFit(self.scale, self.offset_N)
-
     def relaxed(self, relaxed_N: float) -> "DeviceFit":
         """Return the fit that gives, for a model's force m, the force and deviation that this fit gives for m -
         `relaxed_N`."""
@@ -124,7 +98,7 @@ class DeviceFit(Value):
             self.offset_variance_N2 + relaxed_N * (by_scale_N - 2.0 * self.covariance_N),
         )
 
-    def surely_within_N(self, max_N: float, bounds: DeviceBounds) -> float:
+    def surely_within_N(self, max_N: float, bounds: Trim) -> float:
         """Return the model's force, N, at which the device, taken SURE deviations stronger, gives `max_N`."""
         # scale m + offset + SURE sqrt(variance of that) = max, a quadratic: the smaller root is where the sum is meant
         room_N, sure = max_N - self.offset_N, SURE * SURE
@@ -132,13 +106,18 @@ class DeviceFit(Value):
         half = self.scale * room_N + sure * self.covariance_N
         rest = room_N * room_N - sure * self.offset_variance_N2
         if square <= 0.0:  # so uncertain beside its scale that no force is surely within
-            return max_N / bounds.max_scale
+            return max_N / bounds.most
         root_N = (half - math.sqrt(max(half * half - square * rest, 0.0))) / square
-        return min(max(root_N, max_N / bounds.max_scale), max_N / bounds.min_scale)
+        return within(root_N, (max_N / bounds.most, max_N / bounds.least))
 
 
 UNSEEN: Final = DeviceFit()
 "A device that has shown nothing of itself."
+
+
+def adapting_s(time_s: float, surprise_N: float) -> float:
+    """Return in which time the offset is learned, `time_s` where the readings' mean is not off by `surprise_N`."""
+    return max(time_s / (1.0 + math.pow(surprise_N / SURPRISE_N, 2.0)), MIN_ADAPTS_IN_S)
 
 
 def forgotten(fit: DeviceFit, dt_s: float, adapts_in_s: float) -> DeviceFit:
@@ -161,12 +140,10 @@ def observe(
     dt_s: float,
     *,
     adapts_in_s: float,
-    bounds: DeviceBounds,
+    bounds: Trim,
     learns: tuple[bool, bool] = (True, True),
 ) -> tuple[DeviceFit, bool]:
-    """Return the fit after one reading, and whether one of the `bounds` held its scale."""
-    if dt_s <= 0.0:
-        return fit, False
+    """Return the fit after one reading, which stands for `dt_s` > 0, and whether one of the `bounds` held it."""
     prior = forgotten(fit, dt_s, adapts_in_s)
     noise_N2 = ERROR_N2_S / dt_s
     by_scale = model_N * prior.scale_variance + prior.covariance_N
@@ -176,61 +153,18 @@ def observe(
     gain_offset = by_offset / innovation_variance if learns[1] else 0.0
     error_N = measured_N - fit.force_N(model_N)
     wanted = fit.scale + gain_scale * error_N
-    scale = min(max(wanted, bounds.min_scale), bounds.max_scale)
+    scale = within(wanted, (bounds.least, bounds.most))
     offset_N = fit.offset_N + gain_offset * error_N
     if scale != wanted and learns[1]:
         # a scale that is held is known: what is left of the error is the offset's alone
         by_itself = prior.offset_variance_N2 / (prior.offset_variance_N2 + noise_N2)
         offset_N = fit.offset_N + by_itself * (measured_N - scale * model_N - fit.offset_N)
+    held_N = within(offset_N, (bounds.least_offset_N, bounds.most_offset_N))
     learned = DeviceFit(
         scale,
-        offset_N,
+        held_N,
         prior.scale_variance - gain_scale * by_scale,
         prior.covariance_N - (gain_scale * by_offset if learns[0] else gain_offset * by_scale),
         prior.offset_variance_N2 - gain_offset * by_offset,
     )
-    return learned, scale != wanted
-
-
-@final
-class Strength:
-    """Estimator of one device's scale and offset: `fit`. It learns the offset sooner where readings surprise."""
-
-    fit: DeviceFit = UNSEEN
-    "What is known of the device's force."
-    surprise_N: float = 0.0
-    "Mean of the readings over SURPRISE_S, less what was expected."
-    is_held: bool = False
-    "Whether scale or offset is at one of its bounds."
-
-    def __init__(self, adapts_in_s: float, bounds: DeviceBounds, learns: tuple[bool, bool]) -> None:
-        """Begin with the fit of a device not yet seen."""
-        self._adapts_in_s: Final = adapts_in_s
-        self._bounds: Final = bounds
-        self._learns: Final = learns
-
-    def update(self, model_N: float, reading_N: float, dt_s: float) -> None:
-        """Learn from one reading, which stands for `dt_s` > 0, where the model's force is `model_N`."""
-        error_N = reading_N - self.fit.force_N(model_N)
-        self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)
-        adapts_in_s = self._adapts_in_s / (1.0 + math.pow(self.surprise_N / SURPRISE_N, 2.0))
-        self.fit, self.is_held = observe(
-            self.fit,
-            model_N,
-            reading_N,
-            dt_s,
-            adapts_in_s=max(adapts_in_s, MIN_ADAPTS_IN_S),
-            bounds=self._bounds,
-            learns=self._learns,
-        )
-        bounds = self._bounds
-        offset_N = min(max(self.fit.offset_N, bounds.min_offset_N), bounds.max_offset_N)
-        if offset_N != self.fit.offset_N:
-            self.fit, self.is_held = self.fit.shifted(offset_N - self.fit.offset_N), True
-
-    def settle(self) -> None:
-        self.surprise_N, self.is_held = 0.0, False
-
-    def forget(self, fit: DeviceFit = UNSEEN) -> None:
-        self.fit = fit
-        self.settle()
+    return learned, scale != wanted or held_N != offset_N
