@@ -21,7 +21,7 @@ from tormagd.control.aim.aim import Aim
 from tormagd.control.aim.portrait import Portrait, PortraitSearch, ceiling_mm, lawful_mT
 from tormagd.control.ask.forecast import Forecast, Skill
 from tormagd.control.ask.governor import Governor
-from tormagd.control.ask.path import TIMES_S, Path
+from tormagd.control.ask.path import TIMES_S, nearest_path_mm
 from tormagd.control.ask.way import Way
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.anchor import Anchor
@@ -44,11 +44,11 @@ from tormagd.control.move.homing import Homing
 from tormagd.control.move.motor import full_speed_mm_s, margins
 from tormagd.control.move.opening import Opening
 from tormagd.control.move.pid import Pid
-from tormagd.control.move.reference import Reference, Speeds, follow, target_of
+from tormagd.control.move.reference import Reference, follow, target_of
 from tormagd.control.move.watch import Watch
 from tormagd.control.nominal import FieldOfGap
 from tormagd.control.plausible import is_contradicted, is_outside, leap_between
-from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
+from tormagd.control.records import Ask, GapSpeeds, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import Conditions, SafetyState, command
 from tormagd.control.sight import Sight
@@ -187,7 +187,7 @@ def planning(stage: Planner, draw: Draw) -> object:
         except DomainError as again:
             raise AssertionError(f"afresh after {error}") from again
         raise
-    stage.foresee()
+    stage.governor.foresee()
     return made
 
 
@@ -307,19 +307,19 @@ def forecast(stage: Forecast, draw: Draw) -> object:
             stage.update(draw.step(0.01), 1.2 + 0.2 * math.sin(0.6 * place))
     stage.update(draw.step(0.01), draw(1.2))
     stage.foresee(draw(1.0))
-    ahead = stage.forces_N(0.0, TIMES_S) if stage.trust > 0.0 else []
+    ahead = [stage.force_at_N(after_s) for after_s in TIMES_S] if stage.trust > 0.0 else []
     return [stage.trust, *ahead, *np.frombuffer(stage.history).tolist()]
 
 
-def path(stage: Path, draw: Draw) -> object:
-    wanted_N = [draw(1.2) for _ in TIMES_S]
-    forces_N, sent_mm = stage.pursue(draw(70.0), draw(70.0), abs(draw.bounded(PLAN_S)), wanted_N, UNSEEN, 0.02)
-    return [forces_N, sent_mm, stage.is_near(70.0, draw(1.2), UNSEEN)]
+def path(speeds: GapSpeeds, draw: Draw) -> object:
+    wanted_mm = [draw(70.0) for _ in TIMES_S]
+    elapsed_s = abs(draw.bounded(PLAN_S))
+    return nearest_path_mm(draw(70.0), elapsed_s, TIMES_S, wanted_mm, [1.0] * len(TIMES_S), speeds, len(TIMES_S))
 
 
 def skill(stages: list[Skill], draw: Draw) -> object:
     before = stages[0].score
-    stages[0] = stages[0].after(draw(0.01), draw(0.02), 0.05)
+    stages[0] = stages[0].after(draw(0.01), draw(0.02), 0.2)
     return [before, stages[0].score]
 
 
@@ -335,7 +335,7 @@ def aim() -> list[Any]:
 
 def aiming(stage: list[Any], draw: Draw) -> object:
     begun, remembered, believed = stage
-    asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), is_meant=True)
+    asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), 1.2)
     return begun.update(draw.now_s, setpoint(usual(draw.now_s)), asked, believed, remembered, measured(draw))
 
 
@@ -384,7 +384,7 @@ def pid(stage: Pid, draw: Draw) -> object:
 
 def reference(stages: list[Reference], draw: Draw) -> object:
     to = target_of(plan(draw), draw.now_s, 2e-3, 45.0, 95.0)
-    stages[0], *_ = follow(1600.0, stages[0], to, elapsed_s(draw), Speeds(40.0, 38.0, 38.0), 45.0)
+    stages[0], *_ = follow(1600.0, stages[0], to, elapsed_s(draw), GapSpeeds(38.0, 38.0, 38.0, 40.0), 45.0)
     return stages[0]
 
 
@@ -537,7 +537,7 @@ def stages() -> list[Stage]:
         Stage("ask/way", lambda: Way(-1), way, MEASUREMENT, PLAN_S),
         Stage("ask/governor", lambda: planner().governor, governor, OWN, PLAN_S),
         Stage("ask/forecast", Forecast, forecast, SETPOINT),
-        Stage("ask/path", lambda: Path(made.portrait, made.gap_speeds), path),
+        Stage("ask/path", lambda: made.gap_speeds, path),
         Stage("ask/skill", lambda: [Skill(0.0, 0.0)], skill, SETPOINT),
         Stage("aim/aim", aim, aiming, OWN, PLAN_S),
         Stage("aim/floors", lambda: None, floors),

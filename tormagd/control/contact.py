@@ -24,10 +24,9 @@ PRESSED: Final = 0.9
 class Sliding:
     """The sliding handle of a brake. Plans take it as moving, with its friction mobilised."""
 
-    def __init__(self) -> None:
-        self.displacement_mm: Final = MOBILISED_MM
-        self.rate_mm_s: Final = ROLLER_RATE_MM_S
-        self.slides: Final = True
+    displacement_mm: Final[float] = MOBILISED_MM
+    rate_mm_s: Final[float] = ROLLER_RATE_MM_S
+    slides: Final[bool] = True
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         displacement_mm = MOBILISED_MM
@@ -54,10 +53,11 @@ class Sliding:
 class Pressing:
     """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest."""
 
+    rate_mm_s: Final[float] = 0.0
+    slides: Final[bool] = False
+
     def __init__(self, depth_mm: float) -> None:
         self.displacement_mm: Final = depth_mm
-        self.rate_mm_s: Final = 0.0
-        self.slides: Final = False
 
     def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         depth_mm, rate_mm_s = self.displacement_mm, 0.0

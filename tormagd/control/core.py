@@ -85,8 +85,8 @@ class Planner:
         beside_mm = 0.0 if is_held else planned.gap_mm - portrait.gap_mm_at(device.model_N(planned.governed_N))
         return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
 
-    def foresee(self, *, is_whole: bool = True) -> bool:
-        return self.governor.foresee(is_whole=is_whole)
+    def foresee(self) -> bool:
+        return self.governor.foresee()
 
     def teach(self, learned: Learned) -> None:
         self.believe.teach(learned)

@@ -39,13 +39,6 @@ class Wall(Value):
         self.place_sd_mm: Final = place_sd_mm
         self.stiffness_share: Final = stiffness_share
 
-    def require_numbers(self) -> None:
-        # one sum finds NaN and infinity anywhere
-        size = abs(self.place_mm) + abs(self.stiffness_N_mm) + abs(self.friction_N)
-        if not size + abs(self.place_sd_mm) + abs(self.stiffness_share) <= _LARGEST:
-            for name in self.__match_args__:
-                require_number(name, getattr(self, name))
-
     def force_N(self, handle_mm: float) -> float:
         return self.friction_N + self.stiffness_N_mm * max(handle_mm - self.place_mm, 0.0)
 
@@ -100,22 +93,25 @@ class TimedSetpoint(Value):
 
     def require_numbers(self) -> None:
         """Raise DomainError, naming the field, unless all numbers are finite and within LARGEST."""
+        wall, preview_N = self.wall, self.preview_N
+        # one sum finds NaN and infinity anywhere
         size = abs(self.force_N) + abs(self.stamp_s) + abs(self.valid_for_s)
         size += abs(self.displacement_mm or 0.0) + abs(self.rate_mm_s or 0.0) + abs(self.withdraw_N or 0.0)
+        if wall is not None:
+            size += abs(wall.place_mm) + abs(wall.stiffness_N_mm) + abs(wall.friction_N)
+            size += abs(wall.place_sd_mm) + abs(wall.stiffness_share)
+        if preview_N:
+            size += abs(sum(preview_N))
+            if not 0.0 < self.preview_dt_s <= _LARGEST:
+                raise DomainError("preview_dt_s", self.preview_dt_s, "above 0 s")
         if not size <= _LARGEST:
-            for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s", "withdraw_N"):
-                require_number(name, getattr(self, name) or 0.0)
-        if self.wall is not None:
-            self.wall.require_numbers()
-        if self.preview_N:
-            self._require_preview()
+            self._name_odd()
 
-    def _require_preview(self) -> None:
-        if not 0.0 < self.preview_dt_s <= _LARGEST:
-            raise DomainError("preview_dt_s", self.preview_dt_s, "above 0 s")
-        if not -_LARGEST <= sum(self.preview_N) <= _LARGEST:
-            for force_N in self.preview_N:
-                require_number("preview_N", force_N)
+    def _name_odd(self) -> None:
+        fields = [(name, getattr(of, name)) for of in (self, self.wall) if of is not None for name in of.__match_args__]
+        for name, field in [*fields, *[("preview_N", force_N) for force_N in self.preview_N]]:
+            if isinstance(field, (int, float)):
+                require_number(name, field)
 
     @property
     def is_told(self) -> bool:
@@ -213,15 +209,21 @@ class Measured(Value):
     def skew_mm(self) -> float:
         return self.left_mm - self.right_mm
 
+    def along(self, push_sign: float) -> tuple[float, float]:
+        return push_sign * self.handle_mm, push_sign * self.handle.turn.direction * self.handle.quick_mm_s
+
 
 @final
 class GapSpeeds(Value):
-    """The gap's greatest speeds, and the closing that is counted on."""
+    """The gap's greatest speeds, the closing that is counted on, and that of motors without load."""
 
-    def __init__(self, closing_mm_s: float, opening_mm_s: float, sure_mm_s: float) -> None:
+    def __init__(
+        self, closing_mm_s: float, opening_mm_s: float, sure_mm_s: float, no_load_mm_s: float = math.inf
+    ) -> None:
         self.closing_mm_s: Final = closing_mm_s
         self.opening_mm_s: Final = opening_mm_s
         self.sure_mm_s: Final = sure_mm_s
+        self.no_load_mm_s: Final = no_load_mm_s
 
     def reach_mm(self, passed_s: float) -> tuple[float, float]:
         """Return how far the gap closes and opens."""
@@ -258,7 +260,7 @@ class Belief(Value):
 @final
 class Ask(Value):
     """The force to render now and along `path.PATH_S`. `foresight` is 1 with a preview, 0 where the force is
-    extrapolated.
+    extrapolated; `asked_N` is None where no setpoint is followed.
     """
 
     def __init__(
@@ -268,16 +270,14 @@ class Ask(Value):
         age_s: float | None,
         limits: tuple[Limit, ...],
         foresight: float = 0.0,
-        is_meant: bool = False,
         asked_N: float | None = None,
     ) -> None:
-        self.asked_N: Final = asked_N
         self.force_N: Final = force_N
         self.path_N: Final = path_N
         self.age_s: Final = age_s
         self.limits: Final = limits
         self.foresight: Final = foresight
-        self.is_meant: Final = is_meant
+        self.asked_N: Final = asked_N
 
 
 @final

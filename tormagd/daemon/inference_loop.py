@@ -75,7 +75,7 @@ class InferenceLoop:
     def foresee(self, _beat: Beat) -> bool:
         """Make the next half of the forecast for the next plans; return False if none is due."""
         try:
-            is_made = self.planner.foresee(is_whole=False)
+            is_made = self.planner.foresee()
         except PLAN_ERRORS as error:
             self._begin_afresh(self._clock_ns() * 1e-9, error)
             return True

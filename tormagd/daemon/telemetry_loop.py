@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from tormagd.config import Config
-from tormagd.control.ask.way import place_and_rate
 from tormagd.control.assembly.belief import beliefs
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Limit
@@ -126,7 +125,7 @@ class TelemetryLoop:
         if not (connections["telemetry"] or self.waiting or is_kept):
             return
         in_force, measured = endpoint.inbox.in_force, control.stepper.measured
-        place_mm, rate_mm_s = (None, None) if measured is None else place_and_rate(measured, self._push_sign)
+        place_mm, rate_mm_s = (None, None) if measured is None else measured.along(self._push_sign)
         self.newest = snapshot(
             tick,
             seq=self.timing.runs,
@@ -157,7 +156,7 @@ class TelemetryLoop:
         self._motion_due_ns = period_ns + (beat.due_ns if beat.due_ns - due_ns > period_ns else due_ns)
         self._sensed_s = measured.sensed_s
         heard_ns = time.time_ns() - round(NS * (time.monotonic() - measured.sensed_s))
-        place_mm, rate_mm_s = place_and_rate(measured, self._push_sign)
+        place_mm, rate_mm_s = measured.along(self._push_sign)
         message = Motion(
             v=VERSION, t_ns=heard_ns, device_s=measured.handle_time_s, handle_mm=place_mm, handle_mm_s=rate_mm_s
         )

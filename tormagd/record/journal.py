@@ -11,7 +11,7 @@ import msgspec
 
 from firmware_protocol.codec import DeviceMode, Switches
 from tormagd.config import Config
-from tormagd.control.ask.forecast import Guess, Skill
+from tormagd.control.ask.forecast import Skill
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor_zero import Level
 from tormagd.control.believe.strength import DeviceFit
@@ -33,7 +33,7 @@ FORMAT = 22
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
     *(Measured, Handle, Travel, Turn, TimedSetpoint, Wall, Leap, Reference, Plan, Outside),
-    *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
+    *(DeviceFit, Level, Learned, Skill, Question, Answer, FieldSolution, Reach),
 )
 "All types that `plain_values` reads back."
 STEP = "step"

@@ -1,6 +1,5 @@
 """What comes next: foreseen where a force repeats itself, and believed only where that was earned. All synthetic."""
 
-import copy
 import math
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from tormagd.control.ask.forecast import (
-    BEAT_DELAYS,
+    DELAYS,
     DOUBT_N,
     EVERY,
     FORGIVEN_N,
@@ -21,7 +20,6 @@ from tormagd.control.ask.forecast import (
     MAX_STEP_S,
     MIN_HISTORY,
     RIDGE,
-    RISE_DELAYS,
     SAME_N,
     STRIDE,
     TAPS,
@@ -78,7 +76,9 @@ def follow(times_s: Array, forces_N: Array) -> Followed:
         slope_N, trust = force_N + slope_N_s * np.minimum(AHEAD_S, 0.05), forecast.trust
         mixture_N = slope_N
         if trust > 0.0:
-            mixture_N = slope_N + trust * (np.array(forecast.forces_N(0.0, AHEAD_S.tolist())) - slope_N)
+            mixture_N = slope_N + trust * (
+                np.array([forecast.force_at_N(after_s) for after_s in AHEAD_S.tolist()]) - slope_N
+            )
         came_N = np.interp(time_s + AHEAD_S, times_s, forces_N)
         rows.append((time_s, trust, slope_N - came_N, mixture_N - came_N))
     return Followed(*(np.array(column) for column in zip(*rows, strict=True)))
@@ -218,11 +218,11 @@ def test_a_stamp_again_counts_once_with_its_newest_force(learned: Forecast) -> N
     history, stamp_s = learned.history, learned.stamp_s
     for back_s in (0.0, 0.003):
         learned.update(stamp_s - back_s, 1.7)
-        assert (learned.history, learned.stamp_s, learned.force_N, learned.forces_N(0.0, [0.0])) == (
+        assert (learned.history, learned.stamp_s, learned.force_N, learned.force_at_N(0.0)) == (
             history,
             stamp_s,
             1.7,
-            pytest.approx([1.7]),
+            pytest.approx(1.7),
         )
 
 
@@ -238,78 +238,40 @@ def test_a_forecast_is_looked_for_once_for_every_few_points_of_the_grid(learned:
     assert learned.from_s == learned.time_s
 
 
-def test_where_the_grid_goes_on_between_two_embeddings_the_forecast_is_of_the_first(learned: Forecast) -> None:
-    learned.update(learned.time_s + (EVERY + 0.5) * GRID_S, 1.5)
-    other = copy.deepcopy(learned)
-    assert (learned.foresee(0.0), other.foresee(0.0, is_whole=False), other.from_s < learned.from_s) == (True,) * 3
-    for each in (learned, other):
-        each.update(each.time_s + 1.5 * GRID_S, 1.52)
-    assert other.foresee(0.0, is_whole=False)
-    assert (other.from_s, other.changes_N) == (learned.from_s, learned.changes_N)
-    assert [each is None for each in other.awaited] == [each is None for each in learned.awaited]
-
-
-def by_regression(history: Array, of: tuple[int, ...]) -> tuple[Array, float]:
-    """The constants of a weighted ridge regression, by NumPy's least squares, and the least mean square apart."""
-    delays = np.array(of)
+def by_regression(history: Array) -> Array:
+    """The constants of a weighted ridge regression, by NumPy's least squares."""
+    delays = np.array(DELAYS)
     newest = len(history) - 1
-    ends = np.arange(newest - HORIZON, BEAT_DELAYS[-1] - 1, -STRIDE)[:, None]
+    ends = np.arange(newest - HORIZON, DELAYS[-1] - 1, -STRIDE)[:, None]
     apart = history[ends - delays] - history[ends] - (history[newest - delays] - history[newest])
     followed = history[ends + np.arange(HORIZON + 1)] - history[ends]
-    distance = np.sum(apart**2, axis=1) + TAPS * SAME_N**2
-    weight = distance**-2
+    weight = (np.sum(apart**2, axis=1) + TAPS * SAME_N**2) ** -2
     ridge = RIDGE / TAPS * np.sum(weight[:, None] * apart**2) + SAME_N**2 * np.sum(weight)
     rows = np.sqrt(weight)[:, None] * np.column_stack([np.ones(len(ends)), apart])
     rows = np.vstack([rows, np.sqrt(ridge) * np.eye(TAPS + 1)[1:]])
     wanted = np.vstack([np.sqrt(weight)[:, None] * followed, np.zeros((TAPS, HORIZON + 1))])
     constants: Array = np.linalg.lstsq(rows, wanted)[0][0]
-    return constants, float(distance.min()) / TAPS
+    return constants
 
 
-@pytest.mark.parametrize(("rise_missed", "beat_missed"), [(4e-4, 4e-4), (1e-4, 4e-4), (3e-4, 1e-5), (0.0, 0.0)])
 @pytest.mark.parametrize("seconds", [1.6, 4.0, 12.0])
-def test_a_forecast_is_a_mixture_of_weighted_ridge_regressions(
-    seconds: float, rise_missed: float, beat_missed: float
-) -> None:
+def test_a_forecast_is_a_weighted_ridge_regression(seconds: float) -> None:
     forecast = beaten(seconds)
     forecast.update(forecast.stamp_s + (EVERY + 0.5) * GRID_S, forecast.force_N + 0.004)
-    forecast.rise_missed, forecast.beat_missed = rise_missed, beat_missed
     assert forecast.foresee(0.0)
-    history = np.frombuffer(forecast.history)
-    (rise, rise_apart), (beat, beat_apart) = (by_regression(history, of) for of in (RISE_DELAYS, BEAT_DELAYS))
-    rise_weight, beat_weight = (rise_missed + rise_apart) ** -2, (beat_missed + beat_apart) ** -2
-    mixed = (rise_weight * rise + beat_weight * beat) / (rise_weight + beat_weight)
-    assert forecast.changes_N == pytest.approx(mixed, abs=1e-9)
+    assert forecast.changes_N == pytest.approx(by_regression(np.frombuffer(forecast.history)), abs=1e-9)
 
 
-def test_what_both_embeddings_missed_is_remembered() -> None:
+def test_what_forecast_and_slope_missed_is_remembered() -> None:
     times_s = np.arange(600) * GRID_S * (1.0 + 1e-6)
-    forces_N = pulse_N(times_s)
-    forecast = Forecast()
-    said: list[tuple[float, float] | None] = []
-    missed: tuple[list[float], list[float]] = ([], [])
-    for time_s, force_N in zip(times_s.tolist(), forces_N.tolist(), strict=True):
+    forecast, said, missed = Forecast(), [], []
+    for time_s, force_N in zip(times_s.tolist(), pulse_N(times_s).tolist(), strict=True):
         tell(forecast, time_s, force_N)
-        guess = forecast.awaited[-1]
-        said.append(None if guess is None else (guess.rise_N, guess.beat_N))
+        said.append(forecast.awaited[-1])
         if len(said) > JUDGED and (then := said[-1 - JUDGED]) is not None:
-            for errors, guessed_N in zip(missed, then, strict=True):
-                errors.append(guessed_N - force_N)
-    for errors, found in zip(missed, (forecast.rise_missed, forecast.beat_missed), strict=True):
-        mean = DOUBT_N**2
-        for error in errors:
-            mean += EVERY * GRID_S / (LONG_S + EVERY * GRID_S) * (error**2 - mean)
-        assert len(errors) > 400 / EVERY
-        assert found == pytest.approx(mean, rel=0.01)
-
-
-def test_where_one_finds_nothing_alike_the_other_speaks_for_both(learned: Forecast) -> None:
-    spoken = 0
-    for tick in range(1, BEAT_DELAYS[-1] + 2):
-        tell(learned, 4.0 + tick * GRID_S, 0.8 + 1e-4 * math.sin(tick))
-        guess = learned.awaited[-1]
-        if guess is not None and guess.rise_N == guess.beat_N:
-            spoken += 1
-            constants, _ = by_regression(np.frombuffer(learned.history), RISE_DELAYS)
-            assert learned.changes_N == pytest.approx(constants, abs=1e-9)
-    assert spoken > 10 / EVERY
+            missed.append([guessed_N - force_N for guessed_N in then])
+    gained = 0.0
+    for error_N, slope_error_N in missed:
+        gained += EVERY * GRID_S / (LONG_S + EVERY * GRID_S) * (slope_error_N**2 - error_N**2 - gained)
+    assert len(missed) > 400 / EVERY
+    assert forecast.long.gained == pytest.approx(gained, rel=0.01)

@@ -10,8 +10,8 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, Forecast
-from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, previewed_N
-from tormagd.control.ask.path import PATH_S, TIMES_S
+from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor
+from tormagd.control.ask.path import NEAR_S, PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Ask, GapSpeeds, TimedSetpoint, Travel
 from tormagd.control.safety.codes import Limit
@@ -340,6 +340,25 @@ def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
     assert path_N(late) == pytest.approx(np.full(len(PATH_S), 1.02))
 
 
+ENDS = Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025])
+
+
+@pytest.mark.parametrize(("asked_N", "ahead_N", "end_mm"), [(1.01, 1.0, 90.0), (1.99, 2.0, 50.0)])
+def test_no_carriages_are_sent_past_the_ends(asked_N: float, ahead_N: float, end_mm: float) -> None:
+    following = governor(0.0, asked_N, portrait=ENDS)
+    preview = TimedSetpoint(asked_N, 1.0, VALID_S, preview_N=(ahead_N,) * 200, preview_dt_s=5e-3)
+    decide(following, 1.0, preview)
+    assert following.sent_mm == end_mm
+
+
+@pytest.mark.parametrize("device", [DeviceFit(), DeviceFit(scale=1.5, offset_N=0.1)])
+@pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: float, is_near: bool, way: float) -> None:
+    to_N = device.force_N(1.5 + way * share * NEAR_S * GAP_SPEED_MM_S / 40.0)
+    assert governor(0.0, 1.5, portrait=ENDS)._is_pursued(TimedSetpoint(1.5, 0.0, VALID_S), to_N, 0.5, device) is is_near
+
+
 def beats_N(time_s: float) -> float:
     phase = 2.0 * math.pi * 1.1 * time_s
     return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
@@ -434,7 +453,7 @@ def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> No
             following.foresee()
             decide(following, now_s, setpoint)
             if now_s > 6.0:
-                wanted_N = previewed_N(setpoint, 0.0, following.forecast)
+                wanted_N = following.going_on_N(setpoint, 0.0, following.forecast.trust)
                 known_s = 0.04 + HORIZON_S * is_foreseen
                 assert len(wanted_N) == max(MIN_TIMES, sum(after_s < known_s for after_s in TIMES_S))
                 found.append(wanted_N[MIN_TIMES - 1] - beats_N(now_s + TIMES_S[MIN_TIMES - 1]))

@@ -123,7 +123,7 @@ def test_a_wall_that_is_met_again_is_there_at_once(following: Following) -> None
     following.ask(Travel(14.0, 5.0), wall=WALL, withdraw_N=0.5)
     following.ask(Travel(14.0, -5.0, is_pushing=False), wall=WALL, withdraw_N=0.5)
     following.ask(Travel(14.0, 0.0), wall=WALL, withdraw_N=0.5)
-    assert following.governor.blend_N == 0.0
+    assert following.governor.target_N == WALL.force_N(14.0)
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,7 @@ import math
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.path import NEAR_S, Path, nearest_path_mm
-from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.ask.path import nearest_path_mm
 from tormagd.control.records import GapSpeeds
 
 STEP_S = 0.01
@@ -53,22 +51,6 @@ def test_the_first_gap_is_within_reach_of_the_last() -> None:
 def test_no_more_of_it_is_told_than_is_asked_for() -> None:
     times_s = [STEP_S * place for place in range(12)]
     assert len(nearest_path_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEEDS, 3)) == 3
-
-
-@pytest.mark.parametrize(("from_mm", "wanted_N"), [(89.9, (1.01, 1.0)), (50.1, (1.99, 2.0))])
-def test_no_carriages_are_sent_past_the_ends(from_mm: float, wanted_N: tuple[float, float]) -> None:
-    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEEDS)
-    _, sent_mm = path.pursue(from_mm, from_mm, 1.0, [wanted_N[0]] + [wanted_N[1]] * 14, DeviceFit(), 0.0)
-    assert sent_mm == (90.0 if from_mm > 70.0 else 50.0)
-
-
-@pytest.mark.parametrize("device", [DeviceFit(), DeviceFit(scale=1.5, offset_N=0.1)])
-@pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
-@pytest.mark.parametrize("way", [1.0, -1.0])
-def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: float, is_near: bool, way: float) -> None:
-    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEEDS)
-    to_N = 1.5 + way * share * NEAR_S * SPEED_MM_S / 40.0
-    assert path.is_near(70.0, device.force_N(to_N), device) is is_near
 
 
 @pytest.mark.parametrize(("to_mm", "speed_mm_s"), [(40.0, -50.0), (80.0, 20.0)])

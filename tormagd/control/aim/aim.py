@@ -92,7 +92,7 @@ class Aim:
     ) -> Plan:
         """Return the next plan, which the gap reaches from the plan `before`."""
         device = belief.device
-        curve, outside = self._element.nominal.planned(setpoint if ask.is_meant else None, measured)
+        curve, outside = self._element.nominal.planned(None if ask.asked_N is None else setpoint, measured)
         wanted_N = device.model_N(ask.path_N[0])
         solution = self._solution(now_s, curve, wanted_N)
         element_mT = lawful_mT(self._element.law, wanted_N, solution.field_mT)
@@ -114,8 +114,8 @@ class Aim:
         """Return how far the gap gets from the plan `before`, besides what the setpoint leaps."""
         if before.setpoint_N is None or ask.asked_N is None:
             return wanted_mm
-        asked_mm = self._portrait.gap_mm_at(device.model_N(ask.asked_N))
-        leap_mm = abs(asked_mm - self._portrait.gap_mm_at(device.model_N(before.setpoint_N)))
+        portrait = self._portrait
+        leap_mm = abs(portrait.gap_for_mm(ask.asked_N, device) - portrait.gap_for_mm(before.setpoint_N, device))
         closed_mm, opened_mm = self._speeds.reach_mm(max(now_s - before.time_s, 0.0))
         return within(wanted_mm, (before.gap_mm - closed_mm - leap_mm, before.gap_mm + opened_mm + leap_mm))
 
@@ -165,7 +165,7 @@ class Aim:
             outside=outside,
             sensor_doubted_s=belief.sensor_doubted_s,
             trim=ask.force_N / model_N if model_N > 0.0 else belief.at_speed.scale,
-            stamp_s=setpoint.stamp_s if setpoint is not None and ask.is_meant else -math.inf,
+            stamp_s=-math.inf if setpoint is None or ask.asked_N is None else setpoint.stamp_s,
             search_age_s=now_s - self.answer.time_s if self._element.is_beside else 0.0,
         )
 
@@ -185,7 +185,7 @@ class Aim:
             *((Limit.LOW_CONFIDENCE,) if solution.confidence < self._low_confidence else ()),
         )
         # where nobody asks for a force, none is held back for being too low
-        if solution.reach is _INSIDE or not (ask.is_meant or solution.reach is Reach.ABOVE):
+        if solution.reach is _INSIDE or (ask.asked_N is None and solution.reach is not Reach.ABOVE):
             return limits
         reached = Limit.F_MIN if solution.reach is Reach.BELOW else Limit.F_MAX
         return limits if reached in limits else (*limits, reached)
@@ -193,10 +193,10 @@ class Aim:
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
         """Return the gap's speed and acceleration at the start of a path of forces, by a fitted parabola."""
         # along the portrait: a difference of two solutions would amplify the solver's grain
-        start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))
+        start_mm = self._portrait.gap_for_mm(path_N[0], device)
         speed, acceleration = 0.0, 0.0
         for place, force_N in enumerate(path_N):
-            away_mm = self._portrait.gap_mm_at(device.model_N(force_N)) - start_mm
+            away_mm = self._portrait.gap_for_mm(force_N, device) - start_mm
             speed += _TO_SPEED[place] * away_mm
             acceleration += _TO_ACCELERATION[place] * away_mm
         most, hardest = self._speeds, self._max_mm_s2

@@ -12,8 +12,6 @@ from tormagd.control.nominal import FieldOfGap
 from tormagd.control.records import Belief
 from tormagd.element.inverse.solution import FieldSolution, Reach, checked_near_mT
 from tormagd.element.model.force_curve import ForceCurve
-from tormagd.element.physics.field import PowerFieldLaw
-from tormagd.element.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
@@ -52,6 +50,9 @@ class Portrait:
     def gap_mm_at(self, force_N: float) -> float:
         return interpolated(force_N, self._rising_N, self.gap_mm)
 
+    def gap_for_mm(self, force_N: float, device: DeviceFit) -> float:
+        return self.gap_mm_at(device.model_N(force_N))
+
     def force_N_at(self, gap_mm: float) -> float:
         return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
@@ -88,15 +89,6 @@ class LawOfField:
 
     def field_mT(self, force_N: float) -> float:
         return interpolated(force_N, self._rising_N, self.fields_mT)
-
-
-def law_beside(
-    shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
-) -> LawOfField:
-    forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
-    scale = float(np.median(np.array(shown.force_N) / forces_N))
-    scaled_N: list[float] = (scale * forces_N).tolist()
-    return LawOfField(scaled_N, [field.field_mT(gap_mm) for gap_mm in shown.gap_mm])
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:

@@ -1,6 +1,7 @@
 """The force asked of the device: what is wanted over the next 400 ms, and the corridor around it.
 
-wanted    at TIMES_S: a wall's forces as the handle moves, or a preview; else slope and, as far as trusted, forecast
+wanted    at TIMES_S: a wall's forces as the handle moves; or a preview, and past its end (without one, past the newest
+          setpoint) the slope and, as far as it is trusted, the forecast
 corridor  what the scene allows and the device gives; besides
           law     to another wall or to none: the release rate, and what the handle's motion changes; where the scene
                   has a decay, DECAY of that rate for what gives way while the hand pushes on
@@ -16,7 +17,16 @@ from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
-from tormagd.control.ask.path import PATH_S, SPEEDING_UP_S, TIMES_S, Path
+from tormagd.control.ask.path import (
+    CHANGES_PER_S,
+    FLATTEST_N_MM,
+    LASTS_S,
+    NEAR_S,
+    PATH_S,
+    SPEEDING_UP_S,
+    TIMES_S,
+    nearest_path_mm,
+)
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.interpolation import at_step, low_pass, require_finite
 from tormagd.control.records import AT_REST, Ask, GapSpeeds, TimedSetpoint, Travel, Wall
@@ -26,7 +36,7 @@ from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
 SLOPE_FILTER_S: Final = 0.003
 AHEAD_S: Final = 0.05
-"Setpoints are carried on along their slope, or past their preview's end, by no more than this."
+"The slope goes on for so long, and for no longer than the preview before it."
 MIN_TIMES: Final = 9
 "At least this many of TIMES_S are looked at, however short a preview is."
 OUTRUN_N: Final = 0.02
@@ -55,26 +65,24 @@ class Governor:
     expected_N: float
     "What the lagging gap should give by now."
     last: TimedSetpoint | None
-    slope_N_s: float
-    is_passing: bool
-    "Whether the force is on the ramp to the forces of its holder."
     target_N: float | None
     "What was asked of a hand that pushed on at `target_mm`."
     target_mm: float
-    blend_N: float
-    "What is left of a law's ramp."
+    slope_N_s: float
+    "How the force goes on after what is known."
+    is_passing: bool
+    "Whether the force is on the ramp to the forces of its holder."
 
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, speeds: GapSpeeds, terms: Terms = EVERY_TERM
     ) -> None:
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
-        self._path: Final = Path(portrait, speeds)
         self._speeds: Final = speeds
         self._least_N: Final = force.least_N
         self._allowed: Final = (force.waiting_N, force.most_N)
         self._release_N_s: Final = force.release_N_s
-        self._decay_N_s: Final = DECAY * force.release_N_s if force.breakthrough == "decay" else ENDLESS
+        self._has_decay: Final = force.breakthrough == "decay"
         self.forecast = Forecast()
         self.begin(now_s)
 
@@ -85,8 +93,8 @@ class Governor:
         self._forget()
         self.is_passing = False
 
-    def foresee(self, *, is_whole: bool = True) -> bool:
-        return self._has_forecast and self.forecast.foresee(self.slope_N_s, is_whole=is_whole)
+    def foresee(self) -> bool:
+        return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def update(
         self,
@@ -101,7 +109,7 @@ class Governor:
         given = max(device.force_N(self._portrait.min_N), 0.0), max(device.force_N(self._portrait.max_N), 0.0)
         dt_s, self.time_s = max(now_s - self.time_s, 0.0), now_s
         if held_N is not None:
-            self.is_passing = True
+            self.is_passing, dt_s = True, 0.0
             self._stand_at(held_N, device)
         age_s, limits = None, [Limit.NO_SETPOINT]
         if setpoint is not None:
@@ -128,56 +136,64 @@ class Governor:
         given: Bounds,
         is_free: bool,
     ) -> Ask:
-        asked_N = setpoint.asked_N(travel)
-        force_N, limits = self._target(setpoint, travel, asked_N, dt_s, given)
-        self._learn(setpoint, travel, force_N, device)
-        path_N, foresight, governed_N, sent_mm = self._path_N(
-            setpoint, travel, max(age_s, 0.0), device, lag_s, dt_s, force_N, given
-        )
-        if self.blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N:
-            limits = (*limits, Limit.RATE)
-        step_N = self._release_N_s * dt_s if is_free else 0.0
-        is_let_go = is_free and force_N < self.asked_N and setpoint.lets_go(travel)
-        self.is_passing = self.is_passing and not is_let_go and abs(path_N[0] - self.asked_N) > step_N
-        if self.is_passing:
-            governed_N = self.asked_N + math.copysign(step_N, path_N[0] - self.asked_N)
-            path_N, sent_mm = [governed_N] * len(PATH_S), None
-            limits, foresight = (*limits, Limit.TAKEOVER), 0.0
-        self._stand_at(path_N[0], device, sent_mm)
-        return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True, asked_N=asked_N)
-
-    def _target(
-        self, setpoint: TimedSetpoint, travel: Travel, asked_N: float, dt_s: float, given: Bounds
-    ) -> tuple[float, tuple[Limit, ...]]:
-        """Return what is asked for now, within the corridor, and what holds it there."""
+        asked_N, step_N = setpoint.asked_N(travel), self._release_N_s * dt_s
         allowed_N = within(asked_N, self._allowed)
-        lawful_N = within(allowed_N, self._law(setpoint, travel, dt_s))
-        self.blend_N = lawful_N - allowed_N
-        self.target_N, self.target_mm = lawful_N if travel.is_pushing else None, travel.place_mm
+        lawful_N = self._lawful_N(setpoint, travel, allowed_N, step_N)
+        blend_N, force_N = lawful_N - allowed_N, within(lawful_N, given)
+        self._learn(setpoint, force_N, device)
+        ahead_N, trust = self._ahead_N(setpoint, travel, max(age_s, 0.0), lag_s)
+        bounds = within(self._allowed[0], given), within(self._allowed[1], given)
+        wanted_N = [within(within(each_N, bounds) + blend_N, bounds) for each_N in ahead_N]
+        if self.is_passing:
+            trust, is_let_go = 0.0, is_free and setpoint.lets_go(travel) and force_N < self.asked_N
+            self.is_passing = not is_let_go and abs(wanted_N[0] - self.asked_N) > step_N
+        if self.is_passing:
+            force_N = self.asked_N + math.copysign(step_N, wanted_N[0] - self.asked_N)
+            wanted_N = [force_N] * len(PATH_S)
+        path_N, governed_N = wanted_N[: len(PATH_S)], force_N
+        if self._is_pursued(setpoint, wanted_N[-1], trust, device):
+            path_mm = self._path_mm(setpoint.wall, travel, wanted_N, device, lag_s, dt_s, blend_N, bounds)
+            path_N = self._behind_N(path_mm, wanted_N, trust, device, lag_s, dt_s, bounds)
+            governed_N = within(self.expected_N, bounds) if setpoint.is_told else force_N
+        else:
+            self._stand_at(path_N[0], device)
+        is_late = blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N
+        limits = self._limits(setpoint, asked_N, lawful_N, given, is_late)
+        return Ask(governed_N, path_N, age_s, limits, trust, asked_N)
+
+    def _limits(
+        self, setpoint: TimedSetpoint, asked_N: float, lawful_N: float, given: Bounds, is_late: bool
+    ) -> tuple[Limit, ...]:
+        """Return what holds the force that is asked for now."""
         waiting_N, most_N = self._allowed
-        return within(lawful_N, given), (
+        return (
             *((Limit.RANGE,) if not self._least_N <= asked_N <= most_N else ()),
             *((Limit.STANDBY,) if self._least_N < waiting_N > asked_N else ()),
             *((Limit.F_MIN,) if lawful_N < given[0] else ()),
             *((Limit.F_MAX,) if lawful_N > given[1] else ()),
             *setpoint.limits,
+            *((Limit.RATE,) if is_late else ()),
+            *((Limit.TAKEOVER,) if self.is_passing else ()),
         )
 
-    def _law(self, setpoint: TimedSetpoint, travel: Travel, dt_s: float) -> Bounds:
-        """Return what a law's ramp leaves of the corridor."""
-        before_N, last, wall = self.target_N, self.last, setpoint.wall
+    def _lawful_N(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, step_N: float) -> float:
+        """Return what a law's ramp leaves of `allowed_N`."""
+        before_N, last, wall, lawful_N = self.target_N, self.last, setpoint.wall, allowed_N
         # a new holder has a ramp of its own
-        if last is None or before_N is None or not travel.is_pushing or setpoint.holder != last.holder:
-            return -ENDLESS, ENDLESS
-        if wall is not None:
-            most_N = self._release_N_s * dt_s + wall.stiffness_N_mm * abs(travel.place_mm - self.target_mm)
-        elif self._decay_N_s < ENDLESS:
-            return before_N - self._decay_N_s * dt_s, ENDLESS
-        else:
-            most_N = ENDLESS if last.wall is None and self.blend_N == 0.0 else self._release_N_s * dt_s
-        return before_N - most_N, before_N + most_N
+        if travel.is_pushing and before_N is not None and last is not None and setpoint.holder == last.holder:
+            rises_N = falls_N = step_N
+            if wall is not None:
+                rises_N = falls_N = step_N + wall.stiffness_N_mm * abs(travel.place_mm - self.target_mm)
+            elif self._has_decay:
+                rises_N, falls_N = ENDLESS, DECAY * step_N
+            elif last.wall is None and before_N == within(last.force_N, self._allowed):
+                rises_N = falls_N = ENDLESS
+            lawful_N = within(allowed_N, (before_N - falls_N, before_N + rises_N))
+        self.target_N, self.target_mm = lawful_N if travel.is_pushing else None, travel.place_mm
+        return lawful_N
 
-    def _learn(self, setpoint: TimedSetpoint, travel: Travel, force_N: float, device: DeviceFit) -> None:
+    def _learn(self, setpoint: TimedSetpoint, force_N: float, device: DeviceFit) -> None:
+        """Learn how the force goes on after what is known: after a preview, or else after the newest force."""
         last, self.last = self.last or setpoint, setpoint
         spacing_s = setpoint.stamp_s - last.stamp_s
         if setpoint.holder != last.holder:  # another publisher's forces say nothing about this one's
@@ -190,109 +206,120 @@ class Governor:
             most = -self._speeds.opening_mm_s * per_mm_s, self._speeds.sure_mm_s * per_mm_s
             risen_N = within(setpoint.force_N, self._allowed) - within(last.force_N, self._allowed)
             self.slope_N_s = low_pass(self.slope_N_s, within(risen_N / spacing_s, most), spacing_s, SLOPE_FILTER_S)
-        if self._has_forecast:
-            self._remember(
-                setpoint, 0.0 if setpoint.wall is not None or setpoint.lets_go(travel) else setpoint.preview_s
-            )
-
-    def _remember(self, setpoint: TimedSetpoint, ahead_s: float) -> None:
-        """Give the forecast the newest force, or a preview's last."""
-        if ahead_s >= TIMES_S[-1]:
+        end_s, end_N = 0.0, setpoint.force_N
+        if setpoint.preview_N:
+            end_s, end_N, self.slope_N_s = setpoint.preview_s, setpoint.preview_N[-1], setpoint.preview_slope_N_s
+        if end_s >= TIMES_S[-1]:
             self.forecast.forget()
-            return
-        newest_N = setpoint.force_N
-        if ahead_s > 0.0:
-            self.slope_N_s, newest_N = setpoint.preview_slope_N_s, setpoint.preview_N[-1]
-        self.forecast.update(setpoint.stamp_s + ahead_s, within(newest_N, self._allowed))
-
-    def _path_N(
-        self,
-        setpoint: TimedSetpoint,
-        travel: Travel,
-        soon_s: float,
-        device: DeviceFit,
-        lag_s: float,
-        dt_s: float,
-        force_N: float,
-        given: Bounds,
-    ) -> tuple[list[float], float, float, float | None]:
-        """Return the forces at PATH_S, how far they are foreseen, what the gap gives by now, and where it is sent."""
-        if setpoint.lets_go(travel):
-            return [force_N] * len(PATH_S), 1.0, force_N, None
-        bounds = within(self._allowed[0], given), within(self._allowed[1], given)
-        ahead_N, trust = self._ahead_N(setpoint, travel, soon_s, lag_s)
-        wanted_N = [within(within(each_N, bounds) + self.blend_N, bounds) for each_N in ahead_N]
-        is_near = setpoint.is_told or (trust > 0.0 and self._path.is_near(self.sent_mm, wanted_N[-1], device))
-        if self.is_passing or not is_near:
-            return wanted_N[: len(PATH_S)], trust, force_N, None
-        most_N = self._most_N(setpoint.wall, travel, lag_s, bounds)
-        pursued_N, sent_mm = self._path.pursue(self.from_mm, self.sent_mm, dt_s, wanted_N, device, lag_s, most_N)
-        path_N = [
-            trust * within(each_N, bounds) + (1.0 - trust) * other_N
-            for each_N, other_N in zip(pursued_N, wanted_N)  # noqa: B905 only such a zip is compiled to a plain loop
-        ]
-        # the path sets out earlier by as much as the carriages come later
-        if dt_s > 0.0:
-            self.expected_N = low_pass(self.expected_N, path_N[0], dt_s, lag_s)
-        return path_N, trust, within(self.expected_N, bounds) if setpoint.is_told else force_N, sent_mm
+        elif self._has_forecast:
+            self.forecast.update(setpoint.stamp_s + end_s, within(end_N, self._allowed))
 
     def _ahead_N(
         self, setpoint: TimedSetpoint, travel: Travel, soon_s: float, lag_s: float
     ) -> tuple[list[float], float]:
         """Return the forces known ahead at TIMES_S, and the trust in them."""
-        wall, slope_N_s = setpoint.wall, self.slope_N_s
+        wall = setpoint.wall
+        if setpoint.lets_go(travel):
+            return [setpoint.asked_N(travel)] * len(PATH_S), 0.0
         if wall is not None:
             place_mm = travel.place_mm + travel.rate_mm_s * (lag_s + SPEEDING_UP_S)
             return [wall.force_N(place_mm + travel.rate_mm_s * after_s) for after_s in TIMES_S], 1.0
-        if setpoint.preview_N:
-            return previewed_N(setpoint, soon_s + lag_s, self.forecast), 1.0
         # a publisher that has fallen silent is not believed to go on as it did
-        trust = self.forecast.trust if soon_s <= MAX_STEP_S else 0.0
-        begins_s, times_s = soon_s + trust * lag_s, TIMES_S[: MIN_TIMES if trust > 0.0 else len(PATH_S)]
-        last_N = within(setpoint.force_N, self._allowed)
-        ahead_N = [last_N + slope_N_s * min(begins_s + after_s, AHEAD_S) for after_s in times_s]
-        if trust > 0.0:
-            for place, forecast_N in enumerate(self.forecast.forces_N(begins_s, times_s)):
-                ahead_N[place] += trust * (forecast_N - ahead_N[place])
-        return ahead_N, trust
+        foreseen = self.forecast.trust if soon_s <= MAX_STEP_S else 0.0
+        trust = 1.0 if setpoint.preview_N else foreseen
+        return self.going_on_N(setpoint, soon_s + trust * lag_s, foreseen), trust
 
-    def _most_N(self, wall: Wall | None, travel: Travel, lag_s: float, bounds: Bounds) -> list[Bounds] | None:
-        """Return the most at PATH_S that the gap may give, and may be sent to."""
+    def going_on_N(self, setpoint: TimedSetpoint, begins_s: float, foreseen: float) -> list[float]:
+        """Return the forces at TIMES_S from `begins_s` after the stamp: of the preview, and of what comes after it."""
+        end_s, forces_N = setpoint.preview_s, [setpoint.force_N, *setpoint.preview_N]
+        known_s = end_s + (HORIZON_S if foreseen > 0.0 else 0.0)
+        most_s = min(AHEAD_S, end_s) if setpoint.preview_N else AHEAD_S
+        ahead_N: list[float] = []
+        for after_s in TIMES_S:
+            at_s = begins_s + after_s
+            past_s = at_s - end_s
+            if at_s >= known_s and len(ahead_N) >= MIN_TIMES:
+                break
+            if past_s < 0.0:
+                force_N = at_step(at_s / setpoint.preview_dt_s, forces_N)
+            else:
+                force_N = within(forces_N[-1], self._allowed) + self.slope_N_s * min(past_s, most_s)
+                if foreseen > 0.0:
+                    force_N += foreseen * (self.forecast.force_at_N(past_s) - force_N)
+            ahead_N.append(force_N)
+        return ahead_N
+
+    def _is_pursued(self, setpoint: TimedSetpoint, to_N: float, trust: float, device: DeviceFit) -> bool:
+        """Tell whether a path leads to what is known ahead: where it is told, or the gap gets there soon."""
+        if trust == 0.0 or setpoint.is_told:
+            return trust > 0.0
+        closing_mm, most = self.sent_mm - self._portrait.gap_for_mm(to_N, device), self._speeds
+        return -NEAR_S * most.opening_mm_s < closing_mm < NEAR_S * most.sure_mm_s
+
+    def _path_mm(
+        self,
+        wall: Wall | None,
+        travel: Travel,
+        wanted_N: list[float],
+        device: DeviceFit,
+        lag_s: float,
+        dt_s: float,
+        blend_N: float,
+        bounds: Bounds,
+    ) -> list[float]:
+        """Return the best path through `wanted_N` for late carriages, not early before a wall."""
+        portrait, late_s = self._portrait, SPEEDING_UP_S + lag_s
+        require_finite("sent_mm", self.sent_mm)
+        # compiled, pairs and ** make objects
+        wanted_mm, weights = wanted_N[:], LASTS_S[: len(wanted_N)]
+        for place, force_N in enumerate(wanted_N):
+            wanted_mm[place], slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
+            weights[place] *= math.pow(max(slope_N_mm, FLATTEST_N_MM), 2.0)
         if wall is None:
-            return None
-        over_N = within(within(wall.friction_N, self._allowed) + self.blend_N, bounds) - wall.friction_N + EARLY_N
-        places_mm = [travel.place_mm + travel.rate_mm_s * after_s for after_s in PATH_S]
-        on_mm = travel.rate_mm_s * (lag_s + SPEEDING_UP_S)
-        return [(wall.most_N(each_mm) + over_N, wall.most_N(each_mm + on_mm) + over_N) for each_mm in places_mm]
+            for place in range(len(wanted_mm) - 1):
+                wanted_mm[place] += late_s * CHANGES_PER_S[place] * (wanted_mm[place + 1] - wanted_mm[place])
+        path_mm = nearest_path_mm(self.sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._speeds, len(PATH_S))
+        if wall is None:
+            return path_mm
+        over_N = within(within(wall.friction_N, self._allowed) + blend_N, bounds) - wall.friction_N + EARLY_N
+        lead_mm, on_mm = late_s * self._speeds.sure_mm_s, travel.rate_mm_s * late_s
+        for place, after_s in enumerate(PATH_S):
+            place_mm = travel.place_mm + travel.rate_mm_s * after_s
+            now_mm = portrait.gap_for_mm(wall.most_N(place_mm) + over_N, device) - lead_mm
+            then_mm = portrait.gap_for_mm(wall.most_N(place_mm + on_mm) + over_N, device)
+            # compiled, max() of three makes objects
+            path_mm[place] = max(path_mm[place], max(now_mm, then_mm))
+        return path_mm
 
-    def _stand_at(self, force_N: float, device: DeviceFit, sent_mm: float | None = None) -> None:
-        self.asked_N, self.from_mm = force_N, self._portrait.gap_mm_at(device.model_N(force_N))
-        if sent_mm is None:
-            self.expected_N, sent_mm = force_N, self.from_mm
-        self.sent_mm = sent_mm
+    def _behind_N(
+        self,
+        path_mm: list[float],
+        wanted_N: list[float],
+        trust: float,
+        device: DeviceFit,
+        lag_s: float,
+        dt_s: float,
+        bounds: Bounds,
+    ) -> list[float]:
+        """Send the carriages along the path, and return the forces of the gap behind them."""
+        portrait, late_s, gap_mm, path_N = self._portrait, SPEEDING_UP_S + lag_s, self.from_mm, []
+        left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_S[1] / late_s)
+        for to_mm, other_N in zip(path_mm, wanted_N):  # noqa: B905 only such a zip is compiled to a plain loop
+            gap_mm, left = to_mm + (gap_mm - to_mm) * left, left_in_a_step
+            given_N = within(device.force_N(portrait.force_N_at(gap_mm)), bounds)
+            path_N.append(trust * given_N + (1.0 - trust) * other_N)
+        # the path sets out earlier by as much as the carriages come later
+        expected_N = low_pass(self.expected_N, path_N[0], dt_s, lag_s) if dt_s > 0.0 else self.expected_N
+        self._stand_at(path_N[0], device)
+        # a path may lead past the portrait's ends, where no carriages are sent
+        self.expected_N, self.sent_mm = expected_N, within(path_mm[0], (portrait.gap_mm[-1], portrait.gap_mm[0]))
+        return path_N
+
+    def _stand_at(self, force_N: float, device: DeviceFit) -> None:
+        self.asked_N, self.expected_N = force_N, force_N
+        self.from_mm = self.sent_mm = self._portrait.gap_for_mm(force_N, device)
 
     def _forget(self) -> None:
         self.last, self.slope_N_s, self.is_passing = None, 0.0, True
-        self.target_N, self.target_mm, self.blend_N = None, 0.0, 0.0
+        self.target_N, self.target_mm = None, 0.0
         self.forecast.forget()
-
-
-def previewed_N(setpoint: TimedSetpoint, begins_s: float, forecast: Forecast) -> list[float]:
-    """Return the forces of a preview at TIMES_S from `begins_s` after its stamp."""
-    trust = forecast.trust
-    ahead_N: list[float] = []
-    known_s = setpoint.preview_s + (HORIZON_S if trust > 0.0 else 0.0)
-    forces_N = [setpoint.force_N, *setpoint.preview_N]
-    for after_s in TIMES_S:
-        at_s = begins_s + after_s
-        past_s = at_s - setpoint.preview_s
-        if at_s >= known_s and len(ahead_N) >= MIN_TIMES:
-            break
-        force_N = at_step(at_s / setpoint.preview_dt_s, forces_N)
-        if past_s >= 0.0:
-            force_N += setpoint.preview_slope_N_s * min(min(past_s, AHEAD_S), setpoint.preview_s)
-            if trust > 0.0:
-                force_N += trust * (forecast.forces_N(past_s, [0.0])[0] - force_N)
-        require_finite("preview_N", force_N)
-        ahead_N.append(force_N)
-    return ahead_N

@@ -7,13 +7,9 @@ least. A dynamic programme solves this exactly, backwards over the points (Johns
 for the fused lasso, the dual).
 """
 
-import math
 from itertools import pairwise
-from typing import Final, final
+from typing import Final
 
-from tormagd.control.aim.portrait import Portrait
-from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.interpolation import require_finite
 from tormagd.control.records import GapSpeeds
 from tormagd.element.model.force_curve import within
 
@@ -33,60 +29,6 @@ NEAR_S: Final = 0.18
 "What the gap reaches within this time is near."
 FLATTEST_N_MM: Final = 1e-3
 "The least weight's slope, for forces that hardly depend on the gap."
-
-
-@final
-class Path:
-    """Finds the gap's best path, for one portrait and the gap's top speeds."""
-
-    def __init__(self, portrait: Portrait, speeds: GapSpeeds) -> None:
-        self._portrait: Final = portrait
-        self._speeds: Final = speeds
-
-    def gap_mm(self, force_N: float, device: DeviceFit) -> float:
-        return self._portrait.gap_mm_at(device.model_N(force_N))
-
-    def is_near(self, from_mm: float, to_N: float, device: DeviceFit) -> bool:
-        """Tell whether the gap gets from `from_mm` to the force `to_N` within NEAR_S."""
-        closing_mm, most = from_mm - self.gap_mm(to_N, device), self._speeds
-        return -NEAR_S * most.opening_mm_s < closing_mm < NEAR_S * most.sure_mm_s
-
-    def pursue(
-        self,
-        from_mm: float,
-        sent_mm: float,
-        dt_s: float,
-        wanted_N: list[float],
-        device: DeviceFit,
-        lag_s: float,
-        most_N: list[tuple[float, float]] | None = None,
-    ) -> tuple[list[float], float]:
-        """Find the best path for `wanted_N` at TIMES_S; return its forces at PATH_S and a gap to send."""
-        portrait = self._portrait
-        late_s = SPEEDING_UP_S + lag_s
-        require_finite("sent_mm", sent_mm)
-        # compiled, pairs and ** make objects
-        wanted_mm, weights = wanted_N[:], LASTS_S[: len(wanted_N)]
-        for place, force_N in enumerate(wanted_N):
-            wanted_mm[place], slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
-            weights[place] *= math.pow(max(slope_N_mm, FLATTEST_N_MM), 2.0)
-        if most_N is None:
-            for place in range(len(wanted_mm) - 1):
-                wanted_mm[place] += late_s * CHANGES_PER_S[place] * (wanted_mm[place + 1] - wanted_mm[place])
-        path_mm = nearest_path_mm(sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._speeds, len(PATH_S))
-        if most_N is not None:
-            lead_mm = late_s * self._speeds.sure_mm_s
-            for place, (now_N, then_N) in enumerate(most_N):
-                least_mm = max(self.gap_mm(now_N, device) - lead_mm, self.gap_mm(then_N, device))
-                path_mm[place] = max(path_mm[place], least_mm)
-        gap_mm, forces_N = from_mm, []
-        left, left_in_a_step = math.exp(-dt_s / late_s), math.exp(-PATH_S[1] / late_s)
-        for to_mm in path_mm:
-            gap_mm = to_mm + (gap_mm - to_mm) * left
-            forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
-            left = left_in_a_step
-        # a path may lead past the portrait's ends, where no carriages are sent
-        return forces_N, within(path_mm[0], (portrait.gap_mm[-1], portrait.gap_mm[0]))
 
 
 def nearest_path_mm(

@@ -17,11 +17,6 @@ SLID_MM: Final = 0.5
 "More than the bristles of the softest elastomer give, at 5 N/mm and 1.5 N either way."
 
 
-def place_and_rate(measured: Measured, push_sign: float) -> tuple[float, float]:
-    handle = measured.handle
-    return push_sign * measured.handle_mm, push_sign * handle.turn.direction * handle.quick_mm_s
-
-
 @final
 class Way:
     """Follows a brake's handle along the way of the task."""
@@ -49,5 +44,5 @@ class Way:
             is_pushing = not is_pushing
         if is_pushing != before.is_pushing:
             self.changed_mm = place_mm
-        self.travel = Travel(*place_and_rate(measured, self._push_sign), is_pushing)
+        self.travel = Travel(*measured.along(self._push_sign), is_pushing)
         return self.travel

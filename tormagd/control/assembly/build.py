@@ -16,7 +16,7 @@ from msgspec import UNSET
 
 from tormagd.config import Config
 from tormagd.control.aim.aim import Element
-from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, PortraitSearch, law_beside, portrait
+from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, PortraitSearch, portrait
 from tormagd.control.assembly.renderable import Missed, missed
 from tormagd.control.contact import PRESSED, ElementContact, Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
@@ -29,7 +29,7 @@ from tormagd.element.model.memory import NO_MEMORY
 from tormagd.element.model.model_file import ForceModel, ModelFileError, falling_at, load_model, model_path
 from tormagd.element.physics.errors import DomainError, require
 from tormagd.element.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
-from tormagd.element.physics.force import Geometry
+from tormagd.element.physics.force import Geometry, brake_force_N
 from tormagd.element.physics.inserts import insert
 from tormagd.scenes.measured import measured
 from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Finger, Scene, load_scene, scene_path
@@ -175,7 +175,10 @@ def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
         fitted.thickness_mm * metres,
         fitted.roller_radius_mm * metres,
     )
-    return law_beside(reach, PowerFieldLaw(), field, insert(fitted.name).elastomer, geometry)
+    moments_Tm = PowerFieldLaw().radial_moment_Tm(np.array(reach.gap_mm))
+    forces_N = brake_force_N(moments_Tm, insert(fitted.name).elastomer, geometry)
+    scale = float(np.median(np.array(reach.force_N) / forces_N))
+    return LawOfField((scale * forces_N).tolist(), [field.field_mT(gap_mm) for gap_mm in reach.gap_mm])
 
 
 def _known_fields_mT(
@@ -204,7 +207,7 @@ def _known_fields_mT(
 def _stable_margins(config: Config) -> Margins:
     """Return the position loop's stability margins; raise ConfigError where they are too small."""
     stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
-    if stability.phase_margin_deg < MIN_PHASE_MARGIN_DEG or stability.gain_margin_dB < MIN_GAIN_MARGIN_DB:
+    if not (stability.phase_margin_deg >= MIN_PHASE_MARGIN_DEG and stability.gain_margin_dB >= MIN_GAIN_MARGIN_DB):
         raise ConfigError(
             f"position: these gains leave a phase margin of {stability.phase_margin_deg:.2f} degrees and a gain margin "
             f"of {stability.gain_margin_dB:.2f} dB: allowed is at least {MIN_PHASE_MARGIN_DEG:g} and "

@@ -173,7 +173,7 @@ class _Running:
                 except PLAN_ERRORS as error:
                     self._failure = error
             case journal.FORESEE:
-                self._planner.foresee(is_whole=False)
+                self._planner.foresee()
             case journal.AFRESH:
                 self._failure = None
                 self._planner.afresh(msgspec.convert(entry[1], float))
