@@ -115,7 +115,7 @@ def duties(core: Core, recorded: list[Sample], device_s: float, host_s: float) -
             stepper.command("enable", now_s, READY)
         if tick % 4 == 0:
             planner.plan(now_s, setpoint.replaced(stamp_s=host_s + setpoint.stamp_s), stepper.measured)
-            planner.foresee()
+            planner.governor.foresee()
     return found
 
 

@@ -178,7 +178,7 @@ def test_a_profile_that_lies_never_presses_over_the_ceiling(
     hand = RecordedHand((0.0, RESTS_S, RESTS_S + 30.0), (0.0, 0.0, 30.0 * goes_mm_s))
     loop = arm(f"sample_{draw.randint(1, 3)}", hand)
     fit = DeviceFit(scale, offset_N, draw.choice((1e-6, 1e-2)), 0.0, 1e-4)
-    loop.planner.teach(Learned(fit, draw.uniform(0.7, 1.2), 1.0, draw.uniform(-0.3, 0.3)))
+    loop.planner.believe.teach(Learned(fit, draw.uniform(0.7, 1.2), 1.0, draw.uniform(-0.3, 0.3)))
     samples = render(loop, MAX_N, 4.0)
     assert max(abs(sample.truth.force_N) for sample in samples) < 1.25 * MAX_N + 0.1
     assert set(samples[-1].safety.faults) <= {Fault.SENSOR}

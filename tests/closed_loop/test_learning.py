@@ -64,7 +64,7 @@ def test_a_weak_device_that_was_slid_at_speed_is_known_as_such_and_right_at_once
     render(loop, 0.7, 1.0)
     render(loop, 2.0, 2.0)
     again = arm("sample_2")
-    again.planner.teach(loop.planner.believe.learned())
+    again.planner.believe.teach(loop.planner.believe.learned())
     forces_N = [abs(each.truth.force_N) for each in render(again, 2.0, 2.5)]
     assert max(forces_N) < 2.0 + 0.06
     assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)

@@ -247,7 +247,7 @@ def test_a_friction_that_differs_by_the_way_is_believed_from_the_beginning(bench
     file.write_text(calibration(msgspec.structs.replace(NEW, findings=found), CONFIG))
     planner = build_core(load_calibration(file, CONFIG, 7)).planner()
     assert planner.believe.zero.way == pytest.approx(0.03, abs=0.006)
-    planner.teach(NOTHING_LEARNED)
+    planner.believe.teach(NOTHING_LEARNED)
     assert planner.believe.zero.way == pytest.approx(0.03, abs=0.006)
 
 

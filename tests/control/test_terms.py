@@ -38,7 +38,7 @@ def told(moving, planned):
         handle = Handle(MOBILISED_MM, rate_mm_s, Turn(1.0, 0.0, at_mm), rate_mm_s)
         force_N = 1.2 + 0.002 * ((planner.believe.read + 1) % 2)  # a sensor that stands still is not believed
         plan = planned(planner, asked_N, moving(78.0, force_N, handle=handle, handle_mm=at_mm), **setpoint)
-        planner.foresee()
+        planner.governor.foresee()
         return plan
 
     return tell
@@ -140,7 +140,7 @@ def test_without_the_motor_what_is_known_of_it_is_not_looked_at(told) -> None:
 
     def gap_mm(core: Core, lag_s: float) -> float:
         planner = core.planner()
-        planner.teach(Learned(lag_s=lag_s))
+        planner.believe.teach(Learned(lag_s=lag_s))
         return told(planner, 1.0, **ahead).gap_mm
 
     assert gap_mm(core_without(), 0.02) != gap_mm(core_without(), 0.0)

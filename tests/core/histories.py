@@ -95,7 +95,7 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
                 try:
                     planner.plan(now_s, setpoint, stepper.measured, rng.random() < 0.8)
                     seen.see(planner)
-                    planner.foresee()
+                    planner.governor.foresee()
                 except (ValueError, OverflowError) as error:
                     seen.see(error)
                     seen.see(planner)

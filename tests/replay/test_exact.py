@@ -110,7 +110,7 @@ def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core
         sample = loop.tick(setpoint)
         if planner.planned is not planned:
             assert planner_again.plan(sample.time_s, setpoint, stepper_again.measured) == planner.planned
-            planner_again.foresee()
+            planner_again.governor.foresee()
         assert stepper_again.step(sample.time_s, sample.measurement, planner_again.planned) == sample.output
         if tick % 50 == 0:
             assert first_difference(plain(loop.stepper), plain(stepper_again)) is None

@@ -15,9 +15,8 @@ from tormagd.config import Config
 from tormagd.control.aim.aim import Aim, Element
 from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.way import Way
-from tormagd.control.believe.believe import Believe, Learned
+from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.sensor import Disputed
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.measure import Measure
 from tormagd.control.move.actuator import Actuator
@@ -82,18 +81,8 @@ class Planner:
             return device.force_N(portrait.min_N)
         # the rest of the plan's gap is the element's memory and the handle's rate
         is_held = Limit.CEILING in planned.limits
-        beside_mm = 0.0 if is_held else planned.gap_mm - portrait.gap_mm_at(device.model_N(planned.governed_N))
+        beside_mm = 0.0 if is_held else planned.gap_mm - portrait.gap_for_mm(planned.governed_N, device)
         return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
-
-    def foresee(self) -> bool:
-        return self.governor.foresee()
-
-    def teach(self, learned: Learned) -> None:
-        self.believe.teach(learned)
-
-    def confirm(self, wrong: Disputed) -> None:
-        """Settle a dispute between device and sensor by the operator's word."""
-        self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
         """Begin again at `now_s` after a failed plan, with nothing known of the device or of setpoints."""

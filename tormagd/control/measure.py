@@ -33,6 +33,7 @@ class Measure:
         self, home_mm: float, derivative_filter_s: float, turns: bool, full_speed_mm_s: float, period_s: float
     ) -> None:
         self.sight = Sight(period_s)
+        self._period_s: Final = period_s
         self._home_mm: Final = home_mm
         self._derivative_filter_s: Final = derivative_filter_s
         self._turns: Final = turns
@@ -61,8 +62,7 @@ class Measure:
         self.measured = None
 
     def forget(self) -> None:
-        self.measured, self.leap = None, None
-        self.sight.forget()
+        self.measured, self.leap, self.sight = None, None, Sight(self._period_s)
 
     def begin(self, measurement: Measurement) -> None:
         """Replace the newest record by one of `measurement` at rest."""

@@ -31,10 +31,6 @@ class Sight:
         self.stalled_s = -math.inf
         self._blind_s: Final = max(BLIND_S, BLIND_PERIODS * period_s)
 
-    def forget(self) -> None:
-        self.seen_s, self.stalled_s, self.stall_s = math.inf, -math.inf, 0.0
-        self.is_blind = self.was_blind = False
-
     def has_stalled(self, now_s: float) -> bool:
         return now_s - self.stalled_s < SHOWN_S
 

@@ -40,11 +40,11 @@ class InferenceLoop:
 
     def teach(self, learned: Learned) -> None:
         self._journal.note(TEACH, learned)
-        self.planner.teach(learned)
+        self.planner.believe.teach(learned)
 
     def confirm(self, wrong: Disputed) -> None:
         self._journal.note(CONFIRM, wrong)
-        self.planner.confirm(wrong)
+        self.planner.believe.confirm(wrong)
 
     def is_due(self, beat: Beat) -> bool:
         # counted from when beats are due, not when they begin: lateness does not lower the rate
@@ -75,7 +75,7 @@ class InferenceLoop:
     def foresee(self, _beat: Beat) -> bool:
         """Make the next half of the forecast for the next plans; return False if none is due."""
         try:
-            is_made = self.planner.foresee()
+            is_made = self.planner.governor.foresee()
         except PLAN_ERRORS as error:
             self._begin_afresh(self._clock_ns() * 1e-9, error)
             return True

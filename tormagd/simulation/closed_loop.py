@@ -230,7 +230,7 @@ class ClosedLoop:
         if is_asked or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
             self._answer_question(planner, now_s)
             planner.plan(now_s, setpoint, self.stepper.measured, self.stepper.is_followed)
-            planner.foresee()
+            planner.governor.foresee()
             self._asked = self._asked or planner.aim.question
         return planner.planned
 

@@ -41,9 +41,6 @@ class IdealCarriages(Actuator):
     def begin(self, gap_mm: float) -> None:
         self.reference = Reference(gap_mm)
 
-    def resume(self, measured: Measured) -> None:
-        self.begin(measured.gap_mm)
-
     def update(
         self,
         now_s: float,

@@ -95,7 +95,7 @@ def test_what_cannot_be_given_is_said_once(first, moving, force_N: float, limit:
 
 
 def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(planner, planned, first) -> None:
-    planner.teach(Learned(DeviceFit(scale=1.6)))
+    planner.believe.teach(Learned(DeviceFit(scale=1.6)))
     plan = planned(planner, 0.7)
     assert Limit.F_MIN in plan.limits
     assert plan.gap_mm == pytest.approx(95.0, abs=0.1)
@@ -103,7 +103,7 @@ def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(planner
 
 
 def test_the_trim_is_the_devices_force_over_the_models_where_the_plan_leads(planner, planned) -> None:
-    planner.teach(Learned(DeviceFit(1.25, 0.2)))
+    planner.believe.teach(Learned(DeviceFit(1.25, 0.2)))
     assert planned(planner, 1.2).trim == pytest.approx(1.2 / 0.8)
 
 

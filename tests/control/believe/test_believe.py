@@ -53,7 +53,7 @@ def test_a_force_is_a_pull_only_where_the_sensors_zero_is_known(planner, planned
 
 @pytest.mark.parametrize("static", [0.95, 1.12])
 def test_a_reading_just_above_a_creep_teaches_the_force_there(planner, hear, moving, static: float) -> None:
-    planner.teach(Learned(slow_factor=static, slow_learned=1.0))
+    planner.believe.teach(Learned(slow_factor=static, slow_learned=1.0))
     slow = {"handle": Handle(MOBILISED_MM, 6.0, TURN, 6.0)}
     plan = hear(planner, 8.0, moving(force_N=0.9 * 1.0871, **slow)).planned
     assert plan.predicted_N == pytest.approx(0.9 * 1.0871, abs=6e-3)
@@ -74,7 +74,7 @@ def test_a_reading_just_above_a_creep_teaches_the_force_there(planner, hear, mov
 )
 def test_what_teaches_nothing_leaves_the_device_as_it_is(planner, planned, moving, changes) -> None:
     known = DeviceFit(scale=1.1, scale_variance=1e-4)
-    planner.teach(Learned(known))
+    planner.believe.teach(Learned(known))
     for _ in range(20):
         planned(planner, 1.0, None if changes is None else moving(force_N=1.4, **changes))
     assert planner.believe.device == known
@@ -82,7 +82,7 @@ def test_what_teaches_nothing_leaves_the_device_as_it_is(planner, planned, movin
 
 def test_without_learning_no_reading_teaches_and_the_sensor_is_judged_all_the_same(planner, hear, moving) -> None:
     learned = Learned(DeviceFit(1.1, 0.02, 1e-4), 1.05, 0.5, 0.01, 0.02)
-    planner.teach(learned)
+    planner.believe.teach(learned)
     planner.believe.learns = False
     back = Handle(MOBILISED_MM, -42.0, Turn(-1.0, 0.0, 100.0), 42.0)
     for changes in ({}, {"handle": back}, CREEPING):
@@ -166,7 +166,7 @@ def test_a_scene_that_tolerates_more_goes_on_learning(core, hear, moving) -> Non
 
 
 def test_what_its_zero_is_off_by_is_no_part_of_what_a_sensor_teaches_and_is_said(planner, hear, moving) -> None:
-    planner.teach(Learned(sensor_zero_N=1.1 * UNTARED_N))
+    planner.believe.teach(Learned(sensor_zero_N=1.1 * UNTARED_N))
     plan = hear(planner, 1.0, moving(force_N=1.0871 + 1.1 * UNTARED_N)).planned
     assert plan.trim == pytest.approx(1.0, abs=0.01)
     assert Limit.SENSOR_ZERO in plan.limits
@@ -174,7 +174,7 @@ def test_what_its_zero_is_off_by_is_no_part_of_what_a_sensor_teaches_and_is_said
 
 def test_what_its_zero_is_off_by_is_no_friction_at_a_creep(core, planner, hear, moving) -> None:
     right = hear(core.planner(), 0.5, moving(force_N=1.3, **CREEPING)).believe.slow.factor
-    planner.teach(Learned(sensor_zero_N=0.1))
+    planner.believe.teach(Learned(sensor_zero_N=0.1))
     assert hear(planner, 0.5, moving(force_N=1.4, **CREEPING)).believe.slow.factor == pytest.approx(right)
     assert right != 1.0
 
@@ -204,7 +204,7 @@ def test_what_a_force_says_before_homing_and_before_break_away_is_not_predicted(
     ids=["at rest", "sliding", "a sensor that is not believed"],
 )
 def test_what_is_known_of_the_lag_outlasts_what_the_sensor_teaches(planner, hear, moving, changes, is_doubted) -> None:
-    planner.teach(Learned(lag_s=0.02))
+    planner.believe.teach(Learned(lag_s=0.02))
     believed = hear(planner, 1.2, moving(**changes)).believe
     assert (believed.sensor.is_doubted, believed.read, believed.carriages.lag_s) == (is_doubted, 299, 0.02)
 
@@ -230,7 +230,7 @@ def swing(core, moving):
             ahead_N = tuple(force_N(now_s + 2e-3 * k) for k in range(1, 40)) if is_known else ()
             setpoint = TimedSetpoint(force_N(now_s), now_s, 0.1, preview_N=ahead_N, preview_dt_s=2e-3)
             planner.plan(now_s, setpoint, moving(gap_mm, left_mm_s=side_mm_s, right_mm_s=side_mm_s, **RESTING))
-            planner.foresee()
+            planner.governor.foresee()
         return planner
 
     return swung
@@ -254,7 +254,7 @@ def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(swing) ->
 
 def test_what_is_taught_is_known_until_it_begins_afresh(planner) -> None:
     learned = Learned(DeviceFit(1.1, 0.02, 1e-4), 1.05, 0.5, 0.01, 0.02)
-    planner.teach(learned)
+    planner.believe.teach(learned)
     assert planner.believe.learned() == learned
     planner.afresh(3.0)
     assert planner.believe.learned() == NOTHING_LEARNED

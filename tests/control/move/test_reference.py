@@ -8,13 +8,14 @@ from hypothesis import example, given, settings, strategies as st
 
 from tormagd.config import Config, Position
 from tormagd.control.move.motor import full_speed_mm_s
-from tormagd.control.move.reference import Expected, Reference, Speeds, follow
+from tormagd.control.move.reference import Expected, Reference, follow
+from tormagd.control.records import GapSpeeds
 
 DT_S = 1e-3
 LIMITS = Config().position
 MAX_MM_S2 = LIMITS.gap_acceleration_mm_s2
 NO_LOAD_MM_S = 2.0 * full_speed_mm_s(Config().motor)
-SPEEDS = Speeds(NO_LOAD_MM_S, LIMITS.gap_speed_mm_s, LIMITS.gap_speed_mm_s)
+SPEEDS = GapSpeeds(*[LIMITS.gap_speed_mm_s] * 3, NO_LOAD_MM_S)
 HALF_COUNT_MM = 0.5 * 8.0 / 4480.0
 
 
@@ -22,7 +23,7 @@ def followed(
     start_mm: float,
     targets: Iterable[Reference],
     dt_s: float = DT_S,
-    speeds: Speeds = SPEEDS,
+    speeds: GapSpeeds = SPEEDS,
     floor_mm: float = -math.inf,
 ) -> Iterator[Reference]:
     reference = Reference(start_mm)
@@ -33,7 +34,8 @@ def followed(
 
 gaps = st.floats(45.0, 95.0)
 limits = st.builds(Position, gap_acceleration_mm_s2=st.floats(100.0, 5_000.0))
-fastest = st.builds(Speeds, st.floats(40.0, 60.0), st.floats(5.0, 60.0), st.floats(5.0, 60.0))
+slow = st.floats(5.0, 60.0)
+fastest = st.builds(GapSpeeds, slow, slow, slow, st.floats(40.0, 60.0))
 periods = st.floats(1e-5, 0.1)
 
 
@@ -46,7 +48,7 @@ periods = st.floats(1e-5, 0.1)
     targets=st.lists(st.tuples(gaps, st.floats(-200.0, 200.0), st.floats(-1e4, 1e4), periods), min_size=1, max_size=60),
 )
 def test_speed_and_acceleration_limits_hold_for_any_target(
-    position: Position, speeds: Speeds, start: float, targets: list[tuple[float, float, float, float]]
+    position: Position, speeds: GapSpeeds, start: float, targets: list[tuple[float, float, float, float]]
 ) -> None:
     reference = Reference(start)
     for target, speed, turning, dt_s in targets:
@@ -54,7 +56,7 @@ def test_speed_and_acceleration_limits_hold_for_any_target(
         reference, _, _ = follow(position.gap_acceleration_mm_s2, last, Reference(target, speed, turning), dt_s, speeds)
         assert math.isfinite(reference.gap_mm + reference.speed_mm_s + reference.acceleration_mm_s2)
         rounding = 1.0 + 1e-12
-        assert -speeds.closing_mm_s * rounding <= reference.speed_mm_s <= speeds.opening_mm_s * rounding
+        assert -speeds.sure_mm_s * rounding <= reference.speed_mm_s <= speeds.opening_mm_s * rounding
         change = reference.speed_mm_s - last.speed_mm_s
         most = position.gap_acceleration_mm_s2 * dt_s
         # away from its target a motor's own speed brakes, too
@@ -76,12 +78,12 @@ def test_speed_and_acceleration_limits_hold_for_any_target(
 @given(position=limits, speeds=fastest, start=gaps, target=gaps)
 @example(position=LIMITS, speeds=SPEEDS, start=70.0, target=69.0)
 @example(position=LIMITS, speeds=SPEEDS, start=95.0, target=45.0)
-def test_a_step_is_reached_without_overshoot(position: Position, speeds: Speeds, start: float, target: float) -> None:
+def test_a_step_is_reached_without_overshoot(
+    position: Position, speeds: GapSpeeds, start: float, target: float
+) -> None:
     reference = Reference(start)
     distance = abs(target - start)
-    for _ in range(
-        round(1_000 * (distance / min(speeds.no_load_mm_s, speeds.opening_mm_s, speeds.closing_mm_s) + 1.0))
-    ):
+    for _ in range(round(1_000 * (distance / min(speeds.no_load_mm_s, speeds.opening_mm_s, speeds.sure_mm_s) + 1.0))):
         reference, _, _ = follow(position.gap_acceleration_mm_s2, reference, Reference(target), DT_S, speeds)
         assert (reference.gap_mm - target) * math.copysign(1.0, target - start) <= HALF_COUNT_MM
     assert reference.gap_mm == pytest.approx(target, abs=1e-3)

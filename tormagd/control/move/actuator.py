@@ -57,8 +57,8 @@ class Actuator:
         raise NotImplementedError
 
     def resume(self, measured: Measured) -> None:
-        """Go on without a jump from the measured gap and speed that a blind time ended with."""
-        raise NotImplementedError
+        """Go on from the measured gap, and without a jump from its speed, after a blind time."""
+        self.begin(measured.gap_mm)
 
     def update(
         self,

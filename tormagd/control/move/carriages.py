@@ -13,8 +13,8 @@ from tormagd.config import Config
 from tormagd.control.move.actuator import Actuator, Drive
 from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, gap_speeds, mechanical_time_s, pull_V
 from tormagd.control.move.pid import Pid
-from tormagd.control.move.reference import Expected, Reference, Speeds, follow, target_of
-from tormagd.control.records import Measured, Plan
+from tormagd.control.move.reference import Expected, Reference, follow, target_of
+from tormagd.control.records import GapSpeeds, Measured, Plan
 from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.scene import Scene
@@ -42,6 +42,7 @@ class Carriages(Actuator):
         position, motor = config.position, config.motor
         self.expected = Expected()
         self.left, self.right = Pid(position), Pid(position)
+        self._position: Final = position
         self._duty_limit: Final = position.duty_limit
         self._derivative_time_s: Final = position.derivative_time_s
         self._derivative_filter_s: Final = position.derivative_filter_s
@@ -53,7 +54,6 @@ class Carriages(Actuator):
         self._pull_V: Final = motor.pull_V
         self._supply_V: Final = motor.supply_V
         self._full_speed_mm_s: Final = full_speed_mm_s(motor)
-        self._no_load_mm_s: Final = 2.0 * self._full_speed_mm_s
         self._mechanical_time_s: Final = mechanical_time_s(motor)
         self._lag_s: Final = electrical_time_s(motor) + EXCHANGE_S
         self._gear_loss: Final = 1.0 - motor.gear_efficiency
@@ -65,16 +65,11 @@ class Carriages(Actuator):
         """Begin at the gap `gap_mm`, at rest and with empty integrals, so that no duty jumps."""
         self.reference = Reference(gap_mm)
         self.expected.begin(gap_mm)
-        self.left.begin()
-        self.right.begin()
+        self.left, self.right = Pid(self._position), Pid(self._position)
 
     def resume(self, measured: Measured) -> None:
         """Go on from the measured gap and speed, because the device kept its last duty in the blind time."""
         self.reference = self._begun_at(measured)
-
-    def forget(self) -> None:
-        self.begin(0.0)
-        super().forget()
 
     def update(
         self,
@@ -117,7 +112,7 @@ class Carriages(Actuator):
         now_s: float,
         dt_s: float,
         plan: Plan | None,
-        speeds: Speeds,
+        speeds: GapSpeeds,
         measured: Measured,
         is_over: bool,
         limits: list[Limit],
@@ -143,21 +138,22 @@ class Carriages(Actuator):
         return reference, is_slewed
 
     def _begun_at(self, measured: Measured) -> Reference:
-        speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
+        most_mm_s = self._gap_speeds.no_load_mm_s
+        speed_mm_s = min(max(measured.gap_speed_mm_s, -most_mm_s), most_mm_s)
         self.expected.begin(measured.gap_mm, speed_mm_s)
         return Reference(measured.gap_mm, speed_mm_s)
 
-    def _speeds(self, pull: float, measured: Measured) -> Speeds:
-        """Return the gap's speed at no load, and the greatest at which it may open and close."""
-        motors_mm_s = self._no_load_mm_s
+    def _speeds(self, pull: float, measured: Measured) -> GapSpeeds:
+        """Return the gap's speeds with these motors, and with this share of the supply against the magnets' pull."""
+        most = self._gap_speeds
+        motors_mm_s = most.no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
         # the pull helps to close, but a reserve of duty is worth more there than a little speed
-        opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
-        most = self._gap_speeds
+        opening_mm_s = most.no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         # compiled, min() of three makes objects
         opening_mm_s = min(min(motors_mm_s, most.opening_mm_s), opening_mm_s)
-        return Speeds(motors_mm_s, opening_mm_s, min(motors_mm_s, most.sure_mm_s))
+        return GapSpeeds(most.closing_mm_s, opening_mm_s, min(motors_mm_s, most.sure_mm_s), motors_mm_s)
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:

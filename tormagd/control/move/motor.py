@@ -28,11 +28,10 @@ LIVELY: Final = 1.1
 
 
 class TransferFunction(NamedTuple):
-    """H(z) = numerator(z) / denominator(z), highest power first, sampled every `period_s`."""
+    """H(z) = numerator(z) / denominator(z), highest power first."""
 
     numerator: Array
     denominator: Array
-    period_s: float
 
 
 class Margins(NamedTuple):
@@ -54,9 +53,10 @@ def gap_speeds(config: Config) -> GapSpeeds:
     """Return the gap's speeds. Counted on is what the motors do against dry friction."""
     position, motor = config.position, config.motor
     closing_mm_s = position.closing_mm_s or most_closing_mm_s(config)
-    sure_mm_s = 2.0 * full_speed_mm_s(motor) * (position.duty_limit - motor.coulomb_V / motor.supply_V)
+    no_load_mm_s = 2.0 * full_speed_mm_s(motor)
+    sure_mm_s = no_load_mm_s * (position.duty_limit - motor.coulomb_V / motor.supply_V)
     sure_mm_s = min(closing_mm_s, max(sure_mm_s, position.gap_speed_mm_s))
-    return GapSpeeds(closing_mm_s, position.gap_speed_mm_s, sure_mm_s)
+    return GapSpeeds(closing_mm_s, position.gap_speed_mm_s, sure_mm_s, no_load_mm_s)
 
 
 def pull_V(stated_V: float, gap_mm: float) -> float:
@@ -77,42 +77,16 @@ def electrical_time_s(motor: Motor) -> float:
 
 def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
     """Return H(z) from duty to carriage position, mm, exact for a duty held over each period."""
-    inductance_H = motor.inductance_mH * 1e-3
-    advance_mm = motor.screw_lead_mm / (2.0 * math.pi * motor.gear_ratio)
-    # states: current A, motor speed rad/s, carriage position mm; last, the held input
-    continuous = np.zeros((4, 4))
-    continuous[0] = [
-        -motor.resistance_ohm / inductance_H,
-        -motor.back_emf_V_s / inductance_H,
-        0.0,
-        motor.supply_V / inductance_H,
-    ]
-    continuous[1, 0] = motor.back_emf_V_s / motor.inertia_kg_m2
-    continuous[2, 1] = advance_mm
-    discrete = _exponential(continuous * period_s)
-    transition, drive = discrete[:3, :3], discrete[:3, 3]
-    denominator = np.poly(transition)
-    # the Markov parameters c A^k b are the impulse response; times the denominator they give the numerator
-    impulse = [0.0]
-    state = drive
-    for _ in range(3):
-        impulse.append(float(state[2]))
-        state = transition @ state
-    numerator = np.array([sum(denominator[j] * impulse[k - j] for j in range(k + 1)) for k in range(4)])
-    return TransferFunction(numerator, np.asarray(denominator, dtype=np.float64), period_s)
-
-
-def _exponential(matrix: Array) -> Array:
-    """Return the exponential of a square matrix, by scaling and squaring a Taylor series."""
-    squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300))) + 4)
-    scaled = matrix / 2.0**squarings
-    total = term = np.eye(len(matrix))
-    for k in range(1, 16):
-        term = term @ scaled / k
-        total = total + term
-    for _ in range(squarings):
-        total = total @ total
-    return total
+    slow_s, quick_s = mechanical_time_s(motor), electrical_time_s(motor)
+    poles = np.roots([slow_s * quick_s, slow_s, 1.0]).astype(np.complex128)
+    # the step response at full speed: the sum of share (e^(p t) - 1 - p t) over the poles p
+    shares_s = 1.0 / (slow_s * quick_s * poles**2 * (poles - poles[::-1]))
+    exponents = period_s * np.outer(np.arange(4.0), poles)
+    steps_s = ((np.expm1(exponents) - exponents) @ shares_s).real
+    denominator: Array = np.poly([1.0, *np.exp(period_s * poles)]).real.astype(np.float64)
+    # its differences are the impulse response; times the denominator they give the numerator
+    numerator = full_speed_mm_s(motor) * np.convolve(denominator, np.diff(steps_s, prepend=0.0))[:4]
+    return TransferFunction(numerator, denominator)
 
 
 def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:

@@ -30,9 +30,6 @@ class Pid:
         self._back_calculation_s: Final = position.back_calculation_s
         self._limit: Final = position.duty_limit
 
-    def begin(self) -> None:
-        self.integral, self.is_saturated = 0.0, False
-
     def rest(self, error_mm: float, dt_s: float) -> None:
         """Let the integral decay while the carriage is on its target."""
         if abs(error_mm) <= ON_TARGET_MM:

@@ -5,7 +5,7 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.control.interpolation import low_pass
-from tormagd.control.records import Plan
+from tormagd.control.records import GapSpeeds, Plan
 
 CARRY_S: Final = 0.012
 "A plan's gap is carried on for no more than three inference periods."
@@ -23,14 +23,6 @@ class Reference(Value):
         self.gap_mm: Final = gap_mm
         self.speed_mm_s: Final = speed_mm_s
         self.acceleration_mm_s2: Final = acceleration_mm_s2
-
-
-@final
-class Speeds(Value):
-    def __init__(self, no_load_mm_s: float, opening_mm_s: float, closing_mm_s: float) -> None:
-        self.no_load_mm_s: Final = no_load_mm_s
-        self.opening_mm_s: Final = opening_mm_s
-        self.closing_mm_s: Final = closing_mm_s
 
 
 def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
@@ -51,7 +43,7 @@ def follow(
     reference: Reference,
     target: Reference,
     dt_s: float,
-    speeds: Speeds,
+    speeds: GapSpeeds,
     floor_mm: float = -math.inf,
 ) -> tuple[Reference, bool, bool]:
     """Return the reference `dt_s` later, and whether its speed and its acceleration held it back."""
@@ -61,7 +53,7 @@ def follow(
     closing = math.copysign(_stopping_mm_s(abs(distance), relative, dt_s), distance)
     wanted = target.speed_mm_s + closing
     wanted = max(wanted, -_stopping_mm_s(max(reference.gap_mm - floor_mm, 0.0), acceleration_mm_s2, dt_s))
-    bounded = min(max(wanted, -speeds.closing_mm_s), speeds.opening_mm_s)
+    bounded = min(max(wanted, -speeds.sure_mm_s), speeds.opening_mm_s)
     share = min(abs(reference.speed_mm_s) / speeds.no_load_mm_s, 1.0)
     speeding_up = acceleration_mm_s2 * (1.0 - share)
     braking = acceleration_mm_s2 * (1.0 + share if reference.speed_mm_s * distance < 0.0 else 1.0)

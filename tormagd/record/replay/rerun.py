@@ -173,20 +173,20 @@ class _Running:
                 except PLAN_ERRORS as error:
                     self._failure = error
             case journal.FORESEE:
-                self._planner.foresee()
+                self._planner.governor.foresee()
             case journal.AFRESH:
                 self._failure = None
                 self._planner.afresh(msgspec.convert(entry[1], float))
             case journal.TEACH | journal.ANSWER:
                 match restored(entry[1], KNOWN):
                     case Learned() as learned:
-                        self._planner.teach(learned)
+                        self._planner.believe.teach(learned)
                     case Answer() as answer:
                         self._planner.aim.answer = answer
                     case other:
                         raise ValueError(f"{other!r}: allowed is what is learned of a device, or what a search found")
             case journal.CONFIRM:
-                self._planner.confirm(msgspec.convert(entry[1], Disputed))
+                self._planner.believe.confirm(msgspec.convert(entry[1], Disputed))
             case journal.COMMAND:
                 command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
                 try:
