@@ -15,7 +15,8 @@ DT_S = 1e-3
 LIMITS = Config().position
 MAX_MM_S2 = LIMITS.gap_acceleration_mm_s2
 NO_LOAD_MM_S = 2.0 * full_speed_mm_s(Config().motor)
-SPEEDS = GapSpeeds(*[LIMITS.gap_speed_mm_s] * 3, NO_LOAD_MM_S)
+FASTEST_MM_S = LIMITS.gap_speed_mm_s
+SPEEDS = GapSpeeds(FASTEST_MM_S, FASTEST_MM_S, FASTEST_MM_S, NO_LOAD_MM_S)
 HALF_COUNT_MM = 0.5 * 8.0 / 4480.0
 
 

@@ -227,6 +227,9 @@ class Governor:
         # a publisher that has fallen silent is not believed to go on as it did
         foreseen = self.forecast.trust if soon_s <= MAX_STEP_S else 0.0
         trust = 1.0 if setpoint.preview_N else foreseen
+        if trust == 0.0:
+            last_N = within(setpoint.force_N, self._allowed)
+            return [last_N + self.slope_N_s * min(soon_s + after_s, AHEAD_S) for after_s in PATH_S], trust
         return self.going_on_N(setpoint, soon_s + trust * lag_s, foreseen), trust
 
     def going_on_N(self, setpoint: TimedSetpoint, begins_s: float, foreseen: float) -> list[float]:
