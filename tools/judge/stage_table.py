@@ -537,7 +537,7 @@ def stages() -> list[Stage]:
         Stage("ask/way", lambda: Way(-1), way, MEASUREMENT, PLAN_S),
         Stage("ask/governor", lambda: planner().governor, governor, OWN, PLAN_S),
         Stage("ask/forecast", Forecast, forecast, SETPOINT),
-        Stage("ask/path", lambda: made.gap_speeds, path),
+        Stage("ask/path", lambda: made.gap_speeds, path, SETPOINT),
         Stage("ask/skill", lambda: [Skill(0.0, 0.0)], skill, SETPOINT),
         Stage("aim/aim", aim, aiming, OWN, PLAN_S),
         Stage("aim/floors", lambda: None, floors),
