@@ -73,7 +73,7 @@ class InferenceLoop:
         self._due_ns = period_ns + (self._due_ns if is_regular else beat.due_ns)
 
     def foresee(self, _beat: Beat) -> bool:
-        """Make the next half of the forecast for the next plans; return False if none is due."""
+        """Make a forecast for the next plans; return False if none is due."""
         try:
             is_made = self.planner.governor.foresee()
         except PLAN_ERRORS as error:
