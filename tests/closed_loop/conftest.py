@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator
 
-import msgspec
 import pytest
 
 from tormagd.config import Config
@@ -12,7 +11,7 @@ from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant, standing
 
 OPEN_MM = 95.0
 VALID_S = 0.2
@@ -44,8 +43,7 @@ def arm(make: Maker) -> Maker:
         plant: str | PlantParameters = "sample_1", *hand: Hand, planned: bool = True, **options: object
     ) -> ClosedLoop:
         parameters = load_plant(plant) if isinstance(plant, str) else plant
-        left_open = msgspec.structs.replace(parameters.assumed, start_left_mm=47.0, start_right_mm=46.5)
-        loop = make(msgspec.structs.replace(parameters, assumed=left_open), *hand, planned=planned, **options)
+        loop = make(standing(parameters, 47.0, 46.5), *hand, planned=planned, **options)
         loop.arm(None if planned else gap_plan(OPEN_MM))
         return loop
 

@@ -90,7 +90,7 @@ def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, fro
 def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
     publish(armed, lambda time_s: 1.2, 1.2)
     armed.command("pause")
-    held_mm = armed.device.truth.gap_mm
+    held_mm = armed.simulated.truth.gap_mm
     assert all(
         sample.truth.gap_mm == pytest.approx(held_mm, abs=0.3) for sample in publish(armed, lambda time_s: 1.8, 0.4)
     )
@@ -111,11 +111,11 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
 def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
     loop = arm(faults=["worn_gearbox@2.5"])
     publish(loop, lambda time_s: 1.6, 1.5)
-    closed_mm = loop.device.truth.gap_mm
+    closed_mm = loop.simulated.truth.gap_mm
     for _ in range(2_500):
         loop.skip()
-        assert loop.device.truth.gap_mm > closed_mm - 1.0
-    assert loop.device.truth.gap_mm > OPEN_MM - 2.0
+        assert loop.simulated.truth.gap_mm > closed_mm - 1.0
+    assert loop.simulated.truth.gap_mm > OPEN_MM - 2.0
 
 
 def test_a_loop_without_a_planner_wants_plans(make) -> None:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-import msgspec
 import pytest
 from bad_lines import BadSerialLine, losing
 
@@ -18,7 +17,7 @@ from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, changed, load_plant
 
 CLOSED_MM, HALF_MM, OPEN_MM = 48.0, 70.0, 95.0
 NAMED_S = 0.5
@@ -102,20 +101,13 @@ def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_an
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
 
 
-def with_other(plant: PlantParameters, part: str, **values: float) -> PlantParameters:
-    return msgspec.structs.replace(plant, **{part: msgspec.structs.replace(getattr(plant, part), **values)})
-
-
 SAMPLES = {name: load_plant(name) for name in ("sample_1", "sample_2", "sample_3")}
 HEALTHY = {
     **{bus: (bus, SAMPLES["sample_1"]) for bus in ("serial", "can")},
+    **{f"{name} at 9.1 V": ("serial", changed(plant, "electronics", supply_V=9.1)) for name, plant in SAMPLES.items()},
+    "14.9 V": ("serial", changed(SAMPLES["sample_2"], "electronics", supply_V=14.9)),
     **{
-        f"{name} at 9.1 V": ("serial", with_other(plant, "electronics", supply_V=9.1))
-        for name, plant in SAMPLES.items()
-    },
-    "14.9 V": ("serial", with_other(SAMPLES["sample_2"], "electronics", supply_V=14.9)),
-    **{
-        f"{ambient_C:g} C": ("serial", with_other(SAMPLES["sample_1"], "assumed", ambient_C=ambient_C))
+        f"{ambient_C:g} C": ("serial", changed(SAMPLES["sample_1"], "assumed", ambient_C=ambient_C))
         for ambient_C in (5.0, 40.0)
     },
     "slow clock": ("serial", SAMPLES["sample_1"], "clock=-5%"),
@@ -142,7 +134,7 @@ def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
 @pytest.mark.parametrize("gap_mm", [50.0, 85.0])
 def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: float) -> None:
     loop = closed("serial", gap_mm=gap_mm)
-    loop.device = line = BadSerialLine(loop.device)
+    loop.port.device = line = BadSerialLine(loop.port.device)
     line.spoil(partial(losing, 0.1))
     loop.command("disable")
     assert named_s(loop, seconds=4.0) == math.inf

@@ -36,8 +36,7 @@ from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import SerialDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
-from tormagd.simulation.plant import Truth
+from tormagd.simulation.parameters import load_plant, standing
 
 UP, DOWN = "to the daemon", "to the device"
 SLOWEST = 0.7
@@ -93,10 +92,6 @@ class BadLine:
         self.driven = 0
         self.came = dict.fromkeys(SILENT_MS, 0)
 
-    @property
-    def truth(self) -> Truth:
-        return self._device.truth
-
     def receive(self, now_s: float, data: bytes) -> None:
         frame = self._carried(DOWN, data)
         if frame is data and data[1] == FUNCTION[Drive]:
@@ -123,11 +118,7 @@ class BadLine:
         return frame
 
 
-@cache
-def plant() -> PlantParameters:
-    parameters = load_plant("sample_1")
-    near = msgspec.structs.replace(parameters.assumed, start_left_mm=47.2, start_right_mm=47.0)
-    return msgspec.structs.replace(parameters, assumed=near)
+NEAR_HOME = standing(load_plant("sample_1"), 47.2, 47.0)
 
 
 @cache
@@ -141,10 +132,10 @@ class Together(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         core = rare_plans()
-        device = VirtualDevice(plant(), SteadyHand(), [], 1, boot=CompiledFirmware)
+        device = VirtualDevice(NEAR_HOME, SteadyHand(), [], 1, boot=CompiledFirmware)
         self.loop = ClosedLoop(core.config, core.stepper(), core.planner(), device)
         self.line = BadLine(device)
-        self.loop.device = self.line
+        self.loop.port.device = self.line
         self.struck: set[str] = set()
         self.force_N = 1.1
         self.is_armed = False

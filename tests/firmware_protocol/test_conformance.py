@@ -1349,7 +1349,7 @@ def test_an_interrupted_run_leaves_the_gap_open(ran: Callable[..., int], capsys:
             signal.signal(number, handler)
     assert "ok    left_open" in capsys.readouterr().out
     assert device.messages.firmware.mode is DeviceMode.IDLE
-    assert device.truth.gap_mm > 94.0
+    assert device.messages.truth.gap_mm > 94.0
 
 
 def test_a_line_that_goes_is_told_and_no_success(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:

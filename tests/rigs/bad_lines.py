@@ -7,7 +7,6 @@ from typing import Generic, TypeVar
 from tormagd.simulation.can_device import CanDevice, Delivery
 from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.device import MessageDevice, SerialDevice
-from tormagd.simulation.plant import Truth
 
 FOREIGN_HOST = 2
 FOREIGN = CanFrame(0x00F, bytes(8))
@@ -85,10 +84,6 @@ class _Spoilt(Generic[DeviceT]):
     @property
     def messages(self) -> MessageDevice:
         return self._device.messages
-
-    @property
-    def truth(self) -> Truth:
-        return self._device.truth
 
     def spoil(self, way: MakeTransfer) -> None:
         self._up, self._down = way(), way()

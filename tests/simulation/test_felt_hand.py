@@ -2,7 +2,6 @@
 
 import itertools
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,7 +14,7 @@ from tormagd.simulation.hand import (
     SteadyHand,
     parse_hand,
 )
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant, standing
 from tormagd.simulation.plant import Plant
 from tormagd.simulation.second_element import SecondElement
 
@@ -28,9 +27,7 @@ with_each = pytest.mark.parametrize("impedance", [FINGER, WRIST, ARM], ids=["fin
 
 
 def at_gap(name: str) -> PlantParameters:
-    plant = load_plant(name)
-    start = msgspec.structs.replace(plant.assumed, start_left_mm=GAP_MM / 2.0, start_right_mm=GAP_MM / 2.0)
-    return msgspec.structs.replace(plant, assumed=start)
+    return standing(load_plant(name), GAP_MM / 2.0, GAP_MM / 2.0)
 
 
 def at_brake(name: str, hand: FeltHand, seconds: float = END_S) -> np.ndarray:

@@ -15,7 +15,7 @@ from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import PressingHand, ReversingHand, SteadyHand
-from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantError, PlantParameters, changed, load_plant, standing
 from tormagd.simulation.plant import SUBSTEP_S, Plant
 from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.second_element import SecondElement
@@ -38,14 +38,6 @@ def steps(duration_s: float) -> int:
 def turn(axis: Axis, duration_s: float, volts: float | None, attraction_N: float = 0.0) -> None:
     for _ in range(steps(duration_s)):
         axis.step(volts, attraction_N)
-
-
-def changed(plant: PlantParameters, table: str, **values: object) -> PlantParameters:
-    return msgspec.structs.replace(plant, **{table: msgspec.structs.replace(getattr(plant, table), **values)})
-
-
-def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
-    return changed(plant, "assumed", start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
 
 
 def holding(plant: PlantParameters, gap_mm: float, wear: float = 1.0) -> tuple[float, float]:
@@ -133,7 +125,7 @@ def test_attraction_and_holding_margin_over_the_stroke(name: str) -> None:
 @pytest.mark.parametrize("name", SAMPLES)
 @pytest.mark.parametrize("gap_mm", [45.5, 60.0, 75.0, 94.0])
 def test_the_carriages_hold_with_the_power_off(name: str, gap_mm: float) -> None:
-    plant = Plant(at_gap(load_plant(name), gap_mm), SteadyHand())
+    plant = Plant(standing(load_plant(name), gap_mm / 2.0, gap_mm / 2.0), SteadyHand())
     plant.advance(1.0)
     assert plant.gap_mm == pytest.approx(gap_mm, abs=1e-6)
     assert plant.left.angle_rad == plant.right.angle_rad == 0.0
@@ -143,7 +135,7 @@ def test_the_carriages_hold_with_the_power_off(name: str, gap_mm: float) -> None
 def test_a_worn_gearbox_lets_the_magnets_close_the_gap_where_the_margin_is_negative(name: str) -> None:
     parameters = load_plant(name)
     for gap_mm in (46.0, 90.0):
-        plant = Plant(at_gap(parameters, gap_mm), SteadyHand())
+        plant = Plant(standing(parameters, gap_mm / 2.0, gap_mm / 2.0), SteadyHand())
         plant.wear(4.0)
         plant.advance(3.0)
         closes = holding(parameters, gap_mm, wear=4.0)[1] < 0.0
@@ -166,7 +158,7 @@ HARD_MOTIONS: dict[str, Callable[[float], Volts]] = {
 @pytest.mark.parametrize("motion", HARD_MOTIONS)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_substep_is_fine_enough_for_hard_motion(name: str, motion: str, drag_left_N: float) -> None:
-    parameters = at_gap(changed(load_plant(name), "screw", drag_left_N=drag_left_N), 60.0)
+    parameters = standing(changed(load_plant(name), "screw", drag_left_N=drag_left_N), 30.0, 30.0)
 
     def path(substep_s: float) -> np.ndarray:
         """A row per tick: gap, um, force, mN, the left screw's way, um, and its current, mA."""
@@ -289,10 +281,11 @@ def test_warming_weakens_the_force_and_levels_off() -> None:
     warm = TorqueElement(msgspec.structs.replace(without_memory(SAMPLE_1), thermal=SAMPLE_1.thermal), 50.0, STEP_S)
     for one in (element, warm):
         one.advance(3600.0, 50.0, SPEED_MM_S)
-    assert warm.temperature_C == pytest.approx(25.97, abs=0.01)
-    assert warm.kinetic_N / element.kinetic_N == pytest.approx(1.0 - 0.004 * (warm.temperature_C - 25.0), rel=1e-9)
+    warmer_K = warm.warmth.temperature_C - 25.0
+    assert warmer_K == pytest.approx(0.97, abs=0.01)
+    assert warm.kinetic_N / element.kinetic_N == pytest.approx(1.0 - 0.004 * warmer_K, rel=1e-9)
     warm.advance(1e7, 50.0, SPEED_MM_S)
-    assert warm.temperature_C == pytest.approx(40.0)
+    assert warm.warmth.temperature_C == pytest.approx(40.0)
 
 
 @pytest.mark.parametrize(
@@ -419,11 +412,6 @@ SLID_MM_S = 42.0
 SECOND = load_plant("second")
 
 
-def second_of(**values: object) -> PlantParameters:
-    assert SECOND.second is not None
-    return msgspec.structs.replace(SECOND, second=msgspec.structs.replace(SECOND.second, **values))
-
-
 def slid(
     gap_mm: float, plant: PlantParameters = SECOND, seconds: float = 0.2, speed_mm_s: float = SLID_MM_S
 ) -> SecondElement:
@@ -443,7 +431,7 @@ def test_the_force_rises_as_the_gap_closes_and_is_of_the_order_of_the_samples() 
 def test_the_field_lags_by_its_play_and_does_not_depend_on_the_rate() -> None:
     found = []
     for steps in (10, 1000):
-        element = SecondElement(second_of(creeping_share=0.0), 90.0, STEP_S)
+        element = SecondElement(changed(SECOND, "second", creeping_share=0.0), 90.0, STEP_S)
         for start_mm, end_mm in ((90.0, 60.0), (60.0, 50.0), (50.0, 60.0)):
             for step in range(1, steps + 1):
                 element.advance(0.0, start_mm + (end_mm - start_mm) * step / steps, SLID_MM_S)
@@ -469,7 +457,7 @@ def test_a_step_creeps_with_the_logarithm_of_time_and_comes_to_an_end() -> None:
 
 
 def test_friction_grows_with_the_logarithm_of_speed_and_with_rest() -> None:
-    quiet = second_of(creeping_share=0.0)
+    quiet = changed(SECOND, "second", creeping_share=0.0)
     slow_N, middle_N, fast_N = (slid(60.0, quiet, 12.0 / speed, speed).force_N for speed in (1.0, 10.0, 100.0))
     assert middle_N / slow_N == pytest.approx(fast_N / middle_N, rel=0.03)
     assert 1.02 < middle_N / slow_N < 1.06
@@ -490,5 +478,5 @@ def test_warmth_weakens_it() -> None:
     element.advance(0.0, 60.0, SLID_MM_S)
     cool_N = element.kinetic_N
     element.advance(1e7, 60.0, SLID_MM_S)
-    assert element.temperature_C == pytest.approx(40.0)
+    assert element.warmth.temperature_C == pytest.approx(40.0)
     assert element.kinetic_N < 0.96 * cool_N

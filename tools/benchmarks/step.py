@@ -22,7 +22,7 @@ from tormagd.scenes.scene import load_scene
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant, standing
 from tormagd.simulation.plant import Plant
 
 START_MM, STEP_MM = 60.0, 1.0
@@ -111,7 +111,7 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
 
 def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[Array, Array]:
     """Return both carriages' mean position every tick of a duty step, by the encoders and by H(z)."""
-    plant = Plant(_at_rest(parameters, MODEL_GAP_MM), SteadyHand())
+    plant = Plant(standing(parameters, MODEL_GAP_MM / 2.0, MODEL_GAP_MM / 2.0), SteadyHand())
     volts = duty * parameters.electronics.supply_V
     counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
     count = round(MODEL_S / TICK_S)
@@ -152,7 +152,7 @@ def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, 
     """Return the true gap every 0.1 ms until rest, and that time, for full voltage reversed at `switch_s`."""
     gaps: list[float] = []
     time_s, tick = 0.0, TICK_S / 10.0
-    plant = Plant(_at_rest(parameters, start_mm), SteadyHand(), substep_s=tick)
+    plant = Plant(standing(parameters, start_mm / 2.0, start_mm / 2.0), SteadyHand(), substep_s=tick)
     volts = np.sign(distance_mm) * parameters.electronics.supply_V
     is_turning = False
     while not is_turning and time_s <= 6.0:
@@ -164,11 +164,6 @@ def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, 
         gaps.append(plant.gap_mm)
         is_turning = time_s > switch_s and (plant.gap_mm - before) * distance_mm <= 0.0
     return np.array(gaps), time_s
-
-
-def _at_rest(parameters: PlantParameters, gap_mm: float) -> PlantParameters:
-    begun = msgspec.structs.replace(parameters.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
-    return msgspec.structs.replace(parameters, assumed=begun)
 
 
 OPTIONS = {"--plant": {"default": "sample_1", "help": "plant file or the name of a committed sample"}}

@@ -52,8 +52,9 @@ class Axis:
                 f"{screw.stiffness_N_um} and motor.back_emf_V_s_rad = {motor.back_emf_V_s_rad}; a substep of {dt_s} s "
                 "would not follow the motion"
             )
-        self.gear_friction_Nm = gear.output_friction_Nm
-        self.screw_friction_m = screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+        self._new_gear_Nm = gear.output_friction_Nm
+        self._new_screw_m = screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+        self.wear(1.0)
         self.drag_N = drag_N
         self.angle_rad = 0.0
         self.speed_rad_s = 0.0
@@ -67,6 +68,10 @@ class Axis:
     @property
     def back_emf_V(self) -> float:
         return self._coupling_Nm_A * self.speed_rad_s
+
+    def wear(self, divisor: float) -> None:
+        """Leave gearbox and screw this part of their friction when new."""
+        self.gear_friction_Nm, self.screw_friction_m = self._new_gear_Nm / divisor, self._new_screw_m / divisor
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
         # runs four times per simulated millisecond: hence local names

@@ -11,7 +11,6 @@ from typing import NamedTuple, Protocol
 
 from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.device import MessageDevice
-from tormagd.simulation.plant import Truth
 
 DEFAULT_BITRATE = 1_000_000
 DEFAULT_NODE = 1
@@ -37,10 +36,6 @@ class CanLine(Protocol):
     def messages(self) -> MessageDevice:
         """The device itself."""
 
-    @property
-    def truth(self) -> Truth:
-        """The plant's true state at the time of the last call."""
-
     def receive(self, now_s: float, frame: CanFrame) -> None:
         """Take the frame that the host hands to its controller."""
 
@@ -60,10 +55,6 @@ class CanDevice:
         self._flight: Delivery | None = None
         self._now_s = 0.0
         self._delivered: list[Delivery] = []
-
-    @property
-    def truth(self) -> Truth:
-        return self.messages.truth
 
     @property
     def next_event_s(self) -> float:

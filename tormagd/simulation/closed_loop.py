@@ -146,8 +146,8 @@ class ClosedLoop:
         self._ticks = 0
         self._output: Duty | None = None
         self._asked: Question | None = None
-        self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
-        self.connection = Connection(config.device, self._port.open, stepper.lose_link)
+        self.port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
+        self.connection = Connection(config.device, self.port.open, stepper.lose_link)
         self.connection.open(0.0)
 
     @property
@@ -155,21 +155,8 @@ class ClosedLoop:
         return self._ticks * self._period_s
 
     @property
-    def device(self) -> SerialDevice:
-        """What is at the other end of the serial line."""
-        if isinstance(self._port, VirtualBus):
-            raise TypeError("this device is on a bus: allowed are `simulated` and `truth`")
-        return self._port.device
-
-    @device.setter
-    def device(self, device: SerialDevice) -> None:
-        if isinstance(self._port, VirtualBus):
-            raise TypeError("this device is on a bus")
-        self._port.device = device
-
-    @property
     def simulated(self) -> MessageDevice:
-        return self._port.device.messages
+        return self.port.device.messages
 
     @property
     def measurement(self) -> Measurement | None:
@@ -179,7 +166,7 @@ class ClosedLoop:
         """Run one control period, and return what happened in it."""
         self._ticks += 1
         now_s = self.now_s
-        self._port.advance(now_s)
+        self.port.advance(now_s)
         self.connection.receive(now_s)
         used = self._infer(now_s, setpoint) if plan is None else plan
         measurement, stepper = self.connection.measurement, self.stepper
@@ -189,12 +176,12 @@ class ClosedLoop:
         )
         self._output = output
         measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
-        return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
+        return Sample(now_s, measured, safety, reference, output, used, self.simulated.truth, measurement)
 
     def skip(self) -> None:
         """Let one control period pass in which the daemon, stopped or killed, does nothing."""
         self._ticks += 1
-        self._port.advance(self.now_s)
+        self.port.advance(self.now_s)
 
     def command(self, name: str) -> None:
         self.stepper.command(name, self.now_s, self.conditions())

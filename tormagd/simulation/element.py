@@ -51,7 +51,7 @@ class TorqueElement:
             static_ratio=friction.static_to_kinetic,
             stribeck_speed_mm_s=friction.stribeck_speed_mm_s,
         )
-        self._warmth = Warmth(plant)
+        self.warmth = Warmth(plant)
         series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
         self._relax = series.discretise(dt_s)
 
@@ -61,10 +61,6 @@ class TorqueElement:
         self.force_N = 0.0
         self.kinetic_N, self._memory = self._relax.advance(self._memory, self._memory[0])
 
-    @property
-    def temperature_C(self) -> float:
-        return self._warmth.temperature_C
-
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
@@ -72,7 +68,7 @@ class TorqueElement:
     def prepare(self, time_s: float, gap_mm: float) -> None:
         """Begin a step that ends at `time_s` and `gap_mm`: advance all but the bristles."""
         moment_Tm = self._field.advance(gap_mm)
-        driving_N = self._force.at(moment_Tm) * self._warmth.advance(time_s)
+        driving_N = self._force.at(moment_Tm) * self.warmth.advance(time_s)
         relaxed_N, self._memory = self._relax.advance(self._memory, driving_N)
         # relaxing from a high force may pull the insert off the shaft, but never push the handle on
         self.kinetic_N = max(relaxed_N, 0.0)

@@ -288,6 +288,16 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
     return msgspec.structs.replace(carried, pad=read.pad, second=read.second)
 
 
+def changed(plant: PlantParameters, table: str, **values: object) -> PlantParameters:
+    """Return the plant with other values in one of its tables."""
+    return msgspec.structs.replace(plant, **{table: msgspec.structs.replace(getattr(plant, table), **values)})
+
+
+def standing(plant: PlantParameters, left_mm: float, right_mm: float) -> PlantParameters:
+    """Return the plant whose carriages are there at power-on."""
+    return changed(plant, "assumed", start_left_mm=left_mm, start_right_mm=right_mm)
+
+
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
     """Return the plant with another insert."""
     nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer

@@ -1,6 +1,5 @@
 """The plant: two carriages, the magnets, the element between them (insert or pad), the hand and the force sensor."""
 
-import math
 import random
 from collections import deque
 from typing import Final, Protocol, final
@@ -135,7 +134,7 @@ class Plant:
             right.position_m * 1e3,
             left.current_A,
             right.current_A,
-            element.temperature_C,
+            element.warmth.temperature_C,
             self.handle_mm,
             self.handle_mm_s,
             element.kinetic_N,
@@ -186,9 +185,8 @@ class Plant:
         self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:
-        for axis in (self.left, self.right):
-            axis.gear_friction_Nm /= divisor
-            axis.screw_friction_m /= divisor
+        self.left.wear(divisor)
+        self.right.wear(divisor)
 
 
 def _applied_V(axis: Axis, voltage_V: float | None) -> float:
@@ -216,8 +214,6 @@ class SimulatedSensor:
         self._spread_N = sensor.noise_mN * 1e-3
         self._drift_N_s = noise.choice((-1.0, 1.0)) * sensor.drift_mN_min * 1e-3 / 60.0
         self._range_N = plant.assumed.force_range_N
-        self._has_spare = False
-        self._spare = 0.0
         self._samples = 0
         self._in_flight: deque[tuple[float, float]] = deque()
         self.reading_N = 0.0
@@ -226,19 +222,8 @@ class SimulatedSensor:
         # a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
             self._samples += 1
-            sample_N = force_N + self._drift_N_s * time_s + self._spread_N * self._normal()
+            sample_N = force_N + self._drift_N_s * time_s + self._noise.gauss(0.0, self._spread_N)
             sample_N = min(max(sample_N, -self._range_N), self._range_N)
             self._in_flight.append((time_s + self._delay_s, sample_N))
         while self._in_flight and self._in_flight[0][0] <= time_s + 0.5 * ELEMENT_STEP_S:
             self.reading_N = self._in_flight.popleft()[1]
-
-    def _normal(self) -> float:
-        """Return a standard normal number; two are made at a time (Box and Muller, 1958)."""
-        if self._has_spare:
-            self._has_spare = False
-            return self._spare
-        angle = self._noise.random() * math.tau
-        radius = math.sqrt(-2.0 * math.log(1.0 - self._noise.random()))
-        self._spare = math.sin(angle) * radius
-        self._has_spare = True
-        return math.cos(angle) * radius

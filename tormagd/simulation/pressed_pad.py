@@ -25,20 +25,16 @@ class PressedPad:
         self._dt_s = dt_s
         self._field = GapField(plant, gap_mm)
         self._pad: TactilePad = worked_pad(plant.pad)
-        self._warmth = Warmth(plant)
+        self.warmth = Warmth(plant)
         self.force_N = 0.0
 
     @property
     def kinetic_N(self) -> float:
         return self.force_N
 
-    @property
-    def temperature_C(self) -> float:
-        return self._warmth.temperature_C
-
     def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
         """Advance by one step that ends at `time_s` and `gap_mm`."""
         field_mT = MT_PER_TM * self._field.advance(gap_mm)
         depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)
         speed_mm_s = min(max(speed_mm_s, -FASTEST_MM_S), FASTEST_MM_S)
-        self.force_N = self._warmth.advance(time_s) * self._pad.advance(self._dt_s, depth_mm, speed_mm_s, field_mT)
+        self.force_N = self.warmth.advance(time_s) * self._pad.advance(self._dt_s, depth_mm, speed_mm_s, field_mT)
