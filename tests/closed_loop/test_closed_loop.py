@@ -77,12 +77,12 @@ def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
 @pytest.mark.parametrize(("from_mm", "to_mm"), [(47.0, 95.0), (95.0, 47.0)], ids=["opening", "closing"])
-def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, from_mm: float, to_mm: float) -> None:
+def test_a_gap_at_full_speed_turns_round_at_once(arm, sample: str, from_mm: float, to_mm: float) -> None:
     loop = arm(sample, planned=False)
-    hold_gap(loop, 47.0, 0.7)
+    list(loop.hold(47.0, 0.7))
     if from_mm > to_mm:
-        hold_gap(loop, 95.0, 0.3)
-    went_mm = np.array([abs(each.truth.gap_mm - to_mm) for each in hold_gap(loop, to_mm, 0.2)])
+        list(loop.hold(95.0, 0.3))
+    went_mm = np.array([abs(each.truth.gap_mm - to_mm) for each in loop.hold(to_mm, 0.2)])
     assert went_mm.argmax() < 30, "ms"
     assert went_mm.max() - went_mm[0] < 0.6
 

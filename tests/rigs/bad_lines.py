@@ -79,14 +79,15 @@ class _Spoilt(Generic[DeviceT]):
 
     def __init__(self, device: DeviceT) -> None:
         self._device = device
-        self._up, self._down = whole(), whole()
+        self.spoil(whole)
 
     @property
     def messages(self) -> MessageDevice:
         return self._device.messages
 
-    def spoil(self, way: MakeTransfer) -> None:
-        self._up, self._down = way(), way()
+    def spoil(self, way: MakeTransfer, foreign_frames_ms: float = 0.0) -> None:
+        """Let the wire carry as `way` does; on a bus, frames of another node win every arbitration besides."""
+        self._up, self._down, self._foreign_frames_ms = way(), way(), foreign_frames_ms
 
 
 class BadSerialLine(_Spoilt[SerialDevice]):
@@ -112,8 +113,6 @@ class BadBus(_Spoilt[CanDevice]):
 
     def __init__(self, device: CanDevice) -> None:
         super().__init__(device)
-        self.foreign_frames_ms = 0.0
-        "Frames of another node, which win every arbitration."
         self._owed = 0.0
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
@@ -124,7 +123,7 @@ class BadBus(_Spoilt[CanDevice]):
         for unit in self._down(now_s, []):
             self._device.receive(now_s, frame_of(unit))
         delivered = self._device.transmit(now_s)
-        self._owed += self.foreign_frames_ms  # called once a millisecond
+        self._owed += self._foreign_frames_ms  # called once a millisecond
         while self._owed >= 1.0:
             self._owed -= 1.0
             self._device.receive(now_s, FOREIGN, FOREIGN_HOST)

@@ -19,7 +19,7 @@ from tormagd.control.core import Stepper
 from tormagd.control.move.motor import margins, zero_order_hold
 from tormagd.element.physics.errors import FloatArray as Array
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
+from tormagd.simulation.closed_loop import ClosedLoop, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, standing
@@ -68,7 +68,7 @@ def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
     device = VirtualDevice(parameters, RecordedHand((0.0,), (0.0,)), seed=1)
     loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
     loop.arm(gap_plan(95.0))
-    drive(loop, START_MM, 3.0)
+    list(loop.hold(START_MM, 3.0))
     return loop
 
 
@@ -77,7 +77,7 @@ def step(loop: ClosedLoop, target_mm: float) -> dict[str, float]:
     if before is None:
         raise RuntimeError("the loop has no measurement")
     start_mm, start_s = before.gap_mm, loop.now_s
-    samples = drive(loop, target_mm, WATCHED_S)
+    samples = list(loop.hold(target_mm, WATCHED_S))
     time_s = np.array([sample.time_s - start_s for sample in samples])
     estimates = [sample.measured for sample in samples if sample.measured is not None]
     gap = np.array([estimate.gap_mm for estimate in estimates])
@@ -93,8 +93,8 @@ def step(loop: ClosedLoop, target_mm: float) -> dict[str, float]:
 
 
 def stroke(loop: ClosedLoop) -> float:
-    drive(loop, STROKE_MM[0], 3.0)
-    gap = np.array([sample.truth.gap_mm for sample in drive(loop, STROKE_MM[1], 3.0)])
+    list(loop.hold(STROKE_MM[0], 3.0))
+    gap = np.array([sample.truth.gap_mm for sample in loop.hold(STROKE_MM[1], 3.0)])
     return float(np.argmax(gap > STROKE_MM[1] - 0.05) + 1) * TICK_S
 
 
@@ -104,7 +104,7 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
     # the first step that closes would go past the end of the stroke
     for gap_mm, target_mm in [(gap_mm, gap_mm + way) for gap_mm in STROKE_GAPS_MM for way in (STEP_MM, -STEP_MM)]:
         if target_mm >= STROKE_GAPS_MM[0]:
-            drive(loop, gap_mm, 0.8)
+            list(loop.hold(gap_mm, 0.8))
             worst = max(worst, step(loop, target_mm)["overshoot"])
     return worst
 
@@ -167,10 +167,6 @@ def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, 
 
 
 OPTIONS = {"--plant": {"default": "sample_1", "help": "plant file or the name of a committed sample"}}
-
-
-def drive(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
-    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(duration_s / TICK_S))]
 
 
 def _rise(time_s: Array, share: Array) -> float:

@@ -4,6 +4,7 @@
 replaced.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from typing import Final, Self, final
 
@@ -197,6 +198,11 @@ class ClosedLoop:
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
+    def hold(self, gap_mm: float, duration_s: float) -> Iterable[Sample]:
+        """Run with plans that ask for a gap."""
+        for _ in range(round(duration_s / self._period_s)):
+            yield self.tick(plan=gap_plan(gap_mm, self.now_s))
+
     def arm(self, plan: Plan | None = None) -> None:
         """Connect, home and enable, as an operator does."""
         self._until(lambda m: True, "answer", plan)
@@ -242,18 +248,13 @@ def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callabl
     """Return a function from the time to the newest setpoint of a publisher."""
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()
-    sent = 0
 
     def newest(now_s: float) -> TimedSetpoint | None:
-        nonlocal sent
-        if sent and sent_s[sent - 1] > now_s:
-            sent = 0  # asked about an earlier time
-        while sent < len(sent_s) and sent_s[sent] <= now_s:
-            sent += 1
+        sent = bisect_right(sent_s, now_s)
         return TimedSetpoint(sent_N[sent - 1], sent_s[sent - 1], valid_for_s) if sent else None
 
     return newest
 
 
-def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
+def gap_plan(gap_mm: float, now_s: float = 0.0) -> Plan:
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
