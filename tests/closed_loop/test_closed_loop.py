@@ -118,11 +118,6 @@ def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) ->
     assert loop.simulated.truth.gap_mm > OPEN_MM - 2.0
 
 
-def test_a_loop_without_a_planner_wants_plans(make) -> None:
-    with pytest.raises(ValueError, match="allowed is a plan"):
-        make(planned=False).tick()
-
-
 # -- the second plant, whose laws differ
 
 

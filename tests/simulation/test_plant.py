@@ -243,26 +243,6 @@ def test_the_joined_field_law_is_smooth_and_falls() -> None:
     assert np.max(np.abs(np.diff(slope)[45_000:])) < 5e-8
 
 
-@pytest.mark.parametrize("steps", [10, 1000])
-def test_hysteresis_lags_and_does_not_depend_on_the_rate(steps: int) -> None:
-    quiet = without_memory(SAMPLE_1)
-    element = TorqueElement(changed(quiet, "field", hysteresis_percent=1.0), 60.0, STEP_S)
-
-    def sweep(start_mm: float, end_mm: float) -> float:
-        for step in range(1, steps + 1):
-            element.advance(0.0, start_mm + (end_mm - start_mm) * step / steps, SPEED_MM_S)
-        return element.kinetic_N
-
-    sweep(60.0, 90.0)
-    closing_N = sweep(90.0, 60.0)
-    sweep(60.0, 46.0)
-    opening_N = sweep(46.0, 60.0)
-    assert opening_N > closing_N
-    # 1% of the largest moment to either side, with F about proportional to the square of the moment
-    assert opening_N / closing_N - 1.0 == pytest.approx(4 * 0.01 * (60.0 / 45.0) ** 1.3, rel=0.1)
-    assert (opening_N + closing_N) / 2.0 == pytest.approx(TorqueElement(quiet, 60.0, STEP_S).kinetic_N, rel=0.01)
-
-
 def test_force_relaxes_after_a_field_step_by_the_stated_share() -> None:
     element = TorqueElement(changed(SAMPLE_1, "thermal", drift_K_h=0.0), 94.0, 0.1)
     before_N = element.kinetic_N
@@ -274,18 +254,6 @@ def test_force_relaxes_after_a_field_step_by_the_stated_share() -> None:
     expected = 0.05 * (1 - np.exp(-30 / 8)) + 0.04 * (1 - np.exp(-30 / 90)) + 0.04 * (1 - np.exp(-30 / 900))
     # the equilibrium level before the step carries its own lost share
     assert lost == pytest.approx(expected, rel=0.05)
-
-
-def test_warming_weakens_the_force_and_levels_off() -> None:
-    element = TorqueElement(without_memory(SAMPLE_1), 50.0, STEP_S)
-    warm = TorqueElement(msgspec.structs.replace(without_memory(SAMPLE_1), thermal=SAMPLE_1.thermal), 50.0, STEP_S)
-    for one in (element, warm):
-        one.advance(3600.0, 50.0, SPEED_MM_S)
-    warmer_K = warm.warmth.temperature_C - 25.0
-    assert warmer_K == pytest.approx(0.97, abs=0.01)
-    assert warm.kinetic_N / element.kinetic_N == pytest.approx(1.0 - 0.004 * warmer_K, rel=1e-9)
-    warm.advance(1e7, 50.0, SPEED_MM_S)
-    assert warm.warmth.temperature_C == pytest.approx(40.0)
 
 
 @pytest.mark.parametrize(
@@ -382,13 +350,8 @@ def test_a_pad_pushes_harder_the_deeper_and_the_nearer_the_magnets(name: str) ->
     assert force_N(name, 70.0, 9.0) == depths[-1]
 
 
-def test_a_held_pad_relaxes_and_a_warm_one_is_softer() -> None:
+def test_a_held_pad_relaxes() -> None:
     assert force_N("pad_1", 70.0, 2.0, seconds=3.0) < 0.98 * force_N("pad_1", 70.0, 2.0)
-    plant = load_plant("pad_1")
-    cold, hot = (PressedPad(made, 70.0, STEP_S) for made in (plant, changed(plant, "thermal", drift_K_h=20.0)))
-    for element in (cold, hot):
-        element.advance(3600.0, 70.0, 2.0, 0.0)
-    assert hot.force_N < 0.96 * cold.force_N
 
 
 def test_the_device_feels_the_finger() -> None:
@@ -428,17 +391,49 @@ def test_the_force_rises_as_the_gap_closes_and_is_of_the_order_of_the_samples() 
     assert 3.0 < forces_N[-1] < 5.0
 
 
-def test_the_field_lags_by_its_play_and_does_not_depend_on_the_rate() -> None:
+# -- what the elements share -------------------------------------------------------------------------------------------
+
+
+CREEPLESS = changed(SECOND, "second", creeping_share=0.0)
+
+
+def made(plant: PlantParameters, gap_mm: float) -> TorqueElement | SecondElement | PressedPad:
+    kind = PressedPad if plant.pad else SecondElement if plant.second else TorqueElement
+    return kind(plant, gap_mm, STEP_S)
+
+
+@pytest.mark.parametrize(
+    ("plant", "apart"),
+    [
+        # 1% of the largest moment to either side, with F about proportional to the square of the moment
+        (changed(without_memory(SAMPLE_1), "field", hysteresis_percent=1.0), 4 * 0.01 * (60.0 / 45.0) ** 1.3),
+        (CREEPLESS, 0.05),
+    ],
+    ids=["sample_1", "second"],
+)
+def test_the_field_lags_and_does_not_depend_on_the_rate(plant: PlantParameters, apart: float) -> None:
     found = []
     for steps in (10, 1000):
-        element = SecondElement(changed(SECOND, "second", creeping_share=0.0), 90.0, STEP_S)
-        for start_mm, end_mm in ((90.0, 60.0), (60.0, 50.0), (50.0, 60.0)):
+        element = made(plant, 60.0)
+        for start_mm, end_mm in ((60.0, 90.0), (90.0, 60.0), (60.0, 46.0), (46.0, 60.0)):
             for step in range(1, steps + 1):
                 element.advance(0.0, start_mm + (end_mm - start_mm) * step / steps, SLID_MM_S)
             found.append(element.kinetic_N)
-    closing_N, _, opening_N = found[:3]
-    assert found[3:] == pytest.approx(found[:3], rel=1e-9)
-    assert 1.01 < opening_N / closing_N < 1.1
+    _, closing_N, _, opening_N = found[:4]
+    assert found[4:] == pytest.approx(found[:4], rel=1e-9)
+    assert opening_N / closing_N - 1.0 == pytest.approx(apart, rel=0.1)
+    assert (opening_N + closing_N) / 2.0 == pytest.approx(made(plant, 60.0).kinetic_N, rel=0.01)
+
+
+@pytest.mark.parametrize("plant", [without_memory(SAMPLE_1), CREEPLESS, load_plant("pad_1")])
+def test_warming_weakens_the_force_and_levels_off(plant: PlantParameters) -> None:
+    cool, warm = (made(changed(plant, "thermal", drift_K_h=each_K_h), 50.0) for each_K_h in (0.0, 1.0))
+    for time_s, warmer_K in ((3600.0, 0.968), (1e7, 15.0)):
+        for element in (cool, warm):
+            element.advance(time_s, 50.0, *([2.0, 0.0] if plant.pad else [SLID_MM_S]))
+        assert warm.warmth.temperature_C - 25.0 == pytest.approx(warmer_K, abs=1e-3)
+        weaker = -0.004 * (warm.warmth.temperature_C - 25.0)
+        assert warm.kinetic_N / cool.kinetic_N == pytest.approx(1.0 + weaker, rel=1e-9)
 
 
 def test_a_step_creeps_with_the_logarithm_of_time_and_comes_to_an_end() -> None:
@@ -471,12 +466,3 @@ def test_friction_grows_with_the_logarithm_of_speed_and_with_rest() -> None:
             element.advance(0.0, 60.0, SLID_MM_S)
             peaks_N[-1] = max(peaks_N[-1], element.force_N)
     assert 1.05 < peaks_N[1] / peaks_N[0] < 1.2
-
-
-def test_warmth_weakens_it() -> None:
-    element = SecondElement(SECOND, 60.0, STEP_S)
-    element.advance(0.0, 60.0, SLID_MM_S)
-    cool_N = element.kinetic_N
-    element.advance(1e7, 60.0, SLID_MM_S)
-    assert element.warmth.temperature_C == pytest.approx(40.0)
-    assert element.kinetic_N < 0.96 * cool_N

@@ -74,8 +74,7 @@ def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
 
 def step(loop: ClosedLoop, target_mm: float) -> dict[str, float]:
     before = loop.stepper.measured
-    if before is None:
-        raise RuntimeError("the loop has no measurement")
+    assert before is not None, "this loop has run"
     start_mm, start_s = before.gap_mm, loop.now_s
     samples = list(loop.hold(target_mm, WATCHED_S))
     time_s = np.array([sample.time_s - start_s for sample in samples])

@@ -216,8 +216,7 @@ class ClosedLoop:
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> Plan:
         """Plan where the setpoint is new or the inference period is over, and return the newest plan."""
         planner = self.planner
-        if planner is None:
-            raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
+        assert planner is not None, "a loop without a planner takes a plan at every tick"
         is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
         is_asked = is_new and self._config.rates.plan_every_setpoint
         if is_asked or now_s - planner.planned.time_s >= self._inference_s - 1e-9:

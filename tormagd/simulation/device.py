@@ -92,6 +92,7 @@ class MessageDevice:
         self._jitter = random.Random(f"reply jitter {seed}")
         self._jitter_s = parameters.firmware.reply_jitter_us * 1e-6
         self._rate = 1.0 + parameters.firmware.clock_ppm * 1e-6
+        self._supply_V = parameters.electronics.supply_V
         self._pwm_steps = float(2**parameters.electronics.pwm_bits - 1)
         self._counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
         self._handle_counts_per_mm = parameters.assumed.handle_counts_per_rev / (math.tau * ROLLER_RADIUS_MM)
@@ -109,7 +110,6 @@ class MessageDevice:
         self._left_extra_counts = 0
         self._right_extra_counts = 0
         self._time_s = 0.0
-        self._suffer()
         self._reset(0.0)
 
     @property
@@ -118,10 +118,7 @@ class MessageDevice:
         return self.plant.truth
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
-        """Queue a payload that arrives at `time_s`."""
-        latest_s = self._inbox[-1].time_s if self._inbox else self._time_s
-        if not latest_s <= time_s < math.inf:
-            raise ValueError(f"time_s = {time_s}: allowed is from {latest_s} on")
+        """Queue a payload that arrives at `time_s`, none before those that came before."""
         self._inbox.append(Packet(time_s, function, payload))
 
     def advance(self, now_s: float) -> None:

@@ -112,8 +112,7 @@ class EmulatedFirmware(ViewedFirmware):
 
     def identity(self) -> Identity:
         """Return the answer to the last Hello."""
-        if self._identity is None:
-            raise RuntimeError("the firmware has sent no Identity yet: allowed is to ask after a Hello")
+        assert self._identity is not None, "it is asked after a Hello"
         return self._identity
 
     @property

@@ -20,8 +20,7 @@ class PressedPad:
     """The worked, rested pad between the magnets, with its state."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
-        if plant.pad is None:
-            raise ValueError("plant.pad = None: allowed is the plant of a pad")
+        assert plant.pad is not None, "this is the plant of a pad"
         self._dt_s = dt_s
         self._field = GapField(plant, gap_mm)
         self._pad: TactilePad = worked_pad(plant.pad)

@@ -54,8 +54,7 @@ class SecondElement:
     """The second plant's element, behind the interface of `TorqueElement`."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
-        if plant.second is None:
-            raise ValueError("plant.second = None: allowed is the second plant")
+        assert plant.second is not None, "this is the second plant"
         self._plant = plant
         self._second = second = plant.second
         self._dt_s = dt_s
