@@ -11,7 +11,7 @@ import pytest
 from devices import SAMPLES
 from hypothesis import given, settings, strategies as st
 
-from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.force import TORMAG, brake_force_N
 from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import PressingHand, ReversingHand, SteadyHand
@@ -228,9 +228,7 @@ def test_without_memory_the_force_is_the_constitutive_law_at_the_true_gap(name: 
     element = TorqueElement(plant, gap_mm, STEP_S)
     for step in range(400):
         element.advance(step * STEP_S, gap_mm, SPEED_MM_S)
-    of = plant.elastomer
-    insert = Elastomer(of.shear_modulus_kPa * 1e3, of.relative_permeability, of.kinetic_friction)
-    law_N = brake_force_N(float(radial_moment_Tm(np.array([gap_mm]), plant)[0]), insert, TORMAG)
+    law_N = brake_force_N(float(radial_moment_Tm(np.array([gap_mm]), plant)[0]), plant.elastomer.law, TORMAG)
     assert element.force_N == pytest.approx(law_N, rel=1e-5)
 
 

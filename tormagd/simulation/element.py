@@ -7,8 +7,6 @@ pre-sliding friction with a Stribeck level.
 import math
 from typing import Final, final
 
-from tormagd.element.physics.friction import Friction
-from tormagd.element.physics.relaxation import PronySeries
 from tormagd.simulation.gap_field import GapField
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import force_over_moment
@@ -44,15 +42,9 @@ class TorqueElement:
         weakest_Tm = self._field.static.at(2.0 * plant.open_stop_mm) - self._field.branch_Tm
         strongest_Tm = self._field.static.at(2.0 * plant.closed_stop_mm) + self._field.branch_Tm
         self._force = force_over_moment(plant, weakest_Tm, strongest_Tm)
-        friction = plant.friction
-        self._friction = Friction(
-            presliding_stiffness_N_mm=friction.presliding_stiffness_N_mm,
-            viscous_N_s_mm=friction.viscous_N_s_mm,
-            static_ratio=friction.static_to_kinetic,
-            stribeck_speed_mm_s=friction.stribeck_speed_mm_s,
-        )
+        self._friction = plant.friction.law
         self.warmth = Warmth(plant)
-        series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
+        series = plant.relaxation.law
         self._relax = series.discretise(dt_s)
 
         # the device has been at this gap for long before the power came

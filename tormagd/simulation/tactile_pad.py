@@ -38,9 +38,8 @@ class TactilePad:
 
     def __init__(self, parameters: PadParameters) -> None:
         self._parameters = parameters
-        relaxing, field_relaxing = parameters.relaxing, parameters.field_relaxing
-        self._series: PronySeries = PronySeries(relaxing.fractions, relaxing.times_s)
-        self._field_series: PronySeries = PronySeries(field_relaxing.fractions, field_relaxing.times_s)
+        self._series: PronySeries = parameters.relaxing.law
+        self._field_series: PronySeries = parameters.field_relaxing.law
         self._damage: float = 0.0
         self._deepest_mm: float = 0.0
         self._dt_s: float = 0.0
