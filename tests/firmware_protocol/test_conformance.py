@@ -47,8 +47,7 @@ from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 from firmware_protocol.conformance.rules import MODES, RULES, TAKES
 from firmware_protocol.framing import DELIMITER, FrameDecoder, cobs_decode, cobs_encode, encode_frame
-from tormagd.simulation.can_device import DEVICE, CanDevice
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import DEVICE, CanDevice, CanFrame
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault

@@ -42,8 +42,8 @@ from tormagd.control.safety.operating_state import OperatingState
 from tormagd.hardware.backend import Backend, BackendError, choose
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import LinkState
-from tormagd.simulation.can_device import DEVICE, CanDevice
-from tormagd.simulation.can_frame import CanFrame, from_socket, to_socket
+from tormagd.simulation.can_device import DEVICE, CanDevice, CanFrame
+from tormagd.simulation.can_port import from_socket, to_socket
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand

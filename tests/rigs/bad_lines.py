@@ -4,8 +4,7 @@ import random
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from tormagd.simulation.can_device import CanDevice, Delivery
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import CanDevice, CanFrame, Delivery
 from tormagd.simulation.device import MessageDevice, SerialDevice
 
 FOREIGN_HOST = 2
@@ -86,7 +85,7 @@ class _Spoilt(Generic[DeviceT]):
         return self._device.messages
 
     def spoil(self, way: MakeTransfer, foreign_frames_ms: float = 0.0) -> None:
-        """Let the wire carry as `way` does; on a bus, frames of another node win every arbitration besides."""
+        """Carry as `way` does; `FOREIGN` fills a bus."""
         self._up, self._down, self._foreign_frames_ms = way(), way(), foreign_frames_ms
 
 

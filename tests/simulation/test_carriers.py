@@ -23,8 +23,7 @@ from firmware_protocol.codec import (
     period,
 )
 from firmware_protocol.framing import FrameDecoder, encode_frame
-from tormagd.simulation.can_device import DEVICE, MAX_WAITING, CanDevice, Delivery
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import DEVICE, MAX_WAITING, CanDevice, CanFrame, Delivery
 from tormagd.simulation.device import MessageDevice, Packet, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

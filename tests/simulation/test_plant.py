@@ -17,9 +17,9 @@ from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import PressingHand, ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantError, PlantParameters, changed, load_plant, standing
 from tormagd.simulation.plant import SUBSTEP_S, Plant
-from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.second_element import SecondElement
 from tormagd.simulation.static_laws import pull_of_magnets_N, radial_moment_Tm
+from tormagd.simulation.tactile_pad import PressedPad
 
 SAMPLE_1 = load_plant("sample_1")
 LEAD_M_RAD = 8e-3 / math.tau
@@ -387,9 +387,6 @@ def test_the_force_rises_as_the_gap_closes_and_is_of_the_order_of_the_samples() 
     assert forces_N == sorted(forces_N)
     assert 0.3 < forces_N[0] < 0.6
     assert 3.0 < forces_N[-1] < 5.0
-
-
-# -- what the elements share -------------------------------------------------------------------------------------------
 
 
 CREEPLESS = changed(SECOND, "second", creeping_share=0.0)

@@ -66,10 +66,8 @@ MET, MISSED, HOST = demo.Verdict
 VERY_STALLED = STALLED._replace(bare_kept=0.4, waited={"daemon": 0.6})
 FEW = 0.90 - demo.MARGIN
 JUDGED = (
-    # a rate is held against the worst bare timer
     *((shown(), MET, ""), (shown(host=STALLED), MET, ""), (shown(kept=0.90, host=POOR), MET, "")),
     *((shown(kept=FEW, host=POOR), HOST, "control rate"), (shown(kept=FEW), MISSED, "control rate")),
-    # what was missed is the software's unless kernel or bare timer say otherwise
     *(
         (shown(host=host, **missed), HOST if host is STALLED else MISSED, named)
         for host in (QUIET, STALLED)
@@ -80,7 +78,6 @@ JUDGED = (
             ({"exit_codes": {"tormagd": 1}}, "every process ended in order"),
         )
     ),
-    # software that is slow in every tick cannot blame the host
     *(
         (made, MISSED, "4.4 ms")
         for host in (QUIET, STALLED, VERY_STALLED)

@@ -217,7 +217,7 @@ def ideal(case: Case, *, has_motors: bool = True) -> Touch:
 
 
 class Bound:
-    """A gap that the device's own motors, if any, move to where its true force is the wanted one; open at first."""
+    """A gap, open at first, that the device's motors move to where its true force is wanted."""
 
     def __init__(self, core: Core, device: PlantParameters, hand: Hand, *, has_motors: bool = True) -> None:
         self.plant = Plant(device, hand)

@@ -9,7 +9,6 @@ from heapq import heappop, heappush
 from itertools import count
 from typing import NamedTuple, Protocol
 
-from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.device import MessageDevice
 
 DEFAULT_BITRATE = 1_000_000
@@ -18,6 +17,17 @@ MAX_WAITING = 32
 """As in a full transmit queue, frames above this are lost."""
 DEVICE = 0
 """The device as a sender; hosts have other numbers."""
+MAX_IDENTIFIER = 0x7FF
+MAX_DATA = 8
+ERROR_FLAG = 0x2000_0000
+"""Marks an error frame, a report of the controller (linux/can.h)."""
+
+
+class CanFrame(NamedTuple):
+    """A classical frame: 11-bit identifier and 0 to 8 bytes of data; with ERROR_FLAG a report of an error."""
+
+    identifier: int
+    data: bytes
 
 
 class Delivery(NamedTuple):

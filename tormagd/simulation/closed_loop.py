@@ -25,8 +25,7 @@ from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.measurement import Measurement
-from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanLine
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanFrame, CanLine
 from tormagd.simulation.device import MessageDevice, SerialDevice
 from tormagd.simulation.plant import Truth
 

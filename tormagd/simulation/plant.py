@@ -9,9 +9,9 @@ from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import FeltHand, Hand, HandError
 from tormagd.simulation.parameters import PlantParameters
-from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.second_element import SecondElement
 from tormagd.simulation.static_laws import pull_over_gap
+from tormagd.simulation.tactile_pad import PressedPad
 
 SUBSTEP_S: Final = 5e-4
 "At most the motors' electrical time constant."

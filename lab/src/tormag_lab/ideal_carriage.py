@@ -29,7 +29,7 @@ from tormagd.ground.force_file import read_forces
 from tormagd.scenes.scene import Scene, load_scene, scene_path, shipped_scenes
 from tormagd.scenes.signal import asked
 from tormagd.simulation.curve import Curve
-from tormagd.simulation.gap_field import SMALLEST_GAP_MM
+from tormagd.simulation.element import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PLANTS_INSERT, PlantParameters, SecondParameters, load_plant, with_insert
 from tormagd.simulation.second_element import fresh_N, rate_factor, shaft_field_mT
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
