@@ -40,7 +40,7 @@ class Stopped:
     def __getattr__(self, name: str) -> object:
         return getattr(self._device, name)
 
-    def transmit(self, now_s: float) -> bytes:
+    def transmit(self, now_s: float) -> object:
         if now_s < self.until_s:
             return b""
         for data in self._waiting:

@@ -2,7 +2,7 @@
 
 import random
 from collections import deque
-from typing import Final, Protocol, final
+from typing import Final, Protocol, TypeAlias, final
 
 from firmware_protocol.value import Value
 from tormagd.simulation.axis import Axis
@@ -19,6 +19,7 @@ SUBSTEP_S: Final = 5e-4
 ELEMENT_STEP_S: Final = 1e-3
 "The element's updates are exact over it."
 
+Element: TypeAlias = TorqueElement | PressedPad | SecondElement
 _ROUNDING: Final = 1e-6
 "Share of a substep by which sums of time steps may be off."
 
@@ -81,15 +82,9 @@ class Plant:
         screw = parameters.screw
         self.left = Axis(parameters, screw.drag_left_N, assumed.start_left_mm, pull_N, substep_s)
         self.right = Axis(parameters, screw.drag_right_N, assumed.start_right_mm, pull_N, substep_s)
-        self.element: TorqueElement | PressedPad | SecondElement
-        if parameters.pad is not None:
-            if isinstance(hand, FeltHand):
-                raise HandError("hand felt: allowed at a pad is a prescribed hand, as pressing is")
-            self.element = PressedPad(parameters, gap_mm, ELEMENT_STEP_S)
-        elif parameters.second is not None:
-            self.element = SecondElement(parameters, gap_mm, ELEMENT_STEP_S)
-        else:
-            self.element = TorqueElement(parameters, gap_mm, ELEMENT_STEP_S)
+        self.element: Element = element_of(parameters, gap_mm, ELEMENT_STEP_S)
+        if isinstance(self.element, PressedPad) and isinstance(hand, FeltHand):
+            raise HandError("hand felt: allowed at a pad is a prescribed hand, as pressing is")
         self.handle_mm = hand.position_mm(0.0)
         self.handle_mm_s = 0.0
         self.force_sensor: Sensor = SimulatedSensor(parameters, random.Random(seed))
@@ -187,6 +182,15 @@ class Plant:
     def wear(self, divisor: float) -> None:
         self.left.wear(divisor)
         self.right.wear(divisor)
+
+
+def element_of(parameters: PlantParameters, gap_mm: float, dt_s: float) -> Element:
+    """Return what is between the plant's magnets."""
+    if parameters.pad is not None:
+        return PressedPad(parameters, gap_mm, dt_s)
+    if parameters.second is not None:
+        return SecondElement(parameters, gap_mm, dt_s)
+    return TorqueElement(parameters, gap_mm, dt_s)
 
 
 def _applied_V(axis: Axis, voltage_V: float | None) -> float:
