@@ -32,8 +32,8 @@ COMPILED = {
     "tormagd/control/assembly": ("conditions",),
     "tormagd/record": ("journal", "telemetry"),
     "tormagd/simulation": (
-        *("curve", "gap_field", "axis", "element", "second_element", "tactile_pad"),
-        *("pressed_pad", "hand", "plant", "motion", "firmware", "device", "closed_loop", "ideal_actuator"),
+        *("curve", "axis", "element", "second_element", "tactile_pad"),
+        *("hand", "plant", "motion", "firmware", "device", "closed_loop", "ideal_actuator"),
     ),
     "tormagd/daemon": (
         *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay"),

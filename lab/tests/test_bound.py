@@ -250,12 +250,12 @@ def test_they_stand_where_nothing_is_planned_for(command: str) -> None:
     loop = ClosedLoop(core.config, ideal_stepper(core, device.messages.plant), core.planner(), device)
     loop.arm()
     list(loop.run(0.5, lambda now_s: TimedSetpoint(1.4, now_s, 0.1)))
-    stood_mm = device.truth.gap_mm
+    stood_mm = device.messages.truth.gap_mm
     loop.command(command)
     list(loop.run(0.1))
     # the firmware opens a disabled device by its own motors
-    assert (device.truth.gap_mm > stood_mm + 0.3) is (command == "disable")
-    assert device.truth.gap_mm > stood_mm - 0.01
+    assert (device.messages.truth.gap_mm > stood_mm + 0.3) is (command == "disable")
+    assert device.messages.truth.gap_mm > stood_mm - 0.01
 
 
 @pytest.mark.parametrize("gap_mm", [94.0, 70.0, 50.0])

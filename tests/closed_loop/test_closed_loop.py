@@ -77,12 +77,12 @@ def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
 @pytest.mark.parametrize(("from_mm", "to_mm"), [(47.0, 95.0), (95.0, 47.0)], ids=["opening", "closing"])
-def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, from_mm: float, to_mm: float) -> None:
+def test_a_gap_at_full_speed_turns_round_at_once(arm, sample: str, from_mm: float, to_mm: float) -> None:
     loop = arm(sample, planned=False)
-    hold_gap(loop, 47.0, 0.7)
+    list(loop.hold(47.0, 0.7))
     if from_mm > to_mm:
-        hold_gap(loop, 95.0, 0.3)
-    went_mm = np.array([abs(each.truth.gap_mm - to_mm) for each in hold_gap(loop, to_mm, 0.2)])
+        list(loop.hold(95.0, 0.3))
+    went_mm = np.array([abs(each.truth.gap_mm - to_mm) for each in loop.hold(to_mm, 0.2)])
     assert went_mm.argmax() < 30, "ms"
     assert went_mm.max() - went_mm[0] < 0.6
 
@@ -90,7 +90,7 @@ def test_a_gap_at_full_speed_turns_round_at_once(arm, hold_gap, sample: str, fro
 def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
     publish(armed, lambda time_s: 1.2, 1.2)
     armed.command("pause")
-    held_mm = armed.device.truth.gap_mm
+    held_mm = armed.simulated.truth.gap_mm
     assert all(
         sample.truth.gap_mm == pytest.approx(held_mm, abs=0.3) for sample in publish(armed, lambda time_s: 1.8, 0.4)
     )
@@ -111,16 +111,11 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
 def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
     loop = arm(faults=["worn_gearbox@2.5"])
     publish(loop, lambda time_s: 1.6, 1.5)
-    closed_mm = loop.device.truth.gap_mm
+    closed_mm = loop.simulated.truth.gap_mm
     for _ in range(2_500):
         loop.skip()
-        assert loop.device.truth.gap_mm > closed_mm - 1.0
-    assert loop.device.truth.gap_mm > OPEN_MM - 2.0
-
-
-def test_a_loop_without_a_planner_wants_plans(make) -> None:
-    with pytest.raises(ValueError, match="allowed is a plan"):
-        make(planned=False).tick()
+        assert loop.simulated.truth.gap_mm > closed_mm - 1.0
+    assert loop.simulated.truth.gap_mm > OPEN_MM - 2.0
 
 
 # -- the second plant, whose laws differ

@@ -32,16 +32,15 @@ AT_REST = RecordedHand((0.0,), (0.0,))
 "A handle that moves would bring a force over the scene's, and a fault."
 
 
-def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm, hold_gap, gap_ticks) -> None:
+def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm) -> None:
     lags_mm, overshoots_mm = [], []
     for pull_V in (CONFIG.motor.pull_V, 0.0):
         config = msgspec.structs.replace(CONFIG, motor=msgspec.structs.replace(CONFIG.motor, pull_V=pull_V))
         loop = arm(hand=AT_REST, planned=False, config=config, core=build_core(config))
-        hold_gap(loop, 47.0, 2.5)
+        list(loop.hold(47.0, 2.5))
         move = loop.stepper.move
         seen = [
-            (abs(move.expected.gap_mm - sample.measured.gap_mm), sample.truth.gap_mm)
-            for sample in gap_ticks(loop, 70.0, 1.2)
+            (abs(move.expected.gap_mm - sample.measured.gap_mm), sample.truth.gap_mm) for sample in loop.hold(70.0, 1.2)
         ]
         lags_mm.append(max(lag for lag, _ in seen))
         overshoots_mm.append(max(gap for _, gap in seen) - 70.0)
@@ -50,11 +49,11 @@ def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm, hold_gap, gap_tick
     assert overshoots_mm[0] < 0.01 < overshoots_mm[1]
 
 
-def test_a_step_knows_nothing_of_the_stroke_before_it(arm, hold_gap) -> None:
+def test_a_step_knows_nothing_of_the_stroke_before_it(arm) -> None:
     loop = arm(hand=AT_REST, planned=False)
-    hold_gap(loop, 57.0, 2.0)
+    list(loop.hold(57.0, 2.0))
     assert max(abs(loop.stepper.move.left.integral), abs(loop.stepper.move.right.integral)) < 0.002
-    gaps_mm = [sample.measured.gap_mm for sample in hold_gap(loop, 58.0, 0.4) + hold_gap(loop, 57.8, 0.4)]
+    gaps_mm = [sample.measured.gap_mm for sample in (*loop.hold(58.0, 0.4), *loop.hold(57.8, 0.4))]
     assert max(gaps_mm) < 58.0 + 1e-3
     assert min(gaps_mm[400:]) > 57.8 - 0.005
 
@@ -64,15 +63,15 @@ def test_a_step_knows_nothing_of_the_stroke_before_it(arm, hold_gap) -> None:
     [("sample_1", 1.0, 1.4), ("sample_2", 1.0, 1.0), ("sample_3", 1.6, MAX_ACCELERATION_SCALE)],
 )
 def test_lively_motors_are_asked_for_more_and_weak_ones_for_no_less(
-    arm, hold_gap, gap_ticks, sample: str, least: float, most: float
+    arm, sample: str, least: float, most: float
 ) -> None:
     loop = arm(sample, AT_REST, planned=False)
     for stroke in range(6):
-        hold_gap(loop, 60.0 if stroke % 2 else 80.0, 0.8)
+        list(loop.hold(60.0 if stroke % 2 else 80.0, 0.8))
     move = loop.stepper.move
     assert loop.stepper.safety.faults == ()
     assert least <= move.acceleration_scale <= most
-    resting = [move.acceleration_scale for _ in gap_ticks(loop, 80.0, 0.5)]
+    resting = [move.acceleration_scale for _ in loop.hold(80.0, 0.5)]
     assert resting[-1] == resting[250]
 
 

@@ -142,8 +142,8 @@ def test_the_gap_holds_alone(make, render, core: Core, open_core: Core, sample: 
 
 
 @pytest.mark.parametrize("sample", WEAKEST_AND_STRONGEST)
-def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) -> None:
-    shut = hold_gap(arm(sample), 47.0, 4.0)
+def test_the_measured_force_holds_alone(arm, core: Core, sample: str) -> None:
+    shut = list(arm(sample).hold(47.0, 4.0))
     assert shut[-1].safety.faults == (Fault.OVER_FORCE,)
     assert any(Limit.OVER_FORCE in sample.output.limits for sample in shut)
     forces_N = np.array([sample.truth.force_N for sample in shut])

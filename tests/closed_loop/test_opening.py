@@ -4,21 +4,16 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-import msgspec
 import pytest
 from bad_lines import BadSerialLine, losing
 
 from firmware_protocol.codec import DeviceMode
-from tormagd.config import Config
-from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
-from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.closed_loop import ClosedLoop, Sample, VirtualBus, gap_plan
-from tormagd.simulation.device import MessageDevice, VirtualDevice
-from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.closed_loop import ClosedLoop, gap_plan
+from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, changed, load_plant
 
 CLOSED_MM, HALF_MM, OPEN_MM = 48.0, 70.0, 95.0
 NAMED_S = 0.5
@@ -28,20 +23,12 @@ Spoils = Callable[[MessageDevice, float], None]
 Opens = Callable[..., ClosedLoop]
 
 
-def held(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
-    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(duration_s * 1e3))]
-
-
 @pytest.fixture(scope="module")
-def closed(core: Core) -> Opens:
+def closed(make: Opens) -> Opens:
     def build(bus: str, plant: str | PlantParameters = "sample_1", gap_mm: float = HALF_MM, faults=()) -> ClosedLoop:
-        parameters = load_plant(plant) if isinstance(plant, str) else plant
-        struck = [parse_fault(fault) for fault in faults]
-        made = parameters, SteadyHand(0.0), struck, 1
-        device = VirtualBus(CanDevice(MessageDevice(*made))) if bus == "can" else VirtualDevice(*made)
-        loop = ClosedLoop(Config(), core.stepper(), None, device)
+        loop = make(plant, SteadyHand(0.0), faults, planned=False, is_on_bus=bus == "can")
         loop.arm(gap_plan(OPEN_MM))
-        held(loop, gap_mm, 0.6 + (OPEN_MM - gap_mm) / MM_S)
+        list(loop.hold(gap_mm, 0.6 + (OPEN_MM - gap_mm) / MM_S))
         assert loop.stepper.safety.faults == ()
         return loop
 
@@ -49,13 +36,13 @@ def closed(core: Core) -> Opens:
 
 
 def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0) -> float:
-    """Return after how long NOT_OPENING is latched; `spoils` runs before each tick."""
+    """Return after how long NOT_OPENING is latched; `spoils` runs after each tick."""
     begins_s = loop.now_s
-    while loop.now_s < begins_s + seconds:
+    for sample in loop.hold(CLOSED_MM, seconds):
+        if Fault.NOT_OPENING in sample.safety.faults:
+            return loop.now_s - begins_s
         if spoils is not None:
             spoils(loop.simulated, loop.now_s)
-        if Fault.NOT_OPENING in held(loop, CLOSED_MM, 1e-3)[0].safety.faults:
-            return loop.now_s - begins_s
     return math.inf
 
 
@@ -85,37 +72,27 @@ def test_a_retract_that_does_not_begin_is_named(closed: Opens, bus: str, ends: C
 def test_motors_that_do_not_open_or_press_shut_are_named(closed: Opens, bus: str, percent: int) -> None:
     loop = closed(bus, faults=[f"opening={percent}%"])
     loop.command("disable")
-    begins_s, faults = loop.now_s, loop.stepper.safety.faults
-    while not faults and loop.now_s < begins_s + NAMED_S:
-        faults = held(loop, CLOSED_MM, 1e-3)[0].safety.faults
+    faults = next(sample.safety.faults for sample in loop.hold(CLOSED_MM, NAMED_S) if sample.safety.faults)
     assert set(faults) & {Fault.NOT_OPENING, Fault.DEVICE_RETRACT_FAILED, Fault.DEVICE_UNCOMMANDED_MOTION}
 
 
-def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_and_opened(core: Core) -> None:
-    device = VirtualDevice(load_plant("sample_1"), SteadyHand(), [], 1)
-    firmware = device.messages.firmware
+def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_and_opened(make: Opens) -> None:
+    loop = make(planned=False)
+    firmware = loop.simulated.firmware
     assert isinstance(firmware, Firmware)
     firmware.homed, firmware._left_zero_mm, firmware._right_zero_mm = True, 7.5, 8.5
-    loop = ClosedLoop(Config(), core.stepper(), None, device)
     assert named_s(loop) <= NAMED_S + 0.1
-    held(loop, CLOSED_MM, 2.0)
+    list(loop.hold(CLOSED_MM, 2.0))
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
-
-
-def with_other(plant: PlantParameters, part: str, **values: float) -> PlantParameters:
-    return msgspec.structs.replace(plant, **{part: msgspec.structs.replace(getattr(plant, part), **values)})
 
 
 SAMPLES = {name: load_plant(name) for name in ("sample_1", "sample_2", "sample_3")}
 HEALTHY = {
     **{bus: (bus, SAMPLES["sample_1"]) for bus in ("serial", "can")},
+    **{f"{name} at 9.1 V": ("serial", changed(plant, "electronics", supply_V=9.1)) for name, plant in SAMPLES.items()},
+    "14.9 V": ("serial", changed(SAMPLES["sample_2"], "electronics", supply_V=14.9)),
     **{
-        f"{name} at 9.1 V": ("serial", with_other(plant, "electronics", supply_V=9.1))
-        for name, plant in SAMPLES.items()
-    },
-    "14.9 V": ("serial", with_other(SAMPLES["sample_2"], "electronics", supply_V=14.9)),
-    **{
-        f"{ambient_C:g} C": ("serial", with_other(SAMPLES["sample_1"], "assumed", ambient_C=ambient_C))
+        f"{ambient_C:g} C": ("serial", changed(SAMPLES["sample_1"], "assumed", ambient_C=ambient_C))
         for ambient_C in (5.0, 40.0)
     },
     "slow clock": ("serial", SAMPLES["sample_1"], "clock=-5%"),
@@ -127,14 +104,14 @@ HEALTHY = {
 def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
     bus, plant, *faults = HEALTHY[case]
     loop = closed(bus, plant, CLOSED_MM, faults)
-    held(loop, 70.0, 1.5)
-    held(loop, CLOSED_MM, 0.3)
+    list(loop.hold(70.0, 1.5))
+    list(loop.hold(CLOSED_MM, 0.3))
     loop.command("disable")
     assert (named_s(loop, seconds=3.0), loop.stepper.safety.faults) == (math.inf, ())
     assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
     for gap_mm, closes_s, opens_s in ((94.0, 0.3, 1.0), (60.0, 1.0, 2.0)):
         loop.command("enable")
-        held(loop, gap_mm, closes_s)
+        list(loop.hold(gap_mm, closes_s))
         loop.command("disable")
         assert named_s(loop, seconds=opens_s) == math.inf
 
@@ -142,7 +119,7 @@ def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
 @pytest.mark.parametrize("gap_mm", [50.0, 85.0])
 def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: float) -> None:
     loop = closed("serial", gap_mm=gap_mm)
-    loop.device = line = BadSerialLine(loop.device)
+    loop.port.device = line = BadSerialLine(loop.port.device)
     line.spoil(partial(losing, 0.1))
     loop.command("disable")
     assert named_s(loop, seconds=4.0) == math.inf

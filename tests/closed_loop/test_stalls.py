@@ -26,7 +26,7 @@ def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
     forces_N = []
     for _ in range(stall_ms):
         loop.skip()
-        forces_N.append(loop.device.truth.force_N)
+        forces_N.append(loop.simulated.truth.force_N)
     return forces_N
 
 
@@ -34,13 +34,13 @@ class Stopped:
     """A device whose process is stopped: what comes waits for it, and its own time stands still."""
 
     def __init__(self, loop: ClosedLoop, stop_ms: int) -> None:
-        self._device, self._behind_s, self.until_s = loop.device, stop_ms * 1e-3, loop.now_s + stop_ms * 1e-3
+        self._device, self._behind_s, self.until_s = loop.port.device, stop_ms * 1e-3, loop.now_s + stop_ms * 1e-3
         self._waiting: list[bytes] = []
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._device, name)
 
-    def transmit(self, now_s: float) -> bytes:
+    def transmit(self, now_s: float) -> object:
         if now_s < self.until_s:
             return b""
         for data in self._waiting:
@@ -101,7 +101,7 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
 def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(
     holding: ClosedLoop, stop_ms: int, render
 ) -> None:
-    holding.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
+    holding.port.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
     samples = render(holding, FORCE_N, 0.6)
     assert samples[-1].safety.faults == ()
     assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 4)
@@ -111,7 +111,7 @@ def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(
 
 @pytest.mark.parametrize("stop_ms", LONG_MS)
 def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLoop, stop_ms: int, render) -> None:
-    holding.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
+    holding.port.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
     samples = render(holding, FORCE_N, 2.0)
     assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
     assert Fault.HOST_STALL not in samples[-1].safety.faults
@@ -123,7 +123,7 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(
     force_N: float, armed: ClosedLoop, render
 ) -> None:
     render(armed, 1.2, 0.8)
-    armed.device.messages._home_m -= 2e-4
+    armed.simulated._home_m -= 2e-4
     samples = render(armed, force_N, 3.0)
     assert samples[-1].safety.faults == ()
     assert Limit.F_MIN in samples[-1].plan.limits

@@ -8,6 +8,7 @@ from functools import cache
 
 import msgspec
 import pytest
+from bad_lines import BadSerialLine
 from hypothesis import event, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
@@ -24,7 +25,7 @@ from firmware_protocol.codec import (
     State,
     Status,
 )
-from firmware_protocol.framing import DELIMITER, cobs_decode
+from firmware_protocol.framing import cobs_decode
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
@@ -36,8 +37,7 @@ from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import SerialDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
-from tormagd.simulation.plant import Truth
+from tormagd.simulation.parameters import load_plant, standing
 
 UP, DOWN = "to the daemon", "to the device"
 SLOWEST = 0.7
@@ -82,32 +82,25 @@ FRAMES = st.sampled_from([1, 2, 10, 25, 40, 60, 200])
 MS = st.sampled_from([1, 5, 20, 49, 52, 120, 250])
 
 
-class BadLine:
+class BadLine(BadSerialLine):
     """A device behind a line that loses or damages the next frames."""
 
     def __init__(self, device: SerialDevice) -> None:
-        self._device, self.messages = device, device.messages
-        self._unfinished = b""
+        super().__init__(device)
+        self._up = lambda _, frames: [self._carried(UP, frame) for frame in frames]
+        self._down = lambda _, frames: [self._heard(frame) for frame in frames]
         self.spells: dict[tuple[str, int], tuple[int, int]] = {}
         self.period = self.daemons_period = 0
         self.driven = 0
         self.came = dict.fromkeys(SILENT_MS, 0)
 
-    @property
-    def truth(self) -> Truth:
-        return self._device.truth
-
-    def receive(self, now_s: float, data: bytes) -> None:
+    def _heard(self, data: bytes) -> bytes:
         frame = self._carried(DOWN, data)
         if frame is data and data[1] == FUNCTION[Drive]:
             body = cobs_decode(data[:-1])
             if body is not None and body[MODE_AT] == DriveMode.RUN:
                 self.driven = self.period
-        self._device.receive(now_s, frame)
-
-    def transmit(self, now_s: float) -> bytes:
-        *frames, self._unfinished = (self._unfinished + self._device.transmit(now_s)).split(DELIMITER)
-        return b"".join([self._carried(UP, frame + DELIMITER) for frame in frames])
+        return frame
 
     def _carried(self, direction: str, frame: bytes) -> bytes:
         function = frame[1]  # COBS puts a code before it that never equals the function
@@ -123,11 +116,7 @@ class BadLine:
         return frame
 
 
-@cache
-def plant() -> PlantParameters:
-    parameters = load_plant("sample_1")
-    near = msgspec.structs.replace(parameters.assumed, start_left_mm=47.2, start_right_mm=47.0)
-    return msgspec.structs.replace(parameters, assumed=near)
+NEAR_HOME = standing(load_plant("sample_1"), 47.2, 47.0)
 
 
 @cache
@@ -141,10 +130,10 @@ class Together(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         core = rare_plans()
-        device = VirtualDevice(plant(), SteadyHand(), [], 1, boot=CompiledFirmware)
+        device = VirtualDevice(NEAR_HOME, SteadyHand(), [], 1, boot=CompiledFirmware)
         self.loop = ClosedLoop(core.config, core.stepper(), core.planner(), device)
         self.line = BadLine(device)
-        self.loop.device = self.line
+        self.loop.port.device = self.line
         self.struck: set[str] = set()
         self.force_N = 1.1
         self.is_armed = False

@@ -21,7 +21,6 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, ReversingHand
 from tormagd.simulation.parameters import PlantParameters
-from tormagd.simulation.plant import Truth
 
 CONFIG = Config(rates=Rates(control_hz=1000, inference_hz=83))
 PLACES = [OF_TICK.index(name) for name in COLUMNS]
@@ -35,10 +34,6 @@ class AlteringLine:
         self._device, self._alters = device, alters
         self.messages, self.receive = device.messages, device.receive
         self._stream = FrameStream()
-
-    @property
-    def truth(self) -> Truth:
-        return self._device.truth
 
     def transmit(self, now_s: float) -> bytes:
         said = self._stream.unpack(self._device.transmit(now_s))

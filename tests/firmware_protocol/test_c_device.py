@@ -128,7 +128,7 @@ class Twins(CompiledFirmware):
         return measured
 
     def _compare(self, request: str, answer: str, sensors: Sensors) -> None:
-        python, output, view = self.python, self.python.output, self._view()
+        python, output, view = self.python, self.python.output, self.view
         assert (view.mode, view.faults, view.homed) == (python.mode, python.faults, python.homed)
         assert Output(view.left_duty, view.right_duty, view.enabled) == output
         assert encode(self.status(sensors)) == encode(python.status(sensors))

@@ -47,8 +47,7 @@ from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 from firmware_protocol.conformance.rules import MODES, RULES, TAKES
 from firmware_protocol.framing import DELIMITER, FrameDecoder, cobs_decode, cobs_encode, encode_frame
-from tormagd.simulation.can_device import DEVICE, CanDevice
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import DEVICE, CanDevice, CanFrame
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import MessageDevice, VirtualDevice
 from tormagd.simulation.faults import parse_fault
@@ -1349,7 +1348,7 @@ def test_an_interrupted_run_leaves_the_gap_open(ran: Callable[..., int], capsys:
             signal.signal(number, handler)
     assert "ok    left_open" in capsys.readouterr().out
     assert device.messages.firmware.mode is DeviceMode.IDLE
-    assert device.truth.gap_mm > 94.0
+    assert device.messages.truth.gap_mm > 94.0
 
 
 def test_a_line_that_goes_is_told_and_no_success(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:

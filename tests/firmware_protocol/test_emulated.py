@@ -78,7 +78,7 @@ def life(boot: FirmwareKind) -> list[object]:
         firmware = device.messages.firmware
         modes.add(firmware.mode)
         seen.append((device.transmit(time_s), firmware.mode, firmware.faults, firmware.homed, firmware.output))
-        seen.append(device.truth)
+        seen.append(device.messages.truth)
     return [*seen, modes]
 
 

@@ -35,7 +35,8 @@ from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.serial_backend import SerialOptions, open_serial
 from tormagd.hardware.serial_port import SerialPort
 from tormagd.hardware.usb_latency import latency_ms, make_prompt
-from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, to_socket
+from tormagd.simulation.can_device import ERROR_FLAG, CanFrame
+from tormagd.simulation.can_port import to_socket
 from tormagd_client.endpoints import ConfigError
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)

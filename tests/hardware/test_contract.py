@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import can
-import msgspec
 import numpy as np
 import pytest
 from bad_lines import (
@@ -43,13 +42,12 @@ from tormagd.control.safety.operating_state import OperatingState
 from tormagd.hardware.backend import Backend, BackendError, choose
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import LinkState
-from tormagd.simulation.can_device import DEVICE, CanDevice
-from tormagd.simulation.can_frame import CanFrame, from_socket, to_socket
+from tormagd.simulation.can_device import DEVICE, CanDevice, CanFrame
+from tormagd.simulation.can_port import from_socket, to_socket
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import parse_hand
-from tormagd.simulation.parameters import load_plant
-from tormagd.simulation.plant import Truth
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant, standing
 from tormagd.simulation.pty_port import Pty, PtyPort
 from tormagd.simulation.slcan_port import SlcanPort
 
@@ -281,15 +279,11 @@ class Line:
     """The closed loop's device: the real backend, a bad line, and the device behind it."""
 
     def __init__(self, far: FarEnd, device: VirtualDevice, case: Case) -> None:
-        self.far, self._device = far, device
+        self.far, self.messages = far, device.messages
         self.backend = choose(far.configured, CONFIG.rates).open()
         self._bytewise = case.is_bytewise
         self._up, self._down = case.way(), case.way()
         self._to_host, self._from_host = FrameStream(), FrameStream()
-
-    @property
-    def truth(self) -> Truth:
-        return self._device.truth
 
     def exchange(self, now_s: float) -> list[Message]:
         units = self._up(now_s, self.far.units(now_s))
@@ -325,9 +319,7 @@ class Line:
 
 
 def a_device() -> VirtualDevice:
-    plant = load_plant("sample_1")
-    near = msgspec.structs.replace(plant.assumed, start_left_mm=46.0, start_right_mm=45.5)
-    return VirtualDevice(msgspec.structs.replace(plant, assumed=near), parse_hand("steady"), (), 1)
+    return VirtualDevice(standing(load_plant("sample_1"), 46.0, 45.5), SteadyHand(), (), 1)
 
 
 @pytest.fixture
@@ -371,8 +363,8 @@ def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
 def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     transport: str, case: Case, moving: ClosedLoop, lines: Callable[..., Line]
 ) -> None:
-    line = lines(transport, moving.device, case)
-    moving.device = line  # type: ignore[assignment]
+    line = lines(transport, moving.port.device, case)
+    moving.port.device = line  # type: ignore[assignment]
     samples = []
     for sample in ticks(moving, case.bad_s):
         samples.append(sample)

@@ -4,10 +4,8 @@ import random
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from tormagd.simulation.can_device import CanDevice, Delivery
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import CanDevice, CanFrame, Delivery
 from tormagd.simulation.device import MessageDevice, SerialDevice
-from tormagd.simulation.plant import Truth
 
 FOREIGN_HOST = 2
 FOREIGN = CanFrame(0x00F, bytes(8))
@@ -80,18 +78,15 @@ class _Spoilt(Generic[DeviceT]):
 
     def __init__(self, device: DeviceT) -> None:
         self._device = device
-        self._up, self._down = whole(), whole()
+        self.spoil(whole)
 
     @property
     def messages(self) -> MessageDevice:
         return self._device.messages
 
-    @property
-    def truth(self) -> Truth:
-        return self._device.truth
-
-    def spoil(self, way: MakeTransfer) -> None:
-        self._up, self._down = way(), way()
+    def spoil(self, way: MakeTransfer, foreign_frames_ms: float = 0.0) -> None:
+        """Carry as `way` does; `FOREIGN` fills a bus."""
+        self._up, self._down, self._foreign_frames_ms = way(), way(), foreign_frames_ms
 
 
 class BadSerialLine(_Spoilt[SerialDevice]):
@@ -117,8 +112,6 @@ class BadBus(_Spoilt[CanDevice]):
 
     def __init__(self, device: CanDevice) -> None:
         super().__init__(device)
-        self.foreign_frames_ms = 0.0
-        "Frames of another node, which win every arbitration."
         self._owed = 0.0
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
@@ -129,7 +122,7 @@ class BadBus(_Spoilt[CanDevice]):
         for unit in self._down(now_s, []):
             self._device.receive(now_s, frame_of(unit))
         delivered = self._device.transmit(now_s)
-        self._owed += self.foreign_frames_ms  # called once a millisecond
+        self._owed += self._foreign_frames_ms  # called once a millisecond
         while self._owed >= 1.0:
             self._owed -= 1.0
             self._device.receive(now_s, FOREIGN, FOREIGN_HOST)

@@ -12,12 +12,12 @@ from typing import Any
 
 import zmq
 from machines.own import own_machine
-from machines.stream import received
 from machines.wire import carried
 
 from tormagd.config import load_config
 from tormagd.ctl.processes import begun, first_line
 from tormagd.ctl.record import listening
+from tormagd.record.ticks import decode_ticks
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS
 
@@ -118,6 +118,12 @@ class Stand:
     def unhandled(self) -> list[str]:
         lines = (self.folder / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         return [line for line in lines if any(sign in line for sign in UNHANDLED)]
+
+
+def received(socket: "zmq.Socket[bytes]") -> list[dict[str, Any]]:
+    """Return ticks as a subscriber of recordings gets them."""
+    batch = decode_ticks(socket.recv())
+    return [dict(zip(batch.columns, row, strict=True)) for row in batch.rows]
 
 
 def used(child: "subprocess.Popen[str]") -> tuple[int, int]:

@@ -23,8 +23,7 @@ from firmware_protocol.codec import (
     period,
 )
 from firmware_protocol.framing import FrameDecoder, encode_frame
-from tormagd.simulation.can_device import DEVICE, MAX_WAITING, CanDevice, Delivery
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import DEVICE, MAX_WAITING, CanDevice, CanFrame, Delivery
 from tormagd.simulation.device import MessageDevice, Packet, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -92,7 +91,7 @@ def test_handle_and_force_are_those_of_the_plant_in_sensor_steps() -> None:
     turned_mm = 13.0 * SteadyHand().rpm / 60.0 * math.tau * 20.0
     assert turned_mm > span_mm
     assert (sense.handle_position_mm, sense.force_N) == pytest.approx(
-        (turned_mm % span_mm, device.truth.force_N), abs=0.05
+        (turned_mm % span_mm, device.messages.truth.force_N), abs=0.05
     )
 
 
@@ -101,7 +100,7 @@ def test_a_flood_is_bounded_and_the_device_recovers() -> None:
     noise = random.Random(1)
     for _ in range(20):
         device.receive(0.0, noise.randbytes(100_000))
-    assert device.statistics.bytes <= 65_536
+    assert device.decoder.statistics.bytes <= 65_536
     device.receive(1.0, b"\x00" + HELLO)
     assert any(frame.function == FUNCTION[Identity] for frame in FrameDecoder().feed(device.transmit(1.1)))
 

@@ -2,11 +2,9 @@
 
 import itertools
 
-import msgspec
 import numpy as np
 import pytest
 
-from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import (
     FeltHand,
     HandError,
@@ -15,9 +13,8 @@ from tormagd.simulation.hand import (
     SteadyHand,
     parse_hand,
 )
-from tormagd.simulation.parameters import PlantParameters, load_plant
-from tormagd.simulation.plant import Plant
-from tormagd.simulation.second_element import SecondElement
+from tormagd.simulation.parameters import PlantParameters, load_plant, standing
+from tormagd.simulation.plant import Plant, element_of
 
 STEP_S, END_S, GAP_MM = 1e-3, 4.0, 50.0
 STROKE = RecordedHand((0.2, 1.0, 2.2, 3.0), (0.0, 15.0, 15.0, 0.0))
@@ -28,9 +25,7 @@ with_each = pytest.mark.parametrize("impedance", [FINGER, WRIST, ARM], ids=["fin
 
 
 def at_gap(name: str) -> PlantParameters:
-    plant = load_plant(name)
-    start = msgspec.structs.replace(plant.assumed, start_left_mm=GAP_MM / 2.0, start_right_mm=GAP_MM / 2.0)
-    return msgspec.structs.replace(plant, assumed=start)
+    return standing(load_plant(name), GAP_MM / 2.0, GAP_MM / 2.0)
 
 
 def at_brake(name: str, hand: FeltHand, seconds: float = END_S) -> np.ndarray:
@@ -65,8 +60,7 @@ def energies_mJ(rows: np.ndarray, impedance: Impedance) -> np.ndarray:
 
 def finely(name: str, impedance: Impedance, intended: RecordedHand, dt_s: float = STEP_S / 20.0) -> np.ndarray:
     """The same equations by an explicit method in 20 times finer steps, with the rows of `at_brake`."""
-    parameters = at_gap(name)
-    element = (SecondElement if parameters.second else TorqueElement)(parameters, GAP_MM, dt_s)
+    element = element_of(at_gap(name), GAP_MM, dt_s)
     meant_mm = np.interp(dt_s * np.arange(round(END_S / dt_s) + 1), intended.times_s, intended.positions_mm).tolist()
     place_mm = speed_mm_s = 0.0
     rows = []
@@ -77,7 +71,7 @@ def finely(name: str, impedance: Impedance, intended: RecordedHand, dt_s: float 
         resisting_N = element.force_N
         speed_mm_s += dt_s * 1e3 / impedance.mass_kg * (hand_N - resisting_N)
         place_mm += dt_s * speed_mm_s
-        element.advance(step * dt_s, GAP_MM, speed_mm_s)
+        element.advance(step * dt_s, GAP_MM, speed_mm_s)  # type: ignore[call-arg]
         rows.append((place_mm, resisting_N, hand_N))
     return np.array(rows)
 

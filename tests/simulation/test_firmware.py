@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 
-import msgspec
 import pytest
 from devices import SAMPLES
 from virtual_port import VirtualPort
@@ -25,7 +24,7 @@ from firmware_protocol.conformance.line import SerialLine
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import KNOWN, SIZED, parse_fault
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant, standing
 
 # -- the rules of the page are the conformance kit's, which this firmware passes
 # -----------------------------------------
@@ -36,10 +35,9 @@ PERIOD_S = 1e-3
 
 class Bench(Host):
     def __init__(self, faults: Iterable[str] = (), plant: PlantParameters | None = None) -> None:
-        self.device = VirtualDevice(
-            plant or load_plant("sample_1"), SteadyHand(), [parse_fault(fault) for fault in faults]
-        )
-        super().__init__(SerialLine(VirtualPort(self.device)))
+        device = VirtualDevice(plant or load_plant("sample_1"), SteadyHand(), [parse_fault(fault) for fault in faults])
+        self.device = device.messages
+        super().__init__(SerialLine(VirtualPort(device)))
 
     def go_to(self, gap_mm: float, seconds: float = 1.5) -> None:
         target_mm = gap_mm / 2.0 - 47.5
@@ -57,9 +55,7 @@ class Bench(Host):
 
 
 def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "sample_1") -> Bench:
-    sample = load_plant(plant)
-    near_home = msgspec.structs.replace(sample.assumed, start_left_mm=46.0, start_right_mm=45.5)
-    host = Bench(faults, msgspec.structs.replace(sample, assumed=near_home))
+    host = Bench(faults, standing(load_plant(plant), 46.0, 45.5))
     host.homed()
     host.go_to(gap_mm)
     assert host.status.mode is DeviceMode.RUN
@@ -106,7 +102,7 @@ def test_homing_that_fails_opens_where_it_can_and_does_not_press_shut(
     host.pass_time(3.0, DriveMode.OFF)
     assert (host.status.mode, host.status.faults) == (DeviceMode.LATCHED, DeviceFault.HOMING_FAILED)
     assert Switches.HOMED not in host.status.switches
-    assert not host.device.messages.firmware.output.enabled
+    assert not host.device.firmware.output.enabled
     assert host.device.truth.gap_mm == gap_mm
 
 
@@ -216,8 +212,8 @@ def test_a_device_that_is_mended_homes_as_a_healthy_one() -> None:
     mended, healthy = Bench(f"{fault}@0.1" for fault in lasting), Bench()
     mended.pass_time(0.2)
     healthy.pass_time(0.2)
-    assert mended.device.messages.firmware.faults
-    mended.device.messages.mend()
+    assert mended.device.firmware.faults
+    mended.device.mend()
     for host in (mended, healthy):
         for message in (Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1), Clear(2), Home(3)):
             host.send(message)

@@ -33,9 +33,8 @@ from tormagd.config import Device, Rates
 from tormagd.hardware.backend import choose
 from tormagd.simulation.__main__ import main
 from tormagd.simulation.can_bus import SimulatorBus
-from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, from_socket, to_socket
-from tormagd.simulation.can_port import MAX_HOSTS, CanPort
+from tormagd.simulation.can_device import ERROR_FLAG, CanDevice, CanFrame
+from tormagd.simulation.can_port import MAX_HOSTS, SOCKET_FRAME, CanPort, from_socket, to_socket
 from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant

@@ -1,14 +1,12 @@
 """The table of stages, `judge.py numerics` on a sample, and that each can fail."""
 
-import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from judge import numerics
+from judge.frame import parsed
 from judge.stage_table import stages
 from judge.stages import HOSTILE_STEPS, Draw, Stage, tried
 from leaves import leaves
@@ -96,15 +94,11 @@ def test_every_float_of_plain_data_values_and_stages_is_seen() -> None:
     }  # fmt: skip
 
 
-TOOL = Path(__file__).parents[2] / "tools" / "judge.py"
-
-
 def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
-    options = "--cases 4000 --reference 80 --episodes 1 --workers 1"
-    command = [sys.executable, str(TOOL), "numerics", "--json", *options.split()]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads(done.stdout)
+    words = "numerics --cases 4000 --reference 80 --episodes 1 --workers 1"
+    _, options = parsed("judge", {"numerics": ""}, words.split())
+    found = numerics.measure(options)
+    assert found["passed"]
     assert (found["travelled"], found["stage_cases"]) == (0, sum(row["cases"] for row in found["stages"]))
     assert found["cases"] >= 4_000
     assert found["reference_cases"] >= 80

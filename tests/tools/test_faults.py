@@ -1,13 +1,12 @@
 """The fault matrix: on either bus each fault has the name and the end that it should have."""
 
-import msgspec
 import pytest
 from judge import faults
 from judge.faults import OPEN_MM
 from judge.injections import CAN, MATRIX, OPENS, SERIAL, Injection
 
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant, standing
 
 NAMED = {item.name: item for item in MATRIX}
 LOSING = (
@@ -68,9 +67,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """The device was left open, and homes within 1.4 s; two seconds later it follows a force."""
 
     def left_open(name: str) -> PlantParameters:
-        plant = load_plant(name)
-        near = msgspec.structs.replace(plant.assumed, start_left_mm=47.0, start_right_mm=46.5)
-        return msgspec.structs.replace(plant, assumed=near)
+        return standing(load_plant(name), 47.0, 46.5)
 
     monkeypatch.setattr("judge.rig.load_plant", left_open)
     monkeypatch.setattr(faults, "INJECTED_S", 3.3)

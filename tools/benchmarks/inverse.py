@@ -35,8 +35,7 @@ from tormagd.element.model.features import Element
 from tormagd.element.model.force_curve import ForceCurve
 from tormagd.element.model.model_file import ForceModel, falling_at
 from tormagd.element.physics.field import PowerFieldLaw
-from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.element.physics.friction import Friction
+from tormagd.element.physics.force import TORMAG, brake_force_N
 from tormagd.element.physics.inserts import insert
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
 from tormagd.simulation.parameters import PlantParameters, load_plant
@@ -71,18 +70,8 @@ class Course(NamedTuple):
 def plant_force_N(plant: PlantParameters, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
     """Return the plant's force so far after a reversal at a steady rate, at the gap with nominal field `field_mT`."""
     gaps = np.array([min(max(NOMINAL.gap_mm(field), GAPS_MM[0]), GAPS_MM[1]) for field in field_mT.tolist()])
-    elastomer = Elastomer(
-        shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
-        relative_permeability=plant.elastomer.relative_permeability,
-        friction_coefficient=plant.elastomer.kinetic_friction,
-    )
-    kinetic_N = brake_force_N(radial_moment_Tm(gaps, plant), elastomer, TORMAG)
-    friction = Friction(
-        presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
-        viscous_N_s_mm=plant.friction.viscous_N_s_mm,
-        static_ratio=plant.friction.static_to_kinetic,
-        stribeck_speed_mm_s=plant.friction.stribeck_speed_mm_s,
-    )
+    kinetic_N = brake_force_N(radial_moment_Tm(gaps, plant), plant.elastomer.law, TORMAG)
+    friction = plant.friction.law
     # a reversal leaves the bristles bent the other way, which is the largest deflection there is
     columns = zip(displacement_mm.tolist(), rate_mm_s.tolist(), kinetic_N.tolist(), strict=True)
     return np.array([friction.advance(-1e3, rate, level, travel / rate)[0] for travel, rate, level in columns])

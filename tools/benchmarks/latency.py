@@ -18,7 +18,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import zmq
-from machines.stream import received
+from stand import received
 
 from benchmarks.loop import REALTIME, Stand, asked_for, daemon, quantiles, realtime_settings
 from tormag_lab.arrays import Array

@@ -31,7 +31,7 @@ import numpy as np
 import uvloop
 import zmq
 from machines.own import own_machine
-from machines.stream import received
+from stand import received
 
 from firmware_protocol.c.build import FIRMWARE, ROOM, STRICT, BuildError, compiler
 from tormag_lab.arrays import Array

@@ -19,10 +19,10 @@ from tormagd.control.core import Stepper
 from tormagd.control.move.motor import margins, zero_order_hold
 from tormagd.element.physics.errors import FloatArray as Array
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.closed_loop import ClosedLoop, Sample, gap_plan
+from tormagd.simulation.closed_loop import ClosedLoop, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant, standing
 from tormagd.simulation.plant import Plant
 
 START_MM, STEP_MM = 60.0, 1.0
@@ -68,16 +68,15 @@ def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
     device = VirtualDevice(parameters, RecordedHand((0.0,), (0.0,)), seed=1)
     loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
     loop.arm(gap_plan(95.0))
-    drive(loop, START_MM, 3.0)
+    list(loop.hold(START_MM, 3.0))
     return loop
 
 
 def step(loop: ClosedLoop, target_mm: float) -> dict[str, float]:
     before = loop.stepper.measured
-    if before is None:
-        raise RuntimeError("the loop has no measurement")
+    assert before is not None, "this loop has run"
     start_mm, start_s = before.gap_mm, loop.now_s
-    samples = drive(loop, target_mm, WATCHED_S)
+    samples = list(loop.hold(target_mm, WATCHED_S))
     time_s = np.array([sample.time_s - start_s for sample in samples])
     estimates = [sample.measured for sample in samples if sample.measured is not None]
     gap = np.array([estimate.gap_mm for estimate in estimates])
@@ -93,8 +92,8 @@ def step(loop: ClosedLoop, target_mm: float) -> dict[str, float]:
 
 
 def stroke(loop: ClosedLoop) -> float:
-    drive(loop, STROKE_MM[0], 3.0)
-    gap = np.array([sample.truth.gap_mm for sample in drive(loop, STROKE_MM[1], 3.0)])
+    list(loop.hold(STROKE_MM[0], 3.0))
+    gap = np.array([sample.truth.gap_mm for sample in loop.hold(STROKE_MM[1], 3.0)])
     return float(np.argmax(gap > STROKE_MM[1] - 0.05) + 1) * TICK_S
 
 
@@ -104,14 +103,14 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
     # the first step that closes would go past the end of the stroke
     for gap_mm, target_mm in [(gap_mm, gap_mm + way) for gap_mm in STROKE_GAPS_MM for way in (STEP_MM, -STEP_MM)]:
         if target_mm >= STROKE_GAPS_MM[0]:
-            drive(loop, gap_mm, 0.8)
+            list(loop.hold(gap_mm, 0.8))
             worst = max(worst, step(loop, target_mm)["overshoot"])
     return worst
 
 
 def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[Array, Array]:
     """Return both carriages' mean position every tick of a duty step, by the encoders and by H(z)."""
-    plant = Plant(_at_rest(parameters, MODEL_GAP_MM), SteadyHand())
+    plant = Plant(standing(parameters, MODEL_GAP_MM / 2.0, MODEL_GAP_MM / 2.0), SteadyHand())
     volts = duty * parameters.electronics.supply_V
     counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
     count = round(MODEL_S / TICK_S)
@@ -152,7 +151,7 @@ def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, 
     """Return the true gap every 0.1 ms until rest, and that time, for full voltage reversed at `switch_s`."""
     gaps: list[float] = []
     time_s, tick = 0.0, TICK_S / 10.0
-    plant = Plant(_at_rest(parameters, start_mm), SteadyHand(), substep_s=tick)
+    plant = Plant(standing(parameters, start_mm / 2.0, start_mm / 2.0), SteadyHand(), substep_s=tick)
     volts = np.sign(distance_mm) * parameters.electronics.supply_V
     is_turning = False
     while not is_turning and time_s <= 6.0:
@@ -166,16 +165,7 @@ def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, 
     return np.array(gaps), time_s
 
 
-def _at_rest(parameters: PlantParameters, gap_mm: float) -> PlantParameters:
-    begun = msgspec.structs.replace(parameters.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
-    return msgspec.structs.replace(parameters, assumed=begun)
-
-
 OPTIONS = {"--plant": {"default": "sample_1", "help": "plant file or the name of a committed sample"}}
-
-
-def drive(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
-    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(duration_s / TICK_S))]
 
 
 def _rise(time_s: Array, share: Array) -> float:

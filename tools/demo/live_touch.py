@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from devices import device
 from judge.following import armed
-from judge.touching import MASS_KG, Bound, Touch, reached_ms
+from judge.touching import MASS_KG, Bound, Touch, core_with, reached_ms
 from machines.host import HostWatch
 from machines.own import own_machine
 
@@ -38,16 +38,13 @@ from demo.show import (
     watch,
 )
 from tormag_lab.arrays import Json
-from tormag_lab.ideal_carriage import brake_of, drive_of
-from tormagd.config import Config, Rates
-from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.ctl.operate import open_gap
 from tormagd.ctl.processes import first_line
 from tormagd.ctl.scene import use_scene
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.hand import PRESSES_AT_S, parse_hand
-from tormagd.simulation.ideal_actuator import put_gap
 from tormagd.simulation.patient import FOUND, PERIOD_S, VALID_MS, Patient, Unit
 from tormagd.simulation.plant import Plant
 from tormagd_client import ClientError
@@ -154,10 +151,8 @@ def in_virtual_time(begun: Callable[[Core], tuple[Plant, Callable[[TimedSetpoint
 
 
 def cores() -> list[Core]:
-    scene = load_scene(str(SCENE))
-    force = msgspec.structs.replace(scene.force, standby_N=msgspec.UNSET)
-    config = Config(scene=str(SCENE), rates=Rates(control_hz=1000, inference_hz=500))
-    return [build_core(config, each) for each in (msgspec.structs.replace(scene, force=force), scene)]
+    name = str(SCENE)
+    return [core_with(name=name), core_with(load_scene(name).force.standby_N, name)]
 
 
 def played(plant: Plant, advance: Callable[[TimedSetpoint | None], object]) -> Any:
@@ -182,16 +177,8 @@ def played(plant: Plant, advance: Callable[[TimedSetpoint | None], object]) -> A
 
 
 def carriages(core: Core) -> tuple[Plant, Callable[[TimedSetpoint | None], object]]:
-    parameters = device("sample_1")
-    plant = Plant(parameters, parse_hand(HAND))
-    put_gap(plant, core.scene.insert.gap_open_mm)
-    bound = Bound(core, brake_of(parameters), drive_of(parameters))
-
-    def advance(setpoint: TimedSetpoint | None) -> None:
-        bound.update(plant, setpoint)
-        plant.advance(TICK_S)
-
-    return plant, advance
+    bound = Bound(core, device("sample_1"), parse_hand(HAND))
+    return bound.plant, bound.tick
 
 
 def controller(core: Core) -> tuple[Plant, Callable[[TimedSetpoint | None], object]]:

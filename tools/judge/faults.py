@@ -125,11 +125,10 @@ class Watch:
         """Return when the reaction must have begun, by the table of the code that was told."""
         if injection.within_ms is not None:
             return injection.within_ms
+        told = {name: LIMITS[Limit(name)] for name in self._limits} | {name: FAULTS[Fault(name)] for name in self._host}
         for name in injection.names:
-            if name in self._host:
-                return FAULTS[Fault(name)].safe_ms
-            if name in self._limits:
-                return LIMITS[Limit(name)].safe_ms
+            if name in told:
+                return told[name].safe_ms
             if name.startswith("device:"):
                 return FAULTS[Fault(name.replace("device:", "DEVICE_"))].safe_ms
             if self._refusal.startswith(name):
@@ -218,9 +217,7 @@ def shown(figures: Json) -> Iterator[str]:
 def inject(
     injection: Injection, plant: str, bus: str = SERIAL, watched_s: float = WATCHED_S, boot: FirmwareKind = Firmware
 ) -> tuple[Rig, Cell]:
-    if not injection.is_driven:
-        return _begin_with(injection, plant, bus, watched_s, boot)
-    rig, watch = spoiled(injection, plant, bus, boot)
+    rig, watch = (spoiled if injection.is_driven else _begun)(injection, plant, bus, boot)
     for sample in rig.run(watched_s):
         watch.see(sample)
     return rig, watch.cell(injection, bus)
@@ -237,7 +234,7 @@ def spoiled(injection: Injection, plant: str, bus: str, boot: FirmwareKind = Fir
     return rig, Watch(rig, usual, is_driven=True)
 
 
-def _begin_with(injection: Injection, plant: str, bus: str, watched_s: float, boot: FirmwareKind) -> tuple[Rig, Cell]:
+def _begun(injection: Injection, plant: str, bus: str, boot: FirmwareKind) -> tuple[Rig, Watch]:
     """Connect, home and enable as far as the device allows, and then ask for the force."""
     rig = Rig(injection, plant, bus, 0.0, boot)
     rig.spoil(injection)
@@ -250,9 +247,7 @@ def _begin_with(injection: Injection, plant: str, bus: str, watched_s: float, bo
             if rig.safety.faults:
                 break
         rig.publisher.is_silent = bool(rig.safety.faults) or not _is_taken(rig, watch, "enable")
-    for sample in rig.run(watched_s):
-        watch.see(sample)
-    return rig, watch.cell(injection, bus)
+    return rig, watch
 
 
 def _is_taken(rig: Rig, watch: Watch, command: str) -> bool:

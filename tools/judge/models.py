@@ -16,7 +16,7 @@ from tormagd.control.nominal import FieldOfGap
 from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.model_file import ForceModel, load_model, model_path
 from tormagd.element.physics.field import PowerFieldLaw
-from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.element.physics.force import TORMAG, brake_force_N
 from tormagd.element.physics.inserts import Insert, insert
 from tormagd.simulation.parameters import PlantParameters, with_insert
 from tormagd.simulation.static_laws import radial_moment_Tm
@@ -87,8 +87,7 @@ def errors(model: ForceModel, fitted: Insert, plant: PlantParameters, rates_mm_s
 
 
 def brake_N(plant: PlantParameters, rates_mm_s: Array, gaps_mm: Array) -> Array:
-    elastomer, friction, rates = plant.elastomer, plant.friction, rates_mm_s[:, np.newaxis]
-    law = Elastomer(elastomer.shear_modulus_kPa * 1e3, elastomer.relative_permeability, elastomer.kinetic_friction)
+    friction, rates = plant.friction, rates_mm_s[:, np.newaxis]
     stribeck = (friction.static_to_kinetic - 1.0) * np.exp(-np.square(rates / friction.stribeck_speed_mm_s))
-    kinetic_N = brake_force_N(radial_moment_Tm(gaps_mm, plant), law, TORMAG)
+    kinetic_N = brake_force_N(radial_moment_Tm(gaps_mm, plant), plant.elastomer.law, TORMAG)
     return kinetic_N * (1.0 + stribeck) + friction.viscous_N_s_mm * rates

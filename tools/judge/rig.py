@@ -45,13 +45,9 @@ class Rig:
         self.most_N = core.scene.force.most_N
         faults = [parse_fault(f"{fault}@{injected_s}") for fault in (injection.device or "").split()]
         device = VirtualDevice(load_plant(plant), SteadyHand(), faults, seed=1, boot=boot)
-        self.line: BadSerialLine | BadBus
-        if bus == SERIAL:
-            self.line = serial = BadSerialLine(device)
-            self.loop = ClosedLoop(self.config, core.stepper(), core.planner(), serial)
-        else:
-            self.line = can = BadBus(CanDevice(device.messages))
-            self.loop = ClosedLoop(self.config, core.stepper(), core.planner(), VirtualBus(can))
+        self.line = BadSerialLine(device) if bus == SERIAL else BadBus(CanDevice(device.messages))
+        port = VirtualBus(self.line) if isinstance(self.line, BadBus) else self.line
+        self.loop = ClosedLoop(self.config, core.stepper(), core.planner(), port)
         self.publisher = Publisher() if injection.publisher is None else DaemonsBorder()
         self.is_dead = False
         self._stalled_ms = 0
@@ -89,9 +85,7 @@ class Rig:
             pass
 
     def spoil(self, injection: Injection) -> None:
-        self.line.spoil(injection.way)
-        if isinstance(self.line, BadBus):
-            self.line.foreign_frames_ms = injection.fill_frames_ms
+        self.line.spoil(injection.way, injection.fill_frames_ms)
         plant = self.loop.simulated.plant
         if injection.sensor is not None:
             LyingSensor(plant, LIES[injection.sensor])

@@ -18,16 +18,16 @@ from msgspec import UNSET, UnsetType
 from judge.following import VALID_S, armed
 from judge.hands import Legs, WaitingHand
 from tormag_lab.arrays import Array
-from tormag_lab.ideal_carriage import Brake, Drive, brake_of, drive_of
+from tormag_lab.ideal_carriage import brake_of, drive_of
 from tormagd.config import Config, Rates
 from tormagd.control.ask.path import FLATTEST_N_MM, SPEEDING_UP_S, TIMES_S, nearest_path_mm
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import GapSpeeds, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.hand import FeltHand, Impedance
+from tormagd.simulation.hand import FeltHand, Hand, Impedance
 from tormagd.simulation.ideal_actuator import put_gap
-from tormagd.simulation.parameters import with_insert
+from tormagd.simulation.parameters import PlantParameters, with_insert
 from tormagd.simulation.patient import NetworkDelay
 from tormagd.simulation.plant import Plant, Truth
 
@@ -117,10 +117,10 @@ class Link:
 
 
 @cache
-def core_with(standby_N: float | UnsetType = UNSET) -> Core:
-    scene = load_scene("aorta_2")
+def core_with(standby_N: float | UnsetType = UNSET, name: str = "aorta_2") -> Core:
+    scene = load_scene(name)
     force = msgspec.structs.replace(scene.force, standby_N=standby_N)
-    config = Config(scene="aorta_2", rates=Rates(control_hz=1000, inference_hz=500))
+    config = Config(scene=name, rates=Rates(control_hz=1000, inference_hz=500))
     return build_core(config, msgspec.structs.replace(scene, force=force, signal=None))
 
 
@@ -206,39 +206,40 @@ def opened(case: Case, core: Core) -> Touch:
 
 def ideal(case: Case, *, has_motors: bool = True) -> Touch:
     """Play the case by the bound; without motors the gap is at once where it should be."""
-    parameters = device_of(case.device)
     scenario = Scenario(case, core_of(case))
-    plant = Plant(parameters, scenario.felt)
-    bound = Bound(scenario.core, brake_of(parameters), drive_of(parameters) if has_motors else None)
-    put_gap(plant, scenario.core.scene.insert.gap_open_mm)
+    bound = Bound(scenario.core, device_of(case.device), scenario.felt, has_motors=has_motors)
+    plant = bound.plant
     plant.advance(PERIOD_S)
     for _ in scenario.begin(plant.time_s):
-        bound.update(plant, scenario.setpoint(plant.time_s, plant.truth))
-        plant.advance(PERIOD_S)
+        bound.tick(scenario.setpoint(plant.time_s, plant.truth))
         scenario.see(plant.truth)
     return scenario.touch()
 
 
 class Bound:
-    """A gap that the device's own motors move to where its true force is the wanted one."""
+    """A gap, open at first, that the device's motors move to where its true force is wanted."""
 
-    def __init__(self, core: Core, brake: Brake, drive: Drive | None) -> None:
-        self._core, self._drive, self._brake = core, drive, brake
+    def __init__(self, core: Core, device: PlantParameters, hand: Hand, *, has_motors: bool = True) -> None:
+        self.plant = Plant(device, hand)
+        put_gap(self.plant, core.scene.insert.gap_open_mm)
+        self._core, self._drive = core, drive_of(device) if has_motors else None
+        self._brake = brake = brake_of(device)
         self._gap_mm = np.arange(brake.gap_mm[0], brake.gap_mm[-1], GRID_MM)
         moment_Tm = np.interp(self._gap_mm, brake.gap_mm, brake.moment_Tm)
         self._fresh_N = np.interp(moment_Tm, brake.strength_Tm, brake.fresh_N)
         self._speed_mm_s, self._is_pushing, self._sets_out = 0.0, True, False
         self._offset_N, self._scale = 0.0, 1.0
 
-    def update(self, plant: Plant, setpoint: TimedSetpoint | None) -> None:
-        truth = plant.truth
+    def tick(self, setpoint: TimedSetpoint | None) -> None:
+        truth = self.plant.truth
         if abs(truth.force_N) > PULLS_N:
             self._is_pushing = truth.force_N > 0.0
         strength = truth.kinetic_N / float(np.interp(truth.gap_mm, self._gap_mm, self._fresh_N))
         rate_mm_s = abs(truth.handle_mm_s)
         # a hand that rests feels what it gives
         self._offset_N, self._scale = (0.0, 1.0) if rate_mm_s < RESTING_MM_S else self._brake.felt(rate_mm_s)
-        put_gap(plant, self._moved(truth.gap_mm, self._wanted_mm(setpoint, truth, strength)))
+        put_gap(self.plant, self._moved(truth.gap_mm, self._wanted_mm(setpoint, truth, strength)))
+        self.plant.advance(PERIOD_S)
 
     def _gaps_for(self, forces_N: Array, strength: float) -> Array:
         force = self._core.scene.force

@@ -19,6 +19,11 @@ MAX_STEP_SHARE: Final = 0.25
 "The samples stay under 0.07."
 
 
+def lead_m(load_N: float, backlash_m: float, stiffness_N_m: float) -> float:
+    """Return how far the nut is ahead of a carriage that loads it so."""
+    return (backlash_m if load_N > 0.0 else -backlash_m) + load_N / stiffness_N_m
+
+
 @final
 class Axis:
     """State and laws of one carriage with its drive."""
@@ -52,8 +57,10 @@ class Axis:
                 f"{screw.stiffness_N_um} and motor.back_emf_V_s_rad = {motor.back_emf_V_s_rad}; a substep of {dt_s} s "
                 "would not follow the motion"
             )
-        self.gear_friction_Nm = gear.output_friction_Nm
-        self.screw_friction_m = screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+        self.gear_friction_Nm = self._new_gear_Nm = gear.output_friction_Nm
+        self.screw_friction_m = self._new_screw_m = (
+            screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+        )
         self.drag_N = drag_N
         self.angle_rad = 0.0
         self.speed_rad_s = 0.0
@@ -61,12 +68,15 @@ class Axis:
         self.position_m = start_mm * 1e-3
         # at power-on the nut carries the whole attraction
         self.contact_N = attraction_N
-        flank_m = self.backlash_m if attraction_N > 0.0 else -self.backlash_m
-        self._nut_zero_m = self.position_m + (flank_m + attraction_N / self._stiffness_N_m)
+        self._nut_zero_m = self.position_m + lead_m(attraction_N, self.backlash_m, self._stiffness_N_m)
 
     @property
     def back_emf_V(self) -> float:
         return self._coupling_Nm_A * self.speed_rad_s
+
+    def wear(self, divisor: float) -> None:
+        """Leave gearbox and screw this part of their friction when new."""
+        self.gear_friction_Nm, self.screw_friction_m = self._new_gear_Nm / divisor, self._new_screw_m / divisor
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
         # runs four times per simulated millisecond: hence local names
@@ -103,12 +113,8 @@ class Axis:
                 back_rad_s = push_rad_s - against_rad_s
                 rest = speed_rad_s / (speed_rad_s - before_rad_s)
                 speed_rad_s = back_rad_s * rest if (back_rad_s > 0.0) != (before_rad_s > 0.0) else 0.0
-        elif push_rad_s > grip_rad_s:
-            speed_rad_s = push_rad_s - grip_rad_s
-        elif push_rad_s < -grip_rad_s:
-            speed_rad_s = push_rad_s + grip_rad_s
         else:
-            speed_rad_s = 0.0
+            speed_rad_s = push_rad_s - min(max(push_rad_s, -grip_rad_s), grip_rad_s)
         self.speed_rad_s = speed_rad_s
         mean_rad_s = 0.5 * (before_rad_s + speed_rad_s)
         self.angle_rad = angle_rad = self.angle_rad + self._dt_s * mean_rad_s
@@ -121,29 +127,13 @@ class Axis:
 
         # the carriage stands while the guide's drag holds it, else slides to the limit
         nut_m = self._nut_zero_m + angle_rad * lead_m_rad
-        position_m, drag_N = self.position_m, self.drag_N
-        backlash_m, stiffness_N_m = self.backlash_m, self._stiffness_N_m
-        inward_N = attraction_N + drag_N
-        innermost_m = nut_m - ((backlash_m if inward_N > 0.0 else -backlash_m) + inward_N / stiffness_N_m)
-        if position_m < innermost_m:
-            position_m = innermost_m
-        else:
-            outward_N = attraction_N - drag_N
-            outermost_m = nut_m - ((backlash_m if outward_N > 0.0 else -backlash_m) + outward_N / stiffness_N_m)
-            if position_m > outermost_m:
-                position_m = outermost_m
-        if position_m > self._open_stop_m:
-            position_m = self._open_stop_m
-        elif position_m < self._closed_stop_m:
-            position_m = self._closed_stop_m
-        self.position_m = position_m
-        lead_m = nut_m - position_m
-        if lead_m > backlash_m:
-            self.contact_N = stiffness_N_m * (lead_m - backlash_m)
-        elif lead_m < -backlash_m:
-            self.contact_N = stiffness_N_m * (lead_m + backlash_m)
-        else:
-            self.contact_N = 0.0
+        drag_N, backlash_m, stiffness_N_m = self.drag_N, self.backlash_m, self._stiffness_N_m
+        innermost_m = nut_m - lead_m(attraction_N + drag_N, backlash_m, stiffness_N_m)
+        outermost_m = nut_m - lead_m(attraction_N - drag_N, backlash_m, stiffness_N_m)
+        position_m = min(max(self.position_m, innermost_m), outermost_m)
+        self.position_m = position_m = min(max(position_m, self._closed_stop_m), self._open_stop_m)
+        ahead_m = nut_m - position_m
+        self.contact_N = stiffness_N_m * (ahead_m - min(max(ahead_m, -backlash_m), backlash_m))
 
     def shaft_after(self, age_s: float, voltage_V: float | None) -> tuple[float, float]:
         """Return the screw's (angle_rad, current_A) at `age_s` after the last step."""

@@ -15,16 +15,8 @@ from typing import Any
 import can
 from can.typechecking import AutoDetectedConfig
 
-from tormagd.simulation.can_frame import (
-    ERROR_FLAG,
-    MAX_DATA,
-    MAX_IDENTIFIER,
-    SOCKET_FRAME,
-    CanFrame,
-    from_socket,
-    to_socket,
-)
-from tormagd.simulation.can_port import FOLDER_PREFIX
+from tormagd.simulation.can_device import ERROR_FLAG, MAX_DATA, MAX_IDENTIFIER, CanFrame
+from tormagd.simulation.can_port import FOLDER_PREFIX, SOCKET_FRAME, from_socket, to_socket
 
 SEND_BUFFER_BYTES = 4_608
 """The kernel's least, a handful of frames: a host must soon notice that nobody takes its frames."""

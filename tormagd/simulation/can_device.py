@@ -9,9 +9,7 @@ from heapq import heappop, heappush
 from itertools import count
 from typing import NamedTuple, Protocol
 
-from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.device import MessageDevice
-from tormagd.simulation.plant import Truth
 
 DEFAULT_BITRATE = 1_000_000
 DEFAULT_NODE = 1
@@ -19,6 +17,17 @@ MAX_WAITING = 32
 """As in a full transmit queue, frames above this are lost."""
 DEVICE = 0
 """The device as a sender; hosts have other numbers."""
+MAX_IDENTIFIER = 0x7FF
+MAX_DATA = 8
+ERROR_FLAG = 0x2000_0000
+"""Marks an error frame, a report of the controller (linux/can.h)."""
+
+
+class CanFrame(NamedTuple):
+    """A classical frame: 11-bit identifier and 0 to 8 bytes of data; with ERROR_FLAG a report of an error."""
+
+    identifier: int
+    data: bytes
 
 
 class Delivery(NamedTuple):
@@ -36,10 +45,6 @@ class CanLine(Protocol):
     @property
     def messages(self) -> MessageDevice:
         """The device itself."""
-
-    @property
-    def truth(self) -> Truth:
-        """The plant's true state at the time of the last call."""
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
         """Take the frame that the host hands to its controller."""
@@ -60,10 +65,6 @@ class CanDevice:
         self._flight: Delivery | None = None
         self._now_s = 0.0
         self._delivered: list[Delivery] = []
-
-    @property
-    def truth(self) -> Truth:
-        return self.messages.truth
 
     @property
     def next_event_s(self) -> float:

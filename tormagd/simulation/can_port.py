@@ -1,20 +1,48 @@
 """The CAN door: the device's bus as a Unix socket, one frame a packet. Hosts come through `can_bus.SimulatorBus`."""
 
 import contextlib
+import math
 import socket
 import stat
+import struct
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from tormagd.ground.files import is_left_socket
-from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, from_socket, to_socket
+from tormagd.simulation.can_device import ERROR_FLAG, MAX_DATA, MAX_IDENTIFIER, CanDevice, CanFrame
 
 MAX_HOSTS = 8
 FRAMES_AT_ONCE = 16
 FOLDER_PREFIX = "tormagsim-"
 "Names the folder of a channel without a given path."
+SOCKET_FRAME = struct.Struct("=IB?2x8sd")
+"""Linux's `struct can_frame`, with a flag in a spare byte, and a time after it."""
+
+
+class SocketFrame(NamedTuple):
+    """A frame on the simulator's socket."""
+
+    frame: CanFrame
+    is_own: bool
+    """The receiving host has sent the frame itself."""
+    time_s: float
+    """When the frame's last bit passed, s since 1970; 0 from a host."""
+
+
+def to_socket(frame: CanFrame, is_own: bool = False, time_s: float = 0.0) -> bytes:
+    return SOCKET_FRAME.pack(frame.identifier, len(frame.data), is_own, frame.data, time_s)
+
+
+def from_socket(packet: bytes) -> SocketFrame | None:
+    """Return the frame in a packet, or None if it is not valid."""
+    if len(packet) != SOCKET_FRAME.size:
+        return None
+    identifier, length, is_own, data, time_s = SOCKET_FRAME.unpack(packet)
+    if length > MAX_DATA or identifier & ~ERROR_FLAG > MAX_IDENTIFIER or not math.isfinite(time_s):
+        return None
+    return SocketFrame(CanFrame(identifier, data[:length]), is_own, time_s)
 
 
 class CanPort:

@@ -4,6 +4,7 @@
 replaced.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from typing import Final, Self, final
 
@@ -24,8 +25,7 @@ from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.measurement import Measurement
-from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanLine
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanFrame, CanLine
 from tormagd.simulation.device import MessageDevice, SerialDevice
 from tormagd.simulation.plant import Truth
 
@@ -146,8 +146,8 @@ class ClosedLoop:
         self._ticks = 0
         self._output: Duty | None = None
         self._asked: Question | None = None
-        self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
-        self.connection = Connection(config.device, self._port.open, stepper.lose_link)
+        self.port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
+        self.connection = Connection(config.device, self.port.open, stepper.lose_link)
         self.connection.open(0.0)
 
     @property
@@ -155,21 +155,8 @@ class ClosedLoop:
         return self._ticks * self._period_s
 
     @property
-    def device(self) -> SerialDevice:
-        """What is at the other end of the serial line."""
-        if isinstance(self._port, VirtualBus):
-            raise TypeError("this device is on a bus: allowed are `simulated` and `truth`")
-        return self._port.device
-
-    @device.setter
-    def device(self, device: SerialDevice) -> None:
-        if isinstance(self._port, VirtualBus):
-            raise TypeError("this device is on a bus")
-        self._port.device = device
-
-    @property
     def simulated(self) -> MessageDevice:
-        return self._port.device.messages
+        return self.port.device.messages
 
     @property
     def measurement(self) -> Measurement | None:
@@ -179,7 +166,7 @@ class ClosedLoop:
         """Run one control period, and return what happened in it."""
         self._ticks += 1
         now_s = self.now_s
-        self._port.advance(now_s)
+        self.port.advance(now_s)
         self.connection.receive(now_s)
         used = self._infer(now_s, setpoint) if plan is None else plan
         measurement, stepper = self.connection.measurement, self.stepper
@@ -189,12 +176,12 @@ class ClosedLoop:
         )
         self._output = output
         measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
-        return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
+        return Sample(now_s, measured, safety, reference, output, used, self.simulated.truth, measurement)
 
     def skip(self) -> None:
         """Let one control period pass in which the daemon, stopped or killed, does nothing."""
         self._ticks += 1
-        self._port.advance(self.now_s)
+        self.port.advance(self.now_s)
 
     def command(self, name: str) -> None:
         self.stepper.command(name, self.now_s, self.conditions())
@@ -210,6 +197,11 @@ class ClosedLoop:
         for _ in range(round(duration_s / self._period_s)):
             yield self.tick(setpoint(self.now_s))
 
+    def hold(self, gap_mm: float, duration_s: float) -> Iterable[Sample]:
+        """Run with plans that ask for a gap."""
+        for _ in range(round(duration_s / self._period_s)):
+            yield self.tick(plan=gap_plan(gap_mm, self.now_s))
+
     def arm(self, plan: Plan | None = None) -> None:
         """Connect, home and enable, as an operator does."""
         self._until(lambda m: True, "answer", plan)
@@ -223,8 +215,7 @@ class ClosedLoop:
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> Plan:
         """Plan where the setpoint is new or the inference period is over, and return the newest plan."""
         planner = self.planner
-        if planner is None:
-            raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
+        assert planner is not None, "a loop without a planner takes a plan at every tick"
         is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
         is_asked = is_new and self._config.rates.plan_every_setpoint
         if is_asked or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
@@ -255,18 +246,13 @@ def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callabl
     """Return a function from the time to the newest setpoint of a publisher."""
     sent_s: list[float] = times_s.tolist()
     sent_N: list[float] = forces_N.tolist()
-    sent = 0
 
     def newest(now_s: float) -> TimedSetpoint | None:
-        nonlocal sent
-        if sent and sent_s[sent - 1] > now_s:
-            sent = 0  # asked about an earlier time
-        while sent < len(sent_s) and sent_s[sent] <= now_s:
-            sent += 1
+        sent = bisect_right(sent_s, now_s)
         return TimedSetpoint(sent_N[sent - 1], sent_s[sent - 1], valid_for_s) if sent else None
 
     return newest
 
 
-def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
+def gap_plan(gap_mm: float, now_s: float = 0.0) -> Plan:
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())

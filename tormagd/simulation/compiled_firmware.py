@@ -104,7 +104,31 @@ def _sizes(library: ctypes.CDLL) -> list[int]:
     return list(sizes)
 
 
-class CompiledFirmware:
+class ViewedFirmware:
+    """What `view` shows of a firmware in C, as `Firmware` shows it."""
+
+    output: Output = OFF
+    "The same object until it changes, so `is` tells whether it has."
+    view = View()
+
+    @property
+    def mode(self) -> DeviceMode:
+        return DeviceMode(self.view.mode)
+
+    @property
+    def faults(self) -> DeviceFault:
+        return DeviceFault(self.view.faults)
+
+    @property
+    def homed(self) -> bool:
+        return bool(self.view.homed)
+
+    def show(self, view: View) -> None:
+        output = Output(view.left_duty, view.right_duty, view.enabled)
+        self.view, self.output = view, self.output if output == self.output else output
+
+
+class CompiledFirmware(ViewedFirmware):
     """One device's firmware in C from its boot on, with the interface of `Firmware`."""
 
     def __init__(self, plant: PlantParameters) -> None:
@@ -112,21 +136,22 @@ class CompiledFirmware:
         # for alignment
         self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
         library.tormag_device_init(self._device, ctypes.byref(parameters_of(plant)))
-        self._output: Output = OFF
-        self._known: View | None = None
+        self._look()
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        payload, self._known = encode(message), None
+        payload = encode(message)
         answer: int = _library().tormag_bridge_receive(
             self._device, time_s, FUNCTION[type(message)], payload, len(payload), seen(sensors)
         )
+        self._look()
         if answer < 0:
             raise DecodeError(f"{message}: the C codec refuses {payload.hex()} with result {-answer}")
         return ANSWERS[answer]
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        payload, self._known = ctypes.create_string_buffer(MAX_PAYLOAD), None
+        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
         length: int = _library().tormag_bridge_tick(self._device, time_s, seen(sensors), payload)
+        self._look()
         _require_sent(length, sensors)
         return _decoded(Status, payload.raw) if length else None
 
@@ -146,32 +171,10 @@ class CompiledFirmware:
         _library().tormag_bridge_identity(self._device, payload)
         return _decoded(Identity, payload.raw)
 
-    @property
-    def mode(self) -> DeviceMode:
-        return DeviceMode(self._view().mode)
-
-    @property
-    def faults(self) -> DeviceFault:
-        return DeviceFault(self._view().faults)
-
-    @property
-    def homed(self) -> bool:
-        return bool(self._view().homed)
-
-    @property
-    def output(self) -> Output:
-        """The same object until it changes, so `is` tells whether it has."""
-        view = self._view()
-        output = Output(view.left_duty, view.right_duty, view.enabled)
-        if output != self._output:
-            self._output = output
-        return self._output
-
-    def _view(self) -> View:
-        if self._known is None:
-            self._known = View()
-            _library().tormag_bridge_view(self._device, ctypes.byref(self._known))
-        return self._known
+    def _look(self) -> None:
+        view = View()
+        _library().tormag_bridge_view(self._device, ctypes.byref(view))
+        self.show(view)
 
 
 def parameters_of(plant: PlantParameters) -> CParameters:

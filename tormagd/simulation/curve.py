@@ -16,11 +16,7 @@ class Curve:
     def at(self, x: float) -> float:
         """Return the value at `x`; beyond both ends the outermost pieces go on."""
         place = (x - self._start) * self._per_unit
-        index = int(place)
-        if index < 0:
-            index = 0
-        elif index > self._last:
-            index = self._last
+        index = min(max(int(place), 0), self._last)
         values = self._values
         low = values[index]
         return low + (values[index + 1] - low) * (place - index)

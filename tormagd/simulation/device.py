@@ -25,7 +25,7 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
+from firmware_protocol.framing import DELIMITER, FrameDecoder, encode_frame
 from firmware_protocol.value import Value
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.emulated_firmware import EmulatedFirmware
@@ -50,15 +50,6 @@ JAMMED_N: Final = 1e5
 "More drag than any motor overcomes."
 MAX_BACKLOG_BYTES: Final = 65_536
 "What the buffers hold; more is lost, as on a real port."
-STANDING: Final = frozenset(
-    {
-        *("worn_gearbox", "motor_dead_left", "motor_reversed_left", "duties_reversed", "overheated"),
-        *("end_stop_left", "switch_stuck_left", "switch_dead_left"),
-        *("other_schema", "commands_vanish", "answers_half", "state_crc", "no_state", "no_sense", "no_status"),
-    }
-)
-"Faults that are looked up where they show."
-OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed", "opening"})
 SILENCES: Final = {FUNCTION[State]: "no_state", FUNCTION[Sense]: "no_sense", FUNCTION[Status]: "no_status"}
 DRIVE: Final = bytes((FUNCTION[Drive],))
 LEFT_OPEN: Final = 1
@@ -108,13 +99,13 @@ class MessageDevice:
         self._home_m = parameters.assumed.home_mm * 1e-3
         self._closed_m = parameters.assumed.closed_mm * 1e-3
         self._inbox: deque[Packet] = deque()
-        self._struck: set[str] = set()
+        self._struck: dict[str, float] = {}
+        "Faults that last, each with the factor on what it changes."
         self._output: Output = OFF
         self._stuck_left: int | None = None
         self._stuck_handle: int | None = None
         self._frozen_until_s = -math.inf
         self._drives = 0
-        self._opening_share = 1.0
         self._left_count_sign = 1
         self._left_extra_counts = 0
         self._right_extra_counts = 0
@@ -123,13 +114,11 @@ class MessageDevice:
 
     @property
     def truth(self) -> Truth:
+        """The plant's true state at the time of the last call."""
         return self.plant.truth
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
-        """Queue a payload that arrives at `time_s`."""
-        latest_s = self._inbox[-1].time_s if self._inbox else self._time_s
-        if not latest_s <= time_s < math.inf:
-            raise ValueError(f"time_s = {time_s}: allowed is from {latest_s} on")
+        """Queue a payload that arrives at `time_s`, none before those that came before."""
         self._inbox.append(Packet(time_s, function, payload))
 
     def advance(self, now_s: float) -> None:
@@ -170,8 +159,8 @@ class MessageDevice:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
             if "duties_reversed" in self._struck and self.firmware.mode is DeviceMode.RUN:
                 left_V, right_V = -left_V, -right_V
-            if self._opening_share != 1.0 and self.firmware.mode is DeviceMode.RETRACTING:
-                left_V, right_V = self._opening_share * left_V, self._opening_share * right_V
+            if "opening" in self._struck and self.firmware.mode is DeviceMode.RETRACTING:
+                left_V, right_V = self._struck["opening"] * left_V, self._struck["opening"] * right_V
             if "motor_reversed_left" in self._struck:
                 left_V = -left_V
             self.plant.drive(None if "motor_dead_left" in self._struck else left_V, right_V)
@@ -268,7 +257,7 @@ class MessageDevice:
             self._handle_counts() if self._stuck_handle is None else self._stuck_handle,
             END_SWITCHES[switches],
             self._supply_V,
-            HOT_C if "overheated" in struck else plant.element.temperature_C,
+            HOT_C if "overheated" in struck else plant.element.warmth.temperature_C,
         )
 
     def _handle_counts(self) -> int:
@@ -301,48 +290,21 @@ class MessageDevice:
 
     def mend(self) -> None:
         """End all faults that act on the device now."""
-        plant, parameters, time_s = self.plant, self.parameters, self._time_s
-        if "worn_gearbox" in self._struck:
-            plant.wear(1.0 / WEAR)
-        plant.left.drag_N, plant.right.drag_N = parameters.screw.drag_left_N, parameters.screw.drag_right_N
-        for axis in (plant.left, plant.right):
-            axis.backlash_m = 0.5e-6 * parameters.screw.backlash_um
-        self._supply_V = parameters.electronics.supply_V
         self._struck.clear()
         self._stuck_handle = None
-        self._opening_share = 1.0
         if self._stuck_left is not None or self._left_count_sign < 0:
             self._count_on(1)
-        self._run_clock_at(time_s, 1.0 + parameters.firmware.clock_ppm * 1e-6)
+        self._suffer()
+        self._run_clock_at(self._time_s)
         self._drive_bridges()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
-        if fault.name in STANDING:
-            self._struck.add(fault.name)
         match fault.name:
-            case "worn_gearbox":
-                self.plant.wear(WEAR)
-            case "drag_left":
-                self.plant.left.drag_N *= 1.0 + fault.percent / 100.0
-            case "blocked_left":
-                self.plant.left.drag_N = JAMMED_N
-            case "blocked_right":
-                self.plant.right.drag_N = JAMMED_N
-            case "backlash":
-                self.plant.left.backlash_m *= 1.0 + fault.percent / 100.0
-                self.plant.right.backlash_m *= 1.0 + fault.percent / 100.0
-            case "no_handle":
-                self._stuck_handle = self._handle_counts()
+            case "reset":
+                self._reset(time_s)
             case "frozen":
                 self._frozen_until_s = time_s + WATCHDOG_S
                 self._answers.clear()
-            case "encoder_stuck_left":
-                (left_rad, _), (right_rad, _) = self.plant.shafts
-                self._stuck_left, _ = self._encoders(left_rad, right_rad)
-            case "reset":
-                self._reset(time_s)
-            case "supply_loss":
-                self._supply_V = 0.0
             case "encoder_jump" | "encoder_jump_left":
                 counts_rev = self.parameters.electronics.encoder_counts_per_rev
                 counts = round(JUMP_MM / self.parameters.screw.lead_mm * counts_rev)
@@ -351,17 +313,34 @@ class MessageDevice:
                     self._right_extra_counts += counts
             case "encoder_reversed_left":
                 self._count_on(-self._left_count_sign)
-            case "opening":
-                self._opening_share = 1.0 + fault.percent / 100.0
-            case "clock":
-                self._run_clock_at(time_s, self._rate * (1.0 + fault.percent / 100.0))
-            case _ if fault.name not in STANDING:
-                raise ValueError(f"fault {fault.name!r} has no effect defined")
-        if fault.name in OF_BRIDGES:
-            self._drive_bridges()
+            case "encoder_stuck_left":
+                (left_rad, _), (right_rad, _) = self.plant.shafts
+                self._stuck_left, _ = self._encoders(left_rad, right_rad)
+            case "no_handle":
+                self._stuck_handle = self._handle_counts()
+            case _:
+                self._struck[fault.name] = self._share(fault.name) * (1.0 + fault.percent / 100.0)
+                self._suffer()
+                self._drive_bridges()
+                if fault.name == "clock":
+                    self._run_clock_at(time_s)
 
-    def _run_clock_at(self, time_s: float, rate: float) -> None:
-        """Let the firmware's clock run at `rate` from now on."""
+    def _share(self, fault: str) -> float:
+        return self._struck.get(fault, 1.0)
+
+    def _suffer(self) -> None:
+        """Give motors and screws what the lasting faults leave of them."""
+        plant, screw = self.plant, self.parameters.screw
+        plant.wear(WEAR if "worn_gearbox" in self._struck else 1.0)
+        plant.left.drag_N = JAMMED_N if "blocked_left" in self._struck else screw.drag_left_N * self._share("drag_left")
+        plant.right.drag_N = JAMMED_N if "blocked_right" in self._struck else screw.drag_right_N
+        for axis in (plant.left, plant.right):
+            axis.backlash_m = 0.5e-6 * screw.backlash_um * self._share("backlash")
+        self._supply_V = 0.0 if "supply_loss" in self._struck else self.parameters.electronics.supply_V
+
+    def _run_clock_at(self, time_s: float) -> None:
+        """Let the firmware's clock run at its own rate, or a fault's, from now on."""
+        rate = (1.0 + self.parameters.firmware.clock_ppm * 1e-6) * self._share("clock")
         self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
         self._rate = rate
         self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
@@ -373,10 +352,6 @@ class SerialDevice(Protocol):
     @property
     def messages(self) -> MessageDevice:
         """The device itself."""
-
-    @property
-    def truth(self) -> Truth:
-        """The plant's true state at the time of the last call."""
 
     def receive(self, now_s: float, data: bytes) -> None:
         """Take the bytes that the host writes at `now_s`."""
@@ -400,20 +375,12 @@ class VirtualDevice:
     ) -> None:
         self.messages = MessageDevice(parameters, hand, faults, seed, boot)
         self._byte_s = BITS_PER_BYTE / baud
-        self._decoder = FrameDecoder()
+        self.decoder = FrameDecoder()
         self._reads_frames = isinstance(self.messages.firmware, EmulatedFirmware)
         self._receiver_free_s = 0.0
         self._sequence = 0
         self._line: deque[tuple[float, bytes]] = deque()
         self._sender_free_s = 0.0
-
-    @property
-    def truth(self) -> Truth:
-        return self.messages.truth
-
-    @property
-    def statistics(self) -> FramingStatistics:
-        return self._decoder.statistics
 
     def receive(self, now_s: float, data: bytes) -> None:
         self.messages.advance(now_s)
@@ -426,7 +393,7 @@ class VirtualDevice:
             if self._reads_frames:
                 self.messages.receive(start_s + taken * self._byte_s, BYTES, stretch)
                 continue
-            for frame in self._decoder.feed(stretch):
+            for frame in self.decoder.feed(stretch):
                 self.messages.receive(start_s + taken * self._byte_s, frame.function, frame.payload)
         self._receiver_free_s = start_s + taken * self._byte_s
 

@@ -7,11 +7,38 @@ pre-sliding friction with a Stribeck level.
 import math
 from typing import Final, final
 
-from tormagd.element.physics.friction import Friction
-from tormagd.element.physics.relaxation import PronySeries
-from tormagd.simulation.gap_field import GapField
 from tormagd.simulation.parameters import PlantParameters
-from tormagd.simulation.static_laws import force_over_moment
+from tormagd.simulation.static_laws import force_over_moment, moment_over_gap
+
+SMALLEST_GAP_MM: Final = 45.0
+
+
+@final
+class GapField:
+    """Radial moment of a plant's magnets, with rate-independent hysteresis of at most `branch_Tm` either way."""
+
+    def __init__(self, plant: PlantParameters, gap_mm: float) -> None:
+        self.static: Final = moment_over_gap(plant)
+        "Without hysteresis."
+        largest_Tm = self.static.at(SMALLEST_GAP_MM)
+        self.branch_Tm: Final = plant.field.hysteresis_percent / 100.0 * largest_Tm
+        self._turn_Tm: Final = plant.assumed.hysteresis_scale * largest_Tm
+        self._moment_Tm = self.static.at(gap_mm)
+        self._lag_Tm = 0.0
+
+    @property
+    def moment_Tm(self) -> float:
+        return self._moment_Tm + self._lag_Tm
+
+    def advance(self, gap_mm: float) -> float:
+        moment_Tm = self.static.at(gap_mm)
+        change_Tm = moment_Tm - self._moment_Tm
+        if change_Tm != 0.0:
+            # rate-independent: the lag moves along |change| towards the branch that change leads to
+            branch_Tm = -self.branch_Tm if change_Tm > 0.0 else self.branch_Tm
+            self._lag_Tm += (self._lag_Tm - branch_Tm) * math.expm1(-abs(change_Tm) / self._turn_Tm)
+            self._moment_Tm = moment_Tm
+        return moment_Tm + self._lag_Tm
 
 
 @final
@@ -44,15 +71,9 @@ class TorqueElement:
         weakest_Tm = self._field.static.at(2.0 * plant.open_stop_mm) - self._field.branch_Tm
         strongest_Tm = self._field.static.at(2.0 * plant.closed_stop_mm) + self._field.branch_Tm
         self._force = force_over_moment(plant, weakest_Tm, strongest_Tm)
-        friction = plant.friction
-        self._friction = Friction(
-            presliding_stiffness_N_mm=friction.presliding_stiffness_N_mm,
-            viscous_N_s_mm=friction.viscous_N_s_mm,
-            static_ratio=friction.static_to_kinetic,
-            stribeck_speed_mm_s=friction.stribeck_speed_mm_s,
-        )
-        self._warmth = Warmth(plant)
-        series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
+        self._friction = plant.friction.law
+        self.warmth = Warmth(plant)
+        series = plant.relaxation.law
         self._relax = series.discretise(dt_s)
 
         # the device has been at this gap for long before the power came
@@ -61,10 +82,6 @@ class TorqueElement:
         self.force_N = 0.0
         self.kinetic_N, self._memory = self._relax.advance(self._memory, self._memory[0])
 
-    @property
-    def temperature_C(self) -> float:
-        return self._warmth.temperature_C
-
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
@@ -72,7 +89,7 @@ class TorqueElement:
     def prepare(self, time_s: float, gap_mm: float) -> None:
         """Begin a step that ends at `time_s` and `gap_mm`: advance all but the bristles."""
         moment_Tm = self._field.advance(gap_mm)
-        driving_N = self._force.at(moment_Tm) * self._warmth.advance(time_s)
+        driving_N = self._force.at(moment_Tm) * self.warmth.advance(time_s)
         relaxed_N, self._memory = self._relax.advance(self._memory, driving_N)
         # relaxing from a high force may pull the insert off the shaft, but never push the handle on
         self.kinetic_N = max(relaxed_N, 0.0)

@@ -17,8 +17,6 @@ from typing import IO, Final
 from firmware_protocol.c.build import Target, build, debian_tool
 from firmware_protocol.codec import (
     FUNCTION,
-    DeviceFault,
-    DeviceMode,
     Identity,
     Message,
     Sense,
@@ -28,8 +26,8 @@ from firmware_protocol.codec import (
     encode,
 )
 from firmware_protocol.framing import FrameDecoder, FramingStatistics, encode_frame
-from tormagd.simulation.compiled_firmware import CSensors, View, parameters_of, seen
-from tormagd.simulation.firmware import OFF, Answer, Output, Sensors
+from tormagd.simulation.compiled_firmware import CSensors, View, ViewedFirmware, parameters_of, seen
+from tormagd.simulation.firmware import Answer, Sensors
 from tormagd.simulation.parameters import PlantParameters
 
 CYCLES_PER_S: Final = 25e6
@@ -61,7 +59,7 @@ class _PinsOut(ctypes.Structure):
     _fields_ = [("view", View), ("sent", ctypes.c_uint32), ("busy", ctypes.c_uint32)]
 
 
-class EmulatedFirmware:
+class EmulatedFirmware(ViewedFirmware):
     """One device's firmware on its processor, with the interface of `Firmware`."""
 
     def __init__(self, plant: PlantParameters) -> None:
@@ -87,8 +85,7 @@ class EmulatedFirmware:
         self._identity: Identity | None = None
         self._measured: deque[tuple[State, Sense]] = deque()
         self._status: Status | None = None
-        self.output: Output = OFF
-        self._pins = self._told(bytes(parameters_of(plant)))
+        self._told(bytes(parameters_of(plant)))
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
@@ -115,21 +112,8 @@ class EmulatedFirmware:
 
     def identity(self) -> Identity:
         """Return the answer to the last Hello."""
-        if self._identity is None:
-            raise RuntimeError("the firmware has sent no Identity yet: allowed is to ask after a Hello")
+        assert self._identity is not None, "it is asked after a Hello"
         return self._identity
-
-    @property
-    def mode(self) -> DeviceMode:
-        return DeviceMode(self._pins.view.mode)
-
-    @property
-    def faults(self) -> DeviceFault:
-        return DeviceFault(self._pins.view.faults)
-
-    @property
-    def homed(self) -> bool:
-        return bool(self._pins.view.homed)
 
     @property
     def statistics(self) -> FramingStatistics:
@@ -159,11 +143,8 @@ class EmulatedFirmware:
         """Let the firmware sleep until `time_s`, then act on its sensors and `data`."""
         cycles = round(time_s * CYCLES_PER_S)
         record = _PinsIn(seen(sensors), cycles - self._cycles, len(data))
-        self._pins = pins = self._told(bytes(record), data)
+        pins = self._told(bytes(record), data)
         self._cycles = cycles
-        output = Output(pins.view.left_duty, pins.view.right_duty, pins.view.enabled)
-        if output != self.output:
-            self.output = output
         frames = self._decoder.feed(self._link.recv(pins.sent)) if pins.sent else []
         assert self._decoder.statistics.corrupt == 0, "the firmware sends frames that are none"
         return [decode(frame.function, frame.payload) for frame in frames]
@@ -181,7 +162,9 @@ class EmulatedFirmware:
             self._process.wait()
             self._errors.seek(0)
             raise EmulationError(f"the emulator has ended; its last words: {self._errors.read()[-200:]!r}")
-        return _PinsOut.from_buffer_copy(said)
+        self._pins = pins = _PinsOut.from_buffer_copy(said)
+        self.show(pins.view)
+        return pins
 
 
 def _pipes(process: "subprocess.Popen[bytes]") -> tuple[IO[bytes], IO[bytes]]:

@@ -7,7 +7,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from tormagd.element.physics.force import Elastomer as ElastomerLaw
+from tormagd.element.physics.friction import Friction as FrictionLaw
 from tormagd.element.physics.inserts import insert
+from tormagd.element.physics.relaxation import PronySeries
 from tormagd.ground.files import named, shipped
 from tormagd.ground.toml_file import convert, convert_as
 from tormagd_client.endpoints import ConfigError
@@ -31,12 +34,25 @@ class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
     relative_permeability: Annotated[float, Meta(ge=1.0, le=10.0)]
     kinetic_friction: Annotated[float, Meta(gt=0.0, le=2.0)]
 
+    @property
+    def law(self) -> ElastomerLaw:
+        return ElastomerLaw(self.shear_modulus_kPa * 1e3, self.relative_permeability, self.kinetic_friction)
+
 
 class Friction(Struct, frozen=True, forbid_unknown_fields=True):
     static_to_kinetic: Annotated[float, Meta(ge=1.0, le=3.0)]
     stribeck_speed_mm_s: Positive
     presliding_stiffness_N_mm: Positive
     viscous_N_s_mm: NotNegative
+
+    @property
+    def law(self) -> FrictionLaw:
+        return FrictionLaw(
+            presliding_stiffness_N_mm=self.presliding_stiffness_N_mm,
+            viscous_N_s_mm=self.viscous_N_s_mm,
+            static_ratio=self.static_to_kinetic,
+            stribeck_speed_mm_s=self.stribeck_speed_mm_s,
+        )
 
 
 class Field(Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,6 +78,10 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
             f"one for each of {self.times_s}",
         )
         require(sum(self.fractions) < 1.0, "fractions", self.fractions, "a sum under 1")
+
+    @property
+    def law(self) -> PronySeries:
+        return PronySeries(self.fractions, self.times_s)
 
 
 class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -286,6 +306,16 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
         return read
     carried = convert(named("carriages", read.carriages, _PLANTS, ".toml"), PlantParameters)
     return msgspec.structs.replace(carried, pad=read.pad, second=read.second)
+
+
+def changed(plant: PlantParameters, table: str, **values: object) -> PlantParameters:
+    """Return the plant with other values in one of its tables."""
+    return msgspec.structs.replace(plant, **{table: msgspec.structs.replace(getattr(plant, table), **values)})
+
+
+def standing(plant: PlantParameters, left_mm: float, right_mm: float) -> PlantParameters:
+    """Return the plant whose carriages are there at power-on."""
+    return changed(plant, "assumed", start_left_mm=left_mm, start_right_mm=right_mm)
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:

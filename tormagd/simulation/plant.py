@@ -1,18 +1,17 @@
 """The plant: two carriages, the magnets, the element between them (insert or pad), the hand and the force sensor."""
 
-import math
 import random
 from collections import deque
-from typing import Final, Protocol, final
+from typing import Final, Protocol, TypeAlias, final
 
 from firmware_protocol.value import Value
 from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import FeltHand, Hand, HandError
 from tormagd.simulation.parameters import PlantParameters
-from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.second_element import SecondElement
 from tormagd.simulation.static_laws import pull_over_gap
+from tormagd.simulation.tactile_pad import PressedPad
 
 SUBSTEP_S: Final = 5e-4
 "At most the motors' electrical time constant."
@@ -20,6 +19,7 @@ SUBSTEP_S: Final = 5e-4
 ELEMENT_STEP_S: Final = 1e-3
 "The element's updates are exact over it."
 
+Element: TypeAlias = TorqueElement | PressedPad | SecondElement
 _ROUNDING: Final = 1e-6
 "Share of a substep by which sums of time steps may be off."
 
@@ -82,15 +82,9 @@ class Plant:
         screw = parameters.screw
         self.left = Axis(parameters, screw.drag_left_N, assumed.start_left_mm, pull_N, substep_s)
         self.right = Axis(parameters, screw.drag_right_N, assumed.start_right_mm, pull_N, substep_s)
-        self.element: TorqueElement | PressedPad | SecondElement
-        if parameters.pad is not None:
-            if isinstance(hand, FeltHand):
-                raise HandError("hand felt: allowed at a pad is a prescribed hand, as pressing is")
-            self.element = PressedPad(parameters, gap_mm, ELEMENT_STEP_S)
-        elif parameters.second is not None:
-            self.element = SecondElement(parameters, gap_mm, ELEMENT_STEP_S)
-        else:
-            self.element = TorqueElement(parameters, gap_mm, ELEMENT_STEP_S)
+        self.element: Element = element_of(parameters, gap_mm, ELEMENT_STEP_S)
+        if isinstance(self.element, PressedPad) and isinstance(hand, FeltHand):
+            raise HandError("hand felt: allowed at a pad is a prescribed hand, as pressing is")
         self.handle_mm = hand.position_mm(0.0)
         self.handle_mm_s = 0.0
         self.force_sensor: Sensor = SimulatedSensor(parameters, random.Random(seed))
@@ -135,7 +129,7 @@ class Plant:
             right.position_m * 1e3,
             left.current_A,
             right.current_A,
-            element.temperature_C,
+            element.warmth.temperature_C,
             self.handle_mm,
             self.handle_mm_s,
             element.kinetic_N,
@@ -186,9 +180,17 @@ class Plant:
         self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:
-        for axis in (self.left, self.right):
-            axis.gear_friction_Nm /= divisor
-            axis.screw_friction_m /= divisor
+        self.left.wear(divisor)
+        self.right.wear(divisor)
+
+
+def element_of(parameters: PlantParameters, gap_mm: float, dt_s: float) -> Element:
+    """Return what is between the plant's magnets."""
+    if parameters.pad is not None:
+        return PressedPad(parameters, gap_mm, dt_s)
+    if parameters.second is not None:
+        return SecondElement(parameters, gap_mm, dt_s)
+    return TorqueElement(parameters, gap_mm, dt_s)
 
 
 def _applied_V(axis: Axis, voltage_V: float | None) -> float:
@@ -216,8 +218,6 @@ class SimulatedSensor:
         self._spread_N = sensor.noise_mN * 1e-3
         self._drift_N_s = noise.choice((-1.0, 1.0)) * sensor.drift_mN_min * 1e-3 / 60.0
         self._range_N = plant.assumed.force_range_N
-        self._has_spare = False
-        self._spare = 0.0
         self._samples = 0
         self._in_flight: deque[tuple[float, float]] = deque()
         self.reading_N = 0.0
@@ -226,19 +226,8 @@ class SimulatedSensor:
         # a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
             self._samples += 1
-            sample_N = force_N + self._drift_N_s * time_s + self._spread_N * self._normal()
+            sample_N = force_N + self._drift_N_s * time_s + self._noise.gauss(0.0, self._spread_N)
             sample_N = min(max(sample_N, -self._range_N), self._range_N)
             self._in_flight.append((time_s + self._delay_s, sample_N))
         while self._in_flight and self._in_flight[0][0] <= time_s + 0.5 * ELEMENT_STEP_S:
             self.reading_N = self._in_flight.popleft()[1]
-
-    def _normal(self) -> float:
-        """Return a standard normal number; two are made at a time (Box and Muller, 1958)."""
-        if self._has_spare:
-            self._has_spare = False
-            return self._spare
-        angle = self._noise.random() * math.tau
-        radius = math.sqrt(-2.0 * math.log(1.0 - self._noise.random()))
-        self._spare = math.sin(angle) * radius
-        self._has_spare = True
-        return math.cos(angle) * radius

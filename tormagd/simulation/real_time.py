@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, TextIO
 
+from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.plant import Truth
 
 LATE_S = 2e-3
@@ -24,8 +25,8 @@ class PacedDevice(Protocol):
     """A device with its wire; times are seconds from power-on and never fall."""
 
     @property
-    def truth(self) -> Truth:
-        """The plant's true state at the time of the last call."""
+    def messages(self) -> MessageDevice:
+        """The device itself."""
 
     @property
     def next_event_s(self) -> float:
@@ -83,7 +84,7 @@ def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: T
         if truth is not None:
             while row_s <= now_s:
                 device.advance(row_s)
-                truth.write(_truth_row(device.truth, realtime_ns + round(row_s * 1e9)))
+                truth.write(_truth_row(device.messages.truth, realtime_ns + round(row_s * 1e9)))
                 row_s += TRUTH_PERIOD_S
         door.exchange(now_s, readable)
     return Punctuality(late, worst_s, slipped_s)

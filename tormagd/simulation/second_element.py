@@ -54,12 +54,11 @@ class SecondElement:
     """The second plant's element, behind the interface of `TorqueElement`."""
 
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
-        if plant.second is None:
-            raise ValueError("plant.second = None: allowed is the second plant")
+        assert plant.second is not None, "this is the second plant"
         self._plant = plant
         self._second = second = plant.second
         self._dt_s = dt_s
-        self._warmth = Warmth(plant)
+        self.warmth = Warmth(plant)
         creeps = dt_s / second.creep_s
         self._kept, self._lost = math.exp(-creeps), -math.expm1(-creeps)
         self._plays_mT = [shaft_field_mT(gap_mm, plant, second.concentration) for _ in second.play_mT]
@@ -70,10 +69,6 @@ class SecondElement:
         self.force_N = 0.0
         self.kinetic_N = (1.0 - second.creeping_share) * self._fresh_N
 
-    @property
-    def temperature_C(self) -> float:
-        return self._warmth.temperature_C
-
     def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
         self.prepare(time_s, gap_mm)
         self.slide(speed_mm_s)
@@ -81,7 +76,7 @@ class SecondElement:
     def prepare(self, time_s: float, gap_mm: float) -> None:
         """Begin a step that ends at `time_s` and `gap_mm`: advance plays, creep and temperature."""
         second = self._second
-        driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self._warmth.advance(time_s)
+        driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self.warmth.advance(time_s)
         self._creeping_N = self._crept_N(self._creeping_N + second.creeping_share * (driving_N - self._fresh_N))
         self._fresh_N = driving_N
         self.kinetic_N = max((1.0 - second.creeping_share) * driving_N + self._creeping_N, 0.0)

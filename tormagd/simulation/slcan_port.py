@@ -7,8 +7,7 @@ It does what a CANable or a Lawicel CAN232 does between a host's serial port and
 import re
 from collections.abc import Sequence
 
-from tormagd.simulation.can_device import DEVICE, CanDevice
-from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.can_device import DEVICE, CanDevice, CanFrame
 from tormagd.simulation.pty_port import Pty
 
 END = b"\r"

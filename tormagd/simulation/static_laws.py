@@ -54,12 +54,7 @@ def pull_over_gap(plant: PlantParameters) -> Curve:
 
 def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: float) -> Curve:
     """Return the fresh, cool insert's kinetic friction over the radial moment."""
-    elastomer = Elastomer(
-        shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
-        relative_permeability=plant.elastomer.relative_permeability,
-        friction_coefficient=plant.elastomer.kinetic_friction,
-    )
-    return Curve(_brake_force_N(elastomer, weakest_Tm, strongest_Tm).tolist(), weakest_Tm, strongest_Tm)
+    return Curve(_brake_force_N(plant.elastomer.law, weakest_Tm, strongest_Tm).tolist(), weakest_Tm, strongest_Tm)
 
 
 def _magnet(plant: PlantParameters) -> CuboidMagnet:

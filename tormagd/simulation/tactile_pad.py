@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tormagd.element.physics.errors import require
+from tormagd.element.physics.field import PAD_RADIUS_M
 from tormagd.element.physics.relaxation import PronySeries, PronyState, PronyStep
-from tormagd.simulation.parameters import PadParameters
+from tormagd.simulation.element import GapField, Warmth
+from tormagd.simulation.parameters import PadParameters, PlantParameters
 
 Array = NDArray[np.float64]
 
@@ -38,9 +40,8 @@ class TactilePad:
 
     def __init__(self, parameters: PadParameters) -> None:
         self._parameters = parameters
-        relaxing, field_relaxing = parameters.relaxing, parameters.field_relaxing
-        self._series: PronySeries = PronySeries(relaxing.fractions, relaxing.times_s)
-        self._field_series: PronySeries = PronySeries(field_relaxing.fractions, field_relaxing.times_s)
+        self._series: PronySeries = parameters.relaxing.law
+        self._field_series: PronySeries = parameters.field_relaxing.law
         self._damage: float = 0.0
         self._deepest_mm: float = 0.0
         self._dt_s: float = 0.0
@@ -121,3 +122,30 @@ def worked_pad(parameters: PadParameters) -> TactilePad:
     pad.run(time_s, displacement_mm, rate_mm_s, np.zeros_like(time_s))
     pad.rest()
     return pad
+
+
+MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
+
+
+@final
+class PressedPad:
+    """The worked, rested pad between the magnets of the brake, behind the interface of `TorqueElement`."""
+
+    def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
+        assert plant.pad is not None, "this is the plant of a pad"
+        self._dt_s = dt_s
+        self._field = GapField(plant, gap_mm)
+        self._pad: TactilePad = worked_pad(plant.pad)
+        self.warmth = Warmth(plant)
+        self.force_N = 0.0
+
+    @property
+    def kinetic_N(self) -> float:
+        return self.force_N
+
+    def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
+        """Advance by one step that ends at `time_s` and `gap_mm`."""
+        field_mT = MT_PER_TM * self._field.advance(gap_mm)
+        depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)
+        speed_mm_s = min(max(speed_mm_s, -FASTEST_MM_S), FASTEST_MM_S)
+        self.force_N = self.warmth.advance(time_s) * self._pad.advance(self._dt_s, depth_mm, speed_mm_s, field_mT)

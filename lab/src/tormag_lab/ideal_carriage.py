@@ -24,13 +24,12 @@ from tormag_lab.arrays import Array, Json, rms
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
 from tormagd.element.physics.errors import DomainError
-from tormagd.element.physics.friction import Friction
 from tormagd.element.physics.relaxation import PronySeries
 from tormagd.ground.force_file import read_forces
 from tormagd.scenes.scene import Scene, load_scene, scene_path, shipped_scenes
 from tormagd.scenes.signal import asked
 from tormagd.simulation.curve import Curve
-from tormagd.simulation.gap_field import SMALLEST_GAP_MM
+from tormagd.simulation.element import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PLANTS_INSERT, PlantParameters, SecondParameters, load_plant, with_insert
 from tormagd.simulation.second_element import fresh_N, rate_factor, shaft_field_mT
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
@@ -170,15 +169,6 @@ class Brake(NamedTuple):
         return wanted_Tm
 
 
-def friction_of(plant: PlantParameters) -> Friction:
-    return Friction(
-        presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
-        viscous_N_s_mm=plant.friction.viscous_N_s_mm,
-        static_ratio=plant.friction.static_to_kinetic,
-        stribeck_speed_mm_s=plant.friction.stribeck_speed_mm_s,
-    )
-
-
 def drive_of(plant: PlantParameters) -> Drive:
     """Return the drive of both carriages together, with the mean of the guides' drag."""
     motor, gear, screw = plant.motor, plant.gear, plant.screw
@@ -211,14 +201,14 @@ def brake_of(plant: PlantParameters) -> Brake:
     weakest_Tm, strongest_Tm = float(moment_Tm[-1]) - lag.branch_Tm, float(moment_Tm[0]) + lag.branch_Tm
     force = force_over_moment(plant, weakest_Tm, strongest_Tm)
     strength_Tm = np.linspace(weakest_Tm, strongest_Tm, MOMENT_POINTS)
-    friction = friction_of(plant)
+    friction = plant.friction.law
     return Brake(
         gap_mm,
         moment_Tm,
         lag,
         strength_Tm,
         np.array([force.at(strength) for strength in strength_Tm.tolist()]),
-        PronySeries(plant.relaxation.fractions, plant.relaxation.times_s),
+        plant.relaxation.law,
         assumed.start_left_mm + assumed.start_right_mm,
         lambda kinetic_N, hand_mm_s: friction.level_N(hand_mm_s, kinetic_N) + friction.viscous_N_s_mm * abs(hand_mm_s),
     )

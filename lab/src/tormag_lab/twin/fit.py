@@ -9,7 +9,6 @@ import numpy as np
 
 from tormag_lab.arrays import rms
 from tormag_lab.errors import LabError
-from tormag_lab.ideal_carriage import friction_of
 from tormag_lab.twin.carriages import SUPPLY_STEP_V, fit_carriages, lag_s
 from tormag_lab.twin.estimate import TOLD, Estimate, value_at, with_values
 from tormag_lab.twin.excerpt import EVERY_TICK, GRID_HZ, Excerpt
@@ -56,7 +55,7 @@ def slope(plant: PlantParameters) -> float:
 
 
 def low_speed_factor(plant: PlantParameters) -> float:
-    return friction_of(plant).level_N(SLOW_MM_S, 1.0)
+    return plant.friction.law.level_N(SLOW_MM_S, 1.0)
 
 
 OF_FORCE: dict[str, Callable[[PlantParameters], float]] = {

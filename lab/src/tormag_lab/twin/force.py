@@ -14,11 +14,10 @@ from scipy.signal import lfilter
 
 from tormag_lab.arrays import Array, Mask, rms
 from tormag_lab.errors import LabError
-from tormag_lab.ideal_carriage import friction_of, lag_of
+from tormag_lab.ideal_carriage import lag_of
 from tormag_lab.twin.estimate import Estimate, Prior, Values, estimated, named, value_at, with_values
 from tormag_lab.twin.excerpt import GRID_HZ, Excerpt
 from tormagd.element.physics.force import TORMAG, Elastomer as Rubber, reduced
-from tormagd.element.physics.relaxation import PronySeries
 from tormagd.simulation.parameters import Elastomer, Field, PlantParameters, Thermal
 from tormagd.simulation.static_laws import radial_moment_Tm
 
@@ -78,7 +77,7 @@ def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
 
 def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh: Array) -> Array:
     """Return the friction (n), signed as the handle's motion, as the sensor shows it after its delay."""
-    series = PronySeries(plant.relaxation.fractions, plant.relaxation.times_s)
+    series = plant.relaxation.law
     step = series.discretise(1.0 / GRID_HZ)
     changes = np.diff(fresh, prepend=fresh[0])
     kinetic = step.equilibrium_fraction * fresh
@@ -90,7 +89,7 @@ def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh
 
 
 def _felt(plant: PlantParameters, kinetic_N: Array, speed_mm_s: Array) -> Array:
-    friction, bristles_mm, forces = friction_of(plant), 0.0, []
+    friction, bristles_mm, forces = plant.friction.law, 0.0, []
     for speed, level_N in zip(speed_mm_s.tolist(), kinetic_N.tolist(), strict=True):
         force_N, bristles_mm = friction.advance(bristles_mm, speed, level_N, 1.0 / GRID_HZ)
         forces.append(force_N)
