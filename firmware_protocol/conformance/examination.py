@@ -33,7 +33,7 @@ def _is_new(host: Host, how: str) -> str:
     host.begin()
     host.until(lambda: host.status.command_nonce == 0, BOOT_S, None)
     unless(host.status.command_nonce, f"no reset, or one that keeps the nonce: {shown(host.status)}")
-    host.counter = 255
+    host.counter = (host.counter - 1) % 256 if how == "warm" else 255
     seen = [moving.keeps_still(host, "after the reset")]
     host.send(Home(0))
     host.shows(DeviceMode.IDLE, None, homed=False, fault=NO_FAULT, besides="after a Home with nonce 0")

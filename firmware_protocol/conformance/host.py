@@ -34,6 +34,7 @@ from firmware_protocol.codec import (
     period,
 )
 from firmware_protocol.conformance.line import Line
+from firmware_protocol.conformance.rules import NEVER_FOLLOWS
 
 PERIOD_S, STATUS_S, FRESH_S, REPEAT_S = 1e-3, 0.02, 5e-3, 0.05
 "A command that is not acknowledged is sent again after REPEAT_S."
@@ -53,10 +54,11 @@ ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Swi
 OPEN: Final = ENDS[0] | ENDS[1]
 NO_FAULT: Final = DeviceFault(0)
 COLUMNS: Final = (
-    *("arrived_s", "device_time_s", "counter", "left_mm", "right_mm"),
+    *("asked_s", "left_duty", "right_duty", "arrived_s", "device_time_s", "counter", "left_mm", "right_mm"),
     *("left_A", "right_A", "force_N", "handle_mm"),
 )
-"A row of `Host.rows` is a State with its Sense."
+"A row of `Host.rows` is a Drive with its State and Sense."
+UNASKED: Final = (math.nan,) * 3
 STALLED_S: Final = 0.005
 "From this lateness on this process may be to blame for a failed check."
 
@@ -106,12 +108,16 @@ class Host:
         self.random = random.Random(41)
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
+        """Of each kind, also of those that are no longer in `heard`."""
         self.refused = Counter[str]()
         """What was wrong with whole frames that held no message of a device, and how often."""
         self.contradictions = Counter[str]()
         self.rows = array("d")
         """A row of COLUMNS for each Sense."""
-        self._unpaired = deque[State](maxlen=99)
+        self.marks = array("d")
+        """For each Status how many rows came before it, and its mode."""
+        self._asked = deque[tuple[float, ...]](maxlen=99)
+        self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
         self.drives = self.states = 0
         """How many Drives that must be answered were sent, and how many State came."""
@@ -134,6 +140,7 @@ class Host:
         self.drives += 1
         self.drive_s = self.now_s
         self.said = Drive(left, right, mode, self.counter)
+        self._asked.append((self.drive_s, left, right))
         self.send(self.said)
 
     def send_beside(self, message: Message) -> None:
@@ -153,11 +160,13 @@ class Host:
         self.pass_time(ANSWER_S, beat)
 
     def new_nonce(self) -> int:
-        return self.status.command_nonce % MAX_NONCE + 1
+        return self.random.choice([nonce for nonce in range(1, MAX_NONCE + 1) if nonce != self.status.command_nonce])
 
-    def command(self, kind: Command, beat: Beat = DriveMode.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
+    def command(
+        self, kind: Command, beat: Beat = DriveMode.OFF, limit_s: float = ACKNOWLEDGED_S, nonce: int = 0
+    ) -> bool:
         """Repeat a command until a Status acknowledges it; return whether one did within `limit_s`."""
-        nonce = self.new_nonce()
+        nonce = nonce or self.new_nonce()
         start_s = due_s = self._next_s
         while self.status.command_nonce != nonce:
             if self._next_s - start_s >= limit_s:
@@ -168,8 +177,8 @@ class Host:
             self.beat(beat)
         return True
 
-    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF) -> None:
-        unless(not self.command(kind, beat), f"{kind.__name__} not acknowledged: {shown(self.status)}")
+    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF, nonce: int = 0) -> None:
+        unless(not self.command(kind, beat, nonce=nonce), f"{kind.__name__} not acknowledged: {shown(self.status)}")
 
     def beat(
         self,
@@ -205,16 +214,12 @@ class Host:
 
     def begin(self) -> None:
         """Forget the messages heard and the lateness, and restart the rhythm from now."""
-        self.forget()
+        self.heard.clear()
         self.stalled_s = 0.0
         """The greatest lateness of this process since `begin`."""
+        self._asked.clear()
         self._unpaired.clear()
         self._next_s = self.now_s
-        self._status_s, self._owed = math.inf, 0.0
-
-    def forget(self) -> None:
-        """Forget the messages heard, except `newest`."""
-        self.heard.clear()
 
     def all_of(self, kind: type[M]) -> list[tuple[float, M]]:
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
@@ -287,11 +292,11 @@ class Host:
                 State in self.newest and (message.counter - self.last(State).counter) % 256 != 1
             )
             self.states += 1
-            self._unpaired.append(message)
+            asked = self._asked.popleft() if self._asked else UNASKED
+            self._unpaired.append((*asked, heard.time_s, message.device_time_s, message.counter, *places(message)))
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
-            state = self._unpaired.popleft()
             sensed = message.left_current_A, message.right_current_A, message.force_N, message.handle_position_mm
-            self.rows.extend((heard.time_s, state.device_time_s, state.counter, *places(state), *sensed))
+            self.rows.extend((*self._unpaired.popleft(), *sensed))
         if isinstance(message, Identity):
             self.contradictions["another Identity"] += message != self.newest.get(Identity, heard).message
         if isinstance(message, Status):
@@ -299,19 +304,18 @@ class Host:
             self._opens = (self._opens + 1) * is_open(message)
             is_unbraked = before.mode is DeviceMode.RETRACTING is not message.mode and 0 < self._opens < BRAKED
             self.contradictions["at rest without braking"] += is_unbraked
-            self.contradictions["a Status that was late"] += self._is_late(heard.time_s)
             self.contradictions["nonce 0 again: a reset"] += before.command_nonce > message.command_nonce == 0
+            self.contradictions[f"{before.mode.name} then {message.mode.name}"] += (
+                message.mode.name in NEVER_FOLLOWS.get(before.mode.name, ())
+            )
+            is_flickering = is_homed(before) is not is_homed(message) or bool(before.faults & ~message.faults)
+            self.contradictions[f"HOMED or a fault changes in {message.mode.name}"] += (
+                is_flickering and before.mode is message.mode
+            )
             self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
+            self.marks.extend((len(self.rows) / len(COLUMNS), message.mode))
         self.heard.append(heard)
         self.newest[type(message)] = heard
-
-    def _is_late(self, time_s: float) -> bool:
-        """Whether a Status is late that no standing line owed."""
-        gap, owed = (time_s - self._status_s) / STATUS_S, self._owed
-        stood = time_s - max((heard.time_s for heard in self.newest.values()), default=time_s) > STATUS_S
-        self._owed = max(gap - 1.0 + owed * (gap < 0.5), 0.0)
-        self._status_s = time_s
-        return self.stalled_s < STALLED_S and ((gap > 2.5 and not stood) or (gap > 0.5 and owed > 1.5))
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
         """Return the end switches in a Status that do not fit the State just before it."""
@@ -389,19 +393,20 @@ class Host:
             is_off = not ends() and (self.status.mode is not DeviceMode.RUN or self._next_s > end_s)
             unless(is_off, f"on the way to {goals} mm: {positions(self.last(State))}, {shown(self.status)}")
 
-    def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] = lambda: None) -> float:
+    def fall_silent(self, silent_s: float) -> float:
         """Send no Drive in RUN for a time, then one; return the silence by the device's clock, s."""
         self.next_status(DriveMode.RUN)
         self.pass_time(self.random.randrange(20) * PERIOD_S, DriveMode.RUN)
-        self._answered(DriveMode.RUN)
+        self.answered(DriveMode.RUN)
         before = self.last(State)
         while self._next_s < self.drive_s + silent_s - 0.5 * PERIOD_S:
-            self.beat(None, besides=meanwhile)
-        return (self._answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
+            self.beat(None)
+        return (self.answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
 
-    def _answered(self, beat: Beat) -> State:
+    def answered(self, beat: Beat, left: float = 0.0, right: float = 0.0) -> State:
+        """Send a Drive, and return its State."""
         before = self.newest.get(State)
-        self.beat(beat)
+        self.beat(beat, left, right)
         unless(
             not self.until(lambda: self.newest.get(State) is not before, ANSWER_S, None),
             f"no State: {shown(self.status)}",
@@ -414,7 +419,7 @@ class Host:
         if status.mode is not DeviceMode.LATCHED or status.faults != DeviceFault.COMMAND_TIMEOUT:
             self.running(INSIDE_MM)
             self.pass_time(0.1)
-            self.until(self.is_resting, OPENED_S)
+            self.until(self.is_resting, OPENED_S, None)
             self.shows(DeviceMode.LATCHED, None, fault=DeviceFault.COMMAND_TIMEOUT, besides="after silence")
 
     def is_resting(self) -> bool:
@@ -455,7 +460,11 @@ def positions(state: State) -> str:
 def contradictions(status: Status) -> list[str]:
     """Return in words what in one Status cannot be true together."""
     mode, switches = status.mode, status.switches
+    is_supplied = 9.0 <= status.supply_V <= 15.0 or DeviceFault.SUPPLY in status.faults
+    is_cool = -20.0 <= status.temperature_C <= 60.0 or DeviceFault.TEMPERATURE in status.faults
     found = {
+        f"{status.supply_V:.1f} V while {mode.name}": not (is_supplied or mode is DeviceMode.RETRACTING),
+        f"{status.temperature_C:.0f} degC while {mode.name}": not (is_cool or mode is DeviceMode.RETRACTING),
         "LEFT_OPEN with LEFT_CLOSED": (Switches.LEFT_OPEN | Switches.LEFT_CLOSED) in switches,
         "RIGHT_OPEN with RIGHT_CLOSED": (Switches.RIGHT_OPEN | Switches.RIGHT_CLOSED) in switches,
         f"HOMED while {mode.name}": is_homed(status) and mode in (DeviceMode.HOMING, DeviceMode.LATCHED),
