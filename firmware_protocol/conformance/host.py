@@ -8,6 +8,7 @@ import random
 from array import array
 from collections import Counter, deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from firmware_protocol.codec import (
@@ -41,7 +42,7 @@ PERIOD_S, STATUS_S, FRESH_S, REPEAT_S = 1e-3, 0.02, 5e-3, 0.05
 ANSWER_S, SEEN_S, ACKNOWLEDGED_S = 0.02, 0.065, 0.5
 """An immediate answer has arrived by ANSWER_S, on any carrier that the position loop can use. Three Status come in
 SEEN_S: one of them shows the present state, even where one is lost."""
-OPENED_S, HOMED_S, MOVED_S = 10.0, 12.0, 2.0
+OPENED_S, HOMED_S, HOMES_S, MOVED_S = 10.0, 12.0, 0.75, 2.0
 "HOMED_S is what the daemon allows a homing; a motion may take MOVED_S in addition to its time at TRAVEL_MM_S."
 HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
@@ -51,7 +52,7 @@ BRAKED: Final = 3
 "Status, in 50 ms of braking and after."
 TIME_SPAN_S: Final = period(State, "device_time_s")
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
-OPEN: Final = ENDS[0] | ENDS[1]
+OPEN, CLOSED = ENDS[0] | ENDS[1], ENDS[2] | ENDS[3]
 NO_FAULT: Final = DeviceFault(0)
 COLUMNS: Final = (
     *("asked_s", "left_duty", "right_duty", "arrived_s", "device_time_s", "counter", "left_mm", "right_mm"),
@@ -108,19 +109,19 @@ class Host:
         self.random = random.Random(41)
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
-        """Of each kind, also of those that are no longer in `heard`."""
         self.refused = Counter[str]()
         """What was wrong with whole frames that held no message of a device, and how often."""
         self.contradictions = Counter[str]()
         self.rows = array("d")
         """A row of COLUMNS for each Sense."""
         self.marks = array("d")
-        """For each Status how many rows came before it, and its mode."""
+        """For each Status the rows before it, and its mode."""
         self._asked = deque[tuple[float, ...]](maxlen=99)
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
         self.drives = self.states = 0
         """How many Drives that must be answered were sent, and how many State came."""
+        self.home_s = HOMES_S
         self.drive_s = line.port.now_s()
         self.counter = 0
         self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
@@ -163,7 +164,12 @@ class Host:
         return self.random.choice([nonce for nonce in range(1, MAX_NONCE + 1) if nonce != self.status.command_nonce])
 
     def command(
-        self, kind: Command, beat: Beat = DriveMode.OFF, limit_s: float = ACKNOWLEDGED_S, nonce: int = 0
+        self,
+        kind: Command,
+        beat: Beat = DriveMode.OFF,
+        limit_s: float = ACKNOWLEDGED_S,
+        nonce: int = 0,
+        duty: float = 0.0,
     ) -> bool:
         """Repeat a command until a Status acknowledges it; return whether one did within `limit_s`."""
         nonce = nonce or self.new_nonce()
@@ -171,14 +177,16 @@ class Host:
         while self.status.command_nonce != nonce:
             if self._next_s - start_s >= limit_s:
                 return False
-            if self._next_s >= due_s:
-                due_s += REPEAT_S
-                self.send_beside(kind(nonce))
-            self.beat(beat)
+            is_due = self._next_s >= due_s
+            due_s += REPEAT_S * is_due
+            self.beat(beat, duty, duty, besides=partial(self.send_beside, kind(nonce)) if is_due else lambda: None)
         return True
 
-    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF, nonce: int = 0) -> None:
-        unless(not self.command(kind, beat, nonce=nonce), f"{kind.__name__} not acknowledged: {shown(self.status)}")
+    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF, nonce: int = 0, duty: float = 0.0) -> None:
+        unless(
+            not self.command(kind, beat, nonce=nonce, duty=duty),
+            f"{kind.__name__} not acknowledged: {shown(self.status)}",
+        )
 
     def beat(
         self,
@@ -308,9 +316,9 @@ class Host:
             self.contradictions[f"{before.mode.name} then {message.mode.name}"] += (
                 message.mode.name in NEVER_FOLLOWS.get(before.mode.name, ())
             )
-            is_flickering = is_homed(before) is not is_homed(message) or bool(before.faults & ~message.faults)
-            self.contradictions[f"HOMED or a fault changes in {message.mode.name}"] += (
-                is_flickering and before.mode is message.mode
+            flickers = (is_homed(before) is not is_homed(message)) | bool(before.faults & ~message.faults)
+            self.contradictions[f"HOMED or a fault changes in {message.mode.name}"] += flickers & (
+                before.mode is message.mode
             )
             self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
             self.marks.extend((len(self.rows) / len(COLUMNS), message.mode))
@@ -361,6 +369,7 @@ class Host:
         self.obeyed(Home, beat)
         self.until(lambda: self.status.mode is not DeviceMode.HOMING, HOMED_S, beat)
         seconds = self._next_s - start_s
+        self.home_s = min(self.home_s, seconds)
         self.pass_time(SEEN_S, beat)
         return seconds
 
@@ -460,14 +469,15 @@ def positions(state: State) -> str:
 def contradictions(status: Status) -> list[str]:
     """Return in words what in one Status cannot be true together."""
     mode, switches = status.mode, status.switches
-    is_supplied = 9.0 <= status.supply_V <= 15.0 or DeviceFault.SUPPLY in status.faults
-    is_cool = -20.0 <= status.temperature_C <= 60.0 or DeviceFault.TEMPERATURE in status.faults
+    is_supplied = (9.0 <= status.supply_V <= 15.0) | (DeviceFault.SUPPLY in status.faults)
+    is_cool = (-20.0 <= status.temperature_C <= 60.0) | (DeviceFault.TEMPERATURE in status.faults)
     found = {
-        f"{status.supply_V:.1f} V while {mode.name}": not (is_supplied or mode is DeviceMode.RETRACTING),
-        f"{status.temperature_C:.0f} degC while {mode.name}": not (is_cool or mode is DeviceMode.RETRACTING),
+        f"{status.supply_V:.1f} V while {mode.name}": not is_supplied | (mode is DeviceMode.RETRACTING),
+        f"{status.temperature_C:.0f} degC while {mode.name}": not is_cool | (mode is DeviceMode.RETRACTING),
         "LEFT_OPEN with LEFT_CLOSED": (Switches.LEFT_OPEN | Switches.LEFT_CLOSED) in switches,
         "RIGHT_OPEN with RIGHT_CLOSED": (Switches.RIGHT_OPEN | Switches.RIGHT_CLOSED) in switches,
         f"HOMED while {mode.name}": is_homed(status) and mode in (DeviceMode.HOMING, DeviceMode.LATCHED),
+        "RUN at a closed switch": mode is DeviceMode.RUN and bool(switches & CLOSED),
         "LATCHED without a fault": mode is DeviceMode.LATCHED and not status.faults,
         "HOMED in IDLE and not open": mode is DeviceMode.IDLE and is_homed(status) and not is_open(status),
         f"a fault while {mode.name}": status.faults and mode in (DeviceMode.IDLE, DeviceMode.RUN),

@@ -21,7 +21,7 @@ NOISE: Final = bytes((0x55, 0xAA, 0xFF, 0x01, 0x7E, 0x80, 0x0D, 0x0A, 0x11, 0x13
 
 
 TOO_MANY: Final = (1, 2, 5, 8, 12, 13, 14, 15, 16, 32, 64, 128, 243, 256)
-"Bytes before or after a frame, that a buffer's end may cut off."
+"Bytes too many, where a buffer's end may cut them off."
 
 
 class Arrival(NamedTuple):
@@ -66,9 +66,7 @@ class SerialLine:
         frame = self._frame(function, payload)
         body = frame[:-1]
         whole = cobs_decode(body) or b""
-        last = 0
-        while last + body[last] < len(body):
-            last += body[last]
+        last = whole.rfind(DELIMITER) + 1
         damaged = {
             "a bit": [
                 cobs_encode(whole[:at] + bytes((whole[at] ^ 1 << bit,)) + whole[at + 1 :])
@@ -86,12 +84,13 @@ class SerialLine:
 
     def unusual(self, function: int, payload: bytes) -> tuple[tuple[bytes, ...], ...]:
         """Return writes that are one frame each time."""
-        first, second, third = (self._frame(function, payload) for _ in range(3))
+        first, second, third, fourth = (self._frame(function, payload) for _ in range(4))
         beside = encode_frame(NO_FUNCTION, self._sequence, payload)
         return (
-            *((first, first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])),
+            *((first, DELIMITER + first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])),
+            (fourth, NOISE + DELIMITER),
             (beside, self._frame(function, payload)),
-            *((encode_frame(function, (self._sequence + leap) % 256, payload),) for leap in (100, 200, 40, 20)),
+            *((encode_frame(function, (self._sequence + leap) % 256, payload),) for leap in (100, 90, 200, 20)),
         )
 
     def send_damaged(self, unit: bytes) -> None:

@@ -39,21 +39,20 @@ SILENCE, DRIVE = "Who says what when, 6", "Drive"
 ZERO_MM, JUMP_MM, LAST_S = 1.0, 0.2, 8.0
 """A carriage rests ZERO_MM from its zero at most: behind its switch, where it was braked from a creep. It is braked
 when HOMED shows, so that a State further off than JUMP_MM has the old origin."""
-RAMP_PER_S, MAX_DUTY, MOVED_MM, SLOW_S = 1.0, 0.5, 0.3, 0.045
+RAMP_PER_S, MAX_DUTY, MOVED_MM, SLOW_S, REVERSED_S = 1.0, 0.5, 0.3, 0.045, 0.12
 AT_STOP_DUTY, AT_STOP_MM, AT_STOP_A, PHASES = 0.3, 0.1, 0.3, (1.0, 0.9, 0.8, 0.7)
 "A motor that pushes into the stop at AT_STOP_DUTY draws several times AT_STOP_A."
 SLOW_MM_S, BESIDE_MM, SCALE_MM = 2.0, 1.5, 0.02 * STROKE_MM
-SKEW_MM, BOUND_MM, AHEAD_MM = 2.0, 0.3, 1.2
+SKEW_MM, BOUND_MM, AHEAD_MM, ASIDE_MM = 2.0, 0.3, 4.0, 0.5
 "BOUND_MM is two Status at SLOW_MM_S, and the sway of a carriage."
-NEAR, PAST = 0.85, 1.15
-"""Shares of the stroke: that is travelled at a brisk speed; and further than any scale is off, so that a device that
-gets there does not watch."""
+MIDDLE, NEAR = 0.4, 0.97
+"Shares of the stroke; from NEAR a switch comes before SKEW."
 MIDDLE_MM, FREE_MM, ALIKE = 10.0, 2.5, 0.05
 SETTLED_S, PULSE_S, PULSES, SMOOTHED_S, PART_S = 0.04, 0.03, 100, 0.0035, 0.015
 "The start of a pulse shows a current that is smoothed."
 MAX_OFF, MAX_LAG_S, STALL_A = 0.01, 1.5e-3, (0.7, 30.0)
-"""By MAX_OFF of duty a current may differ from what duty, speed and rise make, measured seldom by more. A motor's L / R
-is under MAX_LAG_S. A whole duty makes STALL_A in a motor at rest, outside the unit is wrong."""
+"""MAX_OFF of duty may lie between a current and what duty, speed and rise make. L / R is under MAX_LAG_S; a whole duty
+makes STALL_A."""
 SHORT_S, LONG_S, BORNE_S, NOTICED_S = 0.047, 0.053, 0.0495, 0.0515
 "By the device's clock shorter silences are borne, longer ones noticed, with a tick for tolerance."
 SHORTS, LONGS, HELD_S, HOLDS = 12, 5, 38.0, 3
@@ -71,7 +70,6 @@ TIMED_OUT: Final = DeviceFault.COMMAND_TIMEOUT
 )
 def home_homes(host: Host) -> str:
     host.without_zero()
-    unless(is_homed(host.status), f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     seen = []
     for beat in (DriveMode.OFF, None):
         host.heard.clear()
@@ -150,7 +148,7 @@ def open_switch_stops(host: Host) -> str:
 @check(
     Hazard.MISLED,
     "Homing",
-    f"in RUN one carriage alone {BESIDE_MM:g} mm in and out at {SLOW_MM_S:g} mm/s, then the other; both at -1, 3 times",
+    f"in RUN one carriage {BESIDE_MM:g} mm in and out at {SLOW_MM_S:g} mm/s, then the other; both at -1, 1, 3 times",
     f"each open switch changes within {SWITCH_MM:g} mm of its carriage's 0, and Status shows it at once",
     moves=True,
 )
@@ -160,24 +158,24 @@ def zero_is_at_switch(host: Host) -> str:
         host.bring(*goals, SLOW_MM_S)
         host.pass_time(SEEN_S, DriveMode.RUN)
         host.bring(BESIDE_MM, BESIDE_MM, SLOW_MM_S, lambda: is_open(host.status))
-    for _ in range(3):
-        host.running()
-        host.pass_time(0.2, DriveMode.RUN, duty=-1.0)
+    for duty in 3 * (-1.0, 1.0):
+        host.pass_time(REVERSED_S, DriveMode.RUN, duty=duty)
+    host.shows(DeviceMode.RUN, DriveMode.RUN)
     return unless(+host.contradictions, ", ".join(+host.contradictions) or "all changed in their place")
 
 
 def _pulse(host: Host, period_s: float = PERIOD_S) -> None:
-    """Brake both motors; then send drawn duties, alike or not, each towards the middle, and beside them what RUN keeps.
-
-    So the carriages stay near each other, and the signs are alike or not as well.
-    """
+    """Brake; then send drawn duties, alike or not, towards the middle, and beside them what RUN keeps."""
     host.pass_time(SETTLED_S, DriveMode.RUN, period_s)
     draw, beside = host.random, host.random.choice(list(host.random.choice((taken(host, RUNNING), refused(host)))))
     most = min(PULSE_S / (3.0 * period_s), 1.0)
     size = draw.choice((1.0, draw.random(), ALIKE * draw.random()))
     sizes = size, draw.choice((draw.random(), clamped(size + draw.uniform(-ALIKE, ALIKE), 1.0)))
-    ways_to_mm = ways_mm(host.last(State), (-MIDDLE_MM, -MIDDLE_MM))
-    left, right = (math.copysign(most * each, -way_mm) for each, way_mm in zip(sizes, ways_to_mm, strict=True))
+    left, right = (
+        math.copysign(most * each, -way_mm)
+        for each, way_mm in zip(sizes, ways_mm(host.last(State), (-MIDDLE_MM, -MIDDLE_MM)), strict=True)
+    )
+    host.drive(DriveMode.RUN)  # of two within a millisecond the newer acts
     host.beat(DriveMode.RUN, left, right, period_s, beside.send)
     for _ in range(round(PULSE_S / most / period_s) - 1):
         host.beat(DriveMode.RUN, left, right, period_s)
@@ -188,7 +186,7 @@ def _pulse(host: Host, period_s: float = PERIOD_S) -> None:
 
 
 def _driven(rows: dict[str, Array], side: str) -> Array:
-    """Return duty, speed, the current's rise and mean, and how dense States were, of stretches of equal duties."""
+    """Return of stretches of equal duties: duty, speed, the current's rise and mean, density of States."""
     is_free = (rows["mode"] == DeviceMode.RUN) & (np.maximum(rows["left_mm"], rows["right_mm"]) < -FREE_MM)
     keys = np.column_stack([rows["left_duty"], rows["right_duty"], is_free])
     edges = np.flatnonzero(np.any(np.diff(keys, axis=0) != 0.0, axis=1)) + 1
@@ -199,7 +197,7 @@ def _driven(rows: dict[str, Array], side: str) -> Array:
         at_s, at_mm, at_A = (rows[name][part] for name in ("device_s", f"{side}_mm", f"{side}_A"))
         seconds = at_s[-1] - at_s[0] if len(at_s) else 0.0
         if seconds > PART_S:
-            # means over time, whatever Drives a late host left out
+            # means over time, whatever Drives a host left out
             mean_A = np.sum((at_A[1:] + at_A[:-1]) * np.diff(at_s)) / 2.0 / seconds
             mm_s, rise_A_s = ((at[-1] - at[0]) / seconds for at in (at_mm, at_A))
             found.append((rows[f"{side}_duty"][first], mm_s, rise_A_s, mean_A, PERIOD_S * (len(at_s) - 1) / seconds))
@@ -214,7 +212,7 @@ def _driven(rows: dict[str, Array], side: str) -> Array:
     moves=True,
 )
 def duties_make_currents(host: Host) -> str:
-    """I R = d U - v K - L dI/dt: finds duties that are clipped, coarse, dead or the other side's, unsigned currents."""
+    """I R = d U - v K - L dI/dt: finds clipped, coarse, dead, swapped duties and unsigned currents."""
     host.running(MIDDLE_MM)
     for _ in range(PULSES):
         _pulse(host, host.random.choice((PERIOD_S, SPARSE_S)))
@@ -233,20 +231,19 @@ def duties_make_currents(host: Host) -> str:
     return "; ".join(seen)
 
 
-def _ends_run(fault: DeviceFault, from_share: float, ahead_mm: float, most_mm: float, host: Host) -> str:
-    """Bring the carriages in until one of them goes too far, and then the other."""
+def _ends_run(fault: DeviceFault, from_share: float, most_mm: float, host: Host) -> str:
+    """Bring the carriages in, and one of them on until it is too far; then the other."""
     is_skew, begins_mm = fault is DeviceFault.SKEW, -from_share * host.stroke_mm
     seen = []
     for side in (0, 1):
         host.running(-begins_mm)
         host.heard.clear()
-        for to_mm in (begins_mm,) if is_skew else (begins_mm, -PAST * host.stroke_mm):
-            goals = [to_mm - ahead_mm * (at == side) for at in (0, 1)]
-            host.bring(
-                *goals,
-                SLOW_MM_S,
-                lambda: _apart_mm(host) > SKEW_MM + BOUND_MM or host.status.mode is not DeviceMode.RUN,
-            )
+        host.bring(
+            begins_mm + (ASIDE_MM if side else -AHEAD_MM),
+            begins_mm + (-AHEAD_MM if side else ASIDE_MM),
+            SLOW_MM_S,
+            lambda: _apart_mm(host) > SKEW_MM + BOUND_MM or host.status.mode is not DeviceMode.RUN,
+        )
         innermost_mm = min(places(state)[side] for _, state in host.all_of(State))
         off_mm = _apart_mm(host) - SKEW_MM if is_skew else innermost_mm + host.stroke_mm
         seen.append(f"{off_mm:+.2f} mm from where it ends: {shown(host.next_status(DriveMode.RUN))}")
@@ -365,7 +362,7 @@ SKEW: Final = Check(
     "Faults",
     f"in RUN, one carriage on at {SLOW_MM_S:g} mm/s; then the other one",
     f"SKEW alone from {SKEW_MM:g} mm on, {BOUND_MM:g} more or less; opens and latches",
-    partial(_ends_run, DeviceFault.SKEW, 0.4, 2.0 * SKEW_MM, BOUND_MM),
+    partial(_ends_run, DeviceFault.SKEW, MIDDLE, BOUND_MM),
     moves=True,
     is_gate=False,
 )
@@ -373,9 +370,9 @@ END_STOP: Final = Check(
     "end_stop_opens",
     Hazard.WORN,
     "Faults",
-    f"in RUN at {SLOW_MM_S:g} mm/s to the closed switches, the left carriage {AHEAD_MM:g} mm ahead; then the right one",
+    f"in RUN to {NEAR:g} of the stroke, then one carriage on at {SLOW_MM_S:g} mm/s to its closed switch; the other one",
     f"END_STOP alone, {SCALE_MM:g} mm from the stroke's length at most; opens and latches",
-    partial(_ends_run, DeviceFault.END_STOP, NEAR, AHEAD_MM, SCALE_MM),
+    partial(_ends_run, DeviceFault.END_STOP, NEAR, SCALE_MM),
     moves=True,
     is_gate=False,
 )

@@ -19,7 +19,7 @@ TAKES: Final = {
 }
 "The page's table: a message's cells in the order of MODES."
 NEVER_FOLLOWS: Final = {"RUN": ("IDLE", "HOMING", "LATCHED"), "LATCHED": ("RUN", "HOMING")}
-"Modes that the page's diagram does not lead to from one, not even by another that is over before a Status."
+"Modes that the page's diagram does not lead to from one within a Status."
 REFUSED_DRIVES: Final[dict[str, dict[str, Any]]] = {
     "a left duty of 1.0001": {"left": 10_001},
     "a left duty of -1.0001": {"left": -10_001},

@@ -61,9 +61,8 @@ DUTY: Final = -0.4
 STEPS: Final = round(DUTY * 10_000)
 MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
 "A homing that goes in further than it backs off obeys another message."
-BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM, WITHIN_S = 0.1, 0.2, 0.8, 0.05, 0.6, 0.6
-"""A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S. A message comes WITHIN_S of the
-begin of a motion."""
+BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM, WITHIN_S, LATEST = 0.1, 0.2, 0.8, 0.05, 0.6, 0.6, 0.8
+"A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
 TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 100
 "A Drive and a Status on their way put a Status behind by more than the beats in TWO_STATUS_S."
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
@@ -254,36 +253,35 @@ def _ends(host: Host, place: Place, first: int) -> None:
 
 def acts(place: Place, name: str, host: Host) -> str:
     """Send a message that this mode acts on, at both rates of Drives, and compare what it leads to."""
-    return "; ".join([_acts(host, place, name, period_s) for period_s in (PERIOD_S, SPARSE_S)])
+    first = _closing if place.mode is DeviceMode.RUN else _acts
+    return "; ".join([first(host, place, name, PERIOD_S), _acts(host, place, name, SPARSE_S)])
+
+
+def _closing(host: Host, place: Place, name: str, period_s: float) -> str:
+    """Send what ends RUN, far inside, at full duty."""
+    host.running(host.stroke_mm - FAR_MM)
+    host.pass_time(BEGUN_S / 4.0, DriveMode.RUN, duty=-1.0)
+    beat = DriveMode.OFF if name == OFF else DriveMode.RUN
+    _begun(host, place, name, beat, period_s, COASTED_MM)
+    return opens_fully(host, CAUSES.get(name, NO_FAULT), beat)
 
 
 def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
     place.enter(host)
-    is_deep = place.mode is DeviceMode.RUN and period_s == PERIOD_S
-    if is_deep:
-        host.running(host.stroke_mm - FAR_MM)
-        host.pass_time(BEGUN_S / 4.0, DriveMode.RUN, duty=-1.0)
-    verdict, start = ACTS[name][place.mode], places(host.last(State))
+    within_s = {DeviceMode.HOMING: LATEST * host.home_s, DeviceMode.RETRACTING: WITHIN_S}.get(place.mode, 0.0)
+    host.pass_time(within_s * (host.random.random() + (period_s > PERIOD_S)) / 2.0, place.beat)
     faults = (NO_FAULT if name == "Clear" else host.status.faults) | CAUSES.get(name, NO_FAULT)
-    # one Drive OFF lets go, and Drive RUN then leads to RUN again
-    runs_on = name == OFF and not is_deep
-    beat = DriveMode.OFF if name == OFF and is_deep else place.beat
-    host.pass_time(host.random.uniform(0.0, WITHIN_S) * (place.mode not in RESTING), beat)
-    host.heard.clear()
-    _say(host, place, name, beat, MISFITTING[0 if period_s == PERIOD_S else -1])
-    host.pass_time(BEGUN_S, beat, period_s, 0.0 if runs_on else -1.0)
-    seen = _begun(host, place, verdict.partition(",")[0], start, is_deep)
-    if is_deep:
-        return opens_fully(host, faults, beat)
-    host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, beat)
+    seen = _begun(host, place, name, place.beat, period_s, MOVED_MM)
+    host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, place.beat)
     return host.shows(
-        DeviceMode.RUN if runs_on else ENDS_IN[bool(faults)],
-        beat,
-        homed=not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED)),
+        # one Drive OFF lets go
+        DeviceMode.RUN if name == OFF else ENDS_IN[bool(faults)],
+        place.beat,
+        homed=not any((faults, "not homed" in ACTS[name][place.mode], place.mode is DeviceMode.LATCHED)),
         opened=True,
         fault=faults,
         besides=seen,
-        wrong=name == MISFITS and host.command(Clear, beat, SEEN_S),
+        wrong=name == MISFITS and host.command(Clear, place.beat, SEEN_S),
     )
 
 
@@ -297,29 +295,34 @@ def _fall_silent(host: Host, place: Place) -> None:
         host.beat(None, besides=partial(host.line.send_damaged, host.random.choice(damages)))
 
 
-def _say(host: Host, place: Place, name: str, beat: Beat, misfit: Hello) -> None:
+def _say(host: Host, place: Place, name: str, beat: Beat) -> None:
     if name in COMMANDS:
         nonce = host.new_nonce()
         for other, kind in COMMANDS.items():
             if TAKES[other][place.mode] == "refused":
                 host.send(kind(nonce))
-        host.obeyed(COMMANDS[name], beat, nonce)
+        host.obeyed(COMMANDS[name], beat, nonce, -1.0)
     said = DriveMode.OFF if name == OFF else beat
     duty = -1.0 if said is DriveMode.OFF else 0.0
-    besides = {MISFITS: partial(host.send_beside, misfit), OFF: partial(host.drive, DriveMode.RUN, -1.0, -1.0)}
+    besides = {
+        MISFITS: partial(host.send_beside, host.random.choice(MISFITTING)),
+        OFF: partial(host.drive, DriveMode.RUN, -1.0, -1.0),
+    }
     host.beat(said, duty, duty, besides=besides.get(name, lambda: None))
     if name == SILENT:
         _fall_silent(host, place)
 
 
-def _begun(host: Host, place: Place, to: str, start: tuple[float, float], is_deep: bool) -> str:
-    """Compare the mode after a message, and what RUN ends with, with what must be."""
+def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coasted_mm: float) -> str:
+    """Send a message, and compare what follows at once with what must be."""
+    start, to = places(host.last(State)), ACTS[name][place.mode].partition(",")[0]
+    host.heard.clear()
+    _say(host, place, name, beat)
+    host.pass_time(BEGUN_S, beat, period_s, -1.0 if name != OFF or beat is DriveMode.OFF else 0.0)
     way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_closing = place.mode is DeviceMode.RUN and (
-        min(way_mm) < -(COASTED_MM if is_deep else MOVED_MM) or min(way_mm[-2:]) < BEGUN_MM
-    )
+    is_closing = place.mode is DeviceMode.RUN and (min(way_mm) < -coasted_mm or min(way_mm[-2:]) < BEGUN_MM)
     return unless(is_closing or modes[:1] != [to] * (to in MODES), seen)
 
 
@@ -328,8 +331,7 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> s
     first = len(host.rows)
     host.until(host.is_resting, OPENED_S, beat)
     rows = columns(host, first)
-    leasts, mosts = zip(*(_speeds(rows["device_s"], rows[name]) for name in ("left_mm", "right_mm")), strict=True)
-    drawn_A = [float(np.median(rows[name])) for name in ("left_A", "right_A")]
+    leasts, mosts, drawn_A = zip(*(_opened(rows, side) for side in ("left", "right")), strict=True)
     seen = f"{min(leasts):.1f} mm/s on the way, {max(mosts):.1f} at most, {min(drawn_A):+.2f} A as a rule"
     return host.shows(
         ENDS_IN[bool(fault)],
@@ -344,11 +346,12 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> s
     )
 
 
-def _speeds(times_s: Array, at_mm: Array) -> tuple[float, float]:
-    """Return one carriage's least speed without ENDS_MM at both ends, and its most, over WINDOW States."""
+def _opened(rows: dict[str, Array], side: str) -> tuple[float, float, float]:
+    """Return a carriage's least speed without ENDS_MM, its most, and its usual current."""
+    times_s, at_mm, drawn_A = rows["device_s"], rows[f"{side}_mm"], float(np.median(rows[f"{side}_A"]))
     mm_s = (at_mm[WINDOW:] - at_mm[:-WINDOW]) / (times_s[WINDOW:] - times_s[:-WINDOW])
     is_way = (at_mm[:-WINDOW] > at_mm[0] + ENDS_MM) & (at_mm[WINDOW:] < -ENDS_MM)
-    return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0))
+    return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0)), drawn_A
 
 
 def misfits(host: Host) -> str:

@@ -1,7 +1,6 @@
 """Checks of what the device reports: how often, in which order, how soon, by which clock, and against physics.
 
-Those of all reports read every State and Sense since the start: clocks, positions and handle run on, the currents are
-those of the duties and speeds, the force grows as the gap closes.
+Those of all reports read every State and Sense since the start, by mode.
 """
 
 import math
@@ -47,8 +46,7 @@ Array = npt.NDArray[np.float64]
 WHO, ALL = "Who says what when, ", "everything, from the start on"
 LISTENED_S, DRIVES = 2.0, 1000
 STATUS_TOLERANCE, STATUS_OFF_S, MAX_DRIFT, MAX_LEAP_S, BLOCK = 0.03, 2.5e-3, 0.01, 2e-3, 250
-"""A Status is timed by the States around it, of which one or two may overtake it on a bus. Of BLOCK States the least
-delayed tells the device's clock from the host's."""
+"States time a Status; one may overtake it on a bus. The least delayed of BLOCK States shows the device's clock."
 MAX_ANSWER_S, PAUSE_S = 3e-3, 0.1
 "The device's own millisecond, and the way there and back by any adapter."
 HANDLE_SPAN_MM: Final = period(Sense, "handle_position_mm")
@@ -69,15 +67,14 @@ def columns(host: Host, first: int = 0) -> dict[str, Array]:
     rows = np.array(host.rows[first:]).reshape(-1, len(COLUMNS))
     unless(len(rows) < 2, "no Sense")
     table = dict(zip(COLUMNS, rows.T, strict=True))
-    delay_s = np.unwrap(table["arrived_s"] - table["device_time_s"], period=TIME_SPAN_S)
-    table["device_s"] = table["arrived_s"] - delay_s
+    table["device_s"] = table["arrived_s"] - np.unwrap(table["arrived_s"] - table["device_time_s"], period=TIME_SPAN_S)
     table["handle_mm"] = np.unwrap(table["handle_mm"], period=HANDLE_SPAN_MM)
     table["handle_mm_s"] = np.gradient(table["handle_mm"], table["device_s"] + 1e-9 * np.arange(len(rows)))
     return table
 
 
 def all_columns(host: Host) -> dict[str, Array]:
-    """Return all that came, with the mode that the Status before and after a row both show, or else ENDS less that."""
+    """Return all that came, with the mode that both Status around a row show, else ENDS less the first."""
     unless(len(host.marks) < 4, "no Status")
     table, (at, modes) = columns(host), np.array(host.marks).reshape(-1, 2).T
     table["mode"] = np.full(len(table["counter"]), math.nan)
@@ -88,15 +85,15 @@ def all_columns(host: Host) -> dict[str, Array]:
 
 
 def steps(rows: dict[str, Array], name: str, step_mm: float) -> npt.NDArray[np.int_]:
-    """Return in steps of the wire how far a place went from each State to the next, but where a homing ends."""
+    """Return a place's steps from State to State, but where a homing ends."""
     is_old = rows["mode"] == ENDS - DeviceMode.HOMING
     is_next = (np.diff(rows["device_s"]) < SUCCESSIVE_S) & ~is_old[1:] & ~is_old[:-1]
-    return np.rint(np.diff(rows[name])[is_next] / step_mm).astype(int)
+    return np.asarray(np.rint(np.diff(rows[name])[is_next] / step_mm), dtype=np.int_)
 
 
 @check(Hazard.MISLED, WHO + "1", "3 Hellos", f"one Identity each, at once, with schema {SCHEMA_HASH:08X}", is_gate=True)
 def identity_answers_hello(host: Host) -> str:
-    host.counter = host.status.drive_counter  # so that the first Drive counts
+    host.counter = host.next_status(None).drive_counter  # so that the first Drive counts
     for _ in range(3):
         host.hello()
     theirs = {identity.schema_hash for _, identity in host.all_of(Identity)}
@@ -246,11 +243,9 @@ def none_of(counts: dict[str, int], seen: str) -> str:
     "device_time_s in steps of 10 us, 1 s in a second to 1 %, without leaps",
 )
 def clock_runs_on(host: Host) -> str:
-    """Speeds are computed from this clock."""
     rows = columns(host)
     late_s = rows["arrived_s"] - rows["device_s"]
     slow, _ = np.polyfit(rows["arrived_s"], late_s, 1)
-    # a host is late only, so that the least delayed State of a block shows the device's clock
     starts = np.arange(0, max(len(late_s) - BLOCK, 1), BLOCK)
     blocks_s = np.minimum.reduceat(late_s - slow * rows["arrived_s"], starts)
     drift, leap_s = -float(slow), float(np.abs(np.diff(blocks_s)).max(initial=0.0))
@@ -293,7 +288,7 @@ def positions_run_on(host: Host) -> str:
     Hazard.MISLED,
     "Sense",
     f"{ALL}; somebody turns the handle by over a turn, and back, within {TURNED_S:g} s",
-    "no leap, a force against the motion",
+    f"no leap, a force against the motion, in each mode at most {FORCE_S * 1e3:g} ms old",
 )
 def handle_runs_on(host: Host) -> str:
     """Finds leaps, as of swapped bytes or too few bits, and a force that is not against the motion."""
@@ -306,13 +301,15 @@ def handle_runs_on(host: Host) -> str:
         has_turned = way_mm > 1.05 * TURN_MM and len(along_N) == 2
     ways = steps(rows, "handle_mm", HANDLE_STEP_MM)
     most_mm, coarse = np.abs(ways).max(initial=0) * HANDLE_STEP_MM, np.gcd.reduce(ways)
-    is_new = (np.diff(rows["force_N"]) != 0.0) & (np.abs(rows["handle_mm_s"][1:]) > SLIDES_MM_S)
-    apart_s = np.quantile(np.diff(rows["device_s"][1:][is_new]), 0.25) if np.sum(is_new) > 1 else 0.0
+    is_new = np.diff(rows["force_N"], prepend=math.nan) != 0.0
+    ages_s = rows["device_s"] - np.maximum.accumulate(np.where(is_new, rows["device_s"], -math.inf))
+    slides = [(np.abs(rows["handle_mm_s"]) > SLIDES_MM_S) & (rows["mode"] == mode) for mode in DeviceMode]
+    oldest_s = max((np.median(ages_s[part]) for part in slides if part.any()), default=0.0)
     seen = (
         f"turned by {way_mm:.0f} mm, {most_mm:.3f} mm a time at most, in steps of {coarse}, {along_N} N against it, "
-        f"anew every {apart_s * 1e3:.0f} ms"
+        f"{oldest_s * 1e3:.0f} ms old"
     )
-    unless(most_mm > LEAP_MM or coarse > 1 or min(along_N, default=0.0) < 0.0 or apart_s > FORCE_S, seen)
+    unless(most_mm > LEAP_MM or coarse > 1 or min(along_N, default=0.0) < 0.0 or oldest_s > FORCE_S / 2.0, seen)
     if not has_turned:
         raise Untested(f"{seen}; turn the handle by over a turn and back meanwhile, --only handle_runs_on")
     return seen

@@ -1193,6 +1193,58 @@ PLANTED = (
             else message
         ),
     ),
+    rogue(
+        "15.6 V in one Status of 50",
+        "status_consistent",
+        "status_rate",
+        shows=lambda device, _, status: status.replaced(supply_V=15.6) if device.count[Status] % 50 == 0 else status,
+    ),
+    rogue(
+        "a clock that leaps once",
+        "clock_runs_on",
+        "every_counter",
+        "every_drive_answered",
+        measures=lambda _, time_s, measured: (
+            measured[0].replaced(device_time_s=(time_s + 0.02 * (time_s > 1.0)) % 0.65536),
+            measured[1],
+        ),
+    ),
+    rogue(
+        "no Status after a while alone",
+        "status_rate",
+        shows=lambda device, time_s, status: status if time_s - device.drive_s < 1.5 else None,
+    ),
+    rogue(
+        "a current without sign while opening",
+        "run_drive_off",
+        measures=lambda device, _, measured: (
+            measured[0],
+            measured[1].replaced(left_current_A=-abs(measured[1].left_current_A))
+            if device.real.mode is DeviceMode.RETRACTING
+            else measured[1],
+        ),
+    ),
+    rogue(
+        "a force that stands while opening",
+        "handle_runs_on",
+        "run_drive_off",
+        measures=lambda device, _, measured: (
+            measured[0],
+            measured[1].replaced(force_N=0.25) if device.real.mode is DeviceMode.RETRACTING else measured[1],
+        ),
+    ),
+    rogue(
+        "a reset keeps Drive's counter",
+        "warm_reset",
+        after=lambda device, *_: device.kept.update(counter=device.real._drive_counter),
+        boots=lambda device: setattr(device.real, "_drive_counter", device.kept.get("counter")),
+        kept={},
+    ),
+    rogue(
+        "Home ignores small nonces",
+        "let_go_after_all",
+        hears=lambda _, message: None if isinstance(message, Home) and message.nonce < 100 else message,
+    ),
     wire(
         "whole frames only",
         "frames_as_they_come",
