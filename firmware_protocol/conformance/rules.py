@@ -3,6 +3,7 @@
 `taking` makes its checks from TAKES and the REFUSED; a test compares both, and the words of RULES, with the page.
 """
 
+from collections.abc import Callable
 from typing import Any, Final
 
 from firmware_protocol.codec import FUNCTION, Identity, State
@@ -41,7 +42,13 @@ REFUSED_DRIVES: Final[dict[str, dict[str, Any]]] = {
     **{f"function {number}": {"function": number} for number in (10, 66, 127, FUNCTION[State], FUNCTION[Identity])},
 }
 "Drives, OFF and RUN, that change nothing: where each differs from a good one."
-REFUSED_COMMANDS: Final = {"a byte more": 1, "a byte less": -1, "no bytes": None, "the last accepted nonce": 0}
+REFUSED_COMMANDS: Final[dict[str, Callable[[bytes], bytes] | None]] = {
+    "a byte more": lambda body: body + body[-1:],
+    "a zero more": lambda body: body + bytes(1),
+    "a byte less": lambda body: body[:-1],
+    "no bytes": lambda body: body[:0],
+    "the last accepted nonce": None,
+}
 "Commands that change nothing: the change of length."
 RULES: Final = {
     "A sender refuses a value that does not fit.": "own_messages",

@@ -138,10 +138,10 @@ def refused(host: Host, ahead: int = 1) -> Iterator[Sent]:
             yield Sent(f"a Drive with {name}", partial(_send_drive, host, **{"mode": mode, "ahead": ahead, **differs}))
     for kind in (Home, Clear, Retract, Hello):
         for name, change in REFUSED_COMMANDS.items():
-            if change != 0 or kind is not Hello:
-                body = _command(kind, host.status.command_nonce if change == 0 else host.new_nonce())
-                cut = b"" if change is None else (body + body[-1:])[: len(body) + change]
-                yield Sent(f"{kind.__name__} with {name}", partial(host.line.send, FUNCTION[kind], cut))
+            if change or kind is not Hello:
+                body = _command(kind, host.new_nonce() if change else host.status.command_nonce)
+                sent = change(body) if change else body
+                yield Sent(f"{kind.__name__} with {name}", partial(host.line.send, FUNCTION[kind], sent))
 
 
 def damaged(host: Host) -> Iterator[Sent]:
