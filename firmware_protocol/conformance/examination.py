@@ -11,10 +11,12 @@ from firmware_protocol.conformance.host import (
     NO_FAULT,
     OPENED_S,
     SEEN_S,
+    SWITCH_MM,
     Host,
     Unmet,
     Untested,
     is_open,
+    places,
     positions,
     shown,
     unless,
@@ -56,7 +58,13 @@ def _is_new(host: Host, how: str) -> str:
     seen.append(moving.keeps_still(host, "homed without a Hello,"))
     host.hello()
     host.pass_time(SEEN_S, DriveMode.RUN)
-    return host.shows(DeviceMode.RUN, DriveMode.RUN, homed=True, besides=f"{'; '.join(seen)}; after it")
+    return host.shows(
+        DeviceMode.RUN,
+        DriveMode.RUN,
+        homed=True,
+        besides=f"{'; '.join(seen)}; after it",
+        wrong=min(places(host.last(State))) < -SWITCH_MM,
+    )
 
 
 RESETS: Final = [

@@ -48,7 +48,7 @@ HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
-BRAKED: Final = 3
+BRAKED, LEAP_C = 3, 10.0
 "Status, in 50 ms of braking and after."
 TIME_SPAN_S: Final = period(State, "device_time_s")
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
@@ -59,7 +59,6 @@ COLUMNS: Final = (
     *("left_A", "right_A", "force_N", "handle_mm"),
 )
 "A row of `Host.rows` is a Drive with its State and Sense."
-UNASKED: Final = (math.nan,) * 3
 STALLED_S: Final = 0.005
 "From this lateness on this process may be to blame for a failed check."
 
@@ -119,7 +118,7 @@ class Host:
         self._asked = deque[tuple[float, ...]](maxlen=99)
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
-        self.drives = self.states = 0
+        self.drives = self.states = self.senses = 0
         """How many Drives that must be answered were sent, and how many State came."""
         self.home_s = HOMES_S
         self.drive_s = line.port.now_s()
@@ -300,8 +299,9 @@ class Host:
                 State in self.newest and (message.counter - self.last(State).counter) % 256 != 1
             )
             self.states += 1
-            asked = self._asked.popleft() if self._asked else UNASKED
+            asked = self._asked.popleft() if self._asked else (math.nan,) * 3
             self._unpaired.append((*asked, heard.time_s, message.device_time_s, message.counter, *places(message)))
+        self.senses += isinstance(message, Sense)
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
             sensed = message.left_current_A, message.right_current_A, message.force_N, message.handle_position_mm
             self.rows.extend((*self._unpaired.popleft(), *sensed))
@@ -317,9 +317,9 @@ class Host:
                 message.mode.name in NEVER_FOLLOWS.get(before.mode.name, ())
             )
             flickers = (is_homed(before) is not is_homed(message)) | bool(before.faults & ~message.faults)
-            self.contradictions[f"HOMED or a fault changes in {message.mode.name}"] += flickers & (
-                before.mode is message.mode
-            )
+            self.contradictions[f"HOMED, a fault or the temperature leaps in {message.mode.name}"] += (
+                flickers & (before.mode is message.mode)
+            ) | (abs(message.temperature_C - before.temperature_C) > LEAP_C)
             self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
             self.marks.extend((len(self.rows) / len(COLUMNS), message.mode))
         self.heard.append(heard)

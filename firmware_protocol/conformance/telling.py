@@ -135,8 +135,8 @@ def status_rate(host: Host) -> str:
 def every_drive_answered(host: Host) -> str:
     host.pass_time(DRIVES * PERIOD_S, DriveMode.OFF)
     host.pass_time(10 * ANSWER_S)
-    counts = host.drives, host.states, len(host.rows) // len(COLUMNS)
-    return unless(len(set(counts)) > 1, "{} Drive, {} State, {} Sense behind its State".format(*counts))
+    counts = host.drives, host.states, host.senses, len(host.rows) // len(COLUMNS)
+    return unless(len(set(counts)) > 1, "{} Drive, {} State, {} Sense, {} Sense behind its State".format(*counts))
 
 
 @check(

@@ -1027,6 +1027,7 @@ PLANTED = (
         "no Status at high duty",
         "reports_in_time",
         "zero_is_at_switch",
+        "every_drive_answered",
         shows=lambda device, _, status: (
             None if is_running(device) and abs(device.real.output.left_duty) > 0.8 else status
         ),
@@ -1093,7 +1094,7 @@ PLANTED = (
     rogue(
         "never opens",
         "left_open",
-        "run_drive_off",
+        "left_duty",
         before=OFF_ONLY_SWITCHES_OFF,
         hears=lambda _, message: None if isinstance(message, Retract) else message,
     ),
@@ -1109,6 +1110,7 @@ PLANTED = (
     rogue(
         "force clipped",
         "force_follows_gap",
+        "skew_opens",
         "end_stop_opens",
         measures=sensed(lambda sense: sense.replaced(force_N=min(sense.force_N, 2.047))),
     ),
