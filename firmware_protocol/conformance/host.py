@@ -8,6 +8,7 @@ import random
 from array import array
 from collections import Counter, deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from firmware_protocol.codec import (
@@ -34,29 +35,30 @@ from firmware_protocol.codec import (
     period,
 )
 from firmware_protocol.conformance.line import Line
+from firmware_protocol.conformance.rules import NEVER_FOLLOWS
 
 PERIOD_S, STATUS_S, FRESH_S, REPEAT_S = 1e-3, 0.02, 5e-3, 0.05
 "A command that is not acknowledged is sent again after REPEAT_S."
 ANSWER_S, SEEN_S, ACKNOWLEDGED_S = 0.02, 0.065, 0.5
 """An immediate answer has arrived by ANSWER_S, on any carrier that the position loop can use. Three Status come in
 SEEN_S: one of them shows the present state, even where one is lost."""
-OPENED_S, HOMED_S, MOVED_S = 10.0, 12.0, 2.0
+OPENED_S, HOMED_S, HOMES_S, MOVED_S = 10.0, 12.0, 0.75, 2.0
 "HOMED_S is what the daemon allows a homing; a motion may take MOVED_S in addition to its time at TRAVEL_MM_S."
 HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
-BRAKED: Final = 3
+BRAKED, LEAP_C = 3, 10.0
 "Status, in 50 ms of braking and after."
 TIME_SPAN_S: Final = period(State, "device_time_s")
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
-OPEN: Final = ENDS[0] | ENDS[1]
+OPEN, CLOSED = ENDS[0] | ENDS[1], ENDS[2] | ENDS[3]
 NO_FAULT: Final = DeviceFault(0)
 COLUMNS: Final = (
-    *("arrived_s", "device_time_s", "counter", "left_mm", "right_mm"),
+    *("asked_s", "left_duty", "right_duty", "arrived_s", "device_time_s", "counter", "left_mm", "right_mm"),
     *("left_A", "right_A", "force_N", "handle_mm"),
 )
-"A row of `Host.rows` is a State with its Sense."
+"A row of `Host.rows` is a Drive with its State and Sense."
 STALLED_S: Final = 0.005
 "From this lateness on this process may be to blame for a failed check."
 
@@ -111,10 +113,14 @@ class Host:
         self.contradictions = Counter[str]()
         self.rows = array("d")
         """A row of COLUMNS for each Sense."""
-        self._unpaired = deque[State](maxlen=99)
+        self.marks = array("d")
+        """For each Status the rows before it, and its mode."""
+        self._asked = deque[tuple[float, ...]](maxlen=99)
+        self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
-        self.drives = self.states = 0
+        self.drives = self.states = self.senses = 0
         """How many Drives that must be answered were sent, and how many State came."""
+        self.home_s = HOMES_S
         self.drive_s = line.port.now_s()
         self.counter = 0
         self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
@@ -134,6 +140,7 @@ class Host:
         self.drives += 1
         self.drive_s = self.now_s
         self.said = Drive(left, right, mode, self.counter)
+        self._asked.append((self.drive_s, left, right))
         self.send(self.said)
 
     def send_beside(self, message: Message) -> None:
@@ -153,23 +160,32 @@ class Host:
         self.pass_time(ANSWER_S, beat)
 
     def new_nonce(self) -> int:
-        return self.status.command_nonce % MAX_NONCE + 1
+        return self.random.choice([nonce for nonce in range(1, MAX_NONCE + 1) if nonce != self.status.command_nonce])
 
-    def command(self, kind: Command, beat: Beat = DriveMode.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
+    def command(
+        self,
+        kind: Command,
+        beat: Beat = DriveMode.OFF,
+        limit_s: float = ACKNOWLEDGED_S,
+        nonce: int = 0,
+        duty: float = 0.0,
+    ) -> bool:
         """Repeat a command until a Status acknowledges it; return whether one did within `limit_s`."""
-        nonce = self.new_nonce()
+        nonce = nonce or self.new_nonce()
         start_s = due_s = self._next_s
         while self.status.command_nonce != nonce:
             if self._next_s - start_s >= limit_s:
                 return False
-            if self._next_s >= due_s:
-                due_s += REPEAT_S
-                self.send_beside(kind(nonce))
-            self.beat(beat)
+            is_due = self._next_s >= due_s
+            due_s += REPEAT_S * is_due
+            self.beat(beat, duty, duty, besides=partial(self.send_beside, kind(nonce)) if is_due else lambda: None)
         return True
 
-    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF) -> None:
-        unless(not self.command(kind, beat), f"{kind.__name__} not acknowledged: {shown(self.status)}")
+    def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF, nonce: int = 0, duty: float = 0.0) -> None:
+        unless(
+            not self.command(kind, beat, nonce=nonce, duty=duty),
+            f"{kind.__name__} not acknowledged: {shown(self.status)}",
+        )
 
     def beat(
         self,
@@ -205,16 +221,12 @@ class Host:
 
     def begin(self) -> None:
         """Forget the messages heard and the lateness, and restart the rhythm from now."""
-        self.forget()
+        self.heard.clear()
         self.stalled_s = 0.0
         """The greatest lateness of this process since `begin`."""
+        self._asked.clear()
         self._unpaired.clear()
         self._next_s = self.now_s
-        self._status_s, self._owed = math.inf, 0.0
-
-    def forget(self) -> None:
-        """Forget the messages heard, except `newest`."""
-        self.heard.clear()
 
     def all_of(self, kind: type[M]) -> list[tuple[float, M]]:
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
@@ -287,11 +299,12 @@ class Host:
                 State in self.newest and (message.counter - self.last(State).counter) % 256 != 1
             )
             self.states += 1
-            self._unpaired.append(message)
+            asked = self._asked.popleft() if self._asked else (math.nan,) * 3
+            self._unpaired.append((*asked, heard.time_s, message.device_time_s, message.counter, *places(message)))
+        self.senses += isinstance(message, Sense)
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
-            state = self._unpaired.popleft()
             sensed = message.left_current_A, message.right_current_A, message.force_N, message.handle_position_mm
-            self.rows.extend((heard.time_s, state.device_time_s, state.counter, *places(state), *sensed))
+            self.rows.extend((*self._unpaired.popleft(), *sensed))
         if isinstance(message, Identity):
             self.contradictions["another Identity"] += message != self.newest.get(Identity, heard).message
         if isinstance(message, Status):
@@ -299,19 +312,18 @@ class Host:
             self._opens = (self._opens + 1) * is_open(message)
             is_unbraked = before.mode is DeviceMode.RETRACTING is not message.mode and 0 < self._opens < BRAKED
             self.contradictions["at rest without braking"] += is_unbraked
-            self.contradictions["a Status that was late"] += self._is_late(heard.time_s)
             self.contradictions["nonce 0 again: a reset"] += before.command_nonce > message.command_nonce == 0
+            self.contradictions[f"{before.mode.name} then {message.mode.name}"] += (
+                message.mode.name in NEVER_FOLLOWS.get(before.mode.name, ())
+            )
+            flickers = (is_homed(before) is not is_homed(message)) | bool(before.faults & ~message.faults)
+            self.contradictions[f"HOMED, a fault or the temperature leaps in {message.mode.name}"] += (
+                flickers & (before.mode is message.mode)
+            ) | (abs(message.temperature_C - before.temperature_C) > LEAP_C)
             self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
+            self.marks.extend((len(self.rows) / len(COLUMNS), message.mode))
         self.heard.append(heard)
         self.newest[type(message)] = heard
-
-    def _is_late(self, time_s: float) -> bool:
-        """Whether a Status is late that no standing line owed."""
-        gap, owed = (time_s - self._status_s) / STATUS_S, self._owed
-        stood = time_s - max((heard.time_s for heard in self.newest.values()), default=time_s) > STATUS_S
-        self._owed = max(gap - 1.0 + owed * (gap < 0.5), 0.0)
-        self._status_s = time_s
-        return self.stalled_s < STALLED_S and ((gap > 2.5 and not stood) or (gap > 0.5 and owed > 1.5))
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
         """Return the end switches in a Status that do not fit the State just before it."""
@@ -357,6 +369,7 @@ class Host:
         self.obeyed(Home, beat)
         self.until(lambda: self.status.mode is not DeviceMode.HOMING, HOMED_S, beat)
         seconds = self._next_s - start_s
+        self.home_s = min(self.home_s, seconds)
         self.pass_time(SEEN_S, beat)
         return seconds
 
@@ -389,19 +402,20 @@ class Host:
             is_off = not ends() and (self.status.mode is not DeviceMode.RUN or self._next_s > end_s)
             unless(is_off, f"on the way to {goals} mm: {positions(self.last(State))}, {shown(self.status)}")
 
-    def fall_silent(self, silent_s: float, meanwhile: Callable[[], None] = lambda: None) -> float:
+    def fall_silent(self, silent_s: float) -> float:
         """Send no Drive in RUN for a time, then one; return the silence by the device's clock, s."""
         self.next_status(DriveMode.RUN)
         self.pass_time(self.random.randrange(20) * PERIOD_S, DriveMode.RUN)
-        self._answered(DriveMode.RUN)
+        self.answered(DriveMode.RUN)
         before = self.last(State)
         while self._next_s < self.drive_s + silent_s - 0.5 * PERIOD_S:
-            self.beat(None, besides=meanwhile)
-        return (self._answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
+            self.beat(None)
+        return (self.answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
 
-    def _answered(self, beat: Beat) -> State:
+    def answered(self, beat: Beat, left: float = 0.0, right: float = 0.0) -> State:
+        """Send a Drive, and return its State."""
         before = self.newest.get(State)
-        self.beat(beat)
+        self.beat(beat, left, right)
         unless(
             not self.until(lambda: self.newest.get(State) is not before, ANSWER_S, None),
             f"no State: {shown(self.status)}",
@@ -414,7 +428,7 @@ class Host:
         if status.mode is not DeviceMode.LATCHED or status.faults != DeviceFault.COMMAND_TIMEOUT:
             self.running(INSIDE_MM)
             self.pass_time(0.1)
-            self.until(self.is_resting, OPENED_S)
+            self.until(self.is_resting, OPENED_S, None)
             self.shows(DeviceMode.LATCHED, None, fault=DeviceFault.COMMAND_TIMEOUT, besides="after silence")
 
     def is_resting(self) -> bool:
@@ -455,10 +469,15 @@ def positions(state: State) -> str:
 def contradictions(status: Status) -> list[str]:
     """Return in words what in one Status cannot be true together."""
     mode, switches = status.mode, status.switches
+    is_supplied = (9.0 <= status.supply_V <= 15.0) | (DeviceFault.SUPPLY in status.faults)
+    is_cool = (-20.0 <= status.temperature_C <= 60.0) | (DeviceFault.TEMPERATURE in status.faults)
     found = {
+        f"{status.supply_V:.1f} V while {mode.name}": not is_supplied | (mode is DeviceMode.RETRACTING),
+        f"{status.temperature_C:.0f} degC while {mode.name}": not is_cool | (mode is DeviceMode.RETRACTING),
         "LEFT_OPEN with LEFT_CLOSED": (Switches.LEFT_OPEN | Switches.LEFT_CLOSED) in switches,
         "RIGHT_OPEN with RIGHT_CLOSED": (Switches.RIGHT_OPEN | Switches.RIGHT_CLOSED) in switches,
         f"HOMED while {mode.name}": is_homed(status) and mode in (DeviceMode.HOMING, DeviceMode.LATCHED),
+        "RUN at a closed switch": mode is DeviceMode.RUN and bool(switches & CLOSED),
         "LATCHED without a fault": mode is DeviceMode.LATCHED and not status.faults,
         "HOMED in IDLE and not open": mode is DeviceMode.IDLE and is_homed(status) and not is_open(status),
         f"a fault while {mode.name}": status.faults and mode in (DeviceMode.IDLE, DeviceMode.RUN),

@@ -1,6 +1,7 @@
 """Lines carry frames between the kit and a device, have a clock, and can send damaged frames."""
 
 from collections.abc import Mapping
+from itertools import product
 from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 from firmware_protocol.codec import can_identifier
@@ -17,6 +18,10 @@ from firmware_protocol.framing import (
 NODES, NO_FUNCTION = 16, 127
 NOISE: Final = bytes((0x55, 0xAA, 0xFF, 0x01, 0x7E, 0x80, 0x0D, 0x0A, 0x11, 0x13)) * 3
 "Not a frame; it includes bytes that a terminal acts on: XON and XOFF, CR and LF."
+
+
+TOO_MANY: Final = (1, 2, 5, 8, 12, 13, 14, 15, 16, 32, 64, 128, 243, 256)
+"Bytes too many, where a buffer's end may cut them off."
 
 
 class Arrival(NamedTuple):
@@ -60,27 +65,32 @@ class SerialLine:
         """Return damaged forms of a frame, by the kind of damage, which a device has to ignore."""
         frame = self._frame(function, payload)
         body = frame[:-1]
-        middle = len(body) // 2
         whole = cobs_decode(body) or b""
-        return {
-            "frame_crc_16": (
-                cobs_encode(whole[:-1] + bytes((whole[-1] ^ 0x10,))) + DELIMITER,
-                cobs_encode(whole[:-2] + bytes(byte ^ 0xFF for byte in whole[-2:])) + DELIMITER,
-                cobs_encode(bytes((whole[0], whole[1] ^ 0x40)) + whole[2:]) + DELIMITER,
-            ),
-            "frame_cut_off": tuple(body[:length] + DELIMITER for length in (1, middle, len(body) - 1)),
-            "frame_too_long": (body + b"\x01" + DELIMITER, body + b"\x07" * 300 + DELIMITER, body[:-1] * 3 + DELIMITER),
-            "frame_zero_inside": (body[:middle] + DELIMITER + body[middle:] + DELIMITER,),
-            "noise": (NOISE + DELIMITER, NOISE[: MAX_ENCODED - 2] + DELIMITER, NOISE * 40 + DELIMITER),
+        last = whole.rfind(DELIMITER) + 1
+        damaged = {
+            "a bit": [
+                cobs_encode(whole[:at] + bytes((whole[at] ^ 1 << bit,)) + whole[at + 1 :])
+                for at, bit in product(range(len(whole)), range(8))
+            ],
+            "CRC-16 without its final XOR": [cobs_encode(whole[:-2] + bytes(byte ^ 0xFF for byte in whole[-2:]))],
+            "cut off": [body[:length] for length in range(1, len(body))],
+            "a zero inside": [body[:at] + DELIMITER + body[at:] for at in range(1, len(body))],
+            "COBS that points too far": [body[:last] + bytes((body[last] + 1,)) + body[last + 1 :]],
+            "too long": [body + b"\x07" * many for many in TOO_MANY] + [body[:-1] * 3],
+            "too long before": [b"\x07" * many + body for many in TOO_MANY],
+            "noise": [NOISE, NOISE[: MAX_ENCODED - 2], NOISE * 40],
         }
+        return {what: tuple(form + DELIMITER for form in forms) for what, forms in damaged.items()}
 
     def unusual(self, function: int, payload: bytes) -> tuple[tuple[bytes, ...], ...]:
         """Return writes that are one frame each time."""
-        first, second, third = (self._frame(function, payload) for _ in range(3))
+        first, second, third, fourth = (self._frame(function, payload) for _ in range(4))
         beside = encode_frame(NO_FUNCTION, self._sequence, payload)
         return (
-            *((first, first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])),
+            *((first, DELIMITER + first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])),
+            (fourth, NOISE + DELIMITER),
             (beside, self._frame(function, payload)),
+            *((encode_frame(function, (self._sequence + leap) % 256, payload),) for leap in (100, 90, 200, 20)),
         )
 
     def send_damaged(self, unit: bytes) -> None:
@@ -130,7 +140,7 @@ class CanLine:
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
         """Return whole frames to other nodes, which the device has to ignore."""
         free = [node for node in range(NODES) if node != self._node and node not in self._others]
-        frames = tuple(can_identifier(function, node).to_bytes(2, "big") + payload for node in free[:2])
+        frames = tuple(can_identifier(function, node).to_bytes(2, "big") + payload for node in free)
         return {"other_node": frames} if frames else {}
 
     def send_damaged(self, unit: bytes) -> None:

@@ -3,6 +3,7 @@
 `taking` makes its checks from TAKES and the REFUSED; a test compares both, and the words of RULES, with the page.
 """
 
+from collections.abc import Callable
 from typing import Any, Final
 
 from firmware_protocol.codec import FUNCTION, Identity, State
@@ -18,6 +19,8 @@ TAKES: Final = {
     "Clear": ("accepted, nothing to do", "refused", "refused", "refused", "IDLE, or refused while the cause lasts"),
 }
 "The page's table: a message's cells in the order of MODES."
+NEVER_FOLLOWS: Final = {"RUN": ("IDLE", "HOMING", "LATCHED"), "LATCHED": ("RUN", "HOMING")}
+"Modes that the page's diagram does not lead to from one within a Status."
 REFUSED_DRIVES: Final[dict[str, dict[str, Any]]] = {
     "a left duty of 1.0001": {"left": 10_001},
     "a left duty of -1.0001": {"left": -10_001},
@@ -39,7 +42,13 @@ REFUSED_DRIVES: Final[dict[str, dict[str, Any]]] = {
     **{f"function {number}": {"function": number} for number in (10, 66, 127, FUNCTION[State], FUNCTION[Identity])},
 }
 "Drives, OFF and RUN, that change nothing: where each differs from a good one."
-REFUSED_COMMANDS: Final = {"a byte more": 1, "a byte less": -1, "no bytes": None, "the last accepted nonce": 0}
+REFUSED_COMMANDS: Final[dict[str, Callable[[bytes], bytes] | None]] = {
+    "a byte more": lambda body: body + body[-1:],
+    "a zero more": lambda body: body + bytes(1),
+    "a byte less": lambda body: body[:-1],
+    "no bytes": lambda body: body[:0],
+    "the last accepted nonce": None,
+}
 "Commands that change nothing: the change of length."
 RULES: Final = {
     "A sender refuses a value that does not fit.": "own_messages",
@@ -51,21 +60,21 @@ RULES: Final = {
     "Refuse a payload whose length is not that of its message.": "idle_stays run_stays",
     "Drive and State carry a counter and a CRC-8 of their own": "idle_without_zero_stays own_messages",
     "until Identity answers": "identity_answers_hello",
-    "If hash and protocol version are equal, RUN is allowed": "run_is_entered",
+    "If hash and protocol version are equal, RUN is allowed": "run_drive_off",
     "If either differs, the device latches SCHEMA_MISMATCH, which opens the gap in RUN, and refuses RUN": (
         "misfitting_hello run_hello_misfit"
     ),
     "RUN is also refused, without a fault, before a fitting Hello.": "warm_reset cold_reset",
     "With mode OFF it only asks for measurements.": "idle_stays",
     "only if its CRC-8 is right, its values are in range, and its counter differs": (
-        "every_counter latched_stays run_stays only_good_drives_extend"
+        "every_counter latched_stays run_stays run_silence"
     ),
     "answer every accepted Drive at once, in every mode, even two within a millisecond.": (
-        "every_drive_answered run_drive_off homing_stays retracting_stays"
+        "every_drive_answered reports_in_time homing_stays retracting_stays"
     ),
     "Without Drive there are none.": "every_drive_answered",
     "is sent every 20 ms on the device's own clock, with or without a host, whatever its mode.": (
-        "status_rate status_consistent"
+        "status_rate reports_in_time"
     ),
     "The device acts on a nonce that differs from the last accepted one": "every_nonce latched_stays",
     "A refused command leaves no trace in Status.": "run_stays homing_stays retracting_stays latched_stays",
@@ -76,9 +85,9 @@ RULES: Final = {
     "a Drive OFF has to come before the next Drive RUN counts, also after a Clear and a Home.": (
         "let_go_after_all idle_not_let_go_stays homing_beside_run_stays retracting_beside_run_stays"
     ),
-    "The Drive OFF that ends RUN counts.": "run_is_entered",
+    "The Drive OFF that ends RUN counts.": "run_drive_off",
     "Motors follow the duties only in RUN, from the Drive that enters it on.": (
-        "let_go_after_all left_duty right_duty duties_make_currents idle_stays"
+        "let_go_after_all left_duty right_duty duties_make_currents any_uptime idle_stays"
     ),
     "At the open switch an opening duty counts as 0": "open_switch_stops",
     "LATCHED drops HOMED, and Clear does not restore it.": "latched_clear latched_hello_misfit idle_hello_misfit",
@@ -87,9 +96,10 @@ RULES: Final = {
     "END_STOP: in RUN, a closed switch": "end_stop_opens",
     "OVERCURRENT: in RUN and HOMING, 0.15 s of a stall's current": "overcurrent",
     "UNCOMMANDED_MOTION: 0.2 mm, with the drives off": "uncommanded_motion",
-    "SUPPLY, TEMPERATURE: outside 9 to 15 V, over 60 °C": "plausible_at_rest supply temperature",
+    "SUPPLY, TEMPERATURE: outside 9 to 15 V, over 60 °C": "status_consistent supply temperature",
     "Clear is refused while a supply, temperature or mismatch fault lasts": "latched_by_a_mismatch_stays supply",
     "the device forgets zero, host and nonce, and is IDLE with the drives off.": "warm_reset cold_reset",
+    "The first Drive counts whatever its counter is": "warm_reset cold_reset",
     "A command with nonce 0 repeats the last. A watchdog resets": "warm_reset watchdog",
     "A mismatch of schemas lasts until a Hello that fits.": "misfitting_hello retracting_hello_misfit",
     "brings each carriage to its open switch at the device's own speed": "run_drive_off retracting_stays",
@@ -107,7 +117,7 @@ RULES: Final = {
     "Left screw relative to home": "positions_run_on",
     "When the positions were latched, on the device's clock.": "clock_runs_on",
     "Left motor current; positive": "- its scale only an ammeter tells",
-    "positive drives towards open.": "duties_make_currents",
+    "positive drives towards open.": "duties_make_currents run_drive_off",
     "A motor at rest reads under 0.02 A, a force is at most 30 ms old.": "plausible_at_rest handle_runs_on",
     "Friction force at the roller": "- its scale only a weight tells, and its lag tormagctl commission",
     "positive against a positive motion of the handle.": "handle_runs_on force_follows_gap",

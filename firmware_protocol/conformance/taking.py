@@ -7,7 +7,7 @@ nonce, positions, currents nor the number of answers may differ after it. What a
 import struct
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import chain
+from itertools import chain, cycle
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -61,7 +61,7 @@ DUTY: Final = -0.4
 STEPS: Final = round(DUTY * 10_000)
 MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
 "A homing that goes in further than it backs off obeys another message."
-BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM = 0.1, 0.2, 0.8, 0.05, 0.6
+BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM, WITHIN_S, LATEST = 0.1, 0.2, 0.8, 0.05, 0.6, 0.6, 0.8
 "A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
 TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 100
 "A Drive and a Status on their way put a Status behind by more than the beats in TWO_STATUS_S."
@@ -125,9 +125,10 @@ def _send_drive(host: Host, function: int = FUNCTION[Drive], **differs: int) -> 
     host.line.send(function, _drive(host, **differs))
 
 
-def _send_damaged(host: Host, kind: type[Message], mode: int, nonce: int, what: str, at: int) -> None:
+def _send_damaged(host: Host, kind: type[Message], mode: int, nonce: int, what: str) -> None:
     body = _drive(host, mode) if kind is Drive else _command(kind, nonce)
-    host.line.send_damaged(host.line.damages(FUNCTION[kind], body)[what][at])
+    for form in host.line.damages(FUNCTION[kind], body)[what]:
+        host.line.send_damaged(form)
 
 
 def refused(host: Host, ahead: int = 1) -> Iterator[Sent]:
@@ -137,19 +138,17 @@ def refused(host: Host, ahead: int = 1) -> Iterator[Sent]:
             yield Sent(f"a Drive with {name}", partial(_send_drive, host, **{"mode": mode, "ahead": ahead, **differs}))
     for kind in (Home, Clear, Retract, Hello):
         for name, change in REFUSED_COMMANDS.items():
-            if change != 0 or kind is not Hello:
-                body = _command(kind, host.status.command_nonce if change == 0 else host.new_nonce())
-                cut = b"" if change is None else (body + body[-1:])[: len(body) + change]
-                yield Sent(f"{kind.__name__} with {name}", partial(host.line.send, FUNCTION[kind], cut))
+            if change or kind is not Hello:
+                body = _command(kind, host.new_nonce() if change else host.status.command_nonce)
+                sent = change(body) if change else body
+                yield Sent(f"{kind.__name__} with {name}", partial(host.line.send, FUNCTION[kind], sent))
 
 
 def damaged(host: Host) -> Iterator[Sent]:
     """Yield each message of a host with each damage of the carrier."""
     for kind, mode in ((Drive, 0), (Drive, 1), (Home, 0), (Clear, 0), (Retract, 0), (Hello, 0)):
-        for what, forms in host.line.damages(FUNCTION[kind], _command(kind, 1)).items():
-            for at in range(len(forms)):
-                send = partial(_send_damaged, host, kind, mode, host.new_nonce(), what, at)
-                yield Sent(f"{kind.__name__}: {what}", send)
+        for what in host.line.damages(FUNCTION[kind], _command(kind, 1)):
+            yield Sent(f"{kind.__name__}: {what}", partial(_send_damaged, host, kind, mode, host.new_nonce(), what))
 
 
 def taken(host: Host, place: Place) -> Iterator[Sent]:
@@ -198,7 +197,7 @@ def _changes_nothing(
     host: Host, place: Place, period_s: float, one: Sent, before: Status, start: tuple[float, float]
 ) -> Status:
     """Send a message, compare Status with the one before, unless a motion has ended, and return what it must be."""
-    host.forget()
+    host.heard.clear()
     is_still = place.mode in RESTING
     host.beat(place.beat, place.duty, place.duty, period_s, one.send)
     seen_s = TWO_STATUS_S if is_still or one.nonce is not None else 0.5 * STATUS_S
@@ -254,59 +253,76 @@ def _ends(host: Host, place: Place, first: int) -> None:
 
 def acts(place: Place, name: str, host: Host) -> str:
     """Send a message that this mode acts on, at both rates of Drives, and compare what it leads to."""
-    return "; ".join([_acts(host, place, name, period_s) for period_s in (PERIOD_S, SPARSE_S)])
+    first = _closing if place.mode is DeviceMode.RUN else _acts
+    return "; ".join([first(host, place, name, PERIOD_S), _acts(host, place, name, SPARSE_S)])
+
+
+def _closing(host: Host, place: Place, name: str, period_s: float) -> str:
+    """Send what ends RUN, far inside, at full duty."""
+    host.running(host.stroke_mm - FAR_MM)
+    host.pass_time(BEGUN_S / 4.0, DriveMode.RUN, duty=-1.0)
+    beat = DriveMode.OFF if name == OFF else DriveMode.RUN
+    _begun(host, place, name, beat, period_s, COASTED_MM)
+    return opens_fully(host, CAUSES.get(name, NO_FAULT), beat)
 
 
 def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
     place.enter(host)
-    host.pass_time(ANSWER_S)
-    unanswered = host.drives - host.states
-    is_deep = place.mode is DeviceMode.RUN and period_s == PERIOD_S
-    if is_deep:
-        host.running(host.stroke_mm - FAR_MM)
-        host.pass_time(BEGUN_S / 4.0, DriveMode.RUN, duty=-1.0)
-    verdict, start = ACTS[name][place.mode], places(host.last(State))
+    within_s = {DeviceMode.HOMING: LATEST * host.home_s, DeviceMode.RETRACTING: WITHIN_S}.get(place.mode, 0.0)
+    host.pass_time(within_s * (host.random.random() + (period_s > PERIOD_S)) / 2.0, place.beat)
     faults = (NO_FAULT if name == "Clear" else host.status.faults) | CAUSES.get(name, NO_FAULT)
-    beat = DriveMode.OFF if name == OFF else place.beat
-    host.forget()
-    _say(host, name, beat, MISFITTING[0 if period_s == PERIOD_S else -1])
-    host.pass_time(BEGUN_S, beat, period_s, -1.0)
-    seen = _begun(host, place, verdict.partition(",")[0], start, is_deep)
-    if is_deep:
-        return opens_fully(host, faults, beat)
-    host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, beat)
-    is_mended = name == MISFITS and host.command(Clear, beat, SEEN_S)
-    host.pass_time(ANSWER_S)
-    extra = unanswered - (host.drives - host.states)
-    seen += f", {extra:+d} State besides one for each Drive{', Clear taken' * is_mended}"
+    seen = _begun(host, place, name, place.beat, period_s, MOVED_MM)
+    host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, place.beat)
     return host.shows(
-        ENDS_IN[bool(faults)],
-        beat,
-        homed=not any((faults, "not homed" in verdict, place.mode is DeviceMode.LATCHED)),
+        # one Drive OFF lets go
+        DeviceMode.RUN if name == OFF else ENDS_IN[bool(faults)],
+        place.beat,
+        homed=not any((faults, "not homed" in ACTS[name][place.mode], place.mode is DeviceMode.LATCHED)),
         opened=True,
         fault=faults,
         besides=seen,
-        wrong=extra or is_mended,
+        wrong=name == MISFITS and host.command(Clear, place.beat, SEEN_S),
     )
 
 
-def _say(host: Host, name: str, beat: Beat, misfit: Hello) -> None:
+def _fall_silent(host: Host, place: Place) -> None:
+    """Send no Drive, but all else that changes nothing."""
+    bad = cycle([*list(taken(host, place))[:-2], *refused(host)])
+    damages = list(chain(*host.line.damages(FUNCTION[Drive], _drive(host, 1)).values()))
+    for _ in range(round(2.0 * SILENCE_S / PERIOD_S)):
+        next(bad).send()
+        next(bad).send()
+        host.beat(None, besides=partial(host.line.send_damaged, host.random.choice(damages)))
+
+
+def _say(host: Host, place: Place, name: str, beat: Beat) -> None:
     if name in COMMANDS:
-        host.obeyed(COMMANDS[name], beat)
-    duty = -1.0 if beat is DriveMode.OFF else 0.0
-    besides = {MISFITS: partial(host.send_beside, misfit), OFF: partial(host.drive, DriveMode.RUN, -1.0, -1.0)}
-    host.beat(beat, duty, duty, besides=besides.get(name, lambda: None))
-    host.pass_time(2.0 * SILENCE_S if name == SILENT else 0.0)
+        nonce = host.new_nonce()
+        for other, kind in COMMANDS.items():
+            if TAKES[other][place.mode] == "refused":
+                host.send(kind(nonce))
+        host.obeyed(COMMANDS[name], beat, nonce, -1.0)
+    said = DriveMode.OFF if name == OFF else beat
+    duty = -1.0 if said is DriveMode.OFF else 0.0
+    besides = {
+        MISFITS: partial(host.send_beside, host.random.choice(MISFITTING)),
+        OFF: partial(host.drive, DriveMode.RUN, -1.0, -1.0),
+    }
+    host.beat(said, duty, duty, besides=besides.get(name, lambda: None))
+    if name == SILENT:
+        _fall_silent(host, place)
 
 
-def _begun(host: Host, place: Place, to: str, start: tuple[float, float], is_deep: bool) -> str:
-    """Compare the mode after a message, and what RUN ends with, with what must be."""
+def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coasted_mm: float) -> str:
+    """Send a message, and compare what follows at once with what must be."""
+    start, to = places(host.last(State)), ACTS[name][place.mode].partition(",")[0]
+    host.heard.clear()
+    _say(host, place, name, beat)
+    host.pass_time(BEGUN_S, beat, period_s, -1.0 if name != OFF or beat is DriveMode.OFF else 0.0)
     way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_closing = place.mode is DeviceMode.RUN and (
-        min(way_mm) < -(COASTED_MM if is_deep else MOVED_MM) or min(way_mm[-2:]) < BEGUN_MM
-    )
+    is_closing = place.mode is DeviceMode.RUN and (min(way_mm) < -coasted_mm or min(way_mm[-2:]) < BEGUN_MM)
     return unless(is_closing or modes[:1] != [to] * (to in MODES), seen)
 
 
@@ -315,8 +331,8 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> s
     first = len(host.rows)
     host.until(host.is_resting, OPENED_S, beat)
     rows = columns(host, first)
-    leasts, mosts = zip(*(_speeds(rows["device_s"], rows[name]) for name in ("left_mm", "right_mm")), strict=True)
-    seen = f"{min(leasts):.1f} mm/s on the way, {max(mosts):.1f} at most"
+    leasts, mosts, drawn_A = zip(*(_opened(rows, side) for side in ("left", "right")), strict=True)
+    seen = f"{min(leasts):.1f} mm/s on the way, {max(mosts):.1f} at most, {min(drawn_A):+.2f} A as a rule"
     return host.shows(
         ENDS_IN[bool(fault)],
         beat,
@@ -324,15 +340,18 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> s
         opened=True,
         fault=fault,
         besides=seen,
-        wrong=min(leasts) < MIN_SHARE * host.opening_mm_s or max(mosts) > MAX_SHARE * host.opening_mm_s,
+        wrong=min(leasts) < MIN_SHARE * host.opening_mm_s
+        or max(mosts) > MAX_SHARE * host.opening_mm_s
+        or min(drawn_A) <= 0.0,
     )
 
 
-def _speeds(times_s: Array, at_mm: Array) -> tuple[float, float]:
-    """Return one carriage's least speed without ENDS_MM at both ends, and its most, over WINDOW States."""
+def _opened(rows: dict[str, Array], side: str) -> tuple[float, float, float]:
+    """Return a carriage's least speed without ENDS_MM, its most, and its usual current."""
+    times_s, at_mm, drawn_A = rows["device_s"], rows[f"{side}_mm"], float(np.median(rows[f"{side}_A"]))
     mm_s = (at_mm[WINDOW:] - at_mm[:-WINDOW]) / (times_s[WINDOW:] - times_s[:-WINDOW])
     is_way = (at_mm[:-WINDOW] > at_mm[0] + ENDS_MM) & (at_mm[WINDOW:] < -ENDS_MM)
-    return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0))
+    return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0)), drawn_A
 
 
 def misfits(host: Host) -> str:
@@ -340,7 +359,7 @@ def misfits(host: Host) -> str:
     fault = DeviceFault.SCHEMA_MISMATCH
     for hello in MISFITTING:
         host.idle()
-        host.forget()
+        host.heard.clear()
         host.hello(hello.schema_hash, hello.protocol_version)
         count, seen = len(host.all_of(Identity)), f"schema {hello.schema_hash:08X}, version {hello.protocol_version}"
         host.shows(DeviceMode.LATCHED, homed=False, fault=fault, besides=seen, wrong=count != 1)
@@ -371,15 +390,10 @@ def _homing(host: Host, beat: Beat) -> None:
     host.obeyed(Home, beat)
 
 
-def _mismatched(host: Host) -> None:
-    host.idle()
-    host.hello(SCHEMA_HASH ^ 1)
-
-
 MISMATCHED: Final = "LATCHED by a mismatch"
 PLACES: Final = (
     Place("IDLE without zero", DeviceMode.IDLE, Host.without_zero, DriveMode.RUN, DUTY),
-    Place(MISMATCHED, DeviceMode.LATCHED, _mismatched, DriveMode.OFF, -1.0),
+    Place(MISMATCHED, DeviceMode.LATCHED, partial(Host.hello, schema_hash=SCHEMA_HASH ^ 1), DriveMode.OFF, -1.0),
     Place("IDLE", DeviceMode.IDLE, Host.homed, DriveMode.OFF, -1.0),
     Place("IDLE, not let go", DeviceMode.IDLE, put_off, DriveMode.RUN, DUTY),
     Place("RUN", DeviceMode.RUN, lambda host: host.running(INSIDE_MM), DriveMode.RUN, 0.0),

@@ -764,7 +764,8 @@ PLANTED = (
     fault("no_status", "status_rate"),
     rogue(
         "Status lags beside Drives",
-        "status_rate",
+        "reports_in_time",
+        "every_drive_answered",
         shows=lambda device, time_s, status: (
             None if device.count[Status] % 4 == 0 and time_s - device.drive_s < 0.01 else status
         ),
@@ -774,7 +775,7 @@ PLANTED = (
     fault("no_sense", "every_drive_answered"),
     wire("Sense first", "every_drive_answered", of=Reframed, frame=sense_first),
     wire("streams", "every_drive_answered", "every_drive_answered", of=Reframed, up=streams),
-    wire("late", "every_drive_answered", of=Late),
+    wire("late", "reports_in_time", "every_drive_answered", of=Late),
     rogue(
         "State's counter stuck",
         "status_consistent",
@@ -787,11 +788,12 @@ PLANTED = (
         "every_drive_answered",
         measures=lambda _, time_s, measured: (measured[0].replaced(counter=measured[0].counter // 2), measured[1]),
     ),
-    fault("clock=+2%", "clock_runs_on"),
-    fault("clock=-2%", "clock_runs_on"),
+    fault("clock=+2%", "clock_runs_on", "every_drive_answered"),
+    fault("clock=-2%", "clock_runs_on", "every_drive_answered"),
     rogue(
         "clock in milliseconds",
         "clock_runs_on",
+        "every_drive_answered",
         measurement=lambda device, time_s, sensors: device.real.measurement(time_s * 0.01, sensors),
     ),
     rogue(
@@ -806,13 +808,15 @@ PLANTED = (
     ),
     rogue(
         "supply in tenths",
-        "plausible_at_rest",
+        "status_consistent",
+        "status_rate",
         shows=lambda _, time_s, status: status.replaced(supply_V=status.supply_V / 10.0),
     ),
-    fault("supply_loss", "plausible_at_rest"),
+    fault("supply_loss", "every_nonce"),
     rogue(
         "current with an offset",
         "plausible_at_rest",
+        "every_drive_answered",
         measures=lambda _, time_s, measured: (
             measured[0],
             measured[1].replaced(left_current_A=measured[1].left_current_A + 0.5),
@@ -856,7 +860,7 @@ PLANTED = (
     ),
     rogue(
         "never runs",
-        "run_is_entered",
+        "run_drive_off",
         hears=lambda _, message: message.replaced(mode=DriveMode.OFF) if isinstance(message, Drive) else message,
     ),
     fault("duties_reversed", "left_duty"),
@@ -898,8 +902,8 @@ PLANTED = (
     rogue("timeout of 65 ms", "silence_is_noticed", ticks=timeout_of(0.065)),
     rogue("no timeout", "silence_is_noticed", ticks=extends),
     rogue("latches without opening", "silence_is_noticed", ticked=rests(times_out_opening, DeviceMode.LATCHED)),
-    rogue("any message extends", "only_good_drives_extend", before=extends),
-    rogue("a repetition extends", "only_good_drives_extend", before=repetition_extends),
+    rogue("any message extends", "run_silence", before=extends),
+    rogue("a repetition extends", "run_silence", before=repetition_extends),
     rogue("does not latch", "run_silence", ticked=does_not_latch),
     rogue("latched keeps homed", "run_silence", ticked=latched_keeps_homed),
     rogue(
@@ -1003,6 +1007,7 @@ PLANTED = (
     rogue(
         "time in milliseconds",
         "clock_runs_on",
+        "every_drive_answered",
         measures=lambda _, time_s, measured: (
             measured[0].replaced(device_time_s=math.floor(time_s * 1e3) % 655 * 1e-3),
             measured[1],
@@ -1019,7 +1024,9 @@ PLANTED = (
     ),
     rogue(
         "no Status at high duty",
+        "reports_in_time",
         "zero_is_at_switch",
+        "every_drive_answered",
         shows=lambda device, _, status: (
             None if is_running(device) and abs(device.real.output.left_duty) > 0.8 else status
         ),
@@ -1054,7 +1061,7 @@ PLANTED = (
         "idle_without_zero_stays",
         mended=mending(lambda body: clamped(body) if body[6:7] == RUNS else body),
     ),
-    rogue("one Drive a tick", "run_drive_off", hears=only_one_a_tick),
+    rogue("one Drive a tick", "every_drive_answered", "run_drive_off", hears=only_one_a_tick),
     rogue("nonce of 7 bits", "every_nonce", hears=with_nonce(lambda _, nonce: nonce % 128)),
     rogue(
         "nonce compared signed",
@@ -1068,7 +1075,7 @@ PLANTED = (
             None if isinstance(message, Drive) and device.count[Drive] % 100 == 0 else message
         ),
     ),
-    wire("States late", "every_drive_answered", of=Late, late=3),
+    wire("States late", "reports_in_time", "every_drive_answered", of=Late, late=3),
     Planted(
         "microseconds run over",
         "any_uptime",
@@ -1086,7 +1093,7 @@ PLANTED = (
     rogue(
         "never opens",
         "left_open",
-        "run_drive_off",
+        "left_duty",
         before=OFF_ONLY_SWITCHES_OFF,
         hears=lambda _, message: None if isinstance(message, Retract) else message,
     ),
@@ -1102,12 +1109,14 @@ PLANTED = (
     rogue(
         "force clipped",
         "force_follows_gap",
+        "skew_opens",
         "end_stop_opens",
         measures=sensed(lambda sense: sense.replaced(force_N=min(sense.force_N, 2.047))),
     ),
     rogue(
         "a clock of 65000 steps",
         "clock_runs_on",
+        "every_drive_answered",
         measures=lambda _, time_s, measured: (measured[0].replaced(device_time_s=time_s % 0.65), measured[1]),
     ),
     rogue("every 997th position old", "positions_run_on", "skew_opens", "end_stop_opens", measures=every_997th),
@@ -1144,7 +1153,7 @@ PLANTED = (
     ),
     rogue(
         "no Status as a fault latches",
-        "status_rate",
+        "misfitting_hello",
         shows=lambda device, _, status: status if device.mode is DeviceMode.IDLE else None,
     ),
     rogue(
@@ -1185,6 +1194,58 @@ PLANTED = (
             else message
         ),
     ),
+    rogue(
+        "15.6 V in one Status of 50",
+        "status_consistent",
+        "status_rate",
+        shows=lambda device, _, status: status.replaced(supply_V=15.6) if device.count[Status] % 50 == 0 else status,
+    ),
+    rogue(
+        "a clock that leaps once",
+        "clock_runs_on",
+        "every_counter",
+        "every_drive_answered",
+        measures=lambda _, time_s, measured: (
+            measured[0].replaced(device_time_s=(time_s + 0.02 * (time_s > 1.0)) % 0.65536),
+            measured[1],
+        ),
+    ),
+    rogue(
+        "no Status after a while alone",
+        "status_rate",
+        shows=lambda device, time_s, status: status if time_s - device.drive_s < 1.5 else None,
+    ),
+    rogue(
+        "a current without sign while opening",
+        "run_drive_off",
+        measures=lambda device, _, measured: (
+            measured[0],
+            measured[1].replaced(left_current_A=-abs(measured[1].left_current_A))
+            if device.real.mode is DeviceMode.RETRACTING
+            else measured[1],
+        ),
+    ),
+    rogue(
+        "a force that stands while opening",
+        "handle_runs_on",
+        "run_drive_off",
+        measures=lambda device, _, measured: (
+            measured[0],
+            measured[1].replaced(force_N=0.25) if device.real.mode is DeviceMode.RETRACTING else measured[1],
+        ),
+    ),
+    rogue(
+        "a reset keeps Drive's counter",
+        "warm_reset",
+        after=lambda device, *_: device.kept.update(counter=device.real._drive_counter),
+        boots=lambda device: setattr(device.real, "_drive_counter", device.kept.get("counter")),
+        kept={},
+    ),
+    rogue(
+        "Home ignores small nonces",
+        "let_go_after_all",
+        hears=lambda _, message: None if isinstance(message, Home) and message.nonce < 100 else message,
+    ),
     wire(
         "whole frames only",
         "frames_as_they_come",
@@ -1201,7 +1262,7 @@ SAID = {
     "no CRC-8": "a Drive with a wrong CRC-8",
     "clock=+2%": "+2.0",
     "never opens": "THE GAP MAY BE SHUT",
-    "Sense first": "1000 times a Sense before its State",
+    "Sense first": "999 Sense behind its State",
 }
 """What must be seen of some errors."""
 
@@ -1363,7 +1424,7 @@ def test_a_reader_that_goes_does_not_end_the_run(monkeypatch: pytest.MonkeyPatch
 
     device = VirtualDevice(NEAR_HOME, SteadyHand())
     monkeypatch.setattr(sys, "stdout", Closed())
-    assert ran(SerialLine(Wire(device)), "--yes", "--only", "run_is_entered") == 0
+    assert ran(SerialLine(Wire(device)), "--yes", "--only", "run_drive_off") == 0
     assert device.messages.firmware.mode is DeviceMode.IDLE
 
 
