@@ -108,8 +108,8 @@ def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
 
 @pytest.fixture(scope="session")
 def open_core(core: Core) -> Core:
-    """The scene allows a hundred times the force, so that no ceiling acts."""
-    force = msgspec.structs.replace(core.scene.force, most_N=100.0 * MAX_N)
+    """The scene allows thirty times the force, so that no ceiling acts."""
+    force = msgspec.structs.replace(core.scene.force, most_N=30.0 * core.scene.force.release_N_s)
     return core._replace(scene=msgspec.structs.replace(core.scene, force=force))
 
 

@@ -142,12 +142,12 @@ def test_a_file_cannot_either(tmp_path: Path, ctl, what: str) -> None:
     assert r"\u001b[2J" in captured.err or r"\x1b[2J" in captured.err
 
 
-def test_a_scene_is_shown_without_obeying_it(tmp_path: Path, ctl) -> None:
+def test_a_scene_is_refused_without_obeying_it(tmp_path: Path, ctl) -> None:
     path = tmp_path / "a.toml"
     path.write_text(ctl("scene", "show", "pulse").out.replace('description = "', 'description = "\\u009b2J\\u001b[2J'))
-    printed = ctl("scene", "show", str(path)).ended(0).out
+    printed = ctl("scene", "show", str(path)).ended(2).err
     assert is_harmless(printed)
-    assert r'description = "\u009b2J\u001b[2J' in printed
+    assert r'description = "\x9' in printed
 
 
 def test_the_log_has_a_line_for_each_record_and_a_traceback_its_own() -> None:

@@ -35,8 +35,8 @@ USUAL_STEPS, HOSTILE_STEPS, AFTER_STEPS = 3, 6, 3
 SHARE = 0.25
 "Share of the numbers of a hostile step that are hostile."
 MAX_TOLD = 3
-MEANT = {("out.Plan.stamp_s", -math.inf)}
-"An infinity that a record states: it follows no setpoint."
+MEANT = {("out.Plan.stamp_s", -math.inf), ("out.0.Belief.anchor_N", math.inf)}
+"Infinities that a record states: it follows no setpoint, and a device that has not slid sets no ceiling."
 
 
 class Draw:

@@ -4,6 +4,7 @@ The daemon runs one scene. Nothing that a scene does not ask for is modelled or 
 """
 
 import hashlib
+import unicodedata
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -171,7 +172,7 @@ class Solver(Strict, frozen=True):
 
 
 def is_plain(text: str, besides: str) -> bool:
-    return all(each.isprintable() or each in besides for each in text)
+    return all(each in besides or unicodedata.category(each) not in ("Cc", "Cf") for each in text)
 
 
 class Scene(Strict, frozen=True):
@@ -205,8 +206,8 @@ class Scene(Strict, frozen=True):
                 self.insert.outer_radius_mm,
             ),
         )
-        require(is_plain(self.name, ""), "name", self.name, "printable characters")
-        require(is_plain(self.description, "\n\t"), "description", self.description, "printable characters and lines")
+        require(is_plain(self.name, ""), "name", self.name, "text without control characters")
+        require(is_plain(self.description, "\n\t"), "description", self.description, "text without control characters")
         least_N_s = self.force.most_N / LONGEST_RELEASE_S
         is_let_go = self.force.release_N_s >= least_N_s
         require(

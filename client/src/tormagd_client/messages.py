@@ -586,7 +586,7 @@ def encode(message: Setpoint | Telemetry | Motion | Verdict | Request | Reply | 
     """Return the message as bytes; numbers and arrays of NumPy go as numbers and lists. Raises MessageError."""
     try:
         return _ENCODER.encode(message)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, OverflowError) as error:
         raise MessageError(f"message: allowed are numbers, texts, lists and maps: {error}") from error
 
 

@@ -117,7 +117,7 @@ def test_an_operator_says_whether_device_or_sensor_has_changed(
     known, hear, moving, wrong: str, share: float, limits: tuple[Limit, ...]
 ) -> None:
     hear(known, 1.0, moving(force_N=0.75 * MODEL_N))
-    known.confirm(wrong)
+    known.believe.confirm(wrong)
     hear(known, 0.5, moving(force_N=0.75 * MODEL_N))
     assert (force_N(known.believe), known.planned.limits) == (pytest.approx(share * MODEL_N, abs=0.02), limits)
 
@@ -125,7 +125,7 @@ def test_an_operator_says_whether_device_or_sensor_has_changed(
 def test_without_a_dispute_there_is_nothing_to_confirm(known) -> None:
     before = known.believe.device
     for wrong in ("sensor", "device"):
-        known.confirm(wrong)
+        known.believe.confirm(wrong)
     assert (known.believe.device, known.believe.sensor.is_doubted) == (before, False)
 
 
