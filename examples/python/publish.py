@@ -14,7 +14,5 @@ try:
             client.publish(force, valid_for_ms=500.0, stamp_ns=start_ns + round(t * 1e9))
             for state in client.telemetry():
                 print(f"{t:.3f} asked {force:.3f} measured {state.measured_cf:.3f} {state.operating_state}")
-except OSError as error:
-    sys.exit(str(error))
-except (ClientError, KeyError, TypeError, ValueError) as error:
-    sys.exit(str(error) if isinstance(error, ClientError) else f"{profile}, row {table.line_num}: {error!r}")
+except (ClientError, OSError, KeyError, TypeError, ValueError) as error:
+    sys.exit(str(error) if isinstance(error, ClientError | OSError) else f"{profile}, row {table.line_num}: {error!r}")
