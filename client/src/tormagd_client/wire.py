@@ -182,6 +182,10 @@ def _contact(fields: Mapping[str, float]) -> Contact:
         raise ValueError(f"contact = {fields!r}: allowed are {allowed}") from error
 
 
+OTHERS = "displacement_mm", "rate_mm_s", "preview_N", "preview_dt_ms"
+"Fields of a setpoint that its publisher may state besides."
+
+
 class Numbering:
     """Makes one publisher's setpoints, numbered from 0, in a session above every earlier one of its source."""
 
@@ -213,13 +217,12 @@ class Numbering:
             "withdraw_cf": withdraw_cf,
             "contact": contact if contact is None or isinstance(contact, Contact) else _contact(contact),
         }
-        others = [name for name in Setpoint.__struct_fields__ if name not in given]
-        if unknown := sorted(fields.keys() - set(others)):
-            raise TypeError(f"{unknown[0]}: allowed are {', '.join(others)}")
-        # as the daemon reads it
-        made = decode(encode({name: value for name, value in (given | fields).items() if value is not None}), Setpoint)
+        if unknown := sorted(fields.keys() - set(OTHERS)):
+            raise TypeError(f"{unknown[0]}: allowed are {', '.join(OTHERS)}")
+        data = encode({name: value for name, value in (given | fields).items() if value is not None})
+        decode(data, Setpoint)  # what the daemon would refuse is refused here
         self.sent += 1
-        return encode(made)
+        return data
 
 
 class Connections(Generic[SocketT]):
