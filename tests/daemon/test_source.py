@@ -198,6 +198,7 @@ CLOCKS: dict[str, tuple[Callable[[float], float], float, dict[str, float]]] = {
     "set forward by 1 s": (lambda t: t + 1.0 * (t > 4.0), -1.0, {"steps": 1, "stepped_s": 1.0}),
     "set back by 60 ms": (lambda t: t - 0.06 * (t > 4.0), 0.06, {}),
     "set to and fro": (lambda t: t + (t > 3.0) - 2.0 * (t > 6.0), 1.0, {}),
+    "once three centuries ahead": (lambda t: t + 9.2e9 * (9.9 <= t < 9.905), 0.0, {}),
     "1 s behind, 200 ppm fast": (lambda t: t * (1.0 + 200e-6) - 1.0, 0.998, {}),
     "200 ppm slow": (lambda t: t * (1.0 - 200e-6), 0.002, {}),
 }
@@ -210,6 +211,7 @@ def test_the_delay_is_believed_to_be_what_it_is_whatever_the_clock_shows(name: s
     assert worst_error_s(heard, SETTLED_S + PERIOD_S) <= HIDES_S
     known |= {"is_settled": True, "offset_s": behind_s, "is_wrong": abs(behind_s) > AHEAD_S}
     assert {each: getattr(clock, each) for each in known} == pytest.approx(known, abs=HIDES_S)
+    assert clock.jitter_s < 2.0 * JITTER_S
 
 
 Way = tuple[Callable[[float], float], float, float, float, float, dict[str, float]]

@@ -212,7 +212,8 @@ class SourceClock:
             self.offset_s += rise_s
             self._set(now_s, -rise_s)
         else:
-            self.jitter_s += JITTER_SHARE * (abs(rise_s) - self.jitter_s)
+            if lateness_s > self.offset_s + self.way_s - STEP_S:  # otherwise the clock was set
+                self.jitter_s += JITTER_SHARE * (abs(rise_s) - self.jitter_s)
             leak_s = DRIFT * gap_s
             self.offset_s += leak_s
             self._leaked_s += leak_s
