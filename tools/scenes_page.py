@@ -35,7 +35,7 @@ HEAD = (
     "force the device gives that (`F_MIN`) |\n"
     "| `force.resolution_N` | refused if finer than the sensor's step (1 mN) or four encoder counts (7 µm) at "
     "`most_N` |\n"
-    "| `force.tolerance_rms_N` | decides rates and search, and whether the sensor is needed |\n"
+    "| `force.tolerance_rms_N` | decides rates, and whether the sensor is needed |\n"
     "| `[signal]` | `file`, or `bandwidth_hz`, `step_N`, `hold_s`: the force over time. Refused if the gap's speed "
     "alone exceeds the tolerance |\n"
     "| `signal.is_known_ahead` | whether it is played with a preview |\n"
@@ -50,8 +50,9 @@ HEAD = (
     "| `[solver]` | the search for the field ([which](guides/scene.md)) |\n"
     "| `[terms]` | parts of the controller's model to switch off, `false` each (`tormagd/scenes/scene.py`; [why "
     "all run](decisions/0009-what-a-scene-requires.md)) |\n\n"
-    "Served is the lowest rate at which signal and worst error are like the usual way's, 1000 / 500 Hz, on a "
-    "device that chose and on one that did not. You can [choose by price or error](guides/scene.md#the-tables)."
+    "*Served* has the lowest rates at which signal and worst error are like the usual way's, 1000 / 500 Hz, on a "
+    "device that chose and on one that did not. A daemon takes these rates, and the search of `[solver]`, `nearest` "
+    "for `pulse`. You can [choose by price or error](guides/scene.md#the-tables)."
 )
 
 
@@ -80,7 +81,7 @@ def page(found: dict[str, MeasuredScene]) -> str:
             [_row(name, each) for name, each in found.items()],
         ),
         "Errors are RMS, mN, of the true force, live, from a second after arming, at the handle's greatest speed, on a "
-        "simulated device that no model was learned from. The worst counts of *signal*, the same *seldom* (20 "
+        "simulated device that no model was learned from. Of four the worst counts: *signal*, the same *seldom* (20 "
         f"setpoints a second), *steps* (from {COMES_S:g} s after each) and *contact*, a wall whose force "
         f"rises in {CONTACT_S:g} s. **Bold** is over the tolerance. *Share* is what the daemon took of a "
         "processor meanwhile (`machine_us` "
@@ -96,7 +97,7 @@ def page(found: dict[str, MeasuredScene]) -> str:
         f"that sends seldom costs over {FRONT} times the signal's error in {_named(seldom)}.",
         f"![worst error of each scene, as served and with one thing more](<{PICTURE.as_posix()}>)",
         f"Further left is more exact. In {len(found) - len(flat)} of {len(found)} scenes the worst way is at least "
-        f"{FRONT} times as far off as the most exact. Not where all is within the tolerance ({_named(met)}), nor where "
+        f"{FRONT} times as far off as the most exact. In the others all is within the tolerance ({_named(met)}), or "
         f"nothing given helps ({_named([name for name in flat if name not in met])}: its description says why). "
         "Rates and searches hardly matter; `tormagctl scene explain NAME` lists every way.",
     ]
