@@ -83,7 +83,7 @@ def matrix_page(record: dict[str, Any]) -> str:
         made.setdefault(leads_out, [("fault", "named as", "reaction, safe after")]).append(
             (name, named, f"{reaction}, {max(safe_s):.3f} s" if safe_s else reaction)
         )
-    return _MATRIX_HEAD + says + "\n".join(f"## Leads out: {by}\n\n{table(of[0], of[1:])}" for by, of in made.items())
+    return _MATRIX_HEAD + says + "\n".join(f"## Way out: {by}\n\n{table(of[0], of[1:])}" for by, of in made.items())
 
 
 def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:

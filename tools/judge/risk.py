@@ -160,7 +160,13 @@ def _of_kit(named: Named) -> Iterator[Row]:
         tests = KIT if KIT in named.get(check.name, ()) else ""
         evidence = "planted error found" if tests else ""
         yield Row(
-            f"kit.{check.name}", check.hazard, f"not kept: {check.page}", check.expected, check.name, tests, evidence
+            f"kit.{check.name}",
+            check.hazard,
+            f"rule not kept: {check.page}",
+            check.expected,
+            check.name,
+            tests,
+            evidence,
         )
 
 
@@ -193,12 +199,12 @@ tr.red td.gap { background: #d32222; color: #fff; font-weight: bold; }
 <body>
 <p><a href="safety.html">Safety</a></p>
 <h1>Risk</h1>
-<p>Which hazardous situation may come of what, and what is done about it, in the terms of ISO 14971. It is written for
-a person who analyses the risk of a device. <strong>It certifies nothing</strong>: all evidence is of simulated
+<p>Which hazardous situation may arise from what, and what is done about it, in the terms of ISO 14971. It is written
+for a person who analyses the risk of a device. <strong>It certifies nothing</strong>: all evidence is of simulated
 devices.</p>
 <p>Written by <code>python tools/safety_pages.py</code> from the tables of <code>tormagd/control/safety</code>, the
 conformance kit, the test tree and the <a href="fault-matrix.html">fault matrix</a>. A row is red where a control, a
-code, a test or evidence is missing. Severity and probability are a person's, of <code>docs/risk.toml</code>.</p>
+code, a test or evidence is missing. Severity and probability are a person's, from <code>docs/risk.toml</code>.</p>
 """
 
 
