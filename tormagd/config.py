@@ -163,9 +163,9 @@ class Position(Strict, frozen=True):
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
     "Gain on the skew between the carriages, as a multiple of `proportional_per_mm`."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
-    "Greatest speed of the gap, both carriages together."
+    "Greatest speed at which the gap opens, both carriages together."
     closing_mm_s: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
-    "The same of closing; 0: the motors' own. A file that states `gap_speed_mm_s` alone sets both."
+    "The same for closing; 0: the motors' own. A file that states `gap_speed_mm_s` alone sets both."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
     """Greatest acceleration of the gap from rest; it falls with speed, and rises up to twofold for carriages that
     show more."""
@@ -189,7 +189,7 @@ class Trim(Strict, frozen=True):
     leash: Annotated[float, Meta(ge=0.02, le=0.3)] = 0.08
     "Share of the force first shown by which a falling reading is followed."
     way: Annotated[float, Meta(ge=-0.06, le=0.06)] = 0.0
-    "By which share friction is greater where the handle goes positive, and less the other way: where learning begins."
+    "Share by which friction is greater in the positive direction, and less in the other: where learning begins."
 
 
 class Limits(Strict, frozen=True):

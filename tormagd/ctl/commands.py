@@ -332,7 +332,7 @@ COMMANDS = {
                 "--operate",
                 dest="is_operated",
                 action="store_true",
-                help="also STOP, disable, pause, resume and arm, for who has the link that is printed",
+                help="also STOP, disable, pause, resume and arm, for whoever has the printed link",
             ),
             option(
                 "--origin",
