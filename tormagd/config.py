@@ -163,7 +163,7 @@ class Position(Strict, frozen=True):
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
     "Gain on the skew between the carriages, as a multiple of `proportional_per_mm`."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
-    "Greatest speed at which the gap opens, both carriages together."
+    "Greatest speed of the opening gap, both carriages together."
     closing_mm_s: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
     "The same for closing; 0: the motors' own. A file that states `gap_speed_mm_s` alone sets both."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
