@@ -39,7 +39,6 @@ EXTRAS = {
     "aiohttp": "dashboard",
     "foxglove": "foxglove",
     "prometheus_client": "metrics",
-    "tqdm": "lab",
 }
 SERVICE_CONFIG = Path("/etc/tormag/tormagd.toml")
 EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,

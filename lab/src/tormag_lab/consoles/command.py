@@ -94,7 +94,7 @@ def _judged(report: Report) -> str:
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recordings", metavar="FOLDER|URL", help="where they are, in folders of their own or not")
     parser.add_argument("--out", metavar="FILE|URL", help="Parquet: one row of a recording")
-    executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[lab], and to reach the recordings")
+    executors.add_options(parser, os.cpu_count() or 1, needed="tormag-lab[fleet], and to reach the recordings")
 
 
 def run(options: argparse.Namespace) -> Found:

@@ -225,7 +225,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--starts", type=whole(1, 10_000), default=5, help="random ones")
     parser.add_argument("--seed", type=SEED, default=1)
-    add_executors(parser, os.cpu_count() or 1, needed="tormagd[lab]")
+    add_executors(parser, os.cpu_count() or 1, needed="tormag-lab")
 
 
 def run(options: argparse.Namespace) -> Found:
