@@ -211,13 +211,13 @@ COMMANDS = {
     ),
     "mark": Command(
         "put an event into telemetry and recordings; its segment is kept",
-        "recordings.mark",
+        "record.mark",
         ("client",),
         (option("text", type=words, metavar="TEXT", help="1..200 printable characters"),),
     ),
     "recordings": Command(
         "list or prune a folder of recordings, mark one to keep, or export one with its SHA-256",
-        "recordings.recordings",
+        "record.recordings",
         ("config",),
         (
             option("action", choices=("list", "prune", "mark", "export")),
