@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
@@ -27,11 +26,6 @@ SWING_SHARE, PULSE_HZ = 0.2, 1.2
 "A share of the middle of the scene's range, as often as a heart beats."
 
 Call = Callable[[], object]
-
-
-class CoreCost(NamedTuple):
-    step_us: list[float]
-    plan_us: list[float]
 
 
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
@@ -62,12 +56,14 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
     return loop
 
 
-async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
-    found = CoreCost([], [])
+async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> tuple[list[float], list[float]]:
+    """Return what each step and each plan took, us."""
+    step_us: list[float] = []
+    plan_us: list[float] = []
     ended = asyncio.Event()
 
     def on_beat(_heartbeat: Heartbeat, _beats: int, _now_ns: int) -> None:
-        number = len(found.step_us)
+        number = len(step_us)
         if number == len(steps):
             ended.set()
             return
@@ -75,8 +71,8 @@ async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) 
         plans[number]()
         planned_ns = time.thread_time_ns()
         steps[number]()
-        found.plan_us.append((planned_ns - start_ns) * 1e-3)
-        found.step_us.append((time.thread_time_ns() - planned_ns) * 1e-3)
+        plan_us.append((planned_ns - start_ns) * 1e-3)
+        step_us.append((time.thread_time_ns() - planned_ns) * 1e-3)
 
     await beat(NS // rate_hz, on_beat, ended)
-    return found
+    return step_us, plan_us

@@ -25,8 +25,7 @@ from tormagd.ground.terminal import write_line
 from tormagd.record import journal
 from tormagd.record.black_box import BlackBoxFile
 from tormagd.record.reader import RecordingError
-from tormagd.record.replay.rebuild import Recorded, ReplayError, rebuilt, told
-from tormagd.record.replay.rerun import name_of, planned_for, ticks_of
+from tormagd.record.replay.rerun import Recorded, ReplayError, name_of, planned_for, rebuilt, ticks_of, told
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
