@@ -29,8 +29,7 @@ import zmq
 import zmq.utils.monitor
 from zmq.utils import z85
 
-from tormagd.daemon.peers import Allowance, Peer, Tally, shown
-from tormagd.daemon.requests import Arrivals
+from tormagd.daemon.peers import Allowance, Arrivals, Peer, Tally, shown
 from tormagd.ground.access_keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
