@@ -36,7 +36,7 @@ COMPILED = {
         *("hand", "plant", "motion", "firmware", "device", "closed_loop", "ideal_actuator"),
     ),
     "tormagd/daemon": (
-        *("rate_group", "beat", "source", "inbox", "peers", "force_delay"),
+        *("rate_group", "beat", "source", "inbox", "peers", "verdict"),
         *("control_loop", "inference_loop", "black_box", "commands", "telemetry_loop", "answers"),
         *("endpoint", "daemon"),
     ),

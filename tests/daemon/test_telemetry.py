@@ -14,8 +14,7 @@ from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, Outside, Plan
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, SafetyState
-from tormagd.daemon.force_delay import ForceDelay
-from tormagd.daemon.verdict import ARRIVES, CANNOT, RENDERED, Judged, judged
+from tormagd.daemon.verdict import ARRIVES, CANNOT, RENDERED, ForceDelay, Judged, judged
 from tormagd.element.model.features import FEATURES
 from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement

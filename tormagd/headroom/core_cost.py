@@ -14,7 +14,7 @@ from functools import partial
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
-from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.daemon.realtime import Heartbeat
 from tormagd.headroom.bare_timer import NS, beat
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
