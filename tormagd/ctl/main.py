@@ -60,15 +60,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ClientError as error:
         print_error(options.command, error, options.json)
         return exit_code(error)
-    except ModuleNotFoundError as error:
-        extra = EXTRAS.get(error.name or "")
-        if extra is None:
-            raise
-        missing = usage_error(
-            f"{options.command} needs {error.name}, which is not installed", f"pip install 'tormagd[{extra}]'"
-        )
-        print_error(options.command, missing, options.json)
-        return exit_code(missing)
     except KeyboardInterrupt:
         daemon = "it is told to disable" if options.command == "arm" else "the daemon goes on"
         write_line(f"tormagctl {options.command}: interrupted; {daemon}", sys.stderr)
@@ -77,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Outcome:
-    """Import the command's function, and call it with its options and what it needs."""
+    """Call the command's function with its options and what it needs."""
     command = COMMANDS[options.command]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
@@ -100,14 +91,23 @@ def _run(options: argparse.Namespace) -> Outcome:
 
             known["client"] = stack.enter_context(Client(known["endpoints"], options.wait))
         given = {name: value for name, value in vars(options).items() if name not in ("command", *USUAL)}
-        module, _, name = command.function.partition(".")
+        return _called(options.command, given | {need: known[need] for need in command.needs})
+
+
+def _called(command: str, arguments: dict[str, Any]) -> Outcome:
+    """Import the command's function, and call it."""
+    module, _, name = COMMANDS[command].function.partition(".")
+    try:
         function: Callable[..., Outcome] = getattr(import_module(f"tormagd.ctl.{module}"), name)
-        try:
-            return function(**given, **{need: known[need] for need in command.needs})
-        except UnicodeEncodeError as error:  # of an argument, into a message or a file
-            raise usage_error(
-                f"{in_short(error.object)}: allowed is UTF-8 text", "give another text or name"
-            ) from error
+        return function(**arguments)
+    except ModuleNotFoundError as error:
+        if (extra := EXTRAS.get(error.name or "")) is None:
+            raise
+        raise usage_error(
+            f"{command} needs {error.name}, which is not installed", f"pip install 'tormagd[{extra}]'"
+        ) from error
+    except UnicodeEncodeError as error:  # of an argument, into a message or a file
+        raise usage_error(f"{in_short(error.object)}: allowed is UTF-8 text", "give another text or name") from error
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
