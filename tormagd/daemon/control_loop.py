@@ -1,6 +1,6 @@
 """The control loop, a phase of every beat: step on the newest measurement and plan, and drive.
 
-Arming is one command of an operator: it clears, homes and enables in turn, each as soon as the device allows it.
+Arming is one command: it clears, homes and enables, each as soon as the device allows.
 """
 
 import logging

@@ -2,8 +2,7 @@
 
 The verdict is rendered, arrives in some time, or cannot, and why. The first part of the delay is from the stamp, by the
 corrected clock of its source, to the first duty that follows it. The second is from a Drive to its State, by the link.
-The third is the believed lag of the carriages. Delay before the stamp, such as that of the sensor's filters, cannot be
-seen here.
+The third is the believed lag of the carriages. Delay before the stamp, such as of the sensor's filters, cannot be seen.
 """
 
 import math

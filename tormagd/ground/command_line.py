@@ -14,7 +14,6 @@ LONGEST = 300
 "Characters of a refusal that quotes what was given."
 UNKNOWN_OPTION = "unrecognized arguments: "
 Option: TypeAlias = tuple[tuple[str, ...], dict[str, Any]]
-"What `argparse.ArgumentParser.add_argument` takes, by place and by name."
 
 
 def option(*names: str, **settings: Any) -> Option:

@@ -1,8 +1,8 @@
 """What `plan` and `step` cost on this machine: the scene in virtual time, then both once more, each call timed.
 
 Both are deterministic, so they can be called again with what they were given in the closed loop. They are called at the
-control period's own pace: a processor that sleeps between two ticks finds colder caches, and a step takes two or three
-times as long. Figures are processor time.
+control period's pace: a processor that sleeps between two ticks finds colder caches, and a step takes two or three
+times as long. Figures are processor time, us.
 """
 
 import asyncio
@@ -57,7 +57,6 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> tuple[list[float], list[float]]:
-    """Return what each step and each plan took, us."""
     step_us: list[float] = []
     plan_us: list[float] = []
     ended = asyncio.Event()

@@ -1,4 +1,4 @@
-"""Runs a recorded core again over its recorded inputs: the same bits, or the first tick and field that differ.
+"""Runs a core again over its recorded inputs: the same bits, or the first tick and field that differ.
 
 The core is rebuilt from the file's header, and what differs between its origin and here is told.
 """
