@@ -72,7 +72,7 @@ coverage: $(VENV)/.dev
 	    --cov --cov-report= --cov-fail-under=0
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' --cov --cov-append \
 	    $(CORE_TESTS) tests/physics tests/inverse tests/hardware tests/simulation \
-	    $(patsubst %,tests/daemon/test_%.py,rate_group sequence source_clock telemetry)
+	    $(patsubst %,tests/daemon/test_%.py,rate_group source telemetry)
 
 # other cases of every property than those of `make test`, until one fails or SEARCHES rounds are done
 search: $(VENV)/.dev

@@ -25,7 +25,7 @@ COMPILED = {
     "tormagd/element/model": ("displacement", "force_curve"),
     "tormagd/element/inverse": ("solution", "newton"),
     "tormagd/hardware": (
-        *("serial_port", "frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
+        *("serial_port", "streams", "link", "link_statistics", "measurement", "connection"),
     ),
     "tormagd/control/safety": ("operating_state",),
     "tormagd/control": (*("interpolation", "records", "contact", "nominal", "sight", "plausible", "measure", "core"),),
@@ -36,7 +36,7 @@ COMPILED = {
         *("hand", "plant", "motion", "firmware", "device", "closed_loop", "ideal_actuator"),
     ),
     "tormagd/daemon": (
-        *("rate_group", "beat", "source", "inbox", "peers", "requests", "force_delay"),
+        *("rate_group", "beat", "source", "inbox", "peers", "verdict"),
         *("control_loop", "inference_loop", "black_box", "commands", "telemetry_loop", "answers"),
         *("endpoint", "daemon"),
     ),

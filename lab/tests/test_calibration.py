@@ -17,7 +17,7 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
-from tormagd.ctl.calibrate import COLUMNS, SWEEP_COLUMNS, up_and_down, write_sweeps
+from tormagd.ctl.calibrate import SWEEP_COLUMNS, SWEPT_COLUMNS, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_run import Range
 from tormagd.element.model.displacement import Turn
 from tormagd.element.model.model_file import ForceModel, load_model, model_path
@@ -49,7 +49,7 @@ def sweeps():
             )
             if (seen := sample.measured)
         ]
-        made.append(dict(zip(COLUMNS, np.array(ticks).T, strict=True)))
+        made.append(dict(zip(SWEPT_COLUMNS, np.array(ticks).T, strict=True)))
     return made
 
 

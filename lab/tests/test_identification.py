@@ -22,7 +22,7 @@ from tormagd.commission.procedure import Columns
 from tormagd.config import Config, Rates, load_config
 from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
-from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
+from tormagd.ctl.calibrate import MOTOR_COLUMNS, excitation, motor_log
 from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
 from tormagd.record.telemetry import COLUMNS as OF_TICK, Moment
 from tormagd.record.ticks import decode_ticks
@@ -127,7 +127,7 @@ def calibrated() -> Columns:
         )
         for tick in loop.run(waveform.duration_s, newest)
     ]
-    return dict(zip(COLUMNS, np.array(rows).T, strict=True))
+    return dict(zip(MOTOR_COLUMNS, np.array(rows).T, strict=True))
 
 
 def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, float]:

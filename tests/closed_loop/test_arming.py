@@ -9,7 +9,7 @@ from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import Conditions, OperatingState, RefusedError, SafetyState, latch
-from tormagd.daemon.arming import MOVES_S, PATIENCE_S, Arming
+from tormagd.daemon.control_loop import MOVES_S, PATIENCE_S, Arming
 from tormagd.simulation.closed_loop import ClosedLoop, Sample
 
 ASKED_N = 1.5

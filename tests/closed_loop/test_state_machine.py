@@ -30,7 +30,7 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import COMMANDS, OperatingState, RefusedError
-from tormagd.daemon.arming import Arming
+from tormagd.daemon.control_loop import Arming
 from tormagd.hardware.measurement import DeviceRequest
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.compiled_firmware import CompiledFirmware

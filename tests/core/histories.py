@@ -35,10 +35,10 @@ from tormagd.control.safety.operating_state import (  # noqa: E402
     Transition,
 )
 from tormagd.ground.plain_values import packed, plain  # noqa: E402
-from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
 from tormagd.hardware.link import DeviceLink  # noqa: E402
-from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
+from tormagd.hardware.link_statistics import LinkQuality  # noqa: E402
 from tormagd.hardware.measurement import Measurement  # noqa: E402
+from tormagd.hardware.streams import FrameStream  # noqa: E402
 
 CONFIG = Config()
 STRANGE = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, -1e300, 1e9, -1.0]

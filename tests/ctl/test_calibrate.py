@@ -14,13 +14,8 @@ from tormagd.commission import procedure as course
 from tormagd.commission.finding import Finding
 from tormagd.commission.sequence import STEPS, Stopped, begun
 from tormagd.config import Config
-from tormagd.ctl import (
-    calibrate_device,
-    calibrate_motors as ctl_calibrate_motors,
-    commission as ctl_commission,
-)
-from tormagd.ctl.calibrate import COLUMNS, SWEEP_COLUMNS, agree, write_sweeps
-from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, motor_log
+from tormagd.ctl import calibrate as ctl_calibrate, commission as ctl_commission
+from tormagd.ctl.calibrate import MOTOR_COLUMNS, SWEEP_COLUMNS, SWEPT_COLUMNS, agree, motor_log, write_sweeps
 from tormagd.ctl.calibrate_run import Progress, armed
 from tormagd.ctl.outcome import CommandError
 from tormagd.element.model.displacement import MOVING_MM_S
@@ -87,7 +82,7 @@ class Played:
 
 
 def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, tmp_path, monkeypatch, ctl):
-    monkeypatch.setattr(ctl_calibrate_motors, "armed", lambda *_: contextlib.nullcontext(Played(ticks(300))))
+    monkeypatch.setattr(ctl_calibrate, "armed", lambda *_: contextlib.nullcontext(Played(ticks(300))))
     slow = {name: rate | {"hz": 500.0} for name, rate in status_with()["rates"].items()}
     fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0, rates=slow)
     out = tmp_path / "right.csv"
@@ -125,7 +120,7 @@ def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_mo
 def test_what_names_a_model_is_refused_and_the_sweeps_are_a_table_for_the_laboratory(tmp_path, ctl, fake_daemon):
     refused = ctl(*fake_daemon.at, "--json", "calibrate", "--yes", "--insert", INSERT, "--out", "m.safetensors")
     assert "tormag-lab calibrate" in refused.ended(2).error["hint"]
-    sweep = dict.fromkeys(COLUMNS, np.arange(9.0))
+    sweep = dict.fromkeys(SWEPT_COLUMNS, np.arange(9.0))
     unknown = sweep | {"measured_cf": np.array([np.nan, *range(8)])}
     assert write_sweeps(tmp_path / "sweeps.csv", [sweep, unknown]) == 5
     head, *rows = csv.reader((tmp_path / "sweeps.csv").read_text().splitlines())
@@ -144,13 +139,13 @@ def test_what_names_a_model_is_refused_and_the_sweeps_are_a_table_for_the_labora
 def calibrated(fake_daemon, monkeypatch, ctl):
     def run(**status):
         monkeypatch.setattr(
-            calibrate_device,
+            ctl_calibrate,
             "armed",
             lambda *_: contextlib.nullcontext(
                 Played([Finding("steps", mN, 0.0, "mN", -60.0, 60.0, "look") for mN in (-3.0, 10.0)])
             ),
         )
-        monkeypatch.setattr(calibrate_device, "KEPT_WITHIN_S", 0.2)
+        monkeypatch.setattr(ctl_calibrate, "KEPT_WITHIN_S", 0.2)
         fake_daemon.says(**{"setpoint_age_ms": None, "least_N": 0.6} | status)
         return ctl(*fake_daemon.at, "--json", "calibrate", "--yes", "--device")
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tormagd.ctl.outcome import CommandError
-from tormagd.ctl.watch import held_back
+from tormagd.ctl.send import held_back
 from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
 from tormagd.ground.table import TableError
 from tormagd_client.messages import MAX_PREVIEW_SAMPLES, Setpoint, Status

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from tormagd.daemon.beat import COUNTED, KERNEL, NEWS_NS, Beat, Delay, Phases
-from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.daemon.realtime import Heartbeat
 
 MS = 1_000_000
 

@@ -20,7 +20,7 @@ from tormagd.daemon.black_box import MAX_REQUESTED, PART_TICKS, BlackBox
 from tormagd.daemon.profiles import state_folder
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
-from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.streams import FrameStream
 from tormagd.record.journal import MAX_ENTRIES, PLAN, STEP, TEACH, Journal
 from tormagd.record.keeper import Begin, End, Part, Ring, Write, Written, in_shared_memory
 from tormagd.record.telemetry import Moment

@@ -21,8 +21,20 @@ from served import MOST, NAMES, Served, command, setpoint
 
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
-from tormagd.daemon.peers import LISTENERS, PEERS, TOPICS, Allowance, Listeners, Peer
-from tormagd.daemon.requests import FIRST, WAITING, WAITING_PER_CLIENT, Requests, Waiting, may_go_first
+from tormagd.daemon.peers import (
+    FIRST,
+    LISTENERS,
+    PEERS,
+    TOPICS,
+    WAITING,
+    WAITING_PER_CLIENT,
+    Allowance,
+    Listeners,
+    Peer,
+    Requests,
+    Waiting,
+    may_go_first,
+)
 from tormagd.record.ticks import encode_ticks
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import (

@@ -30,7 +30,7 @@ from tormagd.daemon.causes import Causes
 from tormagd.daemon.daemon import Daemon
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.backend import BackendError
-from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.record.telemetry import COLUMNS
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import is_tick

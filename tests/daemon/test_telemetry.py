@@ -14,10 +14,9 @@ from tormagd.control.move.reference import Reference
 from tormagd.control.records import Duty, Outside, Plan
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, SafetyState
-from tormagd.daemon.force_delay import ForceDelay
-from tormagd.daemon.verdict import ARRIVES, CANNOT, RENDERED, Judged, judged
+from tormagd.daemon.verdict import ARRIVES, CANNOT, RENDERED, ForceDelay, Judged, judged
 from tormagd.element.model.features import FEATURES
-from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.record.telemetry import Moment, limits_held, snapshot
 from tormagd.record.ticks import encode_ticks

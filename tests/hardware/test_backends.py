@@ -30,11 +30,9 @@ from firmware_protocol.codec import (
 from tormagd.config import Device, Rates
 from tormagd.hardware.backend import ENTRY_POINTS, BackendError, choose, installed
 from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
-from tormagd.hardware.can_stream import CanStream
-from tormagd.hardware.frame_stream import FrameStream
-from tormagd.hardware.serial_backend import SerialOptions, open_serial
+from tormagd.hardware.serial_backend import SerialOptions, latency_ms, make_prompt, open_serial
 from tormagd.hardware.serial_port import SerialPort
-from tormagd.hardware.usb_latency import latency_ms, make_prompt
+from tormagd.hardware.streams import CanStream, FrameStream
 from tormagd.simulation.can_device import ERROR_FLAG, CanFrame
 from tormagd.simulation.can_port import to_socket
 from tormagd_client.endpoints import ConfigError

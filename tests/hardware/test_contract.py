@@ -40,8 +40,8 @@ from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState
 from tormagd.hardware.backend import Backend, BackendError, choose
-from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import LinkState
+from tormagd.hardware.streams import FrameStream
 from tormagd.simulation.can_device import DEVICE, CanDevice, CanFrame
 from tormagd.simulation.can_port import from_socket, to_socket
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream

@@ -36,7 +36,7 @@ from tormagd.hardware.link import (
     DeviceLink,
     LinkState,
 )
-from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 US = Identity(SCHEMA_HASH, 1, 2, 77)

@@ -6,14 +6,20 @@ from collections.abc import Callable, Iterable
 import pytest
 from hypothesis import example, given, settings, strategies as st
 
-from tormagd.hardware.link_quality import LOOKED_S, LOOKS, LOSES, SETTLING_LOOKS, Counts, LinkQuality, LinkWatch
 from tormagd.hardware.link_statistics import (
+    LOOKED_S,
+    LOOKS,
+    LOSES,
     MIN_WINDOWS,
     ROUND_TRIPS,
+    SETTLING_LOOKS,
     STANDING,
     WINDOW_S,
     WINDOWS,
+    Counts,
     DeviceClock,
+    LinkQuality,
+    LinkWatch,
     RoundTrip,
 )
 

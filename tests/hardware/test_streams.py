@@ -27,8 +27,7 @@ from firmware_protocol.codec import (
 from firmware_protocol.framing import encode_frame
 from firmware_protocol.layouts import LAYOUTS
 from tormagd.hardware.can_backend import EXCHANGE_BITS
-from tormagd.hardware.can_stream import UNREADABLE, CanStream, SecondHostError
-from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.streams import UNREADABLE, CanStream, FrameStream, SecondHostError
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 

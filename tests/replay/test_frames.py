@@ -20,8 +20,7 @@ from tormagd.control.safety.codes import Fault
 from tormagd.ctl.main import main
 from tormagd.ctl.replay import _instead
 from tormagd.record.black_box import BlackBoxFile, read_black_box
-from tormagd.record.replay.rebuild import ReplayError, rebuilt, recorded
-from tormagd.record.replay.rerun import ticks_of
+from tormagd.record.replay.rerun import ReplayError, rebuilt, recorded, ticks_of
 from tormagd.simulation.rehearse import changed, main as run_changed, rehearse, script
 
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5

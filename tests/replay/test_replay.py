@@ -24,8 +24,7 @@ from tormagd.control.safety.codes import Fault
 from tormagd.record.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.record.journal import ANSWER, CONFIRM, FORMAT, MISSING
 from tormagd.record.reader import RecordingError, Seen, read_recording
-from tormagd.record.replay.rebuild import ReplayError, differences, rebuilt, recorded
-from tormagd.record.replay.rerun import rerun, ticks_of
+from tormagd.record.replay.rerun import ReplayError, differences, rebuilt, recorded, rerun, ticks_of
 from tormagd.record.writer import Derived
 
 CHANGED_TICK = 3_210

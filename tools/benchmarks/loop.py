@@ -40,8 +40,7 @@ from tormagd.ctl.processes import begun, first_line, is_linked, processor_s
 from tormagd.ctl.record import listening
 from tormagd.ctl.scene_check import as_toml
 from tormagd.daemon.endpoint import Endpoint
-from tormagd.daemon.heartbeat import Heartbeat
-from tormagd.daemon.realtime import prepare, priority_of_threads
+from tormagd.daemon.realtime import Heartbeat, prepare, priority_of_threads
 from tormagd.headroom.bare_timer import beat
 from tormagd.record.ticks import encode_ticks
 from tormagd_client import Client, ClientError

@@ -22,7 +22,7 @@ from tormag_lab.arrays import Json
 from tormag_lab.told import table
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, RefusedError, next_commands
-from tormagd.daemon.arming import Arming
+from tormagd.daemon.control_loop import Arming
 from tormagd.simulation.__main__ import FIRMWARES
 from tormagd.simulation.closed_loop import Sample
 from tormagd.simulation.device import FirmwareKind

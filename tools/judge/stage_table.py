@@ -57,8 +57,7 @@ from tormagd.element.model.displacement import MOBILISED_MM, Turn
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.link import DeviceLink
-from tormagd.hardware.link_quality import LinkQuality
-from tormagd.hardware.link_statistics import DeviceClock
+from tormagd.hardware.link_statistics import DeviceClock, LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2

@@ -1,21 +1,27 @@
-"""`tormagctl calibrate`: choose what is calibrated; for an insert, sweep the force for `tormag-lab calibrate`.
+"""`tormagctl calibrate`: the running daemon asks the device for forces, so all its limits apply.
 
-The sweep asks for forces through the running daemon, so all its limits apply.
+--device  the daemon learns while it drives: forces over the whole range, a handle that reverses often enough for
+          the sensor's zero, and steps that show how good the profile is, in under a minute
+--insert  sweeps of the force, for `tormag-lab calibrate`
+--motors  a log of one motor's voltage, current and motion, for `tormag-lab identify-motor`: slow ramps show
+          friction, fast ones the speed term, jumps the inertia
 """
 
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
+import msgspec
 import numpy as np
 
+from tormagd.commission.finding import Array
+from tormagd.commission.force_findings import RAMPS_S, STEP_S, STEP_SHARES, force_over_gap, steps
 from tormagd.commission.procedure import Columns, handle_moved
 from tormagd.config import Config
-from tormagd.ctl.calibrate_device import calibrate_device
-from tormagd.ctl.calibrate_motors import calibrate_motors
-from tormagd.ctl.calibrate_run import SOURCE, Range, Run, armed, known_of
-from tormagd.ctl.outcome import WRITABLE, Outcome, as_usage_error, is_terminal, usage_error
+from tormagd.ctl.calibrate_run import SOURCE, Range, Run, armed, known_of, reach
+from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
@@ -23,8 +29,10 @@ from tormagd.ground.files import new_file
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
+from tormagd_client.messages import ProfileReport, Status
 
-COLUMNS = ("monotonic_s", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s", "measured_cf")
+Side: TypeAlias = Literal["left", "right"]
+SWEPT_COLUMNS = ("monotonic_s", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s", "measured_cf")
 SWEEP_COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 EVERY = 4
 "Neighbouring ticks are nearly the same."
@@ -75,12 +83,16 @@ def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> int:
     start_s = min((float(sweep["monotonic_s"][0]) for sweep in sweeps if sweep["monotonic_s"].size), default=0.0)
     rows = []
     for number, sweep in enumerate(sweeps):
-        ticks = np.column_stack([sweep[name] for name in COLUMNS])
+        ticks = np.column_stack([sweep[name] for name in SWEPT_COLUMNS])
         time_s, left_mm, right_mm, *others = ticks[np.isfinite(ticks).all(axis=1)][::EVERY].T
         rows.append(np.column_stack([time_s - start_s, np.full_like(time_s, number), left_mm + right_mm, *others]))
-    table = np.concatenate(rows)
+    return _saved(path, np.concatenate(rows), "%.9g", SWEEP_COLUMNS)
+
+
+def _saved(path: Path, table: Array, form: str, names: Sequence[str]) -> int:
+    """Write a new CSV file, and return its number of rows."""
     with as_usage_error(OSError, hint=WRITABLE), new_file(path):
-        np.savetxt(path, table, "%.9g", ",", header=",".join(SWEEP_COLUMNS), comments="")
+        np.savetxt(path, table, form, ",", header=",".join(names), comments="")
     return len(table)
 
 
@@ -93,7 +105,7 @@ def calibrate(
     motors: bool,
     out: Path | None,
     rates_N_s: Sequence[float],
-    side: Literal["left", "right"],
+    side: Side,
     is_agreed: bool,
 ) -> Outcome:
     """Calibrate the device, an `insert`, or the `motors`, with a person's agreement."""
@@ -129,3 +141,165 @@ def agree() -> None:
     print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)
     if not sys.stdin.readline():
         raise usage_error("input ended: nobody agreed to the carriages moving", "press Enter to agree")
+
+
+KEPT_WITHIN_S = 5.0
+DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
+
+
+def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
+    with Client(endpoints, wait_s, SOURCE) as client:
+        status = client.status()
+        if not status.profile.folder:
+            raise _not_kept(status.profile)
+        known = known_of(config, status, scene_most_N)
+        with armed(endpoints, client, known.force_N(0.0)) as run:
+            print("turn the handle to and fro, about 20 turns a minute, until the gap opens", file=sys.stderr)
+            run.progress.begin("device", 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES))
+            run.follow(force_over_gap(known))
+            mean, worst, *_ = run.follow(steps(known))
+            status = client.status()
+            require_believed(status)
+        result = {"serial_number": status.link.serial_number, **msgspec.to_builtins(status.device)}
+        result |= {"steps": len(STEP_SHARES), "mean_error_N": _in_N(mean.value), "worst_error_N": _in_N(worst.value)}
+        result["profile"] = _kept(client).folder
+    return Outcome(result, _text(result))
+
+
+def _in_N(value_mN: float | None) -> float:
+    return round((value_mN or 0.0) * 1e-3, 4)
+
+
+def require_believed(status: Status) -> None:
+    """Raise CommandError if the daemon doubts the force sensor, and so has learned nothing."""
+    doubt = next((limit for limit in status.limit_details if limit.code in DOUBTS), None)
+    if doubt is not None:
+        raise CommandError(
+            Exit.REFUSED, "sensor_doubted", f"{doubt.code}: {doubt.cause}: no profile is kept", doubt.remedy
+        )
+
+
+def _kept(client: Client) -> ProfileReport:
+    began_s = time.monotonic()
+    while True:
+        profile = client.status().profile
+        if profile.age_s is not None and profile.age_s < time.monotonic() - began_s + 1.0 and not profile.refusal:
+            return profile
+        if profile.refusal or time.monotonic() - began_s > KEPT_WITHIN_S:
+            raise _not_kept(profile)
+        time.sleep(0.05)
+
+
+def _not_kept(profile: ProfileReport) -> CommandError:
+    return CommandError(
+        Exit.REFUSED,
+        "not_kept",
+        f"no profile is kept: {profile.refusal or 'the daemon has written none'}",
+        "name a folder that the daemon may write to in [device] profiles, and start it again",
+    )
+
+
+def _text(result: dict[str, Any]) -> str:
+    return (
+        f"device {result['serial_number']}: {result['scale']:.3f} +- {result['scale_sd']:.3f} times the model's force, "
+        f"{result['offset_N'] * 1e3:+.0f} +- {result['offset_sd_N'] * 1e3:.0f} mN; its sensor reads "
+        f"{result['sensor_zero_N'] * 1e3:+.0f} +- {result['sensor_zero_sd_N'] * 1e3:.0f} mN without a force\n"
+        f"{result['steps']} steps, by that sensor: {result['mean_error_N'] * 1e3:+.0f} mN off in the mean, "
+        f"{result['worst_error_N'] * 1e3:.0f} at worst\n"
+        f"kept in {result['profile']}; the daemon begins with it the next time"
+    )
+
+
+MOTOR_COLUMNS = (
+    "device_time_s",
+    "left_duty",
+    "right_duty",
+    "supply_V",
+    "left_mm",
+    "right_mm",
+    "left_current_A",
+    "right_current_A",
+    "measured_cf",
+    "reference_gap_mm",
+)
+LOG_COLUMNS = ("t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm")
+
+CLEAR_N = 0.1
+"At the open end the firmware holds back a duty that would push on."
+MOTOR_RAMPS_S = (12.0, 6.0, 3.0)
+"Up, then the same time down."
+JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.0)
+"Shares of the range: small and large jumps, up and down, over the whole stroke."
+JUMP_S = 0.6
+ROUNDS = 2
+"One half is fitted, the other judges."
+MIN_HZ = 900.0
+"A log of 500 Hz makes a motor's delay wrong and the rest less exact."
+LONGEST_HOLE_S = 0.02
+
+
+def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
+    """Return the waveform to ask for: ramps, then jumps, `rounds` times."""
+    low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
+    ramps = [(ramp_s, force_N) for ramp_s in MOTOR_RAMPS_S for force_N in (high_N, low_N)]
+    # each takes a millisecond, and is held
+    jumps = [(lasts_s, low_N + share * (high_N - low_N)) for share in JUMP_SHARES for lasts_s in (1e-3, JUMP_S)]
+    return by_legs(low_N, rounds * (ramps + jumps))
+
+
+def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
+    """Drive both carriages through `excitation`, and write the log of one as CSV."""
+    with Client(endpoints, wait_s, SOURCE) as client:
+        status = client.status()
+        waveform = excitation(reach(status, scene_most_N))
+        hz = status.rates["control"].hz
+        if hz < MIN_HZ:
+            raise CommandError(
+                Exit.REFUSED,
+                "slow_control",
+                f"the daemon controls {hz:.0f} times a second: allowed for a motor log is 1000",
+                "state control_hz = 1000 under [rates] in its configuration, and start it again; where it stands "
+                "there, tormagctl doctor",
+            )
+        with armed(endpoints, client, waveform.least_N) as run:
+            run.progress.begin("motors", waveform.duration_s)
+            columns = run.play(waveform)
+    log = motor_log(columns, side)
+    rows = _saved(path, np.column_stack([log[name] for name in LOG_COLUMNS]), "%.6f", LOG_COLUMNS)
+    result = {"file": str(path), "side": side, "rows": rows, "seconds": round(float(log["t_s"][-1]), 3)}
+    text = f"{path}: {rows} rows of the {side} carriage. next: tormag-lab identify-motor {path}"
+    return Outcome(result, text)
+
+
+def motor_log(ticks: Columns, side: Side) -> Columns:
+    """Return the motor log of one side, evenly spaced on the device's clock."""
+    known = np.isfinite(np.column_stack([ticks[name] for name in MOTOR_COLUMNS])).all(axis=1)
+    time_s = ticks["device_time_s"][known]
+    # of ticks with the same measurement, the device follows the last one's duty
+    fresh = np.append(np.diff(time_s) > 0.0, True)[: len(time_s)]
+    time_s = time_s[fresh]
+    holes = np.diff(time_s)
+    if len(time_s) < 2 or holes.max() > LONGEST_HOLE_S:
+        longest = "no measurements" if len(time_s) < 2 else f"a silence of {holes.max() * 1e3:.0f} ms"
+        raise CommandError(
+            Exit.REFUSED,
+            "holes",
+            f"{longest} in the ticks: allowed are {LONGEST_HOLE_S * 1e3:.0f} ms",
+            "run it again on a machine with less load; tormagctl doctor",
+        )
+    column = {name: ticks[name][known][fresh] for name in MOTOR_COLUMNS}
+    period_s = float(np.median(holes))
+    even_s = np.arange(time_s[0], time_s[-1], period_s)
+    held = np.searchsorted(time_s, even_s + period_s / 2.0, side="right") - 1
+    volts = column[f"{side}_duty"] * column["supply_V"]
+    straight = {
+        "position_mm": column[f"{side}_mm"],
+        "current_A": column[f"{side}_current_A"],
+        "force_N": column["measured_cf"],
+        "reference_mm": column["reference_gap_mm"] / 2.0,
+    }
+    return {
+        "t_s": even_s - even_s[0],
+        "input_V": volts[held],
+        **{name: np.interp(even_s, time_s, values) for name, values in straight.items()},
+    }

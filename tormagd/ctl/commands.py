@@ -4,18 +4,14 @@ import argparse
 import math
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from tormagd.ground.command_line import Within, number
+from tormagd.ground.command_line import Option, Within, number, option
 from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
 ORIGIN = re.compile(r"(https://[a-z0-9.-]+|http://(localhost|127\.0\.0\.1))(:[0-9]{1,5})?")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
-
-
-Option = tuple[tuple[str, ...], dict[str, Any]]
-"What `argparse.ArgumentParser.add_argument` takes, by place and by name."
 
 
 class Command(NamedTuple):
@@ -26,10 +22,6 @@ class Command(NamedTuple):
     needs: tuple[str, ...] = ()
     options: tuple[Option, ...] = ()
     has_daemon: bool = True
-
-
-def option(*names: str, **settings: Any) -> Option:
-    return names, settings
 
 
 def port(text: str) -> int:
@@ -211,13 +203,13 @@ COMMANDS = {
     ),
     "mark": Command(
         "put an event into telemetry and recordings; its segment is kept",
-        "recordings.mark",
+        "record.mark",
         ("client",),
         (option("text", type=words, metavar="TEXT", help="1..200 printable characters"),),
     ),
     "recordings": Command(
         "list or prune a folder of recordings, mark one to keep, or export one with its SHA-256",
-        "recordings.recordings",
+        "record.recordings",
         ("config",),
         (
             option("action", choices=("list", "prune", "mark", "export")),

@@ -7,7 +7,7 @@ import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import msgspec
 
 from tormagd import __version__
 from tormagd.config import Config, load_config, load_endpoints
-from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL, Option
+from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL
 from tormagd.ctl.outcome import (
     Outcome,
     as_usage_error,
@@ -25,7 +25,7 @@ from tormagd.ctl.outcome import (
     print_outcome,
     usage_error,
 )
-from tormagd.ground.command_line import Parser, UsageError
+from tormagd.ground.command_line import Parser, UsageError, add
 from tormagd.ground.terminal import write_in_any_encoding, write_line
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.errors import ClientError
@@ -60,15 +60,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ClientError as error:
         print_error(options.command, error, options.json)
         return exit_code(error)
-    except ModuleNotFoundError as error:
-        extra = EXTRAS.get(error.name or "")
-        if extra is None:
-            raise
-        missing = usage_error(
-            f"{options.command} needs {error.name}, which is not installed", f"pip install 'tormagd[{extra}]'"
-        )
-        print_error(options.command, missing, options.json)
-        return exit_code(missing)
     except KeyboardInterrupt:
         daemon = "it is told to disable" if options.command == "arm" else "the daemon goes on"
         write_line(f"tormagctl {options.command}: interrupted; {daemon}", sys.stderr)
@@ -77,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Outcome:
-    """Import the command's function, and call it with its options and what it needs."""
+    """Call the command's function with its options and what it needs."""
     command = COMMANDS[options.command]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
@@ -100,14 +91,23 @@ def _run(options: argparse.Namespace) -> Outcome:
 
             known["client"] = stack.enter_context(Client(known["endpoints"], options.wait))
         given = {name: value for name, value in vars(options).items() if name not in ("command", *USUAL)}
-        module, _, name = command.function.partition(".")
+        return _called(options.command, given | {need: known[need] for need in command.needs})
+
+
+def _called(command: str, arguments: dict[str, Any]) -> Outcome:
+    """Import the command's function, and call it."""
+    module, _, name = COMMANDS[command].function.partition(".")
+    try:
         function: Callable[..., Outcome] = getattr(import_module(f"tormagd.ctl.{module}"), name)
-        try:
-            return function(**given, **{need: known[need] for need in command.needs})
-        except UnicodeEncodeError as error:  # of an argument, into a message or a file
-            raise usage_error(
-                f"{in_short(error.object)}: allowed is UTF-8 text", "give another text or name"
-            ) from error
+        return function(**arguments)
+    except ModuleNotFoundError as error:
+        if (extra := EXTRAS.get(error.name or "")) is None:
+            raise
+        raise usage_error(
+            f"{command} needs {error.name}, which is not installed", f"pip install 'tormagd[{extra}]'"
+        ) from error
+    except UnicodeEncodeError as error:  # of an argument, into a message or a file
+        raise usage_error(f"{in_short(error.object)}: allowed is UTF-8 text", "give another text or name") from error
 
 
 def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
@@ -137,9 +137,9 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
 def parser() -> argparse.ArgumentParser:
     # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
     shared = Parser(add_help=False, argument_default=argparse.SUPPRESS)
-    _add(shared, SHARED)
+    add(shared, SHARED)
     made = Parser(prog="tormagctl", description="Operate the tormagd haptic controller.", epilog=EXIT_TEXT)
-    _add(made, SHARED)
+    add(made, SHARED)
     of_commands = (each for command in COMMANDS.values() for each in command.options)
     made.options = tuple(name for names, _ in (*SHARED, *of_commands) for name in names)
     made.set_defaults(**USUAL)
@@ -147,16 +147,8 @@ def parser() -> argparse.ArgumentParser:
     # otherwise argparse would lay out a usage to find it
     commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=made.prog)
     for name, (text, _, _, options, _) in COMMANDS.items():
-        _add(
-            commands.add_parser(name, help=text, description=text, parents=[shared], epilog=EXIT_TEXT),
-            options,
-        )
+        add(commands.add_parser(name, help=text, description=text, parents=[shared], epilog=EXIT_TEXT), options)
     return made
-
-
-def _add(parser: argparse.ArgumentParser, options: Iterable[Option]) -> None:
-    for names, settings in options:
-        parser.add_argument(*names, **settings)
 
 
 if __name__ == "__main__":

@@ -105,37 +105,34 @@ def _families(status: Status) -> Iterator[Metric]:
     link, setpoints, rates, followed = status.link, status.setpoints, status.rates, status.following
     error_N, aligned_N, delay_ms = (None, None, None) if followed is None else msgspec.structs.astuple(followed)
     sources, trip_us = setpoints.by_source, status.link.round_trip_us
-    for name, text, value, unit in (
-        ("homed", "Whether the positions are known", float(status.is_homed), 1.0),
-        ("uptime_seconds", "Since the daemon started", status.uptime_s, 1.0),
-        ("force_asked_newtons", "Newest setpoint", status.setpoint_cf, 1.0),
-        ("force_governed_newtons", "What the governor makes of it", status.governed_cf, 1.0),
-        ("force_measured_newtons", "What the force sensor reads", status.measured_cf, 1.0),
-        ("following_rms_newtons", "Measured less asked, while it could be followed", error_N, 1.0),
-        ("following_aligned_rms_newtons", "The same, delay taken out", aligned_N, 1.0),
-        ("following_delay_seconds", "That delay", delay_ms, MILLI),
-        ("force_least_newtons", "Least force of this device", status.least_N, 1.0),
-        ("force_most_newtons", "Greatest force of this device", status.most_N, 1.0),
-        ("gap_meters", "Measured gap between the magnets", status.gap_mm, MILLI),
-        ("skew_meters", "Left minus right carriage", status.skew_mm, MILLI),
-        ("field_teslas", "Flux density that is planned for", status.field_mT, MILLI),
-        ("device_scale_ratio", "The device's force over the model's", status.device.scale, 1.0),
-        ("setpoint_age_seconds", "Of the newest setpoint", status.setpoint_age_ms, MILLI),
-        ("link_running", "Whether the device answers", float(link.state == "RUNNING"), 1.0),
+    for kind, name, text, value, unit in (
+        (GAUGE, "homed", "Whether the positions are known", float(status.is_homed), 1.0),
+        (GAUGE, "uptime_seconds", "Since the daemon started", status.uptime_s, 1.0),
+        (GAUGE, "force_asked_newtons", "Newest setpoint", status.setpoint_cf, 1.0),
+        (GAUGE, "force_governed_newtons", "What the governor makes of it", status.governed_cf, 1.0),
+        (GAUGE, "force_measured_newtons", "What the force sensor reads", status.measured_cf, 1.0),
+        (GAUGE, "following_rms_newtons", "Measured less asked, while it could be followed", error_N, 1.0),
+        (GAUGE, "following_aligned_rms_newtons", "The same, delay taken out", aligned_N, 1.0),
+        (GAUGE, "following_delay_seconds", "That delay", delay_ms, MILLI),
+        (GAUGE, "force_least_newtons", "Least force of this device", status.least_N, 1.0),
+        (GAUGE, "force_most_newtons", "Greatest force of this device", status.most_N, 1.0),
+        (GAUGE, "gap_meters", "Measured gap between the magnets", status.gap_mm, MILLI),
+        (GAUGE, "skew_meters", "Left minus right carriage", status.skew_mm, MILLI),
+        (GAUGE, "field_teslas", "Flux density that is planned for", status.field_mT, MILLI),
+        (GAUGE, "device_scale_ratio", "The device's force over the model's", status.device.scale, 1.0),
+        (GAUGE, "setpoint_age_seconds", "Of the newest setpoint", status.setpoint_age_ms, MILLI),
+        (GAUGE, "link_running", "Whether the device answers", float(link.state == "RUNNING"), 1.0),
+        (COUNTER, "setpoints_accepted", "Setpoints that were taken", setpoints.accepted, 1.0),
+        (COUNTER, "setpoints_refused", "Setpoints that were not valid", setpoints.refused, 1.0),
+        (COUNTER, "setpoints_dropped", "Setpoints that were not read", setpoints.dropped, 1.0),
+        (COUNTER, "link_losses", "Times the link was lost", link.losses, 1.0),
+        (COUNTER, "link_frames", "Frames received since the port was opened", link.frames, 1.0),
+        (COUNTER, "link_corrupt_frames", "Of these, damaged", link.corrupt, 1.0),
+        (COUNTER, "link_lost_frames", "Frames missing in the count", link.lost, 1.0),
+        (COUNTER, "link_repeated_frames", "Frames that came twice", link.repeated, 1.0),
+        (COUNTER, "peers_refused", "Connections that were not let in", status.peers.refused, 1.0),
     ):
-        yield from _family(GAUGE, name, text, (), {(): value}, unit)
-    for name, text, count in (
-        ("setpoints_accepted", "Setpoints that were taken", setpoints.accepted),
-        ("setpoints_refused", "Setpoints that were not valid", setpoints.refused),
-        ("setpoints_dropped", "Setpoints that were not read", setpoints.dropped),
-        ("link_losses", "Times the link was lost", link.losses),
-        ("link_frames", "Frames received since the port was opened", link.frames),
-        ("link_corrupt_frames", "Of these, damaged", link.corrupt),
-        ("link_lost_frames", "Frames missing in the count", link.lost),
-        ("link_repeated_frames", "Frames that came twice", link.repeated),
-        ("peers_refused", "Connections that were not let in", status.peers.refused),
-    ):
-        yield from _family(COUNTER, name, text, (), {(): count})
+        yield from _family(kind, name, text, (), {(): value}, unit)
     for kind, name, text, label, values in (
         (GAUGE, "fault", "Latched faults, 1 for each that is there", "code", dict.fromkeys(status.faults, 1.0)),
         (GAUGE, "limit", "Limits, 1 for each that holds the force back now", "code", dict.fromkeys(status.limits, 1.0)),

@@ -14,8 +14,7 @@ import msgspec
 from tormagd.ctl.outcome import Exit, Outcome, answer_of, as_usage_error, usage_error
 from tormagd.record.black_box import BlackBoxFile
 from tormagd.record.reader import RecordingError
-from tormagd.record.replay.rebuild import Recorded, ReplayError, rebuilt, told
-from tormagd.record.replay.rerun import rerun
+from tormagd.record.replay.rerun import Recorded, ReplayError, rebuilt, rerun, told
 from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 900.0

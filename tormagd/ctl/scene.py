@@ -8,7 +8,16 @@ import msgspec
 
 from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, folded, usage_error
-from tormagd.ctl.scene_check import LONGEST_S, as_toml, check_scene, derived_of, loaded, measured_as, way_of
+from tormagd.ctl.scene_check import (
+    LONGEST_S,
+    as_toml,
+    check_scene,
+    derived_of,
+    loaded,
+    measured_as,
+    serve_scene,
+    way_of,
+)
 from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import Served
 from tormagd.scenes.scene import load_scene, shipped_scenes
@@ -44,8 +53,6 @@ def scene(
             "tormagctl scene new FILE.toml",
         )
     if share is not None or tolerance_N is not None or out is not None:
-        from tormagd.ctl.scene_served import serve_scene
-
         return serve_scene(action, named, share, tolerance_N, out, config.device.backend)
     match action:
         case "list" if name is None:

@@ -3,25 +3,33 @@
 libzmq carries out the handshakes in its own thread. Through ZAP (RFC 27) it asks about every peer that has proved that
 it holds the secret of its key. Through socket monitors it tells of peers that got less far. Both are handled in a slice
 of the beat.
+
+libzmq accepts whatever comes, and ends the process where no descriptor is left for it (`ipc_listener.cpp`). It watches
+its listening sockets through epoll. Here each of them becomes one-shot there (EPOLLONESHOT, `epoll_ctl(2)`): one
+connection is accepted each time that the door is opened. What epoll has to be told of it anew is in /proc/self/fdinfo
+(`proc(5)`).
 """
 
 import contextlib
+import ctypes
 import logging
+import platform
+import re
+import select
 import socket
 import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import zmq
 import zmq.utils.monitor
 from zmq.utils import z85
 
-from tormagd.daemon.accept_gate import door, let_in
-from tormagd.daemon.peers import Allowance, Peer, Tally, shown
-from tormagd.daemon.requests import Arrivals
+from tormagd.daemon.peers import Allowance, Arrivals, Peer, Tally, shown
 from tormagd.ground.access_keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
@@ -51,6 +59,9 @@ WATCHED = (
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
 _CREDENTIALS = struct.Struct("3i")
+_EVENT = struct.Struct("=IQ" if platform.machine() == "x86_64" else "@IQ")
+"`struct epoll_event`, which is packed on x86-64 only."
+_libc = ctypes.CDLL(None, use_errno=True)
 
 MAY: dict[str, frozenset[str]] = {
     "setpoint": frozenset({"publish"}),
@@ -135,7 +146,7 @@ class Admission:
             for known in self._endpoints.values():
                 if not known.is_open and len(known.cut) < CLOSING and time.monotonic_ns() > known.shut_ns:
                     known.is_open = True
-                    let_in(*known.door)
+                    open_door(*known.door)
             if not busy:
                 return number > 0
         return True
@@ -284,3 +295,24 @@ def _borrowed(descriptor: int) -> Iterator[socket.socket]:
         yield connection
     finally:
         connection.detach()
+
+
+def door(listening: int) -> tuple[int, int, int]:
+    """Return what `open_door` takes: the epoll set in which the descriptor `listening` is watched, itself,
+    its data there."""
+    entry = re.compile(rf"^tfd: +{listening} +events: +(\w+) +data: +(\w+)", re.MULTILINE)
+    for _ in range(1_000):  # libzmq's thread takes up a new socket in its own time
+        for path in Path("/proc/self/fdinfo").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+                found = entry.search(path.read_text(encoding="ascii"))
+                if found and int(found[1], 16) & select.EPOLLIN:
+                    return int(path.name), listening, int(found[2], 16)
+        time.sleep(0.001)  # with SCHED_FIFO it would wait for this thread
+    raise OSError("connections cannot be bounded: /proc/self/fdinfo names no epoll set; mount /proc")
+
+
+def open_door(epoll: int, listening: int, data: int) -> None:
+    """Let libzmq accept one connection, the one that waits or comes next."""
+    # 3: EPOLL_CTL_MOD
+    if _libc.epoll_ctl(epoll, 3, listening, _EVENT.pack(select.EPOLLIN | select.EPOLLONESHOT, data)):
+        raise OSError(ctypes.get_errno(), "epoll_ctl")

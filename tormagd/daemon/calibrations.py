@@ -4,7 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 from tormagd.config import Config, load_calibration
 from tormagd.control.assembly.build import Core, build_core
@@ -14,13 +14,9 @@ from tormagd_client.messages import CalibrationReport
 log = logging.getLogger(__name__)
 
 
-class Made(NamedTuple):
-    """What a device is to run by. `core` is None if the running one fits, `file` is empty without a calibration."""
-
-    config: Config
-    core: Core | None
-    file: str
-    refusal: str
+Made: TypeAlias = tuple[Config, Core | None, str, str]
+"""What a device is to run by: configuration, core (None if the running one fits), the calibration's file, and why none
+is used."""
 
 
 class Calibrations:
@@ -61,15 +57,15 @@ class Calibrations:
     def _note(self, serial_number: int, making: "asyncio.Future[Made]") -> None:
         refusal_before = self._refusal
         try:
-            made = making.result()
+            config, core, file, refusal = making.result()
         except ConfigError as error:
             self._refusal = f"the scene does not run without the last device's calibration: {error}"
         else:
-            self._of, self._making, self._file, self._refusal = serial_number, None, made.file, made.refusal
-            if made.core is not None:
-                self._take(made.config, made.core)
-            if made.file:
-                log.info("the device's calibration is in force: %s", made.file)
+            self._of, self._making, self._file, self._refusal = serial_number, None, file, refusal
+            if core is not None:
+                self._take(config, core)
+            if file:
+                log.info("the device's calibration is in force: %s", file)
         if self._refusal and self._refusal != refusal_before:
             log.warning("the device's calibration is not used: %s; next: tormagctl commission", self._refusal)
 
@@ -81,7 +77,7 @@ def _make(path: Path, serial_number: int, configured: Config, running: Config) -
         refusal = "" if isinstance(error.__cause__, FileNotFoundError) else str(error)
     else:
         try:
-            return Made(config, None if config == running else build_core(config), str(path), "")
+            return config, None if config == running else build_core(config), str(path), ""
         except ConfigError as error:
             refusal = f"{path}: {error}"
-    return Made(configured, None if configured == running else build_core(configured), "", refusal)
+    return configured, None if configured == running else build_core(configured), "", refusal

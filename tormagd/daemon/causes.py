@@ -10,7 +10,7 @@ from tormagd.config import Device
 from tormagd.control.core import Stepper
 from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
 from tormagd.daemon.beat import Delay
-from tormagd.hardware.link_quality import LOSES
+from tormagd.hardware.link_statistics import LOSES
 from tormagd.hardware.measurement import Measurement
 from tormagd_client.messages import Explained, StallReport
 

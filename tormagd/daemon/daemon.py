@@ -23,11 +23,10 @@ from tormagd.daemon.causes import Causes
 from tormagd.daemon.commands import Commands
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
-from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, state_folder
 from tormagd.daemon.rate_group import ERROR_PERIODS, Histogram
-from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
+from tormagd.daemon.realtime import Heartbeat, freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
 from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.search_process import SearchProcess

@@ -18,8 +18,7 @@ from tormagd.config import Sources
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.admission import CONNECTIONS, MAY, Admission
 from tormagd.daemon.inbox import EQUAL_SOURCES, SetpointInbox
-from tormagd.daemon.peers import Allowance, Listeners, Peer, Tally
-from tormagd.daemon.requests import FIRST, Arrivals, Requests, Waiting, may_go_first
+from tormagd.daemon.peers import FIRST, Allowance, Arrivals, Listeners, Peer, Requests, Tally, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.ground.access_keys import KeyRing
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints

@@ -7,21 +7,24 @@ from pathlib import Path
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import load_config
-from tormagd.ground.command_line import Parser, UsageError
+from tormagd.ground.command_line import Parser, UsageError, add, option
 from tormagd.ground.terminal import log_to_stderr, write_in_any_encoding, write_line
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import printable
 
 EXIT_TEXT = """exit codes: 0 ended on request, 1 could not run, 2 configuration refused. SIGTERM opens the gap and ends;
 SIGHUP reads keys and configuration again."""
+OPTIONS = (
+    option("--config", type=Path, metavar="FILE", help="TOML configuration"),
+    option("--scene", metavar="NAME", help="scene or scene file instead of the configuration's"),
+    option("--check", action="store_true", help="print the resolved configuration and exit"),
+    option("--version", action="version", version=f"tormagd {__version__}, {settle()}"),
+)
 
 
 def parser() -> Parser:
     made = Parser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
-    made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
-    made.add_argument("--scene", metavar="NAME", help="scene or scene file instead of the configuration's")
-    made.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
-    made.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
+    add(made, OPTIONS)
     return made
 
 

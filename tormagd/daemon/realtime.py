@@ -1,10 +1,15 @@
-"""What the kernel can be asked for: real-time policy, locked memory, processors, no sleep. A refusal is a warning."""
+"""What the kernel is asked for: real-time policy, locked memory, processors, no sleep, and the timer of the beat.
+
+A refusal of the first is a warning. The timer is the kernel's, because asyncio's own round to a millisecond.
+"""
 
 import ctypes
 import gc
 import logging
 import os
 import resource
+import struct
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -17,6 +22,14 @@ _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _LATENCY = Path("/dev/cpu_dma_latency")
 """While it is open, no processor sleeps so deeply that waking takes longer than the us written to it (the kernel's
 Documentation/power/pm_qos_interface)."""
+
+_TFD_TIMER_ABSTIME = 1
+_ITIMERSPEC = struct.Struct("@4l")
+"Interval and first beat, each in seconds and nanoseconds."
+_NS = 1_000_000_000
+
+# os.timerfd_create needs Python 3.13
+_libc = ctypes.CDLL(None, use_errno=True)
 
 log = logging.getLogger(__name__)
 
@@ -80,3 +93,36 @@ def freeze_garbage() -> None:
     """Exempt all living objects from garbage collection: a full one takes tens of milliseconds."""
     gc.collect()
     gc.freeze()
+
+
+class Heartbeat:
+    """A periodic timer on CLOCK_MONOTONIC (timerfd)."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
+        if self._fd < 0:
+            raise OSError(
+                ctypes.get_errno(), "the kernel makes no timer for the beat (timerfd_create); tormagctl doctor"
+            )
+        self.period_ns = period_ns
+        self.due_ns = time.monotonic_ns()
+        setting = _ITIMERSPEC.pack(*divmod(period_ns, _NS), *divmod(self.due_ns + period_ns, _NS))
+        if _libc.timerfd_settime(self._fd, _TFD_TIMER_ABSTIME, setting, None) < 0:
+            raise OSError(
+                ctypes.get_errno(), "the kernel sets no timer for the beat (timerfd_settime); tormagctl doctor"
+            )
+
+    def fileno(self) -> int:
+        return self._fd
+
+    def beats(self) -> int:
+        """Return the number of beats due since the last call."""
+        try:
+            expirations: int = struct.unpack("=Q", os.read(self._fd, 8))[0]
+        except BlockingIOError:
+            return 0
+        self.due_ns += expirations * self.period_ns
+        return expirations
+
+    def close(self) -> None:
+        os.close(self._fd)

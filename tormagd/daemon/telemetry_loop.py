@@ -17,10 +17,9 @@ from tormagd.daemon.black_box import BlackBox
 from tormagd.daemon.commands import Commands
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
-from tormagd.daemon.force_delay import ForceDelay
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import Histogram, RateGroup
-from tormagd.daemon.verdict import CANNOT, Judged, judged
+from tormagd.daemon.verdict import CANNOT, ForceDelay, Judged, judged
 from tormagd.record.force_following import Following
 from tormagd.record.journal import TOLD
 from tormagd.record.telemetry import Moment, snapshot

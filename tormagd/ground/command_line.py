@@ -3,7 +3,8 @@
 import argparse
 import math
 import sys
-from typing import Any, NamedTuple, NoReturn
+from collections.abc import Iterable
+from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 from tormagd.ground.files import did_you_mean
 from tormagd.ground.terminal import write_answer
@@ -12,6 +13,16 @@ from tormagd_client.printable import in_short, printable
 LONGEST = 300
 "Characters of a refusal that quotes what was given."
 UNKNOWN_OPTION = "unrecognized arguments: "
+Option: TypeAlias = tuple[tuple[str, ...], dict[str, Any]]
+
+
+def option(*names: str, **settings: Any) -> Option:
+    return names, settings
+
+
+def add(parser: argparse._ActionsContainer, options: Iterable[Option]) -> None:
+    for names, settings in options:
+        parser.add_argument(*names, **settings)
 
 
 class UsageError(Exception):

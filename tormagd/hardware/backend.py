@@ -13,8 +13,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 from firmware_protocol.codec import Message
 from tormagd.config import Device, Rates, checked
 from tormagd.ground.files import did_you_mean
-from tormagd.hardware.can_stream import CanStream
-from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.streams import CanStream, FrameStream
 from tormagd_client.endpoints import ConfigError, Strict
 
 ENTRY_POINTS = "tormagd.backends"

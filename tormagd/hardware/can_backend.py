@@ -22,7 +22,7 @@ from firmware_protocol.codec import Message
 from tormagd.config import Device, Rates
 from tormagd.ground.files import did_you_mean
 from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver, LinkStatistics
-from tormagd.hardware.can_stream import CanStream, SecondHostError
+from tormagd.hardware.streams import CanStream, SecondHostError
 from tormagd_client.endpoints import ConfigError, Strict
 
 FRAMES_AT_ONCE = 256

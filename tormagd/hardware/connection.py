@@ -14,10 +14,9 @@ from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Me
 from tormagd.config import Device
 from tormagd.ground.plain_values import Kinds, plain, restore
 from tormagd.hardware.backend import Backend, BackendError, Received, Sent, Stream
-from tormagd.hardware.can_stream import CanStream
-from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.streams import CanStream, FrameStream
 from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
 
 FIRST_BACK_OFF_S = 0.05

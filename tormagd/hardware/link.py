@@ -25,8 +25,7 @@ from firmware_protocol.codec import (
     Switches,
     period,
 )
-from tormagd.hardware.link_quality import UNKNOWN_QUALITY, Counts, LinkQuality, LinkWatch
-from tormagd.hardware.link_statistics import DeviceClock, RoundTrip
+from tormagd.hardware.link_statistics import UNKNOWN_QUALITY, Counts, DeviceClock, LinkQuality, LinkWatch, RoundTrip
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 REPEAT_S: Final = 0.05

@@ -5,7 +5,7 @@ from typing import Final, final
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from firmware_protocol.value import Value
-from tormagd.hardware.link_quality import UNKNOWN_QUALITY, LinkQuality
+from tormagd.hardware.link_statistics import UNKNOWN_QUALITY, LinkQuality
 
 # an operation on flags makes a new one, in a microsecond; a shift does not
 _HOMED: Final = Switches.HOMED.bit_length() - 1

@@ -9,7 +9,7 @@ import serial
 
 from firmware_protocol.codec import Message
 from tormagd.hardware.backend import BackendError, LinkStatistics
-from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.streams import FrameStream
 
 READ_BYTES: Final = 4_096
 UNSENT_BYTES: Final = 512

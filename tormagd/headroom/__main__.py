@@ -20,7 +20,7 @@ from tormagd.control.assembly.build import build_core
 from tormagd.ground.machine_loop import machine_us
 from tormagd.ground.terminal import write_line
 from tormagd.headroom.bare_timer import Lateness, lateness
-from tormagd.headroom.core_cost import Call, CoreCost, calls, core_cost
+from tormagd.headroom.core_cost import Call, calls, core_cost
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import printable
 
@@ -46,12 +46,12 @@ def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
     machine = machine_us()
     steps, plans = calls(config, build_core(config), core_s)  # before the timer takes the daemon's priority
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-        late, cost = runner.run(_in_real_time(config, timer_s, steps, plans))
+        late, (step_us, plan_us) = runner.run(_in_real_time(config, timer_s, steps, plans))
     return {
         "machine_us": round(machine, 1),
         "build": build(),
-        "step_us": quantiles(cost.step_us),
-        "plan_us": quantiles(cost.plan_us),
+        "step_us": quantiles(step_us),
+        "plan_us": quantiles(plan_us),
         "bare": {
             "rate_hz": config.rates.control_hz,
             "lateness_us": quantiles(late.beats_us),
@@ -63,7 +63,7 @@ def measured(config: Config, timer_s: float, core_s: float) -> dict[str, Any]:
 
 async def _in_real_time(
     config: Config, timer_s: float, steps: list[Call], plans: list[Call]
-) -> tuple[Lateness, CoreCost]:
+) -> tuple[Lateness, tuple[list[float], list[float]]]:
     rate_hz = config.rates.control_hz
     return await lateness(config.realtime, rate_hz, timer_s), await core_cost(steps, plans, rate_hz)
 

@@ -9,8 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from tormagd.config import RealTime
-from tormagd.daemon.heartbeat import Heartbeat
-from tormagd.daemon.realtime import freeze_garbage, prepare
+from tormagd.daemon.realtime import Heartbeat, freeze_garbage, prepare
 
 NS = 1_000_000_000
 WARM_UP_BEATS = 20

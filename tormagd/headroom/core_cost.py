@@ -1,8 +1,8 @@
 """What `plan` and `step` cost on this machine: the scene in virtual time, then both once more, each call timed.
 
 Both are deterministic, so they can be called again with what they were given in the closed loop. They are called at the
-control period's own pace: a processor that sleeps between two ticks finds colder caches, and a step takes two or three
-times as long. Figures are processor time.
+control period's pace: a processor that sleeps between two ticks finds colder caches, and a step takes two or three
+times as long. Figures are processor time, us.
 """
 
 import asyncio
@@ -10,12 +10,11 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.records import TimedSetpoint
-from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.daemon.realtime import Heartbeat
 from tormagd.headroom.bare_timer import NS, beat
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -27,11 +26,6 @@ SWING_SHARE, PULSE_HZ = 0.2, 1.2
 "A share of the middle of the scene's range, as often as a heart beats."
 
 Call = Callable[[], object]
-
-
-class CoreCost(NamedTuple):
-    step_us: list[float]
-    plan_us: list[float]
 
 
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
@@ -62,12 +56,13 @@ def _armed(config: Config, core: Core) -> ClosedLoop:
     return loop
 
 
-async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
-    found = CoreCost([], [])
+async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> tuple[list[float], list[float]]:
+    step_us: list[float] = []
+    plan_us: list[float] = []
     ended = asyncio.Event()
 
     def on_beat(_heartbeat: Heartbeat, _beats: int, _now_ns: int) -> None:
-        number = len(found.step_us)
+        number = len(step_us)
         if number == len(steps):
             ended.set()
             return
@@ -75,8 +70,8 @@ async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) 
         plans[number]()
         planned_ns = time.thread_time_ns()
         steps[number]()
-        found.plan_us.append((planned_ns - start_ns) * 1e-3)
-        found.step_us.append((time.thread_time_ns() - planned_ns) * 1e-3)
+        plan_us.append((planned_ns - start_ns) * 1e-3)
+        step_us.append((time.thread_time_ns() - planned_ns) * 1e-3)
 
     await beat(NS // rate_hz, on_beat, ended)
-    return found
+    return step_us, plan_us

@@ -19,7 +19,7 @@ from firmware_protocol.value import Value
 from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
 from tormagd.control.safety.operating_state import SafetyState
-from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd_client.messages import VERSION, Telemetry, Tick
 

@@ -18,6 +18,7 @@ from typing import TextIO
 
 from firmware_protocol.c.build import BuildError
 from tormagd.element.physics.errors import DomainError
+from tormagd.ground.command_line import add, option
 from tormagd.ground.files import new_file
 from tormagd.ground.scheduling import ask_for_fifo, ask_for_slices
 from tormagd.ground.terminal import interrupted_by, write_line
@@ -102,55 +103,62 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
     return device, door
 
 
-def parser() -> argparse.ArgumentParser:
-    made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
-    doors = made.add_mutually_exclusive_group(required=True)
-    doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal; prints its path")
-    doors.add_argument("--slcan", action="store_true", help="CAN adapter on a pseudo-terminal; prints its path")
-    doors.add_argument(
-        "--can",
-        nargs="?",
-        const="",
-        metavar="PATH",
-        help="CAN bus for python-can's interface tormagsim; prints its channel",
-    )
-    made.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
-    made.add_argument("--insert", default=PLANTS_INSERT, metavar="NAME", help=f"default {PLANTS_INSERT}; of a brake")
-    made.add_argument("--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing")
-    made.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="SPEC",
-        help=f"may be repeated; {KNOWN_FAULTS}".replace("%", "%%"),
-    )
-    made.add_argument("--seed", type=int, default=0, metavar="N", help="of noise and jitter")
-    made.add_argument(
-        "--baud",
-        type=partial(_rate, 1_200, 20_000_000),
-        default=DEFAULT_BAUD,
-        metavar="N",
-        help=f"default {DEFAULT_BAUD}",
-    )
-    made.add_argument(
-        "--bitrate", type=partial(_rate, 10_000, 1_000_000), default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus"
-    )
-    made.add_argument("--node", type=int, choices=range(16), default=DEFAULT_NODE, metavar="N", help="on the CAN bus")
-    made.add_argument(
-        "--firmware",
-        choices=FIRMWARES,
-        default="python",
-        help="c: the firmware's C sources; qemu: the same on an emulated Cortex-M4; default python",
-    )
-    made.add_argument("--truth", type=Path, metavar="FILE.csv", help="new file: the true state, 1000 rows a second")
-    return made
-
-
 def _rate(least: int, most: int, text: str) -> int:
     rate = int(text)
     if not least <= rate <= most:
         raise argparse.ArgumentTypeError(f"{rate}: allowed are {least} to {most}")
     return rate
+
+
+DOORS = (
+    option("--pty", action="store_true", help="serial line on a pseudo-terminal; prints its path"),
+    option("--slcan", action="store_true", help="CAN adapter on a pseudo-terminal; prints its path"),
+    option(
+        "--can",
+        nargs="?",
+        const="",
+        metavar="PATH",
+        help="CAN bus for python-can's interface tormagsim; prints its channel",
+    ),
+)
+OPTIONS = (
+    option("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}"),
+    option("--insert", default=PLANTS_INSERT, metavar="NAME", help=f"default {PLANTS_INSERT}; of a brake"),
+    option("--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing"),
+    option(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="SPEC",
+        help=f"may be repeated; {KNOWN_FAULTS}".replace("%", "%%"),
+    ),
+    option("--seed", type=int, default=0, metavar="N", help="of noise and jitter"),
+    option(
+        "--baud",
+        type=partial(_rate, 1_200, 20_000_000),
+        default=DEFAULT_BAUD,
+        metavar="N",
+        help=f"default {DEFAULT_BAUD}",
+    ),
+    option(
+        "--bitrate", type=partial(_rate, 10_000, 1_000_000), default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus"
+    ),
+    option("--node", type=int, choices=range(16), default=DEFAULT_NODE, metavar="N", help="on the CAN bus"),
+    option(
+        "--firmware",
+        choices=FIRMWARES,
+        default="python",
+        help="c: the firmware's C sources; qemu: the same on an emulated Cortex-M4; default python",
+    ),
+    option("--truth", type=Path, metavar="FILE.csv", help="new file: the true state, 1000 rows a second"),
+)
+
+
+def parser() -> argparse.ArgumentParser:
+    made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
+    add(made.add_mutually_exclusive_group(required=True), DOORS)
+    add(made, OPTIONS)
+    return made
 
 
 if __name__ == "__main__":

@@ -21,10 +21,9 @@ from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState
 from tormagd.element.inverse.solution import Question
 from tormagd.hardware.backend import LinkStatistics
-from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.connection import Connection
-from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.measurement import Measurement
+from tormagd.hardware.streams import CanStream, FrameStream
 from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanFrame, CanLine
 from tormagd.simulation.device import MessageDevice, SerialDevice
 from tormagd.simulation.plant import Truth

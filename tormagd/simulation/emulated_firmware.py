@@ -15,17 +15,9 @@ from collections import deque
 from typing import IO, Final
 
 from firmware_protocol.c.build import Target, build, debian_tool
-from firmware_protocol.codec import (
-    FUNCTION,
-    Identity,
-    Message,
-    Sense,
-    State,
-    Status,
-    decode,
-    encode,
-)
-from firmware_protocol.framing import FrameDecoder, FramingStatistics, encode_frame
+from firmware_protocol.codec import Identity, Message, Sense, State, Status
+from firmware_protocol.framing import FramingStatistics
+from tormagd.hardware.streams import FrameStream
 from tormagd.simulation.compiled_firmware import CSensors, View, ViewedFirmware, parameters_of, seen
 from tormagd.simulation.firmware import Answer, Sensors
 from tormagd.simulation.parameters import PlantParameters
@@ -79,8 +71,7 @@ class EmulatedFirmware(ViewedFirmware):
             )
         self.close = weakref.finalize(self, _end, self._process, self._link, self._errors)
         "Ends the emulation, and returns how many bytes of the stack were ever used."
-        self._decoder = FrameDecoder()
-        self._sequence = 0
+        self._stream = FrameStream()
         self._cycles = 0
         self._identity: Identity | None = None
         self._measured: deque[tuple[State, Sense]] = deque()
@@ -88,9 +79,7 @@ class EmulatedFirmware(ViewedFirmware):
         self._told(bytes(parameters_of(plant)))
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
-        self._sequence = (self._sequence + 1) % 256
-        return self.hear(time_s, frame, sensors)
+        return self.hear(time_s, self._stream.pack(message), sensors)
 
     def hear(self, time_s: float, data: bytes, sensors: Sensors) -> Answer:
         """Let at most one whole frame arrive, and return what was answered."""
@@ -117,7 +106,7 @@ class EmulatedFirmware(ViewedFirmware):
 
     @property
     def statistics(self) -> FramingStatistics:
-        return self._decoder.statistics
+        return self._stream.statistics
 
     @property
     def instructions(self) -> int:
@@ -145,9 +134,9 @@ class EmulatedFirmware(ViewedFirmware):
         record = _PinsIn(seen(sensors), cycles - self._cycles, len(data))
         pins = self._told(bytes(record), data)
         self._cycles = cycles
-        frames = self._decoder.feed(self._link.recv(pins.sent)) if pins.sent else []
-        assert self._decoder.statistics.corrupt == 0, "the firmware sends frames that are none"
-        return [decode(frame.function, frame.payload) for frame in frames]
+        messages = self._stream.unpack(self._link.recv(pins.sent)) if pins.sent else []
+        assert self.statistics.corrupt == 0, "the firmware sends frames that are none"
+        return messages
 
     def _told(self, record: bytes, data: bytes = b"") -> _PinsOut:
         """Tell the firmware its pins, and return what it says when it waits again."""

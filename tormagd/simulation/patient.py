@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from tormagd.element.physics.friction import Friction
+from tormagd.ground.command_line import add, option
 from tormagd.ground.terminal import interrupted_by
 from tormagd_client import Client, ClientError
 from tormagd_client.contact import ContactEstimator
@@ -203,19 +204,24 @@ def run(
     return published
 
 
+OPTIONS = (
+    option("folder", help="where the daemon's sockets are"),
+    option("--mode", choices=MODES, default=FORCE, help="what a setpoint says"),
+    option("--delay-ms", type=float, default=0.0, metavar="MS", help="each way"),
+    option("--jitter-ms", type=float, default=0.0, metavar="MS", help="each way, on top of the delay"),
+    option("--loss", type=float, default=0.0, metavar="SHARE", help="each way, in bursts of 3"),
+    option("--wall-mm", type=float, default=10.0, metavar="MM", help="from where the handle is first seen"),
+    option("--stiffness-N-mm", type=float, default=0.5, metavar="N/MM", help="of the wall"),
+    option("--friction-N", type=float, default=0.1, metavar="N", help="of the vessel"),
+    option("--seconds", type=float, default=math.inf, metavar="S", help="default until it is interrupted"),
+)
+
+
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="python -m tormagd.simulation.patient", description="A simulated patient, the source of setpoints."
     )
-    made.add_argument("folder", help="where the daemon's sockets are")
-    made.add_argument("--mode", choices=MODES, default=FORCE, help="what a setpoint says")
-    made.add_argument("--delay-ms", type=float, default=0.0, metavar="MS", help="each way")
-    made.add_argument("--jitter-ms", type=float, default=0.0, metavar="MS", help="each way, on top of the delay")
-    made.add_argument("--loss", type=float, default=0.0, metavar="SHARE", help="each way, in bursts of 3")
-    made.add_argument("--wall-mm", type=float, default=10.0, metavar="MM", help="from where the handle is first seen")
-    made.add_argument("--stiffness-N-mm", type=float, default=0.5, metavar="N/MM", help="of the wall")
-    made.add_argument("--friction-N", type=float, default=0.1, metavar="N", help="of the vessel")
-    made.add_argument("--seconds", type=float, default=math.inf, metavar="S", help="default until it is interrupted")
+    add(made, OPTIONS)
     return made
 
 

@@ -20,13 +20,13 @@ from tormagd.config import Config, checked
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
+from tormagd.ground.command_line import add, option
 from tormagd.ground.plain_values import InexactError
 from tormagd.ground.terminal import write_line
 from tormagd.record import journal
 from tormagd.record.black_box import BlackBoxFile
 from tormagd.record.reader import RecordingError
-from tormagd.record.replay.rebuild import Recorded, ReplayError, rebuilt, told
-from tormagd.record.replay.rerun import name_of, planned_for, ticks_of
+from tormagd.record.replay.rerun import Recorded, ReplayError, name_of, planned_for, rebuilt, ticks_of, told
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
@@ -40,6 +40,13 @@ PATIENCE_S = 0.5
 "How long a refused command is repeated: the simulated device may come to rest later than the real one."
 SEED = 1
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
+OPTIONS = (
+    option("file", type=Path),
+    option("--config", type=Path),
+    option("--set", dest="settings", action="append", default=[]),
+    option("--plant", default="sample_1"),
+    option("--fault", dest="faults", action="append", default=[]),
+)
 
 
 class Happened(msgspec.Struct, frozen=True):
@@ -198,11 +205,7 @@ def _hand(ticks: list[Any]) -> RecordedHand:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--config", type=Path)
-    parser.add_argument("--set", dest="settings", action="append", default=[])
-    parser.add_argument("--plant", default="sample_1")
-    parser.add_argument("--fault", dest="faults", action="append", default=[])
+    add(parser, OPTIONS)
     options = parser.parse_args(arguments)
 
     def run(known: Recorded, box: BlackBoxFile) -> dict[str, Any]:

@@ -15,8 +15,7 @@ import uvloop
 
 from machines.host import PERIOD_NS, Stall
 from tormagd.config import RealTime
-from tormagd.daemon.heartbeat import Heartbeat
-from tormagd.daemon.realtime import prepare
+from tormagd.daemon.realtime import Heartbeat, prepare
 from tormagd.headroom.bare_timer import NS, beat
 
 

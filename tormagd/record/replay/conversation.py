@@ -12,12 +12,11 @@ from tormagd.config import Device
 from tormagd.control.records import Duty
 from tormagd.ground.plain_values import first_difference, kinds, packed, plain
 from tormagd.hardware.backend import BackendError, LinkStatistics, Sent, Stream
-from tormagd.hardware.can_stream import CanStream, SecondHostError
 from tormagd.hardware.connection import Connection
-from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import LinkState
-from tormagd.hardware.link_quality import Counts, LinkQuality
+from tormagd.hardware.link_statistics import Counts, LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.streams import CanStream, FrameStream, SecondHostError
 
 KNOWN = kinds(
     *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
