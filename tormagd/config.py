@@ -290,6 +290,18 @@ class Config(Strict, frozen=True):
             f"at most device.command_timeout_ms = {device.command_timeout_ms:g}",
         )
         require(
+            device.measurement_timeout_ms * rates.control_hz >= 2_000.0,
+            "device.measurement_timeout_ms",
+            device.measurement_timeout_ms,
+            f"at least {2e3 / rates.control_hz:g}, two periods of rates.control_hz = {rates.control_hz}",
+        )
+        require(
+            limits.no_motion_duty < self.position.duty_limit,
+            "limits.no_motion_duty",
+            limits.no_motion_duty,
+            f"under position.duty_limit = {self.position.duty_limit:g}, or NO_MOTION and WRONG_DIRECTION never show",
+        )
+        require(
             limits.skew_warning_mm <= limits.skew_fault_mm,
             "limits.skew_warning_mm",
             limits.skew_warning_mm,
