@@ -1,7 +1,7 @@
 """The force asked of the device: what is wanted over the next 400 ms, and the corridor around it.
 
 wanted    at TIMES_S: a wall's forces as the handle moves; or a preview, and past its end (without one, past the newest
-          setpoint) the slope and, as far as it is trusted, the forecast
+          setpoint) the slope and, as far as it is trusted, the forecast, until MAX_STEP_S without a new one
 corridor  what the scene allows and the device gives; besides
           law     to another wall or to none: the release rate, and what the handle's motion changes; where the scene
                   has a decay, DECAY of that rate for what gives way while the hand pushes on
@@ -70,6 +70,8 @@ class Governor:
     target_mm: float
     slope_N_s: float
     "How the force goes on after what is known."
+    silent_s: float
+    "How long no new setpoint has come."
     is_passing: bool
     "Whether the force is on the ramp to the forces of its holder."
 
@@ -140,7 +142,7 @@ class Governor:
         allowed_N = within(asked_N, self._allowed)
         lawful_N = self._lawful_N(setpoint, travel, allowed_N, step_N)
         blend_N, force_N = lawful_N - allowed_N, within(lawful_N, given)
-        self._learn(setpoint, force_N, device)
+        self._learn(setpoint, force_N, device, dt_s)
         ahead_N, trust = self._ahead_N(setpoint, travel, max(age_s, 0.0), lag_s)
         bounds = within(self._allowed[0], given), within(self._allowed[1], given)
         wanted_N = [within(within(each_N, bounds) + blend_N, bounds) for each_N in ahead_N]
@@ -192,10 +194,11 @@ class Governor:
         self.target_N, self.target_mm = lawful_N if travel.is_pushing else None, travel.place_mm
         return lawful_N
 
-    def _learn(self, setpoint: TimedSetpoint, force_N: float, device: DeviceFit) -> None:
+    def _learn(self, setpoint: TimedSetpoint, force_N: float, device: DeviceFit, dt_s: float) -> None:
         """Learn how the force goes on after what is known: after a preview, or else after the newest force."""
         last, self.last = self.last or setpoint, setpoint
         spacing_s = setpoint.stamp_s - last.stamp_s
+        self.silent_s = self.silent_s + dt_s if spacing_s == 0.0 else 0.0
         if setpoint.holder != last.holder:  # another publisher's forces say nothing about this one's
             self.is_passing, self.slope_N_s = True, 0.0
             self.forecast.forget()
@@ -226,6 +229,8 @@ class Governor:
             return [wall.force_N(place_mm + travel.rate_mm_s * after_s) for after_s in TIMES_S], 1.0
         # a publisher that has fallen silent is not believed to go on as it did
         foreseen = self.forecast.trust if soon_s <= MAX_STEP_S else 0.0
+        if self.silent_s > setpoint.preview_s + MAX_STEP_S:
+            self.slope_N_s = 0.0
         trust = 1.0 if setpoint.preview_N else foreseen
         if trust == 0.0:
             last_N = within(setpoint.force_N, self._allowed)
@@ -323,6 +328,6 @@ class Governor:
         self.from_mm = self.sent_mm = self._portrait.gap_for_mm(force_N, device)
 
     def _forget(self) -> None:
-        self.last, self.slope_N_s, self.is_passing = None, 0.0, True
+        self.last, self.slope_N_s, self.silent_s, self.is_passing = None, 0.0, 0.0, True
         self.target_N, self.target_mm = None, 0.0
         self.forecast.forget()
