@@ -118,6 +118,8 @@ class Governor:
             age_s = now_s - setpoint.stamp_s
             setpoint.require_numbers()
             require_finite("age_s", age_s)
+            is_new = self.last is None or setpoint.stamp_s != self.last.stamp_s
+            self.silent_s = 0.0 if is_new else self.silent_s + dt_s
             if age_s <= setpoint.valid_for_s:
                 return self._followed(setpoint, age_s, device, lag_s, travel, dt_s, given, held_N is None)
             limits = [Limit.STALE, *setpoint.limits]
@@ -142,7 +144,7 @@ class Governor:
         allowed_N = within(asked_N, self._allowed)
         lawful_N = self._lawful_N(setpoint, travel, allowed_N, step_N)
         blend_N, force_N = lawful_N - allowed_N, within(lawful_N, given)
-        self._learn(setpoint, force_N, device, dt_s)
+        self._learn(setpoint, force_N, device)
         ahead_N, trust = self._ahead_N(setpoint, travel, max(age_s, 0.0), lag_s)
         bounds = within(self._allowed[0], given), within(self._allowed[1], given)
         wanted_N = [within(within(each_N, bounds) + blend_N, bounds) for each_N in ahead_N]
@@ -194,11 +196,10 @@ class Governor:
         self.target_N, self.target_mm = lawful_N if travel.is_pushing else None, travel.place_mm
         return lawful_N
 
-    def _learn(self, setpoint: TimedSetpoint, force_N: float, device: DeviceFit, dt_s: float) -> None:
+    def _learn(self, setpoint: TimedSetpoint, force_N: float, device: DeviceFit) -> None:
         """Learn how the force goes on after what is known: after a preview, or else after the newest force."""
         last, self.last = self.last or setpoint, setpoint
         spacing_s = setpoint.stamp_s - last.stamp_s
-        self.silent_s = self.silent_s + dt_s if spacing_s == 0.0 else 0.0
         if setpoint.holder != last.holder:  # another publisher's forces say nothing about this one's
             self.is_passing, self.slope_N_s = True, 0.0
             self.forecast.forget()
