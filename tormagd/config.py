@@ -245,6 +245,27 @@ class Recordings(Strict, frozen=True):
         )
 
 
+def _require_in_time(device: Device, rates: Rates, realtime: RealTime) -> None:
+    require(
+        device.command_timeout_ms < realtime.watchdog_ms,
+        "device.command_timeout_ms",
+        device.command_timeout_ms,
+        f"under realtime.watchdog_ms = {realtime.watchdog_ms:g}: the device must act before systemd does",
+    )
+    require(
+        device.measurement_timeout_ms <= device.command_timeout_ms,
+        "device.measurement_timeout_ms",
+        device.measurement_timeout_ms,
+        f"at most device.command_timeout_ms = {device.command_timeout_ms:g}",
+    )
+    require(
+        device.measurement_timeout_ms * rates.control_hz >= 2_000.0,
+        "device.measurement_timeout_ms",
+        device.measurement_timeout_ms,
+        f"at least {2e3 / rates.control_hz:g}, two periods of rates.control_hz = {rates.control_hz}",
+    )
+
+
 class Config(Strict, frozen=True):
     """Top-level keys."""
 
@@ -277,17 +298,12 @@ class Config(Strict, frozen=True):
             rates.telemetry_hz,
             f"a divisor of rates.control_hz = {rates.control_hz}",
         )
+        _require_in_time(device, rates, self.realtime)
         require(
-            device.command_timeout_ms < self.realtime.watchdog_ms,
-            "device.command_timeout_ms",
-            device.command_timeout_ms,
-            f"under realtime.watchdog_ms = {self.realtime.watchdog_ms:g}: the device must act before systemd does",
-        )
-        require(
-            device.measurement_timeout_ms <= device.command_timeout_ms,
-            "device.measurement_timeout_ms",
-            device.measurement_timeout_ms,
-            f"at most device.command_timeout_ms = {device.command_timeout_ms:g}",
+            limits.no_motion_duty < self.position.duty_limit,
+            "limits.no_motion_duty",
+            limits.no_motion_duty,
+            f"under position.duty_limit = {self.position.duty_limit:g}, or NO_MOTION and WRONG_DIRECTION never show",
         )
         require(
             limits.skew_warning_mm <= limits.skew_fault_mm,

@@ -132,6 +132,13 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
             "50.1",
             "device.command_timeout_ms = 50",
         ),
+        (
+            "[device]\nmeasurement_timeout_ms = 3.9\n[rates]\ncontrol_hz = 500",
+            "device.measurement_timeout_ms = 3.9",
+            "at least 4",
+            "rates.control_hz = 500",
+        ),
+        ("[limits]\nno_motion_duty = 1.0", "limits.no_motion_duty = 1.0", "1.0", "position.duty_limit = 1"),
         ("[limits]\nskew_warning_mm = 1.5", "limits.skew_warning_mm = 1.5", "1.5", "limits.skew_fault_mm = 1"),
         # who is let in: this machine alone, without keys
         *(
@@ -273,6 +280,7 @@ def test_check_prints_the_resolved_configuration_and_names_a_broken_plugin(write
         ("[device.options]\ninterface = 'slcan'", "unknown field `interface` - at `$.device.options`"),
         ("[device]\nbackend = 'can'", "missing required field `interface` - at `$.device.options`"),
         ("[position]\nproportional_per_mm = 500.0", "margin"),
+        ("[position]\ngap_acceleration_mm_s2 = 379.0", "gap_acceleration_mm_s2 = 379: allowed is at least 382"),
         ("[position]\nclosing_mm_s = 60.0", "closing_mm_s = 60: allowed is at most 43.7, what the motors can"),
         ("[rates]\ncontrol_hz = 250", "rates.control_hz"),
         ("not toml", "line 1"),

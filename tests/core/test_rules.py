@@ -31,7 +31,7 @@ def test_no_hostile_history_breaks_a_rule(core: Core, histories: ModuleType) -> 
 
 
 def test_a_broken_rule_is_seen(core: Core, histories: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    weak = msgspec.structs.replace(core.config.position, duty_limit=0.01)
+    weak = msgspec.structs.replace(core.config.position, duty_limit=0.36)
     with monkeypatch.context() as patch:
         patch.setattr(histories, "CONFIG", msgspec.structs.replace(core.config, position=weak))
         with pytest.raises(AssertionError, match="duties = "):

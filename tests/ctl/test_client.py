@@ -160,6 +160,13 @@ def test_who_stops_waiting_for_an_arming_takes_the_word_back(client, fake_daemon
     assert fake_daemon.commands[-1] == "disable"
 
 
+def test_an_arming_that_was_not_heard_to_begin_is_taken_back(client, fake_daemon):
+    fake_daemon.answers["arm"] = lambda: {"ok": "perhaps"}
+    with pytest.raises(UnreachableError):
+        client.arm()
+    assert fake_daemon.commands == ["arm", "disable"]
+
+
 def test_setpoints_are_numbered_stamped_and_checked(client, fake_daemon):
     before_ns = time.time_ns()
     client.publish(1.5)
@@ -259,6 +266,21 @@ def test_numbers_and_arrays_of_numpy_are_sent() -> None:
 def test_threads_do_not_take_each_others_answers(fake_daemon) -> None:
     with Client.local(str(fake_daemon.directory), PATIENCE_S) as client, ThreadPoolExecutor(4) as threads:
         assert all(status.is_homed for status in threads.map(lambda _: client.status(), range(40)))
+
+
+def test_tasks_publish_at_once_and_each_of_them_hears_all_that_is_new(fake_daemon) -> None:
+    async def run() -> None:
+        async with AsyncClient.local(str(fake_daemon.directory), PATIENCE_S) as client, asyncio.timeout(PATIENCE_S):
+            await asyncio.gather(*(client.publish(force_N) for force_N in (0.5, 1.0, 1.5)))
+            before, others = await anext(client.telemetry()), client.telemetry()
+            await asyncio.sleep(0.3)
+            first = await anext(heard := client.telemetry())
+            assert first.seq > before.seq + 10  # about 100 were sent
+            pairs = [await asyncio.gather(anext(others), anext(heard)) for _ in range(10)]
+            assert [each.seq for _, each in pairs] == [*range(first.seq + 1, first.seq + 11)]
+
+    asyncio.run(run())
+    assert len(fake_daemon.arrived(3)) == 3
 
 
 def test_a_client_that_was_closed_or_made_before_a_fork_says_so(fake_daemon, monkeypatch) -> None:

@@ -191,7 +191,7 @@ def test_a_narrow_terminal_without_colours_and_with_ascii_alone_is_drawn_on(fake
     assert not re.search(r"\x1b\[[\d;]*[34]\d", text)
 
 
-@pytest.mark.parametrize("end", [b"q", signal.SIGINT, signal.SIGTERM], ids=["q", "Ctrl-C", "SIGTERM"])
+@pytest.mark.parametrize("end", [b"\x1b[Aq", signal.SIGINT, signal.SIGTERM], ids=["arrow, q", "Ctrl-C", "SIGTERM"])
 def test_it_is_ended_by_a_key_or_a_signal_and_only_looks(fake_daemon, end: bytes | signal.Signals) -> None:
     code, text = in_terminal(fake_daemon.control, end)
     assert "ENABLED" in text

@@ -145,3 +145,24 @@ def test_a_line_has_its_time_on_a_terminal_and_none_for_the_journal(opened, time
     finally:
         os.close(far)
         os.close(near)
+
+
+UNREAD = """
+import contextlib, logging, os, tormagd.ground.terminal as t
+far, near = os.pipe()
+os.dup2(near, 2)
+os.set_blocking(near, False)
+with contextlib.suppress(BlockingIOError):
+    while os.write(near, bytes(4096)): pass
+os.set_blocking(near, True)
+t.log_to_stderr()
+logging.warning("lost")
+os.read(far, 1 << 20)
+logging.warning("heard")
+print(os.read(far, 1 << 20).decode())
+"""
+
+
+def test_control_waits_for_no_reader_of_the_log() -> None:
+    told = subprocess.run([sys.executable, "-c", UNREAD], capture_output=True, text=True, check=True, timeout=30)
+    assert told.stdout.strip() == "WARNING root: heard (1 lines before were not read, and are lost)"

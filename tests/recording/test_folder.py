@@ -113,6 +113,10 @@ def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, 
     # what stays free is for black boxes
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=900_000))
     assert "0.9 MB are free, and 1.0 stay so for black boxes" in folder.room(0)
+    # what others fill is not made good by recordings
+    unmarked = of_days(tmp_path, START_NS * 1e-9, -1, 0)
+    assert "nothing unmarked is left that would help" in folder.room(0)
+    assert all(path.exists() for path in unmarked)
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "2026-13-45T05-09-27Z.mcap", "2026-11-26T05-09-27.mcap.part"])

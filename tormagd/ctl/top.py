@@ -1,6 +1,7 @@
 """`tormagctl top`: what the daemon does, live in a terminal."""
 
 import contextlib
+import os
 import select
 import signal
 import sys
@@ -43,8 +44,11 @@ def top(client: Client) -> Outcome:
         tty.setcbreak(sys.stdin)  # keys are read when pressed, without echo
         while not is_interrupted():
             live.update(screen(watcher.look(), *console.size), refresh=True)
-            if select.select([sys.stdin], [], [], REDRAW_S)[0] and sys.stdin.read(1) in ("q", ""):
-                break
+            if select.select([sys.stdin], [], [], REDRAW_S)[0]:
+                # all that came: what Python read ahead would wait for the next key
+                keys = os.read(sys.stdin.fileno(), 1_024)
+                if b"q" in keys or not keys:
+                    break
     seconds = time.monotonic() - start_s
     return Outcome({"seconds": round(seconds, 1)}, f"watched for {seconds:.0f} s; the daemon goes on")
 

@@ -10,10 +10,11 @@ import json
 import logging
 import os
 import re
+import select
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 from typing import TextIO
 
@@ -90,10 +91,26 @@ def interrupted_by(*signals: signal.Signals) -> Iterator[Callable[[], bool]]:
 
 def log_to_stderr() -> None:
     """Send the log of this process, from INFO on, to stderr, a line a record: level, logger's name and message."""
-    handler = logging.StreamHandler(sys.stderr)
+    handler = PromptHandler(sys.stderr)
     time_first = "%(asctime)s " if sys.stderr is not None and sys.stderr.isatty() else ""
     handler.setFormatter(LogFormatter(f"{time_first}%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+class PromptHandler(logging.StreamHandler[TextIO]):
+    """Writes only what its stream takes at once, because control must not wait for a reader; says what it left out."""
+
+    left_out = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record, or count it where a pipe is full or a terminal stopped."""
+        with suppress(OSError, ValueError, TypeError):  # it has no descriptor, so nobody waits
+            if not select.select([], [self.stream], [], 0.0)[1]:
+                self.left_out += 1
+                return
+        if self.left_out:
+            record.msg, self.left_out = f"{record.msg} ({self.left_out} lines before were not read, and are lost)", 0
+        super().emit(record)
 
 
 class LogFormatter(logging.Formatter):

@@ -26,7 +26,7 @@ MAX_GUESSES = 16
 MAX_LINES = 8
 
 T = TypeVar("T")
-_OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
+_OURS = re.compile(r"([a-z_A-Z0-9.]+)(?: =|:) ")
 "The key or table at the head of our own refusals."
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place at the end of msgspec's refusals."

@@ -41,6 +41,10 @@ class Segment(NamedTuple):
     is_marked: bool
     ended_s: float
 
+    @property
+    def may_go(self) -> bool:
+        return not (self.is_marked or self.began_s is None or self.path.is_symlink())
+
 
 def segment_of(path: Path) -> Segment | None:
     """Describe the recording in `path` by its name and size; None where its size cannot be asked, as of no file."""
@@ -105,15 +109,16 @@ class RecordingFolder:
         """Prune for `coming_bytes` more within the budget, and return why they do not fit; empty where they do."""
         self.prune(coming_bytes)
         over = self._over(self.segments(), coming_bytes)
-        return f"No space left on device: {over}, and nothing unmarked is left to take away" if over else ""
+        return f"No space left on device: {over}, and nothing unmarked is left that would help" if over else ""
 
     def prune(self, coming_bytes: float = 0.0) -> list[Segment]:
-        """Delete segments too old, and the oldest until `coming_bytes` more fit budget and disk; return
-        those deleted."""
+        """Delete segments too old, and, where that helps, the oldest until `coming_bytes` more fit budget and
+        disk; return those deleted."""
         left, gone = self.segments(), []
-        old = set(self._too_old(left))
+        old, stay = set(self._too_old(left)), [each for each in left if not each.may_go]
+        helps = not self._over(stay, coming_bytes, sum(each.bytes for each in left if each.may_go))
         for segment in list(left):
-            if (segment in old or self._over(left, coming_bytes)) and self._delete(segment):
+            if (segment in old or (helps and self._over(left, coming_bytes))) and self._delete(segment):
                 left.remove(segment)
                 gone.append(segment)
         return gone
@@ -139,10 +144,10 @@ class RecordingFolder:
                 mark(known[place - 1].path)
         return marked
 
-    def _over(self, left: list[Segment], coming_bytes: float) -> str:
+    def _over(self, left: list[Segment], coming_bytes: float, freed_bytes: float = 0.0) -> str:
         """Say why `coming_bytes` beside the segments `left` break the budget or the disk's reserve; empty where they do
         not."""
-        coming_MB, free_MB = coming_bytes / MB, shutil.disk_usage(self.path).free / MB
+        coming_MB, free_MB = coming_bytes / MB, (shutil.disk_usage(self.path).free + freed_bytes) / MB
         size_MB = sum(each.bytes for each in left) / MB
         if size_MB + coming_MB > self.budget.most_MB:
             over = f"{size_MB:.1f} MB are in {self.path}, up to {coming_MB:.1f} come"
@@ -153,7 +158,7 @@ class RecordingFolder:
 
     def _delete(self, segment: Segment) -> bool:
         """Delete a segment; return True also where it is gone."""
-        if segment.is_marked or segment.began_s is None or segment.path.is_symlink():
+        if not segment.may_go:
             return False
         with contextlib.suppress(FileNotFoundError), segment.path.open("rb") as file:
             try:

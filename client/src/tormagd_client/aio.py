@@ -45,7 +45,7 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
 
     def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
         super().__init__(endpoints, wait_s, source)
-        self._turn = asyncio.Lock()
+        self._turn, self._publishing = asyncio.Lock(), asyncio.Lock()
 
     async def request(self, command: str, **args: Any) -> dict[str, Any]:
         """Give `command` and return its result; requests of several tasks wait for each other.
@@ -69,8 +69,8 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         the handle before. Raises as `request`, and RefusedError if arming failed.
         """
         until_s, report = asyncio.get_running_loop().time() + timeout_s, ArmReport(given=(), is_over=False)
-        await self.request("arm")
         try:
+            await self.request("arm")
             while not report.is_over:
                 if asyncio.get_running_loop().time() > until_s:
                     raise RefusedError("arm", "timeout", f"not armed within {timeout_s:g} s", "tormagctl status")
@@ -88,12 +88,13 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any
     ) -> None:
         """Ask for a force at the roller, as `blocking.Client.publish` does."""
-        setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
-        while await setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
-            self._is_taken = (await setpoints.recv()).startswith(SUBSCRIBED)
-        if not self._is_taken:
-            raise self._untaken()
-        await setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
+        async with self._publishing:
+            setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
+            while await setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
+                self._is_taken = (await setpoints.recv()).startswith(SUBSCRIBED)
+            if not self._is_taken:
+                raise self._untaken()
+            await setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def telemetry(self) -> AsyncIterator[Telemetry]:
         """Yield every telemetry message from now on. Raises MessageError for an invalid one."""
@@ -108,9 +109,11 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
         return self._heard(VERDICT_TOPIC, Verdict)
 
     async def _heard(self, topic: bytes, kind: type[Told]) -> AsyncIterator[Told]:
-        socket = self._socket(zmq.SUB, self._endpoints.telemetry, topic)
-        while True:
-            yield decode((await socket.recv_multipart())[-1], kind)
+        with self._socket(zmq.SUB, self._endpoints.telemetry, topic) as socket:
+            # each hears all, and nothing old waits for the next
+            del self._sockets[zmq.SUB, topic]
+            while True:
+                yield decode((await socket.recv_multipart())[-1], kind)
 
     async def __aenter__(self) -> Self:
         return self

@@ -92,8 +92,8 @@ class Client(Connections["zmq.Socket[bytes]"]):
         the handle before. Raises as `request`, and RefusedError if arming failed.
         """
         until_s, report = time.monotonic() + timeout_s, ArmReport(given=(), is_over=False)
-        self.request("arm")
         try:
+            self.request("arm")
             while not report.is_over:
                 if time.monotonic() > until_s:
                     raise RefusedError("arm", "timeout", f"not armed within {timeout_s:g} s", "tormagctl status")

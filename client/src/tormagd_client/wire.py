@@ -251,9 +251,7 @@ class Connections(Generic[SocketT]):
         """Close the connections; pending setpoints get 0.2 s."""
         if self._process != os.getpid():  # the sockets are those of the process before a fork
             return
-        for socket in self._sockets.values():
-            socket.close()
-        self._context.term()
+        self._context.destroy()
 
     def _socket(self, kind: int, address: str, topic: bytes = b"") -> SocketT:
         if self._context.closed or self._process != os.getpid():

@@ -1,7 +1,7 @@
 """The force asked of the device: what is wanted over the next 400 ms, and the corridor around it.
 
 wanted    at TIMES_S: a wall's forces as the handle moves; or a preview, and past its end (without one, past the newest
-          setpoint) the slope and, as far as it is trusted, the forecast
+          setpoint) the slope and, as far as it is trusted, the forecast, until MAX_STEP_S without a new one
 corridor  what the scene allows and the device gives; besides
           law     to another wall or to none: the release rate, and what the handle's motion changes; where the scene
                   has a decay, DECAY of that rate for what gives way while the hand pushes on
@@ -70,6 +70,8 @@ class Governor:
     target_mm: float
     slope_N_s: float
     "How the force goes on after what is known."
+    silent_s: float
+    "How long no new setpoint has come."
     is_passing: bool
     "Whether the force is on the ramp to the forces of its holder."
 
@@ -116,6 +118,8 @@ class Governor:
             age_s = now_s - setpoint.stamp_s
             setpoint.require_numbers()
             require_finite("age_s", age_s)
+            is_new = self.last is None or setpoint.stamp_s != self.last.stamp_s
+            self.silent_s = 0.0 if is_new else self.silent_s + dt_s
             if age_s <= setpoint.valid_for_s:
                 return self._followed(setpoint, age_s, device, lag_s, travel, dt_s, given, held_N is None)
             limits = [Limit.STALE, *setpoint.limits]
@@ -226,6 +230,8 @@ class Governor:
             return [wall.force_N(place_mm + travel.rate_mm_s * after_s) for after_s in TIMES_S], 1.0
         # a publisher that has fallen silent is not believed to go on as it did
         foreseen = self.forecast.trust if soon_s <= MAX_STEP_S else 0.0
+        if self.silent_s > setpoint.preview_s + MAX_STEP_S:
+            self.slope_N_s = 0.0
         trust = 1.0 if setpoint.preview_N else foreseen
         if trust == 0.0:
             last_N = within(setpoint.force_N, self._allowed)
@@ -323,6 +329,6 @@ class Governor:
         self.from_mm = self.sent_mm = self._portrait.gap_for_mm(force_N, device)
 
     def _forget(self) -> None:
-        self.last, self.slope_N_s, self.is_passing = None, 0.0, True
+        self.last, self.slope_N_s, self.silent_s, self.is_passing = None, 0.0, 0.0, True
         self.target_N, self.target_mm = None, 0.0
         self.forecast.forget()

@@ -44,6 +44,8 @@ SETTLES_MM = 4.0 * 8.0 / 4480.0
 "Friction holds the gap to within four counts of the encoders."
 STANDBY_N = 0.3
 "A hand may feel this much over the open gap's force of a brake that waits."
+TURNS_S = 0.1
+"A gap at its speed comes to rest within this time, or it goes on closing when less is asked."
 DEPTHS = 9
 "A pad's force is checked at this many depths for whether it rises."
 LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
@@ -218,6 +220,12 @@ def _stable_margins(config: Config) -> Margins:
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
+    least_mm_s2, mm_s2 = gap_speeds(config).sure_mm_s / TURNS_S, config.position.gap_acceleration_mm_s2
+    if mm_s2 < least_mm_s2:
+        raise ConfigError(
+            f"position.gap_acceleration_mm_s2 = {mm_s2:g}: allowed is at least {ROUNDED_UP * least_mm_s2:.3g}, which "
+            f"stops a closing gap within {TURNS_S:g} s"
+        )
     needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
     max_V = config.position.duty_limit * motor.supply_V / 2.0
     if needed_V > max_V:
