@@ -240,7 +240,9 @@ class Believe:
             is_disputed=sensor.wrong_s + sensor.outside_s > 2.0 * NAMED_S,
         )
         learns = self.learns and zero_sd_N <= UNKNOWN_SD_N
-        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns)
+        taught_N = sensor.update(
+            fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns, is_prior=self.is_prior
+        )
         unknown_N = self._unknown_N(zero_sd_N)
         least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
         if taught_N is None or not self.learns or (unknown_N > 0.0 and reading_N < least_N):

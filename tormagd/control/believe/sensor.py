@@ -93,6 +93,7 @@ class SensorTrust:
         dt_s: float,
         *,
         learns: bool,
+        is_prior: bool = False,
     ) -> float | None:
         """Take one reading, and return what of it may teach `fit`, N; None where it is old or wrong."""
         is_stale, is_frozen = self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
@@ -113,7 +114,7 @@ class SensorTrust:
         taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
         if learns and beyond_N <= 0.0:
-            self._learn(model_N, rate_mm_s, force_N, deviation_N, believed, taught_N, dt_s)
+            self._learn(model_N, rate_mm_s, force_N, deviation_N, believed, taught_N, dt_s, is_prior)
         if self.has_slid:
             self._give_way(believed, force_N, dt_s)
         return taught_N
@@ -127,9 +128,11 @@ class SensorTrust:
         believed: float,
         taught_N: float,
         dt_s: float,
+        is_prior: bool,
     ) -> None:
         """Teach the anchor, which gives `force_N` there, a force at which it is not known; else learn `fallen`."""
-        if deviation_N <= KNOWN_N:
+        # where a calibration half knows it, a reading that is less is of a sensor that fades, or of a device
+        if deviation_N <= (2.0 * KNOWN_N if is_prior and self.off_N <= 0.0 else KNOWN_N):
             self.fallen = within(believed, (self._trim.least, 1.0))
             return
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
