@@ -316,6 +316,5 @@ class Governor:
         self.from_mm = self.sent_mm = self._portrait.gap_for_mm(force_N, device)
 
     def _forget(self) -> None:
-        self.last, self.target_N, self.slope_N_s = None, None, 0.0
-        self.silent_s, self.is_passing = 0.0, True
+        self.last, self.target_N, self.slope_N_s, self.silent_s, self.is_passing = None, None, 0.0, 0.0, True
         self.forecast.forget()
