@@ -104,8 +104,8 @@ def calibrated() -> Columns:
     loop.arm()
     list(loop.run(1.0))
     # as a daemon's status says it: what the device gives with its gap open, as far as it has shown itself
-    shown = Range(loop.planner.believe.min_N, min(core.portrait.max_N, core.scene.force.most_N))
-    waveform = excitation(shown, 2)
+    least_N = loop.planner.believe.device.force_N(loop.planner.believe.memory.open_N())
+    waveform = excitation(Range(least_N, min(core.portrait.max_N, core.scene.force.most_N)), 2)
     start_s = loop.now_s
 
     def newest(now_s: float) -> TimedSetpoint:

@@ -24,7 +24,6 @@ from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.path import TIMES_S, nearest_path_mm
 from tormagd.control.ask.way import Way
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.freshness import Freshness
@@ -34,7 +33,7 @@ from tormagd.control.believe.ripple import Ripple
 from tormagd.control.believe.sensor import SensorTrust
 from tormagd.control.believe.sensor_zero import SensorZero
 from tormagd.control.believe.slow_friction import SlowFriction
-from tormagd.control.believe.strength import UNSEEN, DeviceFit, adapting_s, observe
+from tormagd.control.believe.strength import UNSEEN, Anchor, DeviceFit, adapting_s, observe
 from tormagd.control.contact import Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.interpolation import Rising, at_step, interpolated, low_pass
@@ -216,7 +215,7 @@ def believing(stage: Believe, draw: Draw) -> object:
     seen = measured(draw)
     belief = stage.update(draw.now_s, seen)
     stage.learn_lag(0.0, seen, draw(1.0), draw(80.0))
-    return [belief, stage.learned(), stage.min_N]
+    return [belief, stage.learned(), stage.memory.open_N()]
 
 
 def strength(stages: list[DeviceFit], draw: Draw) -> object:
@@ -229,10 +228,9 @@ def strength(stages: list[DeviceFit], draw: Draw) -> object:
 
 
 def slow_friction(stage: SlowFriction, draw: Draw) -> object:
-    stage.follow(draw(1.1), draw(10.0))
     stage.rescale(draw(1.1), draw(1.1), abs(draw(5.0)))
-    if UNSEEN.force_N(stage.followed_N) > 0.1:  # as in `believe`
-        stage.update(UNSEEN, abs(draw(1.0)) % 6.0, draw(1.2), PLAN_S)
+    if (model_N := draw(1.1)) > 0.1:  # as in `believe`
+        stage.update(UNSEEN, model_N, abs(draw(1.0)) % 6.0, draw(1.2), PLAN_S)
     return stage.factor_at(abs(draw(1.0)))
 
 
@@ -252,8 +250,7 @@ def sensor_zero(stage: SensorZero, draw: Draw) -> object:
 
 
 def freshness(stage: Freshness, draw: Draw) -> object:
-    stage.update(abs(draw(1.0)), draw(1.1), draw(1.1), draw.positive(PLAN_S), learns=True)
-    return stage.changed_N
+    return list(stage.update(abs(draw(1.0)), draw(1.1), draw(1.1), draw.positive(PLAN_S), learns=True))
 
 
 def sensor(stage: SensorTrust, draw: Draw) -> object:
@@ -277,8 +274,7 @@ def carriage_lag(stage: CarriageLag, draw: Draw) -> object:
 
 
 def handle_watch(stage: HandleWatch, draw: Draw) -> object:
-    stage.update(draw.now_s, draw(10.0), draw(1.1), draw(1.1))
-    return stage.moved_gap_at_rest(1.1)
+    return [stage.update(measured(draw), draw(1.1)), stage.creep_mm_s, stage.moved_gap_at_rest(1.1)]
 
 
 def memory(stage: ElementMemory, draw: Draw) -> object:

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, Forecast
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor
-from tormagd.control.ask.path import NEAR_S, PATH_S, TIMES_S
+from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Ask, GapSpeeds, TimedSetpoint, Travel
 from tormagd.control.safety.codes import Limit
@@ -350,14 +350,6 @@ def test_no_carriages_are_sent_past_the_ends(asked_N: float, ahead_N: float, end
     preview = TimedSetpoint(asked_N, 1.0, VALID_S, preview_N=(ahead_N,) * 200, preview_dt_s=5e-3)
     decide(following, 1.0, preview)
     assert following.sent_mm == end_mm
-
-
-@pytest.mark.parametrize("device", [DeviceFit(), DeviceFit(scale=1.5, offset_N=0.1)])
-@pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
-@pytest.mark.parametrize("way", [1.0, -1.0])
-def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: float, is_near: bool, way: float) -> None:
-    to_N = device.force_N(1.5 + way * share * NEAR_S * GAP_SPEED_MM_S / 40.0)
-    assert governor(0.0, 1.5, portrait=ENDS)._is_pursued(TimedSetpoint(1.5, 0.0, VALID_S), to_N, 0.5, device) is is_near
 
 
 def beats_N(time_s: float) -> float:

@@ -2,9 +2,8 @@
 
 import pytest
 
-from tormagd.control.believe.anchor import LEAST_N, MIDDLE_N, Anchor
 from tormagd.control.believe.sensor import KNOWN_N
-from tormagd.control.believe.strength import UNSEEN
+from tormagd.control.believe.strength import LEAST_N, MIDDLE_N, UNSEEN, Anchor
 
 PERIOD_S = 0.004
 

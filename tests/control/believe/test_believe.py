@@ -7,8 +7,8 @@ import pytest
 
 from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
 from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
+from tormagd.control.believe.handle import BRISTLES_N_MM
 from tormagd.control.believe.sensor_zero import MAX_SD_N, UNKNOWN_SD_N
-from tormagd.control.believe.slow_friction import BRISTLES_N_MM
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle, TimedSetpoint

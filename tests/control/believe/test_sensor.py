@@ -6,7 +6,7 @@ The gap follows whichever explanation has more force, and doubt never presses ha
 import pytest
 
 from tormagd.config import Config
-from tormagd.control.believe.believe import Believe
+from tormagd.control.believe.believe import Believe, Learned
 from tormagd.control.believe.freshness import FROZEN_S
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.sensor import (
@@ -16,6 +16,7 @@ from tormagd.control.believe.sensor import (
     SLACK_N,
     WRONG_S,
 )
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Handle
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
@@ -144,6 +145,15 @@ def test_what_has_fallen_at_a_known_force_has_fallen_at_a_new_one(core, known, h
     here_N = core.portrait.force_N_at(60.0)
     believe = hear(known, 4.0, moving(force_N=0.93 * here_N, **{**CLOSER, "gap_mm": 60.0})).believe
     assert believe.sensor.anchor.force_N(here_N) == pytest.approx(here_N, abs=0.02)
+
+
+@pytest.mark.parametrize(("share", "learned_N"), [(0.97, 0.0), (1.03, 0.02)])
+def test_what_a_calibration_half_knows_is_learned_upward_only(
+    planner, hear, moving, share: float, learned_N: float
+) -> None:
+    planner.believe.teach(Learned(DeviceFit(scale_variance=0.0, offset_variance_N2=0.035**2)))
+    anchor = hear(planner, 4.0, moving(force_N=share * MODEL_N)).believe.sensor.anchor
+    assert anchor.force_N(MODEL_N) - MODEL_N == pytest.approx(learned_N, abs=5e-3)
 
 
 @pytest.mark.parametrize(("seconds", "is_known"), [(4.0, True), (0.3, False)])

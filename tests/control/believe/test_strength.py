@@ -118,7 +118,7 @@ def test_over_the_force_without_memory_it_says_the_same(relaxed_N: float) -> Non
 def test_of_so_many_times_the_force_it_is_as_many_times_as_unsure(factor: float) -> None:
     fit = DeviceFit(0.9, -0.05, 0.01, -0.004, 0.006)
     more = fit.times(factor)
-    assert (more.scale_sd, more.offset_sd_N) == pytest.approx((factor * 0.1, factor * math.sqrt(0.006)))
+    assert (more.scale_sd, more.deviation_N(0.0)) == pytest.approx((factor * 0.1, factor * math.sqrt(0.006)))
     for model_N in (0.5, 2.0):
         assert (more.force_N(model_N), more.deviation_N(model_N)) == pytest.approx(
             (factor * fit.force_N(model_N), factor * fit.deviation_N(model_N))

@@ -9,7 +9,6 @@ extrapolated otherwise.
 """
 
 import math
-from array import array
 from typing import Final, final
 
 import numpy as np
@@ -44,8 +43,6 @@ class Skill(Value):
         return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
 
 
-Array = npt.NDArray[np.float64]
-
 GRID_S: Final = 0.01
 "Step of the time grid of remembered forces. The counts below are in its points."
 HISTORY: Final = 1_000
@@ -72,8 +69,6 @@ UNLIKE_N: Final = 0.05
 "Nothing is forecast where every stretch differs by more. On sample 1, 30 mN do as well, 80 a little worse."
 RIDGE: Final = 0.01
 "Raises the regression's variances, because stretches that hardly differ teach nothing."
-MAX_LEVERAGE: Final = 100.0
-"Nothing is forecast from a stretch of more leverage, as after a jump."
 LONG_S: Final = 2.0
 SHORT_S: Final = 0.2
 "Skill is earned over the long time, a few beats, and lost over the short one."
@@ -138,7 +133,7 @@ class Forecast:
             stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
         spacing_s = stamp_s - self.stamp_s
         if not 0.0 <= spacing_s <= MAX_STEP_S:
-            self.forget(stamp_s, force_N, array("d", [force_N]).tobytes())
+            self.forget(stamp_s, force_N, np.float64(force_N).tobytes())
             return
         count = int((stamp_s - self.time_s) / GRID_S)
         if count > 0 and spacing_s > 0.0:
@@ -173,7 +168,7 @@ class Forecast:
         spacing_s = stamp_s - self.stamp_s
         per_s, before_s = (force_N - self.force_N) / spacing_s, self.time_s - self.stamp_s
         came_N = [self.force_N + per_s * (before_s + GRID_S * step) for step in range(1, count + 1)]
-        self.history = (self.history + array("d", came_N).tobytes())[-HISTORY * _BYTES :]
+        self.history = (self.history + np.array(came_N).tobytes())[-HISTORY * _BYTES :]
         self.time_s += GRID_S * count
         for came, guess in zip(came_N, self.awaited):  # noqa: B905 only such a zip is compiled to a plain loop
             if guess is not None:
@@ -181,12 +176,9 @@ class Forecast:
                 self.long = self.long.after(error_N, slope_error_N, LONG_S)
                 self.short = self.short.after(error_N, slope_error_N, SHORT_S)
         self.awaited = (*self.awaited, *NOTHING_SAID)[min(count, JUDGED) :][:JUDGED]
-        # until the next forecast the last one serves, as far as it reaches
-        if stamp_s - self.from_s >= (HORIZON - 1) * GRID_S:
-            self.changes_N = []
 
 
-def _search(history: Array) -> list[float]:
+def _search(history: npt.NDArray[np.float64]) -> list[float]:
     """Forecast: return the changes of force, N, from the newest point to itself and to the points ahead, if any."""
     places = EMBEDDING[:, : (len(history) - DELAYS[-1] - 1 - HORIZON) // STRIDE + 2]
     changes = history.take(places, mode="wrap")
@@ -201,6 +193,6 @@ def _search(history: Array) -> list[float]:
     ridge = RIDGE / TAPS * variance + SAME_N**2 * total
     # the regression's constants are the last row of the inverse times the sums
     last = np.linalg.solve(sums[:, : TAPS + 1] + ridge * VARIANCES, CONSTANT)
-    if apart.min() > TAPS * UNLIKE_N * UNLIKE_N or total * last[TAPS] > MAX_LEVERAGE:
+    if apart.min() > TAPS * UNLIKE_N * UNLIKE_N:
         return []
     return [0.0, *(last @ sums[:, TAPS + 1 :]).tolist()]

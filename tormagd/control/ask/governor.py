@@ -18,10 +18,8 @@ from typing import Final, final
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
 from tormagd.control.ask.path import (
-    CHANGES_PER_S,
     FLATTEST_N_MM,
     LASTS_S,
-    NEAR_S,
     PATH_S,
     SPEEDING_UP_S,
     TIMES_S,
@@ -49,8 +47,6 @@ DECAY: Final = 0.25
 ENDLESS: Final[float] = math.inf
 "Compiled, a plain float."
 
-Bounds = tuple[float, float]
-
 
 @final
 class Governor:
@@ -67,7 +63,7 @@ class Governor:
     last: TimedSetpoint | None
     target_N: float | None
     "What was asked of a hand that pushed on at `target_mm`."
-    target_mm: float
+    target_mm: float = 0.0
     slope_N_s: float
     "How the force goes on after what is known."
     silent_s: float
@@ -81,10 +77,8 @@ class Governor:
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._speeds: Final = speeds
-        self._least_N: Final = force.least_N
+        self._force: Final = force
         self._allowed: Final = (force.waiting_N, force.most_N)
-        self._release_N_s: Final = force.release_N_s
-        self._has_decay: Final = force.breakthrough == "decay"
         self.forecast = Forecast()
         self.begin(now_s)
 
@@ -125,7 +119,7 @@ class Governor:
             limits = [Limit.STALE, *setpoint.limits]
         # where a device turns out weaker, the gap does not close for it
         left_N = min(self.asked_N, device.force_N(self._portrait.force_N_at(self.from_mm)))
-        self._stand_at(max(left_N - self._release_N_s * dt_s, given[0]), device)
+        self._stand_at(max(left_N - self._force.release_N_s * dt_s, given[0]), device)
         self._forget()
         return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, tuple(limits))
 
@@ -137,10 +131,10 @@ class Governor:
         lag_s: float,
         travel: Travel,
         dt_s: float,
-        given: Bounds,
+        given: tuple[float, float],
         is_free: bool,
     ) -> Ask:
-        asked_N, step_N = setpoint.asked_N(travel), self._release_N_s * dt_s
+        asked_N, step_N = setpoint.asked_N(travel), self._force.release_N_s * dt_s
         allowed_N = within(asked_N, self._allowed)
         lawful_N = self._lawful_N(setpoint, travel, allowed_N, step_N)
         blend_N, force_N = lawful_N - allowed_N, within(lawful_N, given)
@@ -155,24 +149,23 @@ class Governor:
             force_N = self.asked_N + math.copysign(step_N, wanted_N[0] - self.asked_N)
             wanted_N = [force_N] * len(PATH_S)
         path_N, governed_N = wanted_N[: len(PATH_S)], force_N
-        if self._is_pursued(setpoint, wanted_N[-1], trust, device):
+        if trust > 0.0:
             path_mm = self._path_mm(setpoint.wall, travel, wanted_N, device, lag_s, dt_s, blend_N, bounds)
             path_N = self._behind_N(path_mm, wanted_N, trust, device, lag_s, dt_s, bounds)
             governed_N = within(self.expected_N, bounds) if setpoint.is_told else force_N
         else:
             self._stand_at(path_N[0], device)
         is_late = blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N
-        limits = self._limits(setpoint, asked_N, lawful_N, given, is_late)
-        return Ask(governed_N, path_N, age_s, limits, trust, asked_N)
+        return Ask(governed_N, path_N, age_s, self._limits(setpoint, asked_N, lawful_N, given, is_late), trust, asked_N)
 
     def _limits(
-        self, setpoint: TimedSetpoint, asked_N: float, lawful_N: float, given: Bounds, is_late: bool
+        self, setpoint: TimedSetpoint, asked_N: float, lawful_N: float, given: tuple[float, float], is_late: bool
     ) -> tuple[Limit, ...]:
         """Return what holds the force that is asked for now."""
-        waiting_N, most_N = self._allowed
+        least_N, (waiting_N, most_N) = self._force.least_N, self._allowed
         return (
-            *((Limit.RANGE,) if not self._least_N <= asked_N <= most_N else ()),
-            *((Limit.STANDBY,) if self._least_N < waiting_N > asked_N else ()),
+            *((Limit.RANGE,) if not least_N <= asked_N <= most_N else ()),
+            *((Limit.STANDBY,) if least_N < waiting_N > asked_N else ()),
             *((Limit.F_MIN,) if lawful_N < given[0] else ()),
             *((Limit.F_MAX,) if lawful_N > given[1] else ()),
             *setpoint.limits,
@@ -188,7 +181,7 @@ class Governor:
             rises_N = falls_N = step_N
             if wall is not None:
                 rises_N = falls_N = step_N + wall.stiffness_N_mm * abs(travel.place_mm - self.target_mm)
-            elif self._has_decay:
+            elif self._force.breakthrough == "decay":
                 rises_N, falls_N = ENDLESS, DECAY * step_N
             elif last.wall is None and before_N == within(last.force_N, self._allowed):
                 rises_N = falls_N = ENDLESS
@@ -210,13 +203,13 @@ class Governor:
             most = -self._speeds.opening_mm_s * per_mm_s, self._speeds.sure_mm_s * per_mm_s
             risen_N = within(setpoint.force_N, self._allowed) - within(last.force_N, self._allowed)
             self.slope_N_s = low_pass(self.slope_N_s, within(risen_N / spacing_s, most), spacing_s, SLOPE_FILTER_S)
-        end_s, end_N = 0.0, setpoint.force_N
+        end_N = setpoint.force_N
         if setpoint.preview_N:
-            end_s, end_N, self.slope_N_s = setpoint.preview_s, setpoint.preview_N[-1], setpoint.preview_slope_N_s
-        if end_s >= TIMES_S[-1]:
+            end_N, self.slope_N_s = setpoint.preview_N[-1], setpoint.preview_slope_N_s
+        if setpoint.preview_s >= TIMES_S[-1]:
             self.forecast.forget()
         elif self._has_forecast:
-            self.forecast.update(setpoint.stamp_s + end_s, within(end_N, self._allowed))
+            self.forecast.update(setpoint.stamp_s + setpoint.preview_s, within(end_N, self._allowed))
 
     def _ahead_N(
         self, setpoint: TimedSetpoint, travel: Travel, soon_s: float, lag_s: float
@@ -258,13 +251,6 @@ class Governor:
             ahead_N.append(force_N)
         return ahead_N
 
-    def _is_pursued(self, setpoint: TimedSetpoint, to_N: float, trust: float, device: DeviceFit) -> bool:
-        """Tell whether a path leads to what is known ahead: where it is told, or the gap gets there soon."""
-        if trust == 0.0 or setpoint.is_told:
-            return trust > 0.0
-        closing_mm, most = self.sent_mm - self._portrait.gap_for_mm(to_N, device), self._speeds
-        return -NEAR_S * most.opening_mm_s < closing_mm < NEAR_S * most.sure_mm_s
-
     def _path_mm(
         self,
         wall: Wall | None,
@@ -274,11 +260,10 @@ class Governor:
         lag_s: float,
         dt_s: float,
         blend_N: float,
-        bounds: Bounds,
+        bounds: tuple[float, float],
     ) -> list[float]:
         """Return the best path through `wanted_N` for late carriages, not early before a wall."""
         portrait, late_s = self._portrait, SPEEDING_UP_S + lag_s
-        require_finite("sent_mm", self.sent_mm)
         # compiled, pairs and ** make objects
         wanted_mm, weights = wanted_N[:], LASTS_S[: len(wanted_N)]
         for place, force_N in enumerate(wanted_N):
@@ -286,7 +271,9 @@ class Governor:
             weights[place] *= math.pow(max(slope_N_mm, FLATTEST_N_MM), 2.0)
         if wall is None:
             for place in range(len(wanted_mm) - 1):
-                wanted_mm[place] += late_s * CHANGES_PER_S[place] * (wanted_mm[place + 1] - wanted_mm[place])
+                wanted_mm[place] += (
+                    late_s * (wanted_mm[place + 1] - wanted_mm[place]) / (TIMES_S[place + 1] - TIMES_S[place])
+                )
         path_mm = nearest_path_mm(self.sent_mm, dt_s, TIMES_S, wanted_mm, weights, self._speeds, len(PATH_S))
         if wall is None:
             return path_mm
@@ -308,7 +295,7 @@ class Governor:
         device: DeviceFit,
         lag_s: float,
         dt_s: float,
-        bounds: Bounds,
+        bounds: tuple[float, float],
     ) -> list[float]:
         """Send the carriages along the path, and return the forces of the gap behind them."""
         portrait, late_s, gap_mm, path_N = self._portrait, SPEEDING_UP_S + lag_s, self.from_mm, []
@@ -329,6 +316,5 @@ class Governor:
         self.from_mm = self.sent_mm = self._portrait.gap_for_mm(force_N, device)
 
     def _forget(self) -> None:
-        self.last, self.slope_N_s, self.silent_s, self.is_passing = None, 0.0, 0.0, True
-        self.target_N, self.target_mm = None, 0.0
+        self.last, self.target_N, self.slope_N_s, self.silent_s, self.is_passing = None, None, 0.0, 0.0, True
         self.forecast.forget()

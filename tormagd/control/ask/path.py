@@ -7,7 +7,6 @@ least. A dynamic programme solves this exactly, backwards over the points (Johns
 for the fused lasso, the dual).
 """
 
-from itertools import pairwise
 from typing import Final
 
 from tormagd.control.records import GapSpeeds
@@ -22,11 +21,8 @@ LASTS_S: Final = [
     for before_s, after_s in zip([0.0, *TIMES_S[:-1]], [*TIMES_S[1:], TIMES_S[-1]], strict=True)
 ]
 "Each of TIMES_S stands for the time from half way to the one before to half way to the next."
-CHANGES_PER_S: Final = [1.0 / (after_s - before_s) for before_s, after_s in pairwise(TIMES_S)]
 SPEEDING_UP_S: Final = 0.025
 "Time constant of the gap's speed where carriages are in time; 20 to 30 ms do as well (sample 1)."
-NEAR_S: Final = 0.18
-"What the gap reaches within this time is near."
 FLATTEST_N_MM: Final = 1e-3
 "The least weight's slope, for forces that hardly depend on the gap."
 

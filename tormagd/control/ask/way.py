@@ -42,7 +42,6 @@ class Way:
             is_pushing = (onward > 0.0) == (force_N > 0.0)
         elif has_turned and min(turn.displacement_mm(place_mm), abs(place_mm - self.changed_mm)) > SLID_MM:
             is_pushing = not is_pushing
-        if is_pushing != before.is_pushing:
-            self.changed_mm = place_mm
+        self.changed_mm = self.changed_mm if is_pushing == before.is_pushing else place_mm
         self.travel = Travel(*measured.along(self._push_sign), is_pushing)
         return self.travel

@@ -16,7 +16,7 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
     is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust
     return {
         "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),
-        "offset": _told(fit.offset_N, fit.offset_sd_N, "N", terms.offset),
+        "offset": _told(fit.offset_N, fit.deviation_N(0.0), "N", terms.offset),
         "low_speed_factor": _told(believe.slow.factor_at(0.0), None, "", terms.creep),
         "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", believe.knows_zero(now_s)),
         "way": _told(believe.zero.way, math.sqrt(believe.zero.way_variance), "", believe.zero.way != 0.0),

@@ -11,7 +11,6 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.config import Config
-from tormagd.control.believe.anchor import MIDDLE_N, Anchor
 from tormagd.control.believe.carriage_lag import MAX_DT_S, CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
@@ -19,7 +18,7 @@ from tormagd.control.believe.ripple import Ripple
 from tormagd.control.believe.sensor import DOUBTED_S, KNOWN_N, NAMED_S, SLACK_N, Disputed, SensorTrust
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
-from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit, adapting_s, observe
+from tormagd.control.believe.strength import MIDDLE_N, SURE, UNSEEN, Anchor, DeviceFit, adapting_s, observe
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Belief, Measured
 from tormagd.control.safety.codes import Limit
@@ -36,8 +35,6 @@ STUCK_N: Final = 0.08
 """
 COMES_TO_REST: Final = 3.0
 "A handle whose `sliding_mm_s` is at least this many times its rate only comes to rest: it does not creep."
-MIN_EXPECTED_N: Final = 0.1
-"Least force that a share is computed of."
 UNTARED_N: Final = 0.15
 "A zero that is further off gives the limit SENSOR_ZERO: half an hour's drift."
 CONTRADICTED_N: Final = 0.4
@@ -97,29 +94,23 @@ class Believe:
 
     def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
         """Begin with an unseen device."""
-        terms, slides = scene.terms, nominal.contact.slides
         self.memory = memory
-        self.learns = terms.learning
+        self.learns = scene.terms.learning
+        self._terms: Final = scene.terms
         self._trim: Final = config.trim
-        self._learned_terms: Final = (terms.scale, terms.offset)
         self._radius_mm: Final = scene.insert.roller_radius_mm
         self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self._has_lag: Final = terms.motor
-        self._slides: Final = slides
-        self._has_creep: Final = terms.creep and slides
+        self._slides: Final = nominal.contact.slides
+        self._has_creep: Final = scene.terms.creep and nominal.contact.slides
         self.forget()
 
     @property
     def device(self) -> DeviceFit:
         return self.fit.relaxed(self.memory.relaxed_N)
-
-    @property
-    def min_N(self) -> float:
-        return self.device.force_N(self.memory.open_N())
 
     def knows_zero(self, now_s: float) -> bool:
         """Tell whether the sensor's zero is known to within what the scene tolerates: else readings teach nothing."""
@@ -127,16 +118,15 @@ class Believe:
 
     def learned(self) -> Learned:
         """Return what is known of this device now, to `teach` on another day."""
-        slow = self.slow
-        return Learned(self.fit, slow.factor_at(0.0), slow.learned, self.zero.zero_N, self.carriages.lag_s)
+        return Learned(self.fit, self.slow.factor_at(0.0), self.slow.learned, self.zero.zero_N, self.carriages.lag_s)
 
     def teach(self, learned: Learned) -> None:
         """Replace all that is known of the device by `learned`, and begin its estimators anew."""
         self.fit = learned.device
-        self.slow, self.zero, self.ripple = SlowFriction(self._trim), SensorZero(self._trim.way), Ripple()
+        self.slow, self.zero, self.ripple = SlowFriction(self._trim), SensorZero(), Ripple()
         self.sensor, self.carriages = SensorTrust(self._trim, learned.device), CarriageLag()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
-        self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
+        self.zero.zero_N, self.zero.way, self.carriages.lag_s = learned.sensor_zero_N, self._trim.way, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
         self.is_prior, self.is_contradicted = learned.device is not UNSEEN, False
 
@@ -147,40 +137,33 @@ class Believe:
 
     def update(self, now_s: float, measured: Measured | None) -> Belief:
         """Learn from `measured`, where it is new, and return the belief at `now_s`."""
-        slid_N: float | None = None
+        ripple, predicted_N = 1.0, None
         if measured is not None:
             self.memory.update(now_s, measured)
-            self.slow.slide(now_s, measured.handle.sliding_mm_s)
             if measured.is_homed:
                 model_N = self.memory.force_N(self._nominal.now(measured))
-                slid_N = model_N
-                if self._slides:
-                    slid_N = self.slow.follow(model_N, measured.handle_mm)
-                    self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
+                slid_N = self.handle.update(measured, model_N) if self._slides else model_N
                 self._hear(now_s, measured, model_N, slid_N)
-        return self._belief(measured, slid_N)
+                if self._nominal.contact.is_known(measured):
+                    predicted_N = self.fit.force_N(slid_N) * self.slow.factor_at(abs(measured.handle.rate_mm_s))
+            ripple = self._ripple(measured)
+        return self._belief(ripple, None if predicted_N is None else predicted_N * ripple)
 
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan."""
-        if self.learns and self._has_lag and measured is not None:
+        if self.learns and self._terms.motor and measured is not None:
             is_ahead = measured.is_homed and foresight >= MIN_FORESIGHT
             gap_mm, speed_mm_s = measured.gap_mm, measured.gap_speed_mm_s
             self.carriages.update(dt_s, planned_mm if is_ahead else None, gap_mm, speed_mm_s, self._top_speed_mm_s)
 
-    def _belief(self, measured: Measured | None, slid_N: float | None) -> Belief:
-        at_speed = self.device
-        ripple, predicted_N, has_slid = 1.0, None, self.sensor.has_slid
-        if measured is not None:
-            ripple = self._ripple(measured)
-            if slid_N is not None and self._nominal.contact.is_known(measured):
-                now_slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
-                predicted_N = self.fit.force_N(slid_N) * now_slow * ripple
-        slow = self.slow.factor_at(self.slow.creep_mm_s) if self._has_creep else 1.0
+    def _belief(self, ripple: float, predicted_N: float | None) -> Belief:
+        at_speed, has_slid = self.device, self.sensor.has_slid
+        slow = self.slow.factor_at(self.handle.creep_mm_s) if self._has_creep else 1.0
         return Belief(
             device=at_speed.times(slow * ripple),
             at_speed=at_speed,
             unseen=UNSEEN.relaxed(self.memory.relaxed_N) if self.is_prior and not has_slid else None,
-            lag_s=self.carriages.lag_s if self._has_lag else 0.0,
+            lag_s=self.carriages.lag_s if self._terms.motor else 0.0,
             predicted_N=predicted_N,
             limits=(*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits,
             sensor_doubted_s=self.sensor.doubted_s,
@@ -217,22 +200,27 @@ class Believe:
         ):
             self._hear_at_speed(now_s, measured, reading_N, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
         else:
-            self._hear_at_creep(now_s, measured, reading_N, dt_s, is_mobilised)
+            self._hear_at_creep(now_s, measured, reading_N, slid_N, rate_mm_s, dt_s, is_mobilised)
 
     def _hear_at_creep(
-        self, now_s: float, measured: Measured, reading_N: float, dt_s: float, is_mobilised: bool
+        self,
+        now_s: float,
+        measured: Measured,
+        reading_N: float,
+        model_N: float,
+        rate_mm_s: float,
+        dt_s: float,
+        is_mobilised: bool,
     ) -> None:
         """Learn slow friction from one reading of a handle that creeps."""
-        rate_mm_s = abs(measured.handle.rate_mm_s)
-        is_creep = measured.handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
-        is_creep = is_creep and SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S
-        if not (self._has_creep and self.learns and is_creep):
+        most_mm_s = min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
+        is_creep = SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and measured.handle.sliding_mm_s < most_mm_s
+        if not (is_creep and self._has_creep and self.learns and self.knows_zero(now_s)):
             return
-        expected_N = self.fit.force_N(self.slow.followed_N)
+        expected_N = self.fit.force_N(model_N)
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
-        is_lesson = self.knows_zero(now_s) and (is_mobilised or reading_N > expected_N)
-        if expected_N > MIN_EXPECTED_N and is_lesson:
-            self.slow.update(self.fit, rate_mm_s, reading_N, dt_s)
+        if expected_N > SLACK_N and (is_mobilised or reading_N > expected_N):
+            self.slow.update(self.fit, model_N, rate_mm_s, reading_N, dt_s)
 
     def _hear_at_speed(self, now_s: float, measured: Measured, reading_N: float, model_N: float, dt_s: float) -> None:
         """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit."""
@@ -252,22 +240,23 @@ class Believe:
             is_disputed=sensor.wrong_s + sensor.outside_s > 2.0 * NAMED_S,
         )
         learns = self.learns and zero_sd_N <= UNKNOWN_SD_N
-        taught_N = sensor.update(fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns)
+        taught_N = sensor.update(
+            fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns, is_prior=self.is_prior
+        )
         unknown_N = self._unknown_N(zero_sd_N)
         least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
         if taught_N is None or not self.learns or (unknown_N > 0.0 and reading_N < least_N):
             return
-        anchor_N = max(sensor.anchor.force_N(model_N), MIN_EXPECTED_N)
+        anchor_N = max(sensor.anchor.force_N(model_N), SLACK_N)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, anchor_N + sensor.off_N, dt_s)
         if self._slides and Limit.TRIM not in self.limits:
             self.ripple.update(angle, measured.handle.rate_mm_s, anchor_N, reading_N)
 
     def _unknown_N(self, zero_sd_N: float) -> float:
         """Update `limits`, and return what a zero that is known to within `zero_sd_N` may explain, if that is much."""
-        sensor = self.sensor
         self.limits = (Limit.SENSOR_ZERO,) if abs(self.zero.zero_N) > UNTARED_N else ()
-        if sensor.is_disputed:
-            self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
+        if self.sensor.is_disputed:
+            self.limits = (Limit.SENSOR if self.sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
         elif zero_sd_N > self._unknown_sd_N:
             self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
             return SURE * zero_sd_N + SLACK_N
@@ -286,7 +275,7 @@ class Believe:
             dt_s,
             adapts_in_s=adapting_s(self._trim.time_s, mean_N - before_N),
             bounds=self._trim,
-            learns=self._learned_terms,
+            learns=(self._terms.scale, self._terms.offset),
         )
         if is_held:
             self.limits = (Limit.TRIM, *self.limits)

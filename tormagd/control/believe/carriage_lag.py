@@ -47,10 +47,8 @@ class CarriageLag:
             self.expected_mm, self.is_settling = None, False
             return
         dt_s = min(max(dt_s, 0.0), MAX_DT_S)
-        speed_mm_s = min(max(speed_mm_s, -top_speed_mm_s), top_speed_mm_s)  # a new filter may overstate it
-        expected_mm = planned_mm if self.expected_mm is None else self.expected_mm
-        if dt_s > 0.0:
-            expected_mm = low_pass(expected_mm, planned_mm, dt_s, self.lag_s)
+        before_mm = planned_mm if self.expected_mm is None else self.expected_mm
+        expected_mm = low_pass(before_mm, planned_mm, dt_s, self.lag_s) if dt_s > 0.0 else before_mm
         self.expected_mm = expected_mm
         error_mm = expected_mm - gap_mm - speed_mm_s * AGE_S
         self.is_settling = abs(error_mm) > (SETTLED_MM if self.is_settling else MAX_LAG_S * top_speed_mm_s)

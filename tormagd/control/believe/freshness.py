@@ -34,8 +34,6 @@ class Freshness:
     "How long the reading has been the same."
     stood_N: float = 0.0
     "The model's force when the reading last changed."
-    changed_N: float = 0.0
-    "By how much the device's force has changed since the reading last changed."
     runs: int = 0
     "Number of runs there were, HEARD at most."
     run_s: float = 0.0
@@ -49,30 +47,19 @@ class Freshness:
     alternates: float = 0.0
     "Share of the changes that go back on the change before."
 
-    @property
-    def is_stale(self) -> bool:
-        return self.changed_N > STALE_N + self._steps_N
-
-    @property
-    def is_frozen(self) -> bool:
-        """Tell whether the sensor is broken: it should have shown another value by now."""
-        is_resolved = self.alternates > ALTERNATES and self.run_s < RESOLVED * self.min_run_s
-        is_long = self.runs == HEARD and is_resolved and self.still_s > FROZEN_RUNS * self.run_s
-        return self.still_s > FROZEN_S and (is_long or self.changed_N > FROZEN_N + self._steps_N)
-
-    @property
-    def _steps_N(self) -> float:
-        return 2.0 * min(self.step_N, FROZEN_N)
-
-    def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> None:
-        """Take one reading, which stands for `dt_s` > 0, and update `is_stale` and `is_frozen`."""
+    def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> tuple[bool, bool]:
+        """Take one reading, which stands for `dt_s` > 0, and return whether it is stale, and the sensor frozen."""
         if reading_N == self.reading_N:
             self.still_s += dt_s
         else:
             if learns and self.reading_N != math.inf:
                 self._take_run(reading_N - self.reading_N, self.still_s + dt_s)
             self.reading_N, self.still_s, self.stood_N = reading_N, 0.0, model_N
-        self.changed_N = scale * abs(model_N - self.stood_N)
+        changed_N, steps_N = scale * abs(model_N - self.stood_N), 2.0 * min(self.step_N, FROZEN_N)
+        is_resolved = self.alternates > ALTERNATES and self.run_s < RESOLVED * self.min_run_s
+        is_long = self.runs == HEARD and is_resolved and self.still_s > FROZEN_RUNS * self.run_s
+        is_frozen = self.still_s > FROZEN_S and (is_long or changed_N > FROZEN_N + steps_N)
+        return changed_N > STALE_N + steps_N, is_frozen
 
     def _take_run(self, change_N: float, run_s: float) -> None:
         """Learn noise and resolution from a run that lasted `run_s` and ended with a change of `change_N`."""

@@ -35,19 +35,19 @@ class ElementMemory:
     "Relaxation branches of the force that the field adds, N."
     relaxed_N: float = 0.0
     "Force that has relaxed."
-    time_s: float
-    "When the memory was last updated; -inf before the first known gap."
+    time_s: float = math.inf
+    "When the memory was last updated; inf before the first known gap."
     opened_mm: float = 0.0
     "Before the first known gap: by how much the gap has opened since the device was switched on."
 
     def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
         """Begin before the first known gap."""
-        self.time_s = -math.inf
         self._free: Final = memory.free
         self._added: Final = memory.added
         self._width_mT: Final = memory.lag_mT
         self._turn_mT: Final = memory.turn_mT
         self._nominal: Final = nominal
+        self._slides: Final = nominal.contact.slides
         self._field: Final = field
         self._least_mm: Final = gap_range_mm[0] - BEYOND_MM
         self._open_mm: Final = gap_range_mm[1]
@@ -56,7 +56,7 @@ class ElementMemory:
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`."""
         change_mT = field_mT - self.field_mT
-        if change_mT == 0.0 or self.time_s == -math.inf:
+        if change_mT == 0.0 or self.time_s == math.inf:
             return self.lag_mT
         side_mT = math.copysign(self._width_mT, change_mT)
         return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
@@ -71,29 +71,27 @@ class ElementMemory:
 
     def update(self, now_s: float, measured: Measured) -> None:
         """Follow lag and relaxation to `now_s`, along a straight change to the `measured` gap."""
-        slides = self._nominal.contact.slides
-        if slides and not measured.is_homed:
+        if self._slides and not measured.is_homed:
             # before homing, positions count from where the carriages were at switching on, as if that were the open gap
             self.opened_mm = max(measured.gap_mm - self._open_mm, self.opened_mm)
             return
         gap_mm = max(measured.gap_mm, self._least_mm) if measured.is_homed else self._open_mm
         field_mT = self._field.field_mT(gap_mm)
-        curve = self._nominal.only if slides else self._nominal.now(measured)
+        curve = self._nominal.only if self._slides else self._nominal.now(measured)
         free_N = self._force_N(curve, 0.0)
-        if self.time_s == -math.inf:
+        if self.time_s == math.inf:
             self._begin(curve, gap_mm, free_N, now_s)
         self._follow(curve, free_N, field_mT, now_s)
 
     def _begin(self, curve: ForceCurve, gap_mm: float, free_N: float, now_s: float) -> None:
         """Begin relaxed at the gap at which a brake was switched on, and with nothing relaxed on a pad."""
-        slides = self._nominal.contact.slides
-        found_mm = gap_mm - self.opened_mm if slides else gap_mm
+        found_mm = gap_mm - self.opened_mm
         is_known = self._least_mm <= found_mm <= self._open_mm + BEYOND_MM
         self.field_mT = self._field.field_mT(found_mm if is_known else gap_mm)
         self.time_s = now_s
         added_N = self._force_N(curve, self.field_mT) - free_N
-        self.free = self._free.relaxed(free_N if slides else 0.0)
-        self.added = self._added.relaxed(added_N if slides else 0.0)
+        self.free = self._free.relaxed(free_N if self._slides else 0.0)
+        self.added = self._added.relaxed(added_N if self._slides else 0.0)
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
         """Follow a straight change of the gap's field to `field_mT` at `now_s`."""

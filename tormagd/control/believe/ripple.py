@@ -21,10 +21,10 @@ PLACES: Final = 36
 "Waves of up to three a turn are cut by 4 % at most."
 STEEPEST: Final = 0.12
 "No ripple changes by a greater share from place to place, nor moves the gap by as much."
-STEADY_MM_S: Final = 8.0
-"In a pass the handle's rate may change by so much: friction differs with the rate."
 SETTLES: Final = 3
 "After a change of rate or gap so many passes teach nothing."
+STEADY_MM_S: Final = 8.0
+"In a pass the handle's rate may change by so much: friction differs with the rate."
 
 
 @final
@@ -53,7 +53,7 @@ class Ripple:
     rate_mm_s: float = 0.0
     "And its rate."
     passes: int = -SETTLES
-    "How many passes one way have taught; less than 0 while something settles."
+    "How many passes one after the other have taught; less than 0 while something settles."
     risen: float = 0.0
     "By how much the share rose in them, along the way."
     fade: float = 0.0
@@ -84,16 +84,14 @@ class Ripple:
         """Compare the place that the handle leaves with the place before."""
         mean, way, at = self.total / self.readings, self.place - self.last, min(self.place, self.last) % PLACES
         rose = mean - self.mean
+        is_even = max(abs(rose), abs(self.force_N / force_N - 1.0)) <= STEEPEST
         is_steady = abs(way) == 1 and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S
-        if not is_steady or max(abs(rose), abs(self.force_N / force_N - 1.0)) > STEEPEST:
-            self.passes, self.risen = -SETTLES, 0.0
-        else:
-            self.passes += 1
+        self.passes = self.passes + 1 if is_even and is_steady else -SETTLES
         if self.passes > 0:
             rise = way * rose - self.slopes[at]
-            self.risen += way * rise
+            self.risen = way * rise + (self.risen if self.passes > 1 else 0.0)
             if self.passes == PLACES:
-                self.fade, self.passes, self.risen = self.risen / PLACES, 0, 0.0
+                self.fade, self.passes = self.risen / PLACES, 0
             self._learn(at, rise - way * self.fade)
         self.last, self.mean, self.force_N, self.rate_mm_s = self.place, mean, force_N, rate_mm_s
 

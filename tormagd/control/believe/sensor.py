@@ -12,10 +12,9 @@ what no device gives is wrong, and teaches nothing.
 from typing import Final, Literal, final
 
 from tormagd.config import Trim
-from tormagd.control.believe.anchor import Anchor
 from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, VISCOUS_N_S_MM
-from tormagd.control.believe.strength import SURE, UNSEEN, DeviceFit
+from tormagd.control.believe.strength import SURE, UNSEEN, Anchor, DeviceFit
 from tormagd.control.interpolation import low_pass
 from tormagd.element.model.force_curve import within
 
@@ -94,37 +93,48 @@ class SensorTrust:
         dt_s: float,
         *,
         learns: bool,
+        is_prior: bool = False,
     ) -> float | None:
         """Take one reading, and return what of it may teach `fit`, N; None where it is old or wrong."""
-        self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
-        if self.known_s == 0.0:
-            self.rate_mm_s = rate_mm_s
+        is_stale, is_frozen = self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
+        self.rate_mm_s = self.rate_mm_s if self.has_slid else rate_mm_s
         force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
         self.off_N = low_pass(self.off_N, reading_N - force_N, dt_s, FILTER_S)
         unsure_N = SLACK_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
         least_N = self._trim.least * (1.0 - WEAKENED) * model_N - unsure_N
         most_N = self._trim.most * (1.0 + WEAKENED) * model_N + unsure_N
-        is_strange = self.freshness.is_frozen or not least_N <= force_N + self.off_N <= most_N
+        is_strange = is_frozen or not least_N <= force_N + self.off_N <= most_N
         surely_N = SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
         unsure_N += SURE * VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
         beyond_N = abs(self.off_N) - self._trim.leash * force_N - unsure_N - KNOWN_N - surely_N
-        teaches = self._judge(is_strange, beyond_N <= 0.0, dt_s)
+        teaches = self._judge(is_strange, beyond_N <= 0.0, is_stale, dt_s)
         leapt_N = (1.0 - LEAPT) * force_N - unsure_N - surely_N if self.has_slid else least_N
         if not (teaches and max(least_N, leapt_N) <= reading_N <= most_N):
             return None
         taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
-        if deviation_N <= KNOWN_N:
-            self.fallen = within(believed, (self._trim.least, 1.0))
-        elif learns and beyond_N <= 0.0:
-            self._learn(model_N, rate_mm_s, force_N, deviation_N, taught_N, dt_s)
-        self._give_way(believed, force_N, dt_s)
+        if learns and beyond_N <= 0.0:
+            self._learn(model_N, rate_mm_s, force_N, deviation_N, believed, taught_N, dt_s, is_prior)
+        if self.has_slid:
+            self._give_way(believed, force_N, dt_s)
         return taught_N
 
     def _learn(
-        self, model_N: float, rate_mm_s: float, force_N: float, deviation_N: float, taught_N: float, dt_s: float
+        self,
+        model_N: float,
+        rate_mm_s: float,
+        force_N: float,
+        deviation_N: float,
+        believed: float,
+        taught_N: float,
+        dt_s: float,
+        is_prior: bool,
     ) -> None:
-        """Teach the anchor, which gives `force_N` there, a force at which it is not known."""
+        """Teach the anchor, which gives `force_N` there, a force at which it is not known; else learn `fallen`."""
+        # where a calibration half knows it, a reading that is less is of a sensor that fades, or of a device
+        if deviation_N <= (2.0 * KNOWN_N if is_prior and self.off_N <= 0.0 else KNOWN_N):
+            self.fallen = within(believed, (self._trim.least, 1.0))
+            return
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
         if self.has_slid:
             # what has fallen at the forces that are known has fallen here, too
@@ -134,14 +144,12 @@ class SensorTrust:
 
     def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share of the anchor's `force_N` that is `believed`."""
-        if not self.has_slid:
-            return
         # what is lost in the slack is given way, too: readings at its end would teach only their noise
         self.low_s = self.low_s + dt_s if force_N + self.off_N < self.share * force_N else 0.0
         falls = FALLS_1_S * dt_s if self.low_s > LEARNS_S else 0.0
         self.share = within(max(self.share - falls, believed), (1.0 - self._trim.leash, 1.0))
 
-    def _judge(self, is_strange: bool, is_inside: bool, dt_s: float) -> bool:
+    def _judge(self, is_strange: bool, is_inside: bool, is_stale: bool, dt_s: float) -> bool:
         """Weigh how long readings were such as no device gives, or outside the leash; return whether they teach."""
         if is_strange:
             self.wrong_s = self.wrong_s + dt_s if self.wrong_s + dt_s <= WRONG_S else DOUBTED_S
@@ -152,4 +160,4 @@ class SensorTrust:
         self.doubted_s = self.doubted_s + dt_s if self.is_doubted else 0.0
         if self.wrong_s == 0.0:
             self.known_s = min(self.known_s + dt_s, LEARNS_S)
-        return self.wrong_s == 0.0 and not self.freshness.is_stale
+        return self.wrong_s == 0.0 and not is_stale

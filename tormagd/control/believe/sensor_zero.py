@@ -76,20 +76,17 @@ class SensorZero:
     "What the sensor reads without a force."
     variance_N2: float = TARED_VARIANCE_N2
     "Variance of the zero at `told_s`."
-    way: float
+    way: float = 0.0
     "By which share friction is greater one way, and less the other."
     way_variance: float = WAY_VARIANCE
     told_s: float = math.inf
     "When the variance was told: at the first reading, or the newest reversal; inf before."
     direction: float = 0.0
     "The way the handle goes, 1 or -1; 0 before the first reading."
-    level: Level
+    level: Level = UNHEARD
     "Level of the present way."
     before: Level | None = None
     "Level of the way before, until the two have been compared; None without one."
-
-    def __init__(self, way: float = 0.0) -> None:
-        self.way, self.level = way, UNHEARD
 
     def sd_N(self, now_s: float) -> float:
         """Return the zero's standard deviation at `now_s`, N, at most MAX_SD_N."""

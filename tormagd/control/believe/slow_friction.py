@@ -13,19 +13,12 @@ from typing import Final, final
 
 from tormagd.config import Trim
 from tormagd.control.believe.strength import MAX_RELAXED, DeviceFit
-from tormagd.control.interpolation import low_pass
 from tormagd.element.model.force_curve import within
 
 STRIBECK_MM_S: Final = 5.0
 "At this speed most of static friction is gone (plant card)."
 SLOWEST_MM_S: Final = 0.3
 "A slower handle may stand."
-FASTEST_MM_S: Final = 2.0 * STRIBECK_MM_S
-"A faster handle does not creep."
-SLOWS_S: Final = 0.1
-"""A handle that slows down creeps after some SLOWS_S."""
-BRISTLES_N_MM: Final = 8.0
-"Stiffness of the contact's bristles, sample 1's (plant card): friction follows a rising field as they are bent."
 LEARNED_S: Final = 0.3
 "Time constant of learning the factor at rest."
 MIN_STATIC: Final = 0.9
@@ -48,14 +41,6 @@ class SlowFriction:
     "Share of the factor that was learned at a creep, 0..1."
     slowness: float = 1.0
     "e(v) where it was learned, by the same low pass; 1, as at rest, until then."
-    followed_N: float = 0.0
-    "The model's force as far as the bristles of the contact have followed it."
-    handle_mm: float = 0.0
-    "Where the handle was when they last followed."
-    creep_mm_s: float = FASTEST_MM_S
-    "The rate that counts as the handle's, as far as it creeps."
-    slid_s: float = 0.0
-    "When `creep_mm_s` was last updated."
 
     def __init__(self, bounds: Trim) -> None:
         self._bounds: Final = bounds
@@ -63,21 +48,6 @@ class SlowFriction:
     def factor_at(self, rate_mm_s: float) -> float:
         """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
         return 1.0 + _slowness(rate_mm_s) * (within(self.factor, factor_bounds(self._bounds)) - 1.0)
-
-    def slide(self, now_s: float, sliding_mm_s: float) -> None:
-        """Update `creep_mm_s` with the level of rate that friction has, `sliding_mm_s` >= 0, at `now_s`."""
-        from_mm_s = min(self.creep_mm_s, FASTEST_MM_S)
-        self.creep_mm_s = max(low_pass(from_mm_s, sliding_mm_s, now_s - self.slid_s, SLOWS_S), sliding_mm_s)
-        self.slid_s = now_s
-
-    def follow(self, model_N: float, handle_mm: float) -> float:
-        """Update `followed_N` with the model's force `model_N` and the handle at `handle_mm`, and return it."""
-        rise_N = model_N - self.followed_N
-        if rise_N > 0.0 and model_N > 0.0:
-            rise_N *= 1.0 - math.exp(-BRISTLES_N_MM * abs(handle_mm - self.handle_mm) / model_N)
-        self.followed_N += rise_N
-        self.handle_mm = handle_mm
-        return self.followed_N
 
     def rescale(self, before_N: float, after_N: float, rate_mm_s: float) -> None:
         """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N`
@@ -87,15 +57,16 @@ class SlowFriction:
             at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
             self.factor = 1.0 + (within(at_creep, factor_bounds(self._bounds)) - 1.0) / self.slowness
 
-    def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`. k is held within
-        `believable`."""
-        if reading_N < self._bounds.least * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
+    def update(self, fit: DeviceFit, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
+        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`."""
+        if reading_N < self._bounds.least * (1.0 - MAX_RELAXED) * model_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
         share = slowness * dt_s / (LEARNED_S + dt_s)
-        shown = 1.0 + (reading_N / fit.force_N(self.followed_N) - 1.0) / slowness
-        believed = believable(fit, self.followed_N, self._bounds)
+        shown = 1.0 + (reading_N / fit.force_N(model_N) - 1.0) / slowness
+        unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
+        least, most = factor_bounds(self._bounds)
+        believed = max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)
         self.factor = within(self.factor + share * (shown - self.factor), believed)
         self.learned += share * (1.0 - self.learned)
         self.slowness += share * (slowness - self.slowness)
@@ -104,13 +75,6 @@ class SlowFriction:
 def factor_bounds(bounds: Trim) -> tuple[float, float]:
     """Return the least and the greatest k of any device: MIN_STATIC at its least scale, MAX_STATIC at its greatest."""
     return bounds.least * MIN_STATIC, bounds.most * MAX_STATIC
-
-
-def believable(fit: DeviceFit, model_N: float, bounds: Trim) -> tuple[float, float]:
-    """Return the least and the greatest k of a device with this `fit`, where the model's force is `model_N`."""
-    unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
-    least, most = factor_bounds(bounds)
-    return max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)
 
 
 def _slowness(rate_mm_s: float) -> float:
