@@ -551,6 +551,40 @@ def every_997th(device: Rogue, time_s: float, measured: Measured) -> Measured:
     return old if device.since_s % 997 == 0 else measured
 
 
+def stood(device: Rogue, time_s: float, measured: Measured) -> Measured:
+    if device.real.mode is not DeviceMode.HOMING:
+        device.stands_mm = measured[0].left_position_mm
+    return measured[0].replaced(left_position_mm=device.stands_mm), measured[1]
+
+
+def handle_of_10_ms(device: Rogue, time_s: float, measured: Measured) -> Measured:
+    if time_s - device.since_s > 0.01:
+        device.since_s, device.stands_mm = time_s, measured[1].handle_position_mm
+    return measured[0], measured[1].replaced(handle_position_mm=device.stands_mm)
+
+
+def remembers(device: Rogue, sensors: Sensors) -> Sensors:
+    device.sensors = sensors
+    return sensors
+
+
+def zeroes_both(device: Rogue, time_s: float) -> None:
+    sensors, real = device.sensors, device.real
+    if real.mode is not DeviceMode.HOMING and real.homed and device.counts:
+        real._left_zero_mm, real._right_zero_mm = (count * real._mm_per_count for count in device.counts)
+    if real.mode is not DeviceMode.HOMING:
+        device.counts = None
+    elif sensors.switches and not device.counts:
+        device.counts = sensors.left_counts, sensors.right_counts
+
+
+def while_opening(change: Callable[[Sense], Sense]) -> Callable[..., Measured]:
+    return lambda device, _, measured: (
+        measured[0],
+        change(measured[1]) if device.real.mode is DeviceMode.RETRACTING else measured[1],
+    )
+
+
 SWAPPED = {DeviceMode.RUN: DeviceMode.HOMING, DeviceMode.HOMING: DeviceMode.RUN}
 
 
@@ -653,6 +687,20 @@ def noise_is_a_drive(wire: Lenient, stretch: bytes) -> bytes:
     return encode_frame(FUNCTION[Drive], 0, encode(Drive(0.0, 0.0, DriveMode.OFF, 200 + wire.count)))
 
 
+def repeated(wire: Any, stretch: bytes) -> bytes:
+    body = cobs_decode(stretch)
+    if body and FrameDecoder().feed(stretch + DELIMITER):
+        wire.kept = framed(bytes((body[0], (body[1] + 128) % 256)) + body[2:-2])
+        return stretch + DELIMITER
+    return stretch + DELIMITER + bytes(wire.kept)
+
+
+def thrice(wire: Any, stretch: bytes) -> bytes:
+    older, last = wire.olds
+    wire.olds = last, stretch
+    return b"" if stretch == older else stretch + DELIMITER
+
+
 def deafened(wire: Lenient, stretch: bytes) -> bytes:
     was_deaf, wire.is_deaf = wire.is_deaf, len(stretch) > 13
     return b"" if was_deaf and len(stretch) == 12 else stretch + DELIMITER
@@ -753,15 +801,17 @@ PLANTED = (
     rogue("runs unhomed", "idle_without_zero_stays", receive=runs_unhomed),
     rogue(
         "every other Status",
-        "status_rate",
+        "reports_in_time",
+        "every_drive_answered",
         shows=lambda device, _, status: status if device.count[Status] % 2 else None,
     ),
     rogue(
         "Status only beside Drives",
-        "status_rate",
+        "reports_in_time",
+        "every_drive_answered",
         shows=lambda device, time_s, status: status if time_s - device.drive_s < 0.3 else None,
     ),
-    fault("no_status", "status_rate"),
+    fault("no_status", "every_nonce"),
     rogue(
         "Status lags beside Drives",
         "reports_in_time",
@@ -798,6 +848,7 @@ PLANTED = (
     ),
     rogue(
         "Drive's counter behind",
+        "status_consistent",
         "every_counter",
         shows=lambda _, time_s, status: status.replaced(drive_counter=(status.drive_counter - 1) % 256),
     ),
@@ -809,13 +860,13 @@ PLANTED = (
     rogue(
         "supply in tenths",
         "status_consistent",
-        "status_rate",
+        "every_counter",
         shows=lambda _, time_s, status: status.replaced(supply_V=status.supply_V / 10.0),
     ),
     fault("supply_loss", "every_nonce"),
     rogue(
         "current with an offset",
-        "plausible_at_rest",
+        "plausible_in_each_mode",
         "every_drive_answered",
         measures=lambda _, time_s, measured: (
             measured[0],
@@ -971,16 +1022,16 @@ PLANTED = (
     rogue("remembers its zero", "warm_reset", boots=remembering()),
     rogue("remembers its zero", "cold_reset", boots=remembering()),
     rogue("browns out", "duties_make_currents", ticked=browns_out),
-    rogue("switches swapped", "zero_is_at_switch", senses=with_switches(swapped)),
+    rogue("switches swapped", "open_switch_stops", senses=with_switches(swapped)),
     rogue(
         "open switches stuck once homed",
         "status_consistent",
-        "zero_is_at_switch",
+        "open_switch_stops",
         senses=with_switches(lambda device, switches: switches | BOTH_OPEN if device.real.homed else switches),
     ),
     rogue(
         "left switch for both",
-        "zero_is_at_switch",
+        "open_switch_stops",
         senses=with_switches(
             lambda _, switches: switches | BOTH_OPEN if Switches.LEFT_OPEN in switches else switches & ~BOTH_OPEN
         ),
@@ -991,8 +1042,8 @@ PLANTED = (
         drives=lambda device, output: Output(clipped(output.left_duty), clipped(output.right_duty), output.enabled),
     ),
     rogue("positions scaled", "end_stop_opens", measures=moved(1.09, 0.0)),
-    rogue("zero off", "zero_is_at_switch", measures=moved(1.0, 0.6)),
-    rogue("zero off the other way", "zero_is_at_switch", measures=moved(1.0, -0.6)),
+    rogue("zero off", "open_switch_stops", measures=moved(1.0, 0.6)),
+    rogue("zero off the other way", "open_switch_stops", measures=moved(1.0, -0.6)),
     rogue("handle big-endian", "handle_runs_on", measures=sensed(big_endian)),
     rogue(
         "currents in tenths",
@@ -1025,7 +1076,7 @@ PLANTED = (
     rogue(
         "no Status at high duty",
         "reports_in_time",
-        "zero_is_at_switch",
+        "open_switch_stops",
         "every_drive_answered",
         shows=lambda device, _, status: (
             None if is_running(device) and abs(device.real.output.left_duty) > 0.8 else status
@@ -1040,7 +1091,12 @@ PLANTED = (
         ),
     ),
     rogue("equal counters with other duties", "idle_stays", before=other_payload),
-    rogue("force reversed", "handle_runs_on", measures=sensed(lambda sense: sense.replaced(force_N=-sense.force_N))),
+    rogue(
+        "force reversed",
+        "force_follows_gap",
+        "handle_runs_on",
+        measures=sensed(lambda sense: sense.replaced(force_N=-sense.force_N)),
+    ),
     rogue("positions one Drive old", "duties_make_currents", measures=place_old),
     rogue(
         "commands run out",
@@ -1089,7 +1145,7 @@ PLANTED = (
         ),
     ),
     rogue("duties act while homing", "homing_beside_run_stays", drives=drives_in(DeviceMode.HOMING)),
-    rogue("duties act while opening", "retracting_beside_run_stays", drives=drives_in(DeviceMode.RETRACTING)),
+    rogue("duties act while opening", "retracting_after_silence_stays", drives=drives_in(DeviceMode.RETRACTING)),
     rogue(
         "never opens",
         "left_open",
@@ -1144,7 +1200,7 @@ PLANTED = (
             )
         ),
     ),
-    rogue("switches 60 ms late", "zero_is_at_switch", shows=shows_late),
+    rogue("switches 60 ms late", "open_switch_stops", shows=shows_late),
     rogue(
         "another serial number each time",
         "status_consistent",
@@ -1197,7 +1253,7 @@ PLANTED = (
     rogue(
         "15.6 V in one Status of 50",
         "status_consistent",
-        "status_rate",
+        "every_drive_answered",
         shows=lambda device, _, status: status.replaced(supply_V=15.6) if device.count[Status] % 50 == 0 else status,
     ),
     rogue(
@@ -1212,7 +1268,8 @@ PLANTED = (
     ),
     rogue(
         "no Status after a while alone",
-        "status_rate",
+        "reports_in_time",
+        "every_drive_answered",
         shows=lambda device, time_s, status: status if time_s - device.drive_s < 1.5 else None,
     ),
     rogue(
@@ -1227,7 +1284,7 @@ PLANTED = (
     ),
     rogue(
         "a force that stands while opening",
-        "handle_runs_on",
+        "force_follows_gap",
         "run_drive_off",
         measures=lambda device, _, measured: (
             measured[0],
@@ -1246,6 +1303,70 @@ PLANTED = (
         "let_go_after_all",
         hears=lambda _, message: None if isinstance(message, Home) and message.nonce < 100 else message,
     ),
+    # kinds of error that a later kit did not see
+    rogue(
+        "the left position stands while homing",
+        "plausible_in_each_mode",
+        "home_homes",
+        "run_drive_off",
+        measures=stood,
+        stands_mm=0.0,
+    ),
+    rogue(
+        "currents of the other side while opening",
+        "plausible_in_each_mode",
+        "home_homes",
+        "skew_opens",
+        measures=while_opening(
+            lambda sense: sense.replaced(left_current_A=sense.right_current_A, right_current_A=sense.left_current_A)
+        ),
+    ),
+    rogue(
+        "currents without sign while homing",
+        "plausible_in_each_mode",
+        "home_homes",
+        "run_drive_off",
+        measures=lambda device, _, measured: (
+            measured[0],
+            measured[1].replaced(left_current_A=abs(measured[1].left_current_A))
+            if device.real.mode is DeviceMode.HOMING
+            else measured[1],
+        ),
+    ),
+    rogue("handle read at 100 Hz", "handle_runs_on", measures=handle_of_10_ms, stands_mm=0.0),
+    rogue(
+        "every 500th force 0",
+        "force_follows_gap",
+        "run_drive_off",
+        "handle_runs_on",
+        measures=lambda device, _, measured: (
+            measured[0],
+            measured[1].replaced(force_N=measured[1].force_N * (measured[0].counter != 99)),
+        ),
+    ),
+    rogue(
+        "a misfit is not answered in RUN",
+        "run_hello_misfit",
+        answers=lambda device, message, answer: (
+            Answer.NONE
+            if isinstance(message, Hello)
+            and fitting(message, **RIGHT) != message
+            and device.mode is DeviceMode.RETRACTING
+            else answer
+        ),
+    ),
+    rogue(
+        "a Retract clears what opens",
+        "retracting_after_silence_stays",
+        before=lambda device, _, message: (
+            setattr(device.real, "faults", DeviceFault(0))
+            if isinstance(message, Retract) and device.mode is DeviceMode.RETRACTING
+            else None
+        ),
+    ),
+    rogue("the first open switch zeroes both", "cold_reset", ticked=zeroes_both, senses=remembers, counts=None),
+    wire("what is damaged repeats the one before", "idle_stays", mended=repeated, kept=b""),
+    wire("a frame of the one before the last is dropped", "frames_as_they_come", mended=thrice, olds=(b"", b"")),
     wire(
         "whole frames only",
         "frames_as_they_come",
@@ -1312,6 +1433,30 @@ def test_a_check_that_this_computer_spoiled_is_tried_again() -> None:
     assert run(Host(serial_line(wire=Asleep)), [named("silence_is_noticed")])[0].passed
     seen = run(Host(serial_line(wrong(Rogue, ticks=timeout_of(0.035)), Asleep)), [named("silence_is_noticed")])[0].seen
     assert "ms late meanwhile" not in seen, "the last attempt was not late, and is the one that counts"
+
+
+class Pausing(Wire):
+    """The host or the device stands still for 0.5 s, once; what came meanwhile is handled late."""
+
+    of_host = False
+    held: bytes | None = None
+
+    def down(self, data: bytes) -> bytes:
+        pauses = not self.of_host and 0.5 < self.time_s < 1.0
+        self.held, data = (self.held or b"") + data if pauses else b"", b"" if pauses else (self.held or b"") + data
+        return data
+
+    def read(self, until_s: float) -> list[tuple[float, bytes]]:
+        if self.of_host and self.time_s > 0.5 and self.held is None:
+            self.held, until_s = b"", until_s + 0.5
+        return super().read(until_s)
+
+
+@pytest.mark.parametrize("of_host", [False, True])
+def test_a_pause_does_not_move_the_clock(of_host: bool) -> None:
+    checks = [named(name) for name in ("every_drive_answered", "every_nonce", "every_drive_answered", "clock_runs_on")]
+    result = run(Host(serial_line(wire=wrong(Pausing, of_host=of_host))), checks)[-1]
+    assert result.passed, result.seen
 
 
 # -- the command ---------------------------------------------------------------------------------------------------
