@@ -11,7 +11,6 @@ from firmware_protocol.conformance.host import (
     NO_FAULT,
     OPENED_S,
     SEEN_S,
-    SWITCH_MM,
     Host,
     Unmet,
     Untested,
@@ -51,7 +50,7 @@ def _is_new(host: Host, how: str) -> str:
         DriveMode.RUN,
         homed=True,
         besides=f"{'; '.join(seen)}; after it {positions(host.last(State))}",
-        wrong=min(places(host.last(State))) < -SWITCH_MM or max(places(host.last(State))) > moving.ZERO_MM,
+        wrong=max(map(abs, places(host.last(State)))) > moving.ZERO_MM / 2.0,
     )
 
 

@@ -388,7 +388,7 @@ class Host:
             self.pass_time(SEEN_S, DriveMode.RUN)
 
     def bring(
-        self, left_mm: float, right_mm: float, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
+        self, left_mm: float, right_mm: float, *, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
     ) -> None:
         goals = left_mm, right_mm
         targets: tuple[float, ...] = places(self.last(State))

@@ -222,8 +222,10 @@ def _ends_run(fault: DeviceFault, from_share: float, most_mm: float, host: Host)
         host.bring(
             begins_mm + (ASIDE_MM if side else -AHEAD_MM),
             begins_mm + (-AHEAD_MM if side else ASIDE_MM),
-            SLOW_MM_S,
-            lambda: np.ptp(places(host.last(State))) > SKEW_MM + BOUND_MM or host.status.mode is not DeviceMode.RUN,
+            mm_s=SLOW_MM_S,
+            ends=lambda: (
+                bool(np.ptp(places(host.last(State))) > SKEW_MM + BOUND_MM) or host.status.mode is not DeviceMode.RUN
+            ),
         )
         innermost_mm = min(places(state)[side] for _, state in host.all_of(State))
         off_mm = np.ptp(places(host.last(State))) - SKEW_MM if is_skew else innermost_mm + host.stroke_mm

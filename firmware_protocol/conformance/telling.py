@@ -99,11 +99,11 @@ def steps(rows: dict[str, Array], name: str, step: float) -> npt.NDArray[np.int_
 
 
 def oldest_s(rows: dict[str, Array], name: str, moves: npt.NDArray[np.bool_]) -> float:
-    """Return the usual age of what `moves`, in the mode where it is oldest."""
+    """Return a value's usual age while it `moves`, at most."""
     is_new = np.diff(rows[name], prepend=math.nan) != 0.0
     ages_s = rows["device_s"] - np.maximum.accumulate(np.where(is_new, rows["device_s"], -math.inf))
-    parts_s = (ages_s[moves & (rows["mode"] == mode)] for mode in DeviceMode)
-    return max((float(np.median(part_s)) for part_s in parts_s if part_s.size > BLOCK), default=0.0)
+    parts = [moves & (rows["mode"] == mode) for mode in DeviceMode]
+    return max((float(np.median(ages_s[part])) for part in parts if np.sum(part) > BLOCK), default=0.0)
 
 
 @check(Hazard.MISLED, WHO + "1", "3 Hellos", f"one Identity each, at once, with schema {SCHEMA_HASH:08X}", is_gate=True)
@@ -173,21 +173,22 @@ def drawn_A(rows: dict[str, Array], mode: DeviceMode, own: str, other: str) -> t
     WHO + "3",
     ALL,
     f"with the drives off currents under {AT_REST_A:g} A; while HOMING and RETRACTING each motor's that of its own "
-    f"carriage's motion, which HOMING has out and in; a force under {USUAL_N:g} N, as a rule; none far beside both its "
-    "neighbours",
+    f"carriage's motion, which HOMING has out and in; a force under {USUAL_N:g} N, as a rule, none far beside both "
+    "its neighbours",
 )
 def plausible_in_each_mode(host: Host) -> str:
     rows = all_columns(host)
     is_off = np.isin(rows["mode"], (DeviceMode.IDLE, DeviceMode.LATCHED))
     most_A = max(np.abs(rows[name][is_off]).max(initial=0.0) for name in ("left_A", "right_A"))
-    force_N, lone = np.median(np.abs(rows["force_N"])), [alone(rows[name]) for name in ("left_A", "right_A", "force_N")]
-    seen = f"{most_A:.3f} A at rest at most, {force_N:.2f} N as a rule, {lone} alone"
-    is_wrong = most_A > AT_REST_A or force_N > USUAL_N or any(lone)
+    force_N, lone = np.median(np.abs(rows["force_N"])), alone(rows, "force_N")
+    seen = f"{most_A:.3f} A at rest at most, {force_N:.2f} N as a rule, {lone} of them alone"
+    is_wrong = most_A > AT_REST_A or force_N > USUAL_N or lone > 0
     for mode, (own, other) in product((DeviceMode.HOMING, DeviceMode.RETRACTING), (SIDES, SIDES[::-1])):
         out_A, in_A, still_A = drawn_A(rows, mode, own, other)
         seen += f"; {mode.name} {own} {out_A:+.2f} A out, {in_A:+.2f} A in, {still_A:+.2f} A standing"
-        is_wrong |= out_A < AT_REST_A or abs(still_A) > out_A / 2.0
-        is_wrong |= mode is DeviceMode.HOMING and not in_A < -AT_REST_A
+        is_wrong |= (
+            out_A < AT_REST_A or abs(still_A) > out_A / 2.0 or (mode is DeviceMode.HOMING and not in_A < -AT_REST_A)
+        )
     return unless(is_wrong, seen)
 
 
@@ -341,10 +342,11 @@ def _along_N(rows: dict[str, Array], mode: DeviceMode | None = None) -> list[flo
     return [round(float(np.median(way_N)), 2) for way_N in ways_N if way_N.size > BLOCK]
 
 
-def alone(values: Array) -> int:
+def alone(rows: dict[str, Array], name: str) -> int:
     """Return how many values lie far beside both neighbours."""
-    before, after = np.diff(values)[:-1], -np.diff(values)[1:]
-    return int(np.sum((before * after > 0.0) & (np.minimum(np.abs(before), np.abs(after)) > LONE * np.ptp(values))))
+    ways, near = np.diff(rows[name]), np.diff(rows["device_s"]) < SUCCESSIVE_S
+    least = np.minimum(ways[:-1] * -np.sign(ways[1:]), np.abs(ways[1:]))  # over 0 if it turns back
+    return int(np.sum(near[:-1] & near[1:] & (least > LONE * np.ptp(rows[name]))))
 
 
 @check(

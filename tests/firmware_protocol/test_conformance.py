@@ -551,24 +551,24 @@ def every_997th(device: Rogue, time_s: float, measured: Measured) -> Measured:
     return old if device.since_s % 997 == 0 else measured
 
 
-def stood(device: Rogue, time_s: float, measured: Measured) -> Measured:
+def stood(device: Any, time_s: float, measured: Measured) -> Measured:
     if device.real.mode is not DeviceMode.HOMING:
         device.stands_mm = measured[0].left_position_mm
     return measured[0].replaced(left_position_mm=device.stands_mm), measured[1]
 
 
-def handle_of_10_ms(device: Rogue, time_s: float, measured: Measured) -> Measured:
+def handle_of_10_ms(device: Any, time_s: float, measured: Measured) -> Measured:
     if time_s - device.since_s > 0.01:
         device.since_s, device.stands_mm = time_s, measured[1].handle_position_mm
     return measured[0], measured[1].replaced(handle_position_mm=device.stands_mm)
 
 
-def remembers(device: Rogue, sensors: Sensors) -> Sensors:
+def remembers(device: Any, sensors: Sensors) -> Sensors:
     device.sensors = sensors
     return sensors
 
 
-def zeroes_both(device: Rogue, time_s: float) -> None:
+def zeroes_both(device: Any, time_s: float) -> None:
     sensors, real = device.sensors, device.real
     if real.mode is not DeviceMode.HOMING and real.homed and device.counts:
         real._left_zero_mm, real._right_zero_mm = (count * real._mm_per_count for count in device.counts)
@@ -1336,9 +1336,9 @@ PLANTED = (
     rogue("handle read at 100 Hz", "handle_runs_on", measures=handle_of_10_ms, stands_mm=0.0),
     rogue(
         "every 500th force 0",
-        "force_follows_gap",
+        "plausible_in_each_mode",
+        "home_homes",
         "run_drive_off",
-        "handle_runs_on",
         measures=lambda device, _, measured: (
             measured[0],
             measured[1].replaced(force_N=measured[1].force_N * (measured[0].counter != 99)),
