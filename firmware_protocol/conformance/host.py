@@ -125,7 +125,8 @@ class Host:
         self.drive_s = self._next_s = line.port.now_s()
         self.counter = 0
         self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
-        self.begin()
+        self.stalled_s = 0.0
+        """The greatest lateness of this process since `begin`."""
 
     @property
     def now_s(self) -> float:
@@ -226,7 +227,6 @@ class Host:
         self.pass_time(ANSWER_S)
         self.heard.clear()
         self.stalled_s = 0.0
-        """The greatest lateness of this process since `begin`."""
         self._asked.clear()
         self._unpaired.clear()
         self._next_s = self.now_s
