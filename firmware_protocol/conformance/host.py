@@ -47,7 +47,7 @@ HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
-BRAKED, LEAP_C, LATE_DRIVES, OTHER_COUNTER = 3, 10.0, 50, "drive_counter of none of the last Drives"
+BRAKED, LEAP_C, LATE_DRIVES = 3, 10.0, 100
 "BRAKED Status come in 50 ms of braking and after."
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
 OPEN, CLOSED = ENDS[0] | ENDS[1], ENDS[2] | ENDS[3]
@@ -312,7 +312,7 @@ class Host:
             self._opens = (self._opens + 1) * is_open(message)
             is_unbraked = before.mode is DeviceMode.RETRACTING is not message.mode and 0 < self._opens < BRAKED
             self.contradictions["at rest without braking"] += is_unbraked
-            self.contradictions[OTHER_COUNTER] += (
+            self.contradictions["drive_counter of none of the last Drives"] += (
                 len(self._counters) == LATE_DRIVES and message.drive_counter not in self._counters
             )
             self.contradictions["nonce 0 again: a reset"] += before.command_nonce > message.command_nonce == 0

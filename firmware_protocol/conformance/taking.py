@@ -40,7 +40,6 @@ from firmware_protocol.conformance.host import (
     INSIDE_MM,
     NO_FAULT,
     OPENED_S,
-    OTHER_COUNTER,
     PERIOD_S,
     SEEN_S,
     STATUS_S,
@@ -223,7 +222,6 @@ def _changes(host: Host, one: Sent, before: Status) -> dict[str, bool]:
         "another HOMED": is_homed(after) is not is_homed(before),
         f"nonce not {before.command_nonce}": after.command_nonce != before.command_nonce,
         f"{identities} Identity": identities != one.identities,
-        "drive_counter of no Drive": host.contradictions[OTHER_COUNTER] > 0,
     }
 
 
