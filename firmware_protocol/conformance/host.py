@@ -116,7 +116,7 @@ class Host:
         self.marks = array("d")
         """For each Status the rows before it, and its mode."""
         self._asked = deque[tuple[float, ...]](maxlen=999)
-        self._counters = deque[int](maxlen=LATE_DRIVES)
+        self.counters = deque[int](maxlen=LATE_DRIVES)
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
         self.drives = self.states = self.senses = 0
@@ -143,7 +143,7 @@ class Host:
         self.drive_s = self.now_s
         self.said = Drive(left, right, mode, self.counter)
         self._asked.append((self.drive_s, left, right))
-        self._counters.append(self.counter)
+        self.counters.append(self.counter)
         self.send(self.said)
 
     def send_beside(self, message: Message) -> None:
@@ -185,8 +185,8 @@ class Host:
         return True
 
     def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF, nonce: int = 0, duty: float = 0.0) -> None:
-        before, is_shown = len(self.all_of(Status)), self.command(kind, beat, nonce=nonce, duty=duty)
-        unless(not is_shown, f"{kind.__name__} not acknowledged: {shown(self.status)}")
+        before, is_shown = len(self.all_of(Status)), self.command(kind, beat, REPEAT_S, nonce, duty)
+        unless(not is_shown, f"{kind.__name__} not acknowledged before its repetition: {shown(self.status)}")
         came = [each for _, each in self.all_of(Status)[before:] if each.command_nonce == self.status.command_nonce]
         unless(came[0].mode is not LEADS_TO[kind], f"{kind.__name__} acknowledged with {shown(came[0])}")
 
@@ -313,7 +313,7 @@ class Host:
             is_unbraked = before.mode is DeviceMode.RETRACTING is not message.mode and 0 < self._opens < BRAKED
             self.contradictions["at rest without braking"] += is_unbraked
             self.contradictions["drive_counter of none of the last Drives"] += (
-                len(self._counters) == LATE_DRIVES and message.drive_counter not in self._counters
+                len(self.counters) == LATE_DRIVES and message.drive_counter not in self.counters
             )
             self.contradictions["nonce 0 again: a reset"] += before.command_nonce > message.command_nonce == 0
             self.contradictions[f"{before.mode.name} then {message.mode.name}"] += (
@@ -345,8 +345,9 @@ class Host:
     # -- where a check begins ----------------------------------------------------------------------------------------
 
     def idle(self) -> None:
-        self.hello()
         self.pass_time(SEEN_S, DriveMode.OFF)
+        if Identity not in self.newest or DeviceFault.SCHEMA_MISMATCH in self.status.faults:
+            self.hello()
         unless(not self.until(self.is_resting, HOMED_S), f"not at rest after {HOMED_S:g} s: {shown(self.status)}")
         if self.status.mode is DeviceMode.LATCHED:
             self.obeyed(Clear)
@@ -462,11 +463,14 @@ def positions(state: State) -> str:
 def contradictions(status: Status) -> list[str]:
     """Return in words what in one Status cannot be true together."""
     mode, switches = status.mode, status.switches
-    is_supplied = (9.0 <= status.supply_V <= 15.0) | (DeviceFault.SUPPLY in status.faults)
-    is_cool = (-20.0 <= status.temperature_C <= 60.0) | (DeviceFault.TEMPERATURE in status.faults)
+    unwatched = {DeviceMode.RETRACTING: DeviceFault.SUPPLY | DeviceFault.TEMPERATURE}.get(
+        mode, NO_FAULT
+    ) | status.faults
     found = {
-        f"{status.supply_V:.1f} V while {mode.name}": not is_supplied | (mode is DeviceMode.RETRACTING),
-        f"{status.temperature_C:.0f} degC while {mode.name}": not is_cool | (mode is DeviceMode.RETRACTING),
+        f"{status.supply_V:.1f} V while {mode.name}": not (9.0 <= status.supply_V <= 15.0)
+        and DeviceFault.SUPPLY not in unwatched,
+        f"{status.temperature_C:.0f} degC while {mode.name}": not (-20.0 <= status.temperature_C <= 60.0)
+        and DeviceFault.TEMPERATURE not in unwatched,
         "LEFT_OPEN with LEFT_CLOSED": (Switches.LEFT_OPEN | Switches.LEFT_CLOSED) in switches,
         "RIGHT_OPEN with RIGHT_CLOSED": (Switches.RIGHT_OPEN | Switches.RIGHT_CLOSED) in switches,
         f"HOMED while {mode.name}": is_homed(status) and mode in (DeviceMode.HOMING, DeviceMode.LATCHED),

@@ -222,6 +222,7 @@ def _changes(host: Host, one: Sent, before: Status) -> dict[str, bool]:
         "another HOMED": is_homed(after) is not is_homed(before),
         f"nonce not {before.command_nonce}": after.command_nonce != before.command_nonce,
         f"{identities} Identity": identities != one.identities,
+        "drive_counter of no Drive": any(each.drive_counter not in host.counters for _, each in host.all_of(Status)),
     }
 
 

@@ -1445,7 +1445,7 @@ def test_a_failed_check_says_what_to_look_at_and_the_exit_code_is_1(
 ) -> None:
     assert ran(by_error("timeout of 65 ms"), "--yes", "--only", "silence_is_noticed") == 1
     out = capsys.readouterr().out
-    assert re.search(r"FAIL  silence_is_noticed\n +sent +in RUN.*\n +seen +after 53.*\n +expected .*\n +page +", out)
+    assert re.search(r"FAIL  silence_is_noticed\n +sent +in RUN.*\n +seen +after 5[23].*\n +expected .*\n +page +", out)
     assert "virtual: device 1, firmware 1.0: 1 of 2 checks passed" in out
 
 
