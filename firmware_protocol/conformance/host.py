@@ -9,7 +9,7 @@ from array import array
 from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -32,7 +32,6 @@ from firmware_protocol.codec import (
     Switches,
     decode,
     encode,
-    period,
 )
 from firmware_protocol.conformance.line import Line
 from firmware_protocol.conformance.rules import NEVER_FOLLOWS
@@ -48,9 +47,8 @@ HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
-BRAKED, LEAP_C = 3, 10.0
-"Status, in 50 ms of braking and after."
-TIME_SPAN_S: Final = period(State, "device_time_s")
+BRAKED, LEAP_C, LATE_DRIVES = 3, 10.0, 100
+"BRAKED Status come in 50 ms of braking and after."
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
 OPEN, CLOSED = ENDS[0] | ENDS[1], ENDS[2] | ENDS[3]
 NO_FAULT: Final = DeviceFault(0)
@@ -64,6 +62,8 @@ STALLED_S: Final = 0.005
 
 M = TypeVar("M", bound=Message)
 Command = type[Retract] | type[Clear] | type[Home]
+LEADS_TO: Final = {Retract: DeviceMode.RETRACTING, Clear: DeviceMode.IDLE, Home: DeviceMode.HOMING}
+"The mode in the first Status that shows a command."
 
 
 class Unmet(Exception):  # noqa: N818  (what a device leaves unmet; nothing has gone wrong here)
@@ -115,16 +115,18 @@ class Host:
         """A row of COLUMNS for each Sense."""
         self.marks = array("d")
         """For each Status the rows before it, and its mode."""
-        self._asked = deque[tuple[float, ...]](maxlen=99)
+        self._asked = deque[tuple[float, ...]](maxlen=999)
+        self.counters = deque[int](maxlen=LATE_DRIVES)
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
         self.drives = self.states = self.senses = 0
         """How many Drives that must be answered were sent, and how many State came."""
         self.home_s = HOMES_S
-        self.drive_s = line.port.now_s()
+        self.drive_s = self._next_s = line.port.now_s()
         self.counter = 0
         self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
-        self.begin()
+        self.stalled_s = 0.0
+        """The greatest lateness of this process since `begin`."""
 
     @property
     def now_s(self) -> float:
@@ -141,6 +143,7 @@ class Host:
         self.drive_s = self.now_s
         self.said = Drive(left, right, mode, self.counter)
         self._asked.append((self.drive_s, left, right))
+        self.counters.append(self.counter)
         self.send(self.said)
 
     def send_beside(self, message: Message) -> None:
@@ -182,10 +185,10 @@ class Host:
         return True
 
     def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF, nonce: int = 0, duty: float = 0.0) -> None:
-        unless(
-            not self.command(kind, beat, nonce=nonce, duty=duty),
-            f"{kind.__name__} not acknowledged: {shown(self.status)}",
-        )
+        before, is_shown = len(self.all_of(Status)), self.command(kind, beat, REPEAT_S, nonce, duty)
+        unless(not is_shown, f"{kind.__name__} not acknowledged before its repetition: {shown(self.status)}")
+        came = [each for _, each in self.all_of(Status)[before:] if each.command_nonce == self.status.command_nonce]
+        unless(came[0].mode is not LEADS_TO[kind], f"{kind.__name__} acknowledged with {shown(came[0])}")
 
     def beat(
         self,
@@ -220,10 +223,10 @@ class Host:
     # -- what came ---------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Forget the messages heard and the lateness, and restart the rhythm from now."""
+        """Let answers arrive, forget what was heard and the lateness, and restart the rhythm."""
+        self.pass_time(ANSWER_S)
         self.heard.clear()
         self.stalled_s = 0.0
-        """The greatest lateness of this process since `begin`."""
         self._asked.clear()
         self._unpaired.clear()
         self._next_s = self.now_s
@@ -232,15 +235,12 @@ class Host:
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
 
     def last(self, kind: type[M]) -> M:
-        message = self.newest[kind].message if kind in self.newest else None
-        if not isinstance(message, kind):
-            raise Unmet(f"no {kind.__name__} ever came")
-        return message
+        unless(kind not in self.newest, f"no {kind.__name__} ever came")
+        return cast("M", self.newest[kind].message)
 
     @property
     def status(self) -> Status:
-        if Status not in self.newest:
-            self.until(lambda: Status in self.newest, 10 * STATUS_S, None)
+        self.until(lambda: Status in self.newest, 10 * STATUS_S, None)
         return self.last(Status)
 
     def next_status(self, beat: Beat) -> Status:
@@ -299,7 +299,7 @@ class Host:
                 State in self.newest and (message.counter - self.last(State).counter) % 256 != 1
             )
             self.states += 1
-            asked = self._asked.popleft() if self._asked else (math.nan,) * 3
+            asked = self._asked.popleft() if self._asked else (self.drive_s, math.nan, math.nan)
             self._unpaired.append((*asked, heard.time_s, message.device_time_s, message.counter, *places(message)))
         self.senses += isinstance(message, Sense)
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
@@ -312,6 +312,9 @@ class Host:
             self._opens = (self._opens + 1) * is_open(message)
             is_unbraked = before.mode is DeviceMode.RETRACTING is not message.mode and 0 < self._opens < BRAKED
             self.contradictions["at rest without braking"] += is_unbraked
+            self.contradictions["drive_counter of none of the last Drives"] += (
+                len(self.counters) == LATE_DRIVES and message.drive_counter not in self.counters
+            )
             self.contradictions["nonce 0 again: a reset"] += before.command_nonce > message.command_nonce == 0
             self.contradictions[f"{before.mode.name} then {message.mode.name}"] += (
                 message.mode.name in NEVER_FOLLOWS.get(before.mode.name, ())
@@ -327,23 +330,24 @@ class Host:
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
         """Return the end switches in a Status that do not fit the State just before it."""
-        if not {State, Status} <= self.newest.keys() or time_s - self.newest[State].time_s > FRESH_S:
+        is_usable = {State, Status} <= self.newest.keys() and is_homed(self.last(Status)) and is_homed(status)
+        if not is_usable or time_s - self.newest[State].time_s > FRESH_S:
             return []
         left_mm, right_mm = places(self.last(State))
         beyond_mm = (left_mm, right_mm, -self.stroke_mm - left_mm, -self.stroke_mm - right_mm)
         signs = [-1.0 if each in status.switches else 1.0 for each in ENDS]
-        is_usable = is_homed(self.last(Status)) and is_homed(status)
         return [
             f"{each.name} {'not closed' if sign > 0.0 else 'closed'} at {mm:+.1f} mm beyond it"
             for each, sign, mm in zip(ENDS, signs, beyond_mm, strict=True)
-            if is_usable and sign * mm > SWITCH_MM
+            if sign * mm > SWITCH_MM
         ]
 
     # -- where a check begins ----------------------------------------------------------------------------------------
 
     def idle(self) -> None:
-        self.hello()
         self.pass_time(SEEN_S, DriveMode.OFF)
+        if Identity not in self.newest or DeviceFault.SCHEMA_MISMATCH in self.status.faults:
+            self.hello()
         unless(not self.until(self.is_resting, HOMED_S), f"not at rest after {HOMED_S:g} s: {shown(self.status)}")
         if self.status.mode is DeviceMode.LATCHED:
             self.obeyed(Clear)
@@ -373,7 +377,7 @@ class Host:
         self.pass_time(SEEN_S, beat)
         return seconds
 
-    def running(self, inside_mm: float = 0.0) -> None:
+    def running(self, inside_mm: float = 0.0, askew_mm: float = 0.0) -> None:
         self.homed()
         self.pass_time(2 * PERIOD_S, DriveMode.OFF)
         unless(
@@ -381,36 +385,25 @@ class Host:
             f"Drive RUN does not lead to RUN: {shown(self.status)}",
         )
         if inside_mm > 0.0:
-            self.bring(-inside_mm, -inside_mm)
+            self.bring(-inside_mm, askew_mm - inside_mm)
             self.pass_time(SEEN_S, DriveMode.RUN)
 
     def bring(
-        self, left_mm: float, right_mm: float, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
+        self, left_mm: float, right_mm: float, *, mm_s: float = TRAVEL_MM_S, ends: Callable[[], bool] = lambda: False
     ) -> None:
         goals = left_mm, right_mm
-        targets = places(self.last(State))
+        targets: tuple[float, ...] = places(self.last(State))
         end_s = self._next_s + max(map(abs, ways_mm(self.last(State), goals))) / mm_s + MOVED_S
         step_mm = mm_s * PERIOD_S
         while not ends():
             at_mm = places(self.last(State))
             if max(map(abs, ways_mm(self.last(State), goals))) < ARRIVED_MM:
                 return
-            left_to, right_to = (at + clamped(goal - at, step_mm) for at, goal in zip(targets, goals, strict=True))
-            targets = left_to, right_to
+            targets = tuple(at + clamped(goal - at, step_mm) for at, goal in zip(targets, goals, strict=True))
             left, right = (clamped(DUTY_PER_MM * (to - at), 1.0) for to, at in zip(targets, at_mm, strict=True))
             self.beat(DriveMode.RUN, left, right)
             is_off = not ends() and (self.status.mode is not DeviceMode.RUN or self._next_s > end_s)
             unless(is_off, f"on the way to {goals} mm: {positions(self.last(State))}, {shown(self.status)}")
-
-    def fall_silent(self, silent_s: float) -> float:
-        """Send no Drive in RUN for a time, then one; return the silence by the device's clock, s."""
-        self.next_status(DriveMode.RUN)
-        self.pass_time(self.random.randrange(20) * PERIOD_S, DriveMode.RUN)
-        self.answered(DriveMode.RUN)
-        before = self.last(State)
-        while self._next_s < self.drive_s + silent_s - 0.5 * PERIOD_S:
-            self.beat(None)
-        return (self.answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
 
     def answered(self, beat: Beat, left: float = 0.0, right: float = 0.0) -> State:
         """Send a Drive, and return its State."""
@@ -422,14 +415,15 @@ class Host:
         )
         return self.last(State)
 
+    def timed_out(self, inside_mm: float = INSIDE_MM) -> None:
+        self.running(inside_mm)
+        self.pass_time(0.1)
+
     def latched(self) -> None:
-        """Bring the device to LATCHED with COMMAND_TIMEOUT, by silence in RUN."""
-        status = self.next_status(None)
-        if status.mode is not DeviceMode.LATCHED or status.faults != DeviceFault.COMMAND_TIMEOUT:
-            self.running(INSIDE_MM)
-            self.pass_time(0.1)
-            self.until(self.is_resting, OPENED_S, None)
-            self.shows(DeviceMode.LATCHED, None, fault=DeviceFault.COMMAND_TIMEOUT, besides="after silence")
+        """Bring the device to LATCHED with COMMAND_TIMEOUT."""
+        self.timed_out()
+        self.until(self.is_resting, OPENED_S, None)
+        self.shows(DeviceMode.LATCHED, None, fault=DeviceFault.COMMAND_TIMEOUT, besides="after silence")
 
     def is_resting(self) -> bool:
         """Whether the newest Status shows the drives off."""
@@ -469,11 +463,14 @@ def positions(state: State) -> str:
 def contradictions(status: Status) -> list[str]:
     """Return in words what in one Status cannot be true together."""
     mode, switches = status.mode, status.switches
-    is_supplied = (9.0 <= status.supply_V <= 15.0) | (DeviceFault.SUPPLY in status.faults)
-    is_cool = (-20.0 <= status.temperature_C <= 60.0) | (DeviceFault.TEMPERATURE in status.faults)
+    unwatched = {DeviceMode.RETRACTING: DeviceFault.SUPPLY | DeviceFault.TEMPERATURE}.get(
+        mode, NO_FAULT
+    ) | status.faults
     found = {
-        f"{status.supply_V:.1f} V while {mode.name}": not is_supplied | (mode is DeviceMode.RETRACTING),
-        f"{status.temperature_C:.0f} degC while {mode.name}": not is_cool | (mode is DeviceMode.RETRACTING),
+        f"{status.supply_V:.1f} V while {mode.name}": not (9.0 <= status.supply_V <= 15.0)
+        and DeviceFault.SUPPLY not in unwatched,
+        f"{status.temperature_C:.0f} degC while {mode.name}": not (-20.0 <= status.temperature_C <= 60.0)
+        and DeviceFault.TEMPERATURE not in unwatched,
         "LEFT_OPEN with LEFT_CLOSED": (Switches.LEFT_OPEN | Switches.LEFT_CLOSED) in switches,
         "RIGHT_OPEN with RIGHT_CLOSED": (Switches.RIGHT_OPEN | Switches.RIGHT_CLOSED) in switches,
         f"HOMED while {mode.name}": is_homed(status) and mode in (DeviceMode.HOMING, DeviceMode.LATCHED),

@@ -72,7 +72,13 @@ class SerialLine:
                 cobs_encode(whole[:at] + bytes((whole[at] ^ 1 << bit,)) + whole[at + 1 :])
                 for at, bit in product(range(len(whole)), range(8))
             ],
-            "CRC-16 without its final XOR": [cobs_encode(whole[:-2] + bytes(byte ^ 0xFF for byte in whole[-2:]))],
+            "two bytes exchanged": sorted(
+                {cobs_encode(whole[:at] + whole[at : at + 2][::-1] + whole[at + 2 :]) for at in range(len(whole) - 1)}
+                - {body}
+            ),
+            "CRC-16 without its final XOR": [
+                cobs_encode(whole[:-2] + (int.from_bytes(whole[-2:], "big") ^ 0xFFFF).to_bytes(2, "big"))
+            ],
             "cut off": [body[:length] for length in range(1, len(body))],
             "a zero inside": [body[:at] + DELIMITER + body[at:] for at in range(1, len(body))],
             "COBS that points too far": [body[:last] + bytes((body[last] + 1,)) + body[last + 1 :]],
@@ -82,15 +88,19 @@ class SerialLine:
         }
         return {what: tuple(form + DELIMITER for form in forms) for what, forms in damaged.items()}
 
-    def unusual(self, function: int, payload: bytes) -> tuple[tuple[bytes, ...], ...]:
-        """Return writes that are one frame each time."""
-        first, second, third, fourth = (self._frame(function, payload) for _ in range(4))
-        beside = encode_frame(NO_FUNCTION, self._sequence, payload)
+    def unusual(self, function: int, payload: bytes) -> tuple[tuple[int, tuple[bytes, ...]], ...]:
+        """Return writes, and how many of their frames count."""
+        sequence = self._sequence
+        first, second, third, fourth, fifth = (self._frame(function, payload) for _ in range(5))
+        beside = encode_frame(NO_FUNCTION, (sequence + 4) % 256, payload)
+        other = encode_frame(function, (sequence + 4) % 256, payload[:-1] + bytes((payload[-1] ^ 1,)))
         return (
-            *((first, DELIMITER + first, first), (DELIMITER * 3 + second + DELIMITER * 3,), (third[:5], third[5:])),
-            (fourth, NOISE + DELIMITER),
-            (beside, self._frame(function, payload)),
-            *((encode_frame(function, (self._sequence + leap) % 256, payload),) for leap in (100, 90, 200, 20)),
+            (1, (first, DELIMITER + first, first)),
+            (1, (DELIMITER * 3 + second + DELIMITER * 3,)),
+            (1, (third[:5], third[5:])),
+            (1, (fourth, NOISE + DELIMITER)),
+            (3, (beside, fifth, other, fifth)),
+            *((1, (encode_frame(function, (sequence + leap) % 256, payload),)) for leap in (105, 95, 205, 25)),
         )
 
     def send_damaged(self, unit: bytes) -> None:

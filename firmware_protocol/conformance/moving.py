@@ -23,15 +23,14 @@ from firmware_protocol.conformance.host import (
     Unmet,
     clamped,
     is_homed,
-    is_open,
     places,
     positions,
     shown,
     unless,
     ways_mm,
 )
-from firmware_protocol.conformance.taking import DUTY, PLACES, RESTING_A, SPARSE_S, opens_fully, refused, taken
-from firmware_protocol.conformance.telling import Array, all_columns, columns
+from firmware_protocol.conformance.taking import DUTY, PLACES, RESTING, RESTING_A, SPARSE_S, opens_fully, refused, taken
+from firmware_protocol.conformance.telling import TIME_SPAN_S, Array, all_columns, columns
 
 RUNNING: Final = next(place for place in PLACES if place.name == "RUN")
 
@@ -74,7 +73,6 @@ def home_homes(host: Host) -> str:
     for beat in (DriveMode.OFF, None):
         host.heard.clear()
         seconds, state = host.home(beat), host.last(State)
-        modes = [status.mode for _, status in host.all_of(Status)]
         homed_s = next((time_s for time_s, status in host.all_of(Status) if is_homed(status)), math.inf)
         first = next((each for time_s, each in host.all_of(State) if time_s > homed_s), state)
         seen.append(f"{seconds:.1f} s, first {positions(first)}, then {positions(state)}")
@@ -86,7 +84,7 @@ def home_homes(host: Host) -> str:
             opened=True,
             fault=NO_FAULT,
             besides=seen[-1],
-            wrong=is_off or DeviceMode.HOMING not in modes or seconds > LAST_S,
+            wrong=is_off or seconds > LAST_S,
         )
     return "; ".join(seen)
 
@@ -113,16 +111,17 @@ def _duty_moves(side: int, host: Host) -> str:
 @check(
     Hazard.WORN,
     "Modes",
-    f"in RUN, duties of +{AT_STOP_DUTY:g} at both open switches; then each carriage alone {BESIDE_MM:g} mm in, "
-    f"Drives of {PHASES} every {SLOW_S * 1e3:g} ms",
-    f"at a switch, or behind it, no motion over {AT_STOP_MM:g} mm, none over {AT_STOP_A:g} A; the other opens",
+    f"in RUN, duties of +{AT_STOP_DUTY:g} at both open switches; then each carriage alone {BESIDE_MM:g} mm in at "
+    f"{SLOW_MM_S:g} mm/s, Drives of {PHASES} every {SLOW_S * 1e3:g} ms; both at -1, 1, 3 times",
+    f"at a switch, or behind it, no motion over {AT_STOP_MM:g} mm, none over {AT_STOP_A:g} A; the other opens; each "
+    f"switch changes within {SWITCH_MM:g} mm of its carriage's 0, and Status shows it at once",
     moves=True,
 )
 def open_switch_stops(host: Host) -> str:
     host.running()
     seen = []
     for inside, duty in (((False, False), AT_STOP_DUTY), *product(((True, False), (False, True)), PHASES)):
-        host.bring(*np.where(inside, -BESIDE_MM, places(host.last(State))))
+        host.bring(*np.where(inside, -BESIDE_MM, places(host.last(State))), mm_s=SLOW_MM_S)
         host.pass_time(SEEN_S, DriveMode.RUN)
         first, is_shown = len(host.rows), [each not in host.status.switches for each in ENDS[:2]] == list(inside)
         host.pass_time(0.3, DriveMode.RUN, SLOW_S if any(inside) else PERIOD_S, duty)
@@ -142,26 +141,10 @@ def open_switch_stops(host: Host) -> str:
                 (most_A > AT_STOP_A) | (np.abs(moved_mm) > AT_STOP_MM),
             ).any(),
         )
-    return "; ".join(seen)
-
-
-@check(
-    Hazard.MISLED,
-    "Homing",
-    f"in RUN one carriage {BESIDE_MM:g} mm in and out at {SLOW_MM_S:g} mm/s, then the other; both at -1, 1, 3 times",
-    f"each open switch changes within {SWITCH_MM:g} mm of its carriage's 0, and Status shows it at once",
-    moves=True,
-)
-def zero_is_at_switch(host: Host) -> str:
-    host.running()
-    for goals in ((-BESIDE_MM, 0.0), (0.0, -BESIDE_MM)):
-        host.bring(*goals, SLOW_MM_S)
-        host.pass_time(SEEN_S, DriveMode.RUN)
-        host.bring(BESIDE_MM, BESIDE_MM, SLOW_MM_S, lambda: is_open(host.status))
     for duty in 3 * (-1.0, 1.0):
         host.pass_time(REVERSED_S, DriveMode.RUN, duty=duty)
-    host.shows(DeviceMode.RUN, DriveMode.RUN)
-    return unless(+host.contradictions, ", ".join(+host.contradictions) or "all changed in their place")
+    host.shows(DeviceMode.RUN, DriveMode.RUN, besides="at a duty of 1")
+    return unless(+host.contradictions, "; ".join([*+host.contradictions, *seen]))
 
 
 def _pulse(host: Host, period_s: float = PERIOD_S) -> None:
@@ -223,11 +206,9 @@ def duties_make_currents(host: Host) -> str:
         shares, *_ = np.linalg.lstsq((dense * made_by).T, dense * current_A, rcond=None)
         per_duty, lag_s = shares[0], -shares[2]
         off = np.sqrt(dense) * np.abs(current_A - shares @ made_by) / max(abs(per_duty), 1e-3)
-        seen.append(
-            f"{name} {per_duty:.2f} A a duty, {off.max():.3f} off at {made_by[0][off.argmax()]:+.2f}, "
-            f"{lag_s * 1e3:.2f} ms late"
-        )
-        unless(not STALL_A[0] < per_duty < STALL_A[1] or off.max() > MAX_OFF or lag_s > MAX_LAG_S, "; ".join(seen))
+        text = f"{off.max():.3f} off at {made_by[0][off.argmax()]:+.2f}, {lag_s * 1e3:.2f} ms late"
+        is_off = not STALL_A[0] < per_duty < STALL_A[1] or off.max() > MAX_OFF or lag_s > MAX_LAG_S
+        seen.append(unless(is_off, f"{name} {per_duty:.2f} A a duty, {text}"))
     return "; ".join(seen)
 
 
@@ -241,19 +222,17 @@ def _ends_run(fault: DeviceFault, from_share: float, most_mm: float, host: Host)
         host.bring(
             begins_mm + (ASIDE_MM if side else -AHEAD_MM),
             begins_mm + (-AHEAD_MM if side else ASIDE_MM),
-            SLOW_MM_S,
-            lambda: _apart_mm(host) > SKEW_MM + BOUND_MM or host.status.mode is not DeviceMode.RUN,
+            mm_s=SLOW_MM_S,
+            ends=lambda: (
+                bool(np.ptp(places(host.last(State))) > SKEW_MM + BOUND_MM) or host.status.mode is not DeviceMode.RUN
+            ),
         )
         innermost_mm = min(places(state)[side] for _, state in host.all_of(State))
-        off_mm = _apart_mm(host) - SKEW_MM if is_skew else innermost_mm + host.stroke_mm
+        off_mm = np.ptp(places(host.last(State))) - SKEW_MM if is_skew else innermost_mm + host.stroke_mm
         seen.append(f"{off_mm:+.2f} mm from where it ends: {shown(host.next_status(DriveMode.RUN))}")
         unless(host.status.faults != fault or abs(off_mm) > most_mm, "; ".join(seen))
         seen.append(opens_fully(host, fault))
     return "; ".join(seen)
-
-
-def _apart_mm(host: Host) -> float:
-    return abs(float(np.subtract(*places(host.last(State)))))
 
 
 @check(
@@ -266,25 +245,24 @@ def _apart_mm(host: Host) -> float:
 def let_go_after_all(host: Host) -> str:
     seen = []
     for lets_go in (DeviceMode.RETRACTING, DeviceMode.LATCHED, DeviceMode.HOMING, DeviceMode.IDLE):
-        host.running(INSIDE_MM)
-        host.pass_time(0.1)
+        host.timed_out()
         for mode, commands in (
             (DeviceMode.RETRACTING, ()),
             (DeviceMode.LATCHED, (Clear, Home)),
             (DeviceMode.HOMING, ()),
+            (DeviceMode.IDLE, ()),
         ):
+            if mode is DeviceMode.IDLE is lets_go:
+                keeps_still(host, "before a Drive OFF")
             if mode is lets_go:
                 host.beat(DriveMode.OFF)
             for command in commands:
                 host.obeyed(command, DriveMode.RUN)
-            host.until(host.is_resting, OPENED_S, DriveMode.RUN)
-        if lets_go is DeviceMode.IDLE:
-            keeps_still(host, "before a Drive OFF")
-            host.beat(DriveMode.OFF)
+            host.until(lambda: host.status.mode in RESTING, OPENED_S, DriveMode.RUN)
         host.pass_time(2 * SPARSE_S, DriveMode.RUN, SPARSE_S, DUTY)
         most_A = max(host.last(Sense).left_current_A, host.last(Sense).right_current_A)
-        seen.append(f"{lets_go.name} {most_A:+.2f} A at once")
-        host.shows(DeviceMode.RUN, DriveMode.RUN, besides=seen[-1], wrong=most_A > -RESTING_A)
+        text = f"{lets_go.name} {most_A:+.2f} A at once"
+        seen.append(host.shows(DeviceMode.RUN, DriveMode.RUN, besides=text, wrong=most_A > -RESTING_A))
     return "; ".join(seen)
 
 
@@ -301,7 +279,12 @@ def keeps_still(host: Host, when: str) -> str:
 
 
 def _is_noticed(host: Host, silent_s: float) -> bool:
-    silence_s = host.fall_silent(silent_s)
+    """Send no Drive in RUN for a time, then one; return whether RUN has ended, which its length must tell."""
+    host.next_status(DriveMode.RUN)
+    host.pass_time(host.random.randrange(20) * PERIOD_S, DriveMode.RUN)
+    before = host.answered(DriveMode.RUN)
+    host.until(lambda: host.now_s >= host.drive_s + silent_s - 0.5 * PERIOD_S, silent_s, None)
+    silence_s = (host.answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
     status = host.next_status(DriveMode.RUN)
     has_ended = status.mode is not DeviceMode.RUN
     seen = f"after {silence_s * 1e3:.2f} ms on the device's clock: {shown(status)}"
@@ -378,7 +361,6 @@ END_STOP: Final = Check(
 )
 CHECKS: Final = (
     open_switch_stops,
-    zero_is_at_switch,
     SKEW,
     END_STOP,
     let_go_after_all,

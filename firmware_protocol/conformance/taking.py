@@ -63,18 +63,16 @@ MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
 "A homing that goes in further than it backs off obeys another message."
 BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM, WITHIN_S, LATEST = 0.1, 0.2, 0.8, 0.05, 0.6, 0.6, 0.8
 "A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
-TWO_STATUS_S, MAX_BEHIND = 2.2 * STATUS_S, 100
-"A Drive and a Status on their way put a Status behind by more than the beats in TWO_STATUS_S."
+TWO_STATUS_S: Final = 2.2 * STATUS_S
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
 ENDS_IN: Final = {False: DeviceMode.IDLE, True: DeviceMode.LATCHED}
 COMMANDS: Final[dict[str, type[Retract | Home | Clear]]] = {"Retract": Retract, "Home": Home, "Clear": Clear}
-FITS, MISFITS, OFF = "Hello that fits", "Hello that does not", "Drive OFF"
-SILENT: Final = "silence"
+FITS, MISFITS, OFF, SILENT = "Hello that fits", "Hello that does not", "Drive OFF", "silence"
 ACTS: Final = TAKES | {SILENT: ("", "RETRACTING, LATCHED with COMMAND_TIMEOUT", "", "", "")}
 CAUSES: Final = {MISFITS: DeviceFault.SCHEMA_MISMATCH, SILENT: DeviceFault.COMMAND_TIMEOUT}
-MIN_SHARE, MAX_SHARE, ENDS_MM, WINDOW = 0.6, 1.15, 3.0, 50
-"""Bounds of a carriage's speed as shares of the device's opening speed: its least without the ends, and its most, over
-WINDOW States."""
+MIN_SHARE, UNHOMED_SHARE, MAX_SHARE, ENDS_MM, WINDOW = 0.6, 0.5, 1.15, 3.0, 50
+"""Bounds of a carriage's speed as shares of the device's opening speed: its least without the ends, and without a zero,
+and its most, over WINDOW States."""
 MISFITTING: Final = (
     *(Hello(SCHEMA_HASH ^ 1 << bit, PROTOCOL_VERSION, HELLO_NONCE) for bit in (0, 7, 8, 15, 16, 23, 24, 31)),
     *(Hello(SCHEMA_HASH, version, HELLO_NONCE) for version in (0, 2, 129, 255)),
@@ -127,6 +125,7 @@ def _send_drive(host: Host, function: int = FUNCTION[Drive], **differs: int) -> 
 
 def _send_damaged(host: Host, kind: type[Message], mode: int, nonce: int, what: str) -> None:
     body = _drive(host, mode) if kind is Drive else _command(kind, nonce)
+    host.send(Hello(SCHEMA_HASH, PROTOCOL_VERSION, host.status.command_nonce))  # what is damaged must not repeat it
     for form in host.line.damages(FUNCTION[kind], body)[what]:
         host.line.send_damaged(form)
 
@@ -148,7 +147,9 @@ def damaged(host: Host) -> Iterator[Sent]:
     """Yield each message of a host with each damage of the carrier."""
     for kind, mode in ((Drive, 0), (Drive, 1), (Home, 0), (Clear, 0), (Retract, 0), (Hello, 0)):
         for what in host.line.damages(FUNCTION[kind], _command(kind, 1)):
-            yield Sent(f"{kind.__name__}: {what}", partial(_send_damaged, host, kind, mode, host.new_nonce(), what))
+            yield Sent(
+                f"{kind.__name__}: {what}", partial(_send_damaged, host, kind, mode, host.new_nonce(), what), None, 1
+            )
 
 
 def taken(host: Host, place: Place) -> Iterator[Sent]:
@@ -189,7 +190,7 @@ def _stays(host: Host, place: Place, period_s: float) -> int:
     extra = unanswered - (host.drives - host.states)
     unless(extra, f"{extra:+d} State besides one for each Drive")
     if place.mode not in RESTING:
-        _ends(host, place, first)
+        _ends(host, place, first, before.faults)
     return sent
 
 
@@ -206,7 +207,7 @@ def _changes_nothing(
     found = _changes(host, one, after) | (_stirs(host, start) if is_still else {})
     wrong = ", ".join(what for what, is_so in found.items() if is_so)
     unless(
-        wrong and (is_still or host.status.mode is not DeviceMode.IDLE),
+        wrong and (is_still or not host.is_resting()),
         f"{one.name}, a Drive every {period_s * 1e3:g} ms: {wrong}, {shown(host.status)}",
     )
     return after
@@ -215,14 +216,13 @@ def _changes_nothing(
 def _changes(host: Host, one: Sent, before: Status) -> dict[str, bool]:
     """Return what may not change in Status, and whether it did."""
     after, identities = host.status, len(host.all_of(Identity))
-    behind = [(host.counter - each.drive_counter) % 256 for _, each in host.all_of(Status)]
     return {
         "another mode": after.mode is not before.mode,
         "other faults": after.faults != before.faults,
         "another HOMED": is_homed(after) is not is_homed(before),
         f"nonce not {before.command_nonce}": after.command_nonce != before.command_nonce,
         f"{identities} Identity": identities != one.identities,
-        "drive_counter of no Drive": max(behind, default=0) > MAX_BEHIND,
+        "drive_counter of no Drive": any(each.drive_counter not in host.counters for _, each in host.all_of(Status)),
     }
 
 
@@ -235,17 +235,17 @@ def _stirs(host: Host, start: tuple[float, float]) -> dict[str, bool]:
     return {f"moved by {moved_mm:.2f} mm": moved_mm > MOVED_MM, f"{most_A:.2f} A": most_A > RESTING_A}
 
 
-def _ends(host: Host, place: Place, first: int) -> None:
+def _ends(host: Host, place: Place, first: int, faults: DeviceFault) -> None:
     """Let a motion end, which the messages must not have changed."""
     host.until(host.is_resting, HOMED_S, place.beat)
     rows = columns(host, first)
     deepest_mm = min(rows["left_mm"].min(), rows["right_mm"].min())
     host.shows(
-        DeviceMode.IDLE,
+        ENDS_IN[bool(faults)],
         place.beat,
-        homed=True,
+        homed=not faults,
         opened=True,
-        fault=NO_FAULT,
+        fault=faults,
         besides=f"{deepest_mm:+.2f} mm at the innermost",
         wrong=deepest_mm < (-HOMING_MM if place.mode is DeviceMode.HOMING else -DEEP_MM - HOMING_MM),
     )
@@ -322,11 +322,12 @@ def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coa
     way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_closing = place.mode is DeviceMode.RUN and (min(way_mm) < -coasted_mm or min(way_mm[-2:]) < BEGUN_MM)
-    return unless(is_closing or modes[:1] != [to] * (to in MODES), seen)
+    is_wrong = place.mode is DeviceMode.RUN and (min(way_mm) < -coasted_mm or min(way_mm[-2:]) < BEGUN_MM)
+    is_wrong |= name != SILENT and len(host.all_of(Identity)) != (name == MISFITS)
+    return unless(is_wrong or modes[:1] != [to] * (to in MODES), seen)
 
 
-def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> str:
+def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF, *, has_zero: bool = True) -> str:
     """Watch a device open, and judge each carriage's speed on the device's clock."""
     first = len(host.rows)
     host.until(host.is_resting, OPENED_S, beat)
@@ -336,11 +337,11 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF) -> s
     return host.shows(
         ENDS_IN[bool(fault)],
         beat,
-        homed=not fault,
+        homed=has_zero and not fault,
         opened=True,
         fault=fault,
         besides=seen,
-        wrong=min(leasts) < MIN_SHARE * host.opening_mm_s
+        wrong=min(leasts) < MIN_SHARE * (1.0 if has_zero else UNHOMED_SHARE) * host.opening_mm_s
         or max(mosts) > MAX_SHARE * host.opening_mm_s
         or min(drawn_A) <= 0.0,
     )
@@ -350,7 +351,7 @@ def _opened(rows: dict[str, Array], side: str) -> tuple[float, float, float]:
     """Return a carriage's least speed without ENDS_MM, its most, and its usual current."""
     times_s, at_mm, drawn_A = rows["device_s"], rows[f"{side}_mm"], float(np.median(rows[f"{side}_A"]))
     mm_s = (at_mm[WINDOW:] - at_mm[:-WINDOW]) / (times_s[WINDOW:] - times_s[:-WINDOW])
-    is_way = (at_mm[:-WINDOW] > at_mm[0] + ENDS_MM) & (at_mm[WINDOW:] < -ENDS_MM)
+    is_way = (at_mm[:-WINDOW] > at_mm[0] + ENDS_MM) & (at_mm[WINDOW:] < at_mm[-1] - ENDS_MM)
     return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0)), drawn_A
 
 
@@ -369,7 +370,6 @@ def misfits(host: Host) -> str:
         )
         host.hello()
         host.shows(DeviceMode.LATCHED, fault=fault, besides=f"{seen}, then a Hello that fits")
-    host.idle()
     return f"{len(MISFITTING)} latched, and were mended"
 
 
@@ -401,7 +401,11 @@ PLACES: Final = (
     Place("HOMING beside RUN", DeviceMode.HOMING, partial(_homing, beat=DriveMode.RUN), DriveMode.RUN, DUTY),
     Place("RETRACTING", DeviceMode.RETRACTING, partial(_retracting, beat=DriveMode.OFF), DriveMode.OFF, -1.0),
     Place(
-        "RETRACTING beside RUN", DeviceMode.RETRACTING, partial(_retracting, beat=DriveMode.RUN), DriveMode.RUN, -1.0
+        "RETRACTING after silence",
+        DeviceMode.RETRACTING,
+        partial(Host.timed_out, inside_mm=DEEP_MM),
+        DriveMode.RUN,
+        -1.0,
     ),
     Place("LATCHED", DeviceMode.LATCHED, Host.latched, DriveMode.RUN, DUTY),
 )

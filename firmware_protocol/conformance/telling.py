@@ -5,7 +5,7 @@ Those of all reports read every State and Sense since the start, by mode.
 
 import math
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise, product
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,6 @@ from firmware_protocol.codec import (
     Identity,
     Sense,
     State,
-    Status,
     encode,
     period,
 )
@@ -34,7 +33,6 @@ from firmware_protocol.conformance.host import (
     PERIOD_S,
     STATUS_S,
     SWITCH_MM,
-    TIME_SPAN_S,
     Host,
     Untested,
     shown,
@@ -45,17 +43,18 @@ from firmware_protocol.conformance.line import SerialLine
 Array = npt.NDArray[np.float64]
 WHO, ALL = "Who says what when, ", "everything, from the start on"
 LISTENED_S, DRIVES = 2.0, 1000
-STATUS_TOLERANCE, STATUS_OFF_S, MAX_DRIFT, MAX_LEAP_S, BLOCK = 0.03, 2.5e-3, 0.01, 2e-3, 250
-"States time a Status; one may overtake it on a bus. The least delayed of BLOCK States shows the device's clock."
+STATUS_TOLERANCE, STATUS_OFF_S, MAX_DRIFT, MAX_LEAP_S, BLOCK = 0.03, 2.5e-3, 0.01, 1e-3, 250
+"States time a Status; one may overtake it on a bus. BLOCK Drives and arrivals bound the device's clock."
 MAX_ANSWER_S, PAUSE_S = 3e-3, 0.1
 "The device's own millisecond, and the way there and back by any adapter."
-HANDLE_SPAN_MM: Final = period(Sense, "handle_position_mm")
+TIME_SPAN_S, HANDLE_SPAN_MM = period(State, "device_time_s"), period(Sense, "handle_position_mm")
 STEP_MM, HANDLE_STEP_MM = period(State, "left_position_mm") / 2**16, HANDLE_SPAN_MM / 2**16
 TURN_MM, TURNED_S, LEAP_MM = 40.0 * math.pi, 20.0, 1.0
 "A handle at 0.3 m/s moves a third of LEAP_MM in 1 ms; one of swapped bytes leaps by 2 mm a step."
 SUCCESSIVE_S, FORCE_S, AT_REST_A, USUAL_N = 3e-3, 0.03, 0.02, 5.0
-STEPS, FARTHEST_MM, ENDS = 4.5, 0.2, -1.0
-"From so many steps in one period on a place that is not between its neighbours is wrong."
+STEPS, FARTHEST_MM, ENDS, BESIDE_S, FRESH_S, FORCE_STEPS, LONE, UNMOVED = 4.5, 0.2, -1.0, 5e-3, 2e-3, 50, 0.2, 999
+"STEPS in one period tell a place that is not between its neighbours; LONE is a share of the whole range."
+SIDES, MOVES_MM_S, STANDS_MM_S = ("left", "right"), 0.5, 0.1
 NONCES: Final = (1, 129, 1, 65, 1, 33, 1, 17, 1, 9, 1, 5, 1, 3, 2, 254, 253, 128, 127, 126, 6)
 """Each bit changes alone, up and down by any distance."""
 SLIDES_MM_S, NEAR_MM, GROWS, DEPTHS_MM = 10.0, 0.7, 1.15, (12.0, 16.0, 20.0, 24.0)
@@ -63,13 +62,20 @@ SLIDES_MM_S, NEAR_MM, GROWS, DEPTHS_MM = 10.0, 0.7, 1.15, (12.0, 16.0, 20.0, 24.
 
 
 def columns(host: Host, first: int = 0) -> dict[str, Array]:
-    """Return what came from this value of `host.rows` on, unwrapped, and the handle's speed."""
+    """Return what came from this value of `host.rows` on, unwrapped, and speeds."""
     rows = np.array(host.rows[first:]).reshape(-1, len(COLUMNS))
     unless(len(rows) < 2, "no Sense")
     table = dict(zip(COLUMNS, rows.T, strict=True))
-    table["device_s"] = table["arrived_s"] - np.unwrap(table["arrived_s"] - table["device_time_s"], period=TIME_SPAN_S)
+    # whoever stood still, a State was latched between its Drive and its arrival
+    middle_s = 0.5 * (table["asked_s"] + table["arrived_s"])
+    table["device_s"] = middle_s - np.unwrap(middle_s - table["device_time_s"], period=TIME_SPAN_S)
     table["handle_mm"] = np.unwrap(table["handle_mm"], period=HANDLE_SPAN_MM)
-    table["handle_mm_s"] = np.gradient(table["handle_mm"], table["device_s"] + 1e-9 * np.arange(len(rows)))
+    for side in (*SIDES, "handle"):
+        before_mm, after_mm = (
+            np.interp(table["device_s"] + beside_s, table["device_s"], table[f"{side}_mm"])
+            for beside_s in (-BESIDE_S, BESIDE_S)
+        )
+        table[f"{side}_mm_s"] = (after_mm - before_mm) / (2.0 * BESIDE_S)
     return table
 
 
@@ -84,11 +90,20 @@ def all_columns(host: Host) -> dict[str, Array]:
     return table
 
 
-def steps(rows: dict[str, Array], name: str, step_mm: float) -> npt.NDArray[np.int_]:
-    """Return a place's steps from State to State, but where a homing ends."""
+def steps(rows: dict[str, Array], name: str, step: float) -> npt.NDArray[np.int_]:
+    """Return a value's steps from State to State, but where a homing ends."""
     is_old = rows["mode"] == ENDS - DeviceMode.HOMING
     is_next = (np.diff(rows["device_s"]) < SUCCESSIVE_S) & ~is_old[1:] & ~is_old[:-1]
-    return np.asarray(np.rint(np.diff(rows[name])[is_next] / step_mm), dtype=np.int_)
+    ways = np.rint(np.abs(np.diff(rows[name])[is_next]) / step).astype(np.int_)
+    return np.asarray(ways[ways > 0], dtype=np.int_)
+
+
+def oldest_s(rows: dict[str, Array], name: str, moves: npt.NDArray[np.bool_]) -> float:
+    """Return a value's usual age while it `moves`, at most."""
+    is_new = np.diff(rows[name], prepend=math.nan) != 0.0
+    ages_s = rows["device_s"] - np.maximum.accumulate(np.where(is_new, rows["device_s"], -math.inf))
+    parts = [moves & (rows["mode"] == mode) for mode in DeviceMode]
+    return max((float(np.median(ages_s[part])) for part in parts if np.sum(part) > BLOCK), default=0.0)
 
 
 @check(Hazard.MISLED, WHO + "1", "3 Hellos", f"one Identity each, at once, with schema {SCHEMA_HASH:08X}", is_gate=True)
@@ -108,22 +123,11 @@ def identity_answers_hello(host: Host) -> str:
     "each acknowledged",
 )
 def every_nonce(host: Host) -> str:
-    """A command is new whenever its nonce differs; otherwise a Retract could be lost."""
     host.idle()
     for nonce in (*NONCES, *range(1, 255)):
         host.beat(None, besides=partial(host.send, Clear(nonce)))
         unless(host.next_status(None).command_nonce != nonce, f"nonce {nonce} not acknowledged: {shown(host.status)}")
     return f"{len(NONCES) + 254} acknowledged"
-
-
-@check(Hazard.MISLED, WHO + "4", f"for {LISTENED_S:g} s nothing", "50 Status a second, to 3 %")
-def status_rate(host: Host) -> str:
-    host.idle()
-    host.heard.clear()
-    start_s = host.now_s
-    host.pass_time(LISTENED_S)
-    share = len(host.all_of(Status)) * STATUS_S / (host.now_s - start_s)
-    return unless(abs(share - 1.0) > STATUS_TOLERANCE, f"{share:.3f} of all")
 
 
 @check(
@@ -143,44 +147,64 @@ def every_drive_answered(host: Host) -> str:
     Hazard.MISLED,
     WHO + "2",
     "Drive OFF with whole duties, its counter changed by 1 .. 255",
-    "a State for each, the counter in Status",
+    "a State for each",
 )
 def every_counter(host: Host) -> str:
     for change in range(1, 256):
         host.counter = (host.counter + change - 1) % 256
         host.answered(DriveMode.OFF, -1.0, 1.0)
-        if change % 50 == 0:
-            host.next_status(None)
-            seen = f"drive_counter {host.next_status(None).drive_counter} after a Drive with {host.counter}"
-            unless(host.status.drive_counter != host.counter, seen)
     return "255 changes accepted"
 
 
+def drawn_A(rows: dict[str, Array], mode: DeviceMode, own: str, other: str) -> tuple[float, ...]:
+    """Return a motor's usual current going out, in, and standing beside the other."""
+    own_mm_s, other_mm_s, is_whole = rows[f"{own}_mm_s"], rows[f"{other}_mm_s"], rows["mode"] == mode
+    parts = (
+        own_mm_s > MOVES_MM_S,
+        own_mm_s < -MOVES_MM_S,
+        (np.abs(own_mm_s) < STANDS_MM_S) & (np.abs(other_mm_s) > MOVES_MM_S),
+    )
+    currents_A = (rows[f"{own}_A"][is_whole & part] for part in parts)
+    return tuple(float(np.median(part_A)) if part_A.size else math.nan for part_A in currents_A)
+
+
 @check(
     Hazard.MISLED,
     WHO + "3",
     ALL,
-    f"with the drives off currents under {AT_REST_A:g} A; a force under {USUAL_N:g} N, as a rule",
+    f"with the drives off currents under {AT_REST_A:g} A; while HOMING and RETRACTING each motor's that of its own "
+    f"carriage's motion, which HOMING has out and in; a force under {USUAL_N:g} N, as a rule, none far beside both "
+    "its neighbours",
 )
-def plausible_at_rest(host: Host) -> str:
+def plausible_in_each_mode(host: Host) -> str:
     rows = all_columns(host)
     is_off = np.isin(rows["mode"], (DeviceMode.IDLE, DeviceMode.LATCHED))
-    left_A, right_A = (np.abs(rows[name][is_off]).max(initial=0.0) for name in ("left_A", "right_A"))
-    force_N = np.median(np.abs(rows["force_N"]))
-    seen = f"{left_A:.3f} A, {right_A:.3f} A at most, {force_N:.2f} N as a rule"
-    return unless(max(left_A, right_A) > AT_REST_A or force_N > USUAL_N, seen)
+    most_A = max(np.abs(rows[name][is_off]).max(initial=0.0) for name in ("left_A", "right_A"))
+    force_N, lone = np.median(np.abs(rows["force_N"])), alone(rows, "force_N")
+    seen = f"{most_A:.3f} A at rest at most, {force_N:.2f} N as a rule, {lone} of them alone"
+    is_wrong = most_A > AT_REST_A or force_N > USUAL_N or lone > 0
+    for mode, (own, other) in product((DeviceMode.HOMING, DeviceMode.RETRACTING), (SIDES, SIDES[::-1])):
+        out_A, in_A, still_A = drawn_A(rows, mode, own, other)
+        seen += f"; {mode.name} {own} {out_A:+.2f} A out, {in_A:+.2f} A in, {still_A:+.2f} A standing"
+        is_wrong |= (
+            out_A < AT_REST_A or abs(still_A) > out_A / 2.0 or (mode is DeviceMode.HOMING and not in_A < -AT_REST_A)
+        )
+    return unless(is_wrong, seen)
 
 
 @check(
     Hazard.MISLED,
     WHO + "3",
-    ALL,
+    f"{ALL}; then for {LISTENED_S:g} s nothing",
     f"in each mode {STATUS_S * 1e3:g} ms from Status to Status, to {STATUS_OFF_S * 1e3:g} ms, on the device's clock; "
-    f"a State within {MAX_ANSWER_S * 1e3:g} ms of its Drive, as a rule",
+    f"without Drives 50 a second, to {STATUS_TOLERANCE:.0%}; a State within {MAX_ANSWER_S * 1e3:g} ms of its Drive, "
+    "as a rule",
 )
 def reports_in_time(host: Host) -> str:
-    rows = all_columns(host)
-    at = np.array(host.marks[::2]).astype(int)
+    start_s, before = host.now_s, len(host.marks)
+    host.pass_time(LISTENED_S)
+    share = (len(host.marks) - before) / 2 * STATUS_S / (host.now_s - start_s)
+    rows, at = all_columns(host), np.array(host.marks[::2]).astype(int)
     at = at[(at > 0) & (at < len(rows["mode"]))]
     before_s, after_s = rows["device_s"][at - 1], rows["device_s"][at]
     least_s, most_s = before_s[1:] - after_s[:-1], after_s[1:] - before_s[:-1]
@@ -190,27 +214,32 @@ def reports_in_time(host: Host) -> str:
         for mode in DeviceMode
         if mode in rows["mode"]
     }
-    seen = ", ".join([f"{off} Status not in time", *(f"{name} {s * 1e3:.2f} ms" for name, s in usual_s.items())])
-    return unless(off or max(usual_s.values(), default=0.0) > MAX_ANSWER_S, seen)
+    seen = ", ".join(
+        [
+            f"{share:.3f} of all Status alone, {off} not in time",
+            *(f"{name} {s * 1e3:.2f} ms" for name, s in usual_s.items()),
+        ]
+    )
+    return unless(abs(share - 1.0) > STATUS_TOLERANCE or off or max(usual_s.values(), default=0.0) > MAX_ANSWER_S, seen)
 
 
 @check(
     Hazard.MISLED,
     "Carriers",
     f"a Hello byte for byte again; empty frames; a Hello in two parts, {PAUSE_S:g} s apart; one with the sequence of "
-    "another frame before; sequences that leap",
+    "another message before, then of another Hello, then the first again; sequences that leap",
     "1 Identity, then 1 for each Hello",
 )
 def frames_as_they_come(host: Host) -> str:
     assert isinstance(host.line, SerialLine)
     counts = []
-    for parts in host.line.unusual(FUNCTION[Hello], encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, HELLO_NONCE))):
+    for many, parts in host.line.unusual(FUNCTION[Hello], encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, HELLO_NONCE))):
         host.heard.clear()
         for part in parts:
             host.beat(None, period_s=PAUSE_S, besides=partial(host.line.port.write, part))
         host.pass_time(ANSWER_S)
-        counts.append(len(host.all_of(Identity)))
-    return unless(any(count != 1 for count in counts), f"{counts} Identity")
+        counts.append((len(host.all_of(Identity)), many))
+    return unless(any(came != many for came, many in counts), f"(Identity, Hellos) {counts}")
 
 
 @check(
@@ -228,7 +257,6 @@ def own_messages(host: Host) -> str:
     f"each switch closed to {SWITCH_MM:g} mm at its end",
 )
 def status_consistent(host: Host) -> str:
-    """Finds a reset, and a switch that is stuck, late or the other carriage's, and a wrong scale."""
     return none_of(+host.contradictions, f"at last {shown(host.status)}")
 
 
@@ -244,11 +272,12 @@ def none_of(counts: dict[str, int], seen: str) -> str:
 )
 def clock_runs_on(host: Host) -> str:
     rows = columns(host)
-    late_s = rows["arrived_s"] - rows["device_s"]
-    slow, _ = np.polyfit(rows["arrived_s"], late_s, 1)
-    starts = np.arange(0, max(len(late_s) - BLOCK, 1), BLOCK)
-    blocks_s = np.minimum.reduceat(late_s - slow * rows["arrived_s"], starts)
-    drift, leap_s = -float(slow), float(np.abs(np.diff(blocks_s)).max(initial=0.0))
+    delays_s = rows["arrived_s"] - rows["asked_s"]
+    rate, _ = np.polyfit(rows["asked_s"], rows["device_s"], 1, w=1.0 / (PERIOD_S + delays_s))
+    starts = np.arange(0, max(len(rows["device_s"]) - BLOCK, 1), BLOCK)
+    least_s = np.maximum.reduceat(rows["device_s"] - rate * rows["arrived_s"], starts)
+    most_s = np.minimum.reduceat(rows["device_s"] - rate * rows["asked_s"], starts)
+    drift, leap_s = rate - 1.0, np.maximum(least_s[1:] - most_s[:-1], least_s[:-1] - most_s[1:]).max(initial=0.0)
     times = len(set(np.round(rows["device_time_s"] * 1e5) % 100))
     seen = f"{drift:+.2%}, {leap_s * 1e3:.2f} ms of leap at most, {times} different times of 100 within a millisecond"
     return unless(abs(drift) > MAX_DRIFT or leap_s > MAX_LEAP_S or times < 20, seen)
@@ -258,83 +287,88 @@ def astray(device_s: Array, at_mm: Array, step_mm: float) -> int:
     """Return how many places lie off the way of a motion: old, or of another time."""
     steps_s, ways_mm = np.diff(device_s), np.diff(at_mm)
     near = np.logical_and.reduce([steps_s[at : len(steps_s) - 3 + at] < SUCCESSIVE_S for at in range(4)])
-    before, after = ways_mm[:-3], ways_mm[3:]
     off_mm = ways_mm[1:-2] - steps_s[1:-2] * (ways_mm[1:-2] + ways_mm[2:-1]) / (steps_s[1:-2] + steps_s[2:-1])
-    least_mm = np.minimum(np.abs(before), np.abs(after))
-    moves = near & (before * after > 0.0) & (least_mm > STEPS * step_mm)
-    return int(np.sum(moves & (np.abs(off_mm) > 0.6 * least_mm)))
+    least_mm = np.minimum(ways_mm[:-3] * np.sign(ways_mm[3:]), np.abs(ways_mm[3:]))  # over 0 if both go the same way
+    return int(np.sum(near & (least_mm > STEPS * step_mm) & (np.abs(off_mm) > 0.6 * least_mm)))
 
 
 @check(
     Hazard.MISLED,
     "State",
     ALL,
-    f"in each motion a position is between those before and after it; in steps of 1, no leap over {FARTHEST_MM:g} mm",
+    f"in each motion, and each mode, a new position, between those before and after it; in steps of 1, no leap over "
+    f"{FARTHEST_MM:g} mm",
 )
 def positions_run_on(host: Host) -> str:
-    rows = all_columns(host)
-    seen, is_wrong = [], False
-    for name in ("left_mm", "right_mm"):
-        off, ways = astray(rows["device_s"], rows[name], STEP_MM), steps(rows, name, STEP_MM)
-        if np.sum(np.abs(ways) > STEPS) < BLOCK:
+    rows, seen = all_columns(host), []
+    for side in SIDES:
+        off, ways = astray(rows["device_s"], rows[f"{side}_mm"], STEP_MM), steps(rows, f"{side}_mm", STEP_MM)
+        if np.sum(ways > STEPS) < BLOCK:
             raise Untested("nothing moved; run all checks")
-        coarse, most_mm = np.gcd.reduce(ways), np.abs(ways).max() * STEP_MM
-        seen.append(f"{name}: {off} of {len(ways)} astray, in steps of {coarse}, {most_mm:.3f} mm at most")
-        is_wrong |= bool(off) or coarse > 1 or most_mm > FARTHEST_MM
-    return unless(is_wrong, "; ".join(seen))
+        least, most_mm = ways.min(), ways.max() * STEP_MM
+        old_s = oldest_s(rows, f"{side}_mm", np.abs(rows[f"{side}_mm_s"]) > SLIDES_MM_S)
+        text = f"{side}: {off} astray, {old_s * 1e3:.1f} ms old, in steps of {least}, {most_mm:.3f} mm at most"
+        seen.append(unless(off or least > 1 or most_mm > FARTHEST_MM or old_s > FRESH_S, text))
+    return "; ".join(seen)
 
 
 @check(
     Hazard.MISLED,
     "Sense",
     f"{ALL}; somebody turns the handle by over a turn, and back, within {TURNED_S:g} s",
-    f"no leap, a force against the motion, in each mode at most {FORCE_S * 1e3:g} ms old",
+    "no leap, steps of 1, in each mode a new place with each Sense",
 )
 def handle_runs_on(host: Host) -> str:
-    """Finds leaps, as of swapped bytes or too few bits, and a force that is not against the motion."""
     host.ask("turn the handle by over a whole turn, at a steady pace, and back")
     end_s, has_turned = host.now_s + TURNED_S, False
     while not has_turned and host.now_s < end_s:
         host.pass_time(0.5, DriveMode.OFF)
         rows = all_columns(host)
-        way_mm, along_N = float(np.ptp(rows["handle_mm"])), _along_N(rows)
-        has_turned = way_mm > 1.05 * TURN_MM and len(along_N) == 2
+        way_mm = float(np.ptp(rows["handle_mm"]))
+        has_turned = way_mm > 1.05 * TURN_MM and len(_along_N(rows)) == 2
     ways = steps(rows, "handle_mm", HANDLE_STEP_MM)
-    most_mm, coarse = np.abs(ways).max(initial=0) * HANDLE_STEP_MM, np.gcd.reduce(ways)
-    is_new = np.diff(rows["force_N"], prepend=math.nan) != 0.0
-    ages_s = rows["device_s"] - np.maximum.accumulate(np.where(is_new, rows["device_s"], -math.inf))
-    slides = [(np.abs(rows["handle_mm_s"]) > SLIDES_MM_S) & (rows["mode"] == mode) for mode in DeviceMode]
-    oldest_s = max((np.median(ages_s[part]) for part in slides if part.any()), default=0.0)
-    seen = (
-        f"turned by {way_mm:.0f} mm, {most_mm:.3f} mm a time at most, in steps of {coarse}, {along_N} N against it, "
-        f"{oldest_s * 1e3:.0f} ms old"
-    )
-    unless(most_mm > LEAP_MM or coarse > 1 or min(along_N, default=0.0) < 0.0 or oldest_s > FORCE_S / 2.0, seen)
+    least, most_mm = ways.min(initial=UNMOVED), ways.max(initial=0) * HANDLE_STEP_MM
+    old_s = oldest_s(rows, "handle_mm", np.abs(rows["handle_mm_s"]) > SLIDES_MM_S)
+    seen = f"turned by {way_mm:.0f} mm, in steps of {least}, {most_mm:.3f} mm at most, {old_s * 1e3:.1f} ms old"
+    unless(1 < least < UNMOVED or most_mm > LEAP_MM or old_s > FRESH_S, seen)
     if not has_turned:
         raise Untested(f"{seen}; turn the handle by over a turn and back meanwhile, --only handle_runs_on")
     return seen
 
 
-def _along_N(rows: dict[str, Array]) -> list[float]:
-    along_N = (way * rows["force_N"][way * rows["handle_mm_s"] > SLIDES_MM_S] for way in (1.0, -1.0))
-    return [round(float(np.median(part_N)), 2) for part_N in along_N if part_N.size]
+def _along_N(rows: dict[str, Array], mode: DeviceMode | None = None) -> list[float]:
+    is_there = (rows["mode"] == mode) | (mode is None)
+    ways_N = (way * rows["force_N"][is_there & (way * rows["handle_mm_s"] > SLIDES_MM_S)] for way in (1.0, -1.0))
+    return [round(float(np.median(way_N)), 2) for way_N in ways_N if way_N.size > BLOCK]
+
+
+def alone(rows: dict[str, Array], name: str) -> int:
+    """Return how many values lie far beside both neighbours."""
+    ways, near = np.diff(rows[name]), np.diff(rows["device_s"]) < SUCCESSIVE_S
+    least = np.minimum(ways[:-1] * -np.sign(ways[1:]), np.abs(ways[1:]))  # over 0 if it turns back
+    return int(np.sum(near[:-1] & near[1:] & (least > LONE * np.ptp(rows[name]))))
 
 
 @check(
     Hazard.MISLED,
     "Sense",
     f"{ALL}; the handle turned meanwhile",
-    f"a force that grows {GROWS:g} times from each depth of {DEPTHS_MM} mm to the next",
+    f"in each mode a force against the motion, at most {FORCE_S * 1e3:g} ms old, in steps of at most "
+    f"{FORCE_STEPS * 1e-3:g} N; {GROWS:g} times more from each depth of {DEPTHS_MM} mm "
+    "to the next",
 )
 def force_follows_gap(host: Host) -> str:
-    """Finds a force that is clipped or stands, where gap and handle show more."""
-    rows = columns(host)
+    rows = all_columns(host)
     inside_mm, slides = -0.5 * (rows["left_mm"] + rows["right_mm"]), np.abs(rows["handle_mm_s"]) > SLIDES_MM_S
+    against_N = [*chain.from_iterable(_along_N(rows, mode) for mode in DeviceMode)]
+    least, old_s = steps(rows, "force_N", 1e-3).min(initial=UNMOVED), oldest_s(rows, "force_N", slides)
+    seen = f"{against_N} N against it, {old_s * 1e3:.0f} ms old, in steps of {least}"
+    unless(min(against_N, default=1.0) <= 0.0 or FORCE_STEPS < least < UNMOVED or old_s > FORCE_S / 2.0, seen)
     forces_N = [
         np.median(part_N) if part_N.size else math.nan
         for part_N in (np.abs(rows["force_N"][slides & (np.abs(inside_mm - mm) < NEAR_MM)]) for mm in DEPTHS_MM)
     ]
-    seen = ", ".join(f"{force_N:.2f} N" for force_N in forces_N)
+    seen += f"; {', '.join(f'{force_N:.2f}' for force_N in forces_N)} N"
     if np.isnan(forces_N).any():
         raise Untested(f"{seen} at {DEPTHS_MM} mm: run all checks, and turn the handle meanwhile")
     return unless(any(after < GROWS * before for before, after in pairwise(forces_N)), seen)
@@ -343,7 +377,6 @@ def force_follows_gap(host: Host) -> str:
 STREAMS: Final = (
     identity_answers_hello,
     every_nonce,
-    status_rate,
     every_counter,
     frames_as_they_come,
 )
@@ -351,7 +384,7 @@ OVERALL: Final = (
     every_drive_answered,
     clock_runs_on,
     reports_in_time,
-    plausible_at_rest,
+    plausible_in_each_mode,
     positions_run_on,
     handle_runs_on,
     force_follows_gap,
