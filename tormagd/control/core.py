@@ -21,9 +21,8 @@ from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.measure import Measure
 from tormagd.control.move.actuator import Actuator
 from tormagd.control.move.carriages import Carriages
-from tormagd.control.move.homing import Homing
 from tormagd.control.move.motor import full_speed_mm_s, gap_speeds
-from tormagd.control.move.opening import Opening
+from tormagd.control.move.routines import Homing, Opening
 from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
@@ -67,8 +66,7 @@ class Planner:
         # at the open gap the element's field lags and gives more than the portrait says
         device = belief.device.relaxed(self._portrait.min_N - self.believe.memory.open_N())
         ask = self.governor.update(now_s, setpoint, device, belief.lag_s, travel, held_N)
-        before = self.planned if is_followed else None
-        plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured, before)
+        plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured, self.planned, is_followed)
         # what is learned of the carriages' delay acts on the next plan
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan
@@ -102,8 +100,7 @@ class Stepper:
         slides = scene.element == "torque"
         home_mm, full_mm_s = scene.insert.gap_open_mm / 2.0, full_speed_mm_s(config.motor)
         self.measure = Measure(home_mm, position.derivative_filter_s, slides, full_mm_s, period_s)
-        self._ceiling_N: Final = ceiling_N(scene)
-        self.homing = Homing(self._ceiling_N)
+        self.homing = Homing(ceiling_N(scene))
         self.opening = Opening(config, scene)
         self.watch = Watch(config, scene)
         self.move: Actuator = Carriages(config, scene) if move is None else move
@@ -169,15 +166,13 @@ class Stepper:
         shown = self.watch.faults(
             now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
         )
-        if self.safety.is_driven:
-            self.opening.rest(self.safety.request_number)
-        else:
+        if not self.safety.is_driven:
             self.homing.update(now_s, measurement)
-            is_placed = measured.is_homed and not self.safety.needs_homing
-            is_blind = measure.sight.is_blind or measure.leap is not None
-            self.opening.update(measurement, is_placed, is_blind, self.safety)
-            shown = self.homing.faults + self.opening.faults + shown
-        self.safety = latch(self.safety, shown)
+            shown = self.homing.faults + shown
+        is_placed = measured.is_homed and not self.safety.needs_homing
+        is_blind = measure.sight.is_blind or measure.leap is not None
+        self.opening.update(measurement, is_placed, is_blind, self.safety)
+        self.safety = latch(self.safety, self.opening.faults + shown)
         if not self.safety.needs_homing:
             return measured
         self.safety = homed_again(self.safety, measurement.is_homed)
@@ -196,7 +191,7 @@ class Stepper:
             drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
         except DomainError:
             return self._begin_anew()
-        self.watch.update(dt_s, measured, self.move.reference_mm, drive.left_motor, drive.right_motor)
+        self.watch.update(dt_s, measured, self.move.reference, drive.left_motor, drive.right_motor)
         limits = (*drive.limits, *self.watch.limits(now_s, measurement, measured, self.measure.sight))
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
@@ -204,7 +199,6 @@ class Stepper:
         """Latch NOT_FINITE, forget all motion, and stop driving."""
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()
-        self.homing = Homing(self._ceiling_N)
         self.watch.begin(math.inf)
         self.watch.rest()
         self.move.forget()

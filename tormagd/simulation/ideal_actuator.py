@@ -9,8 +9,7 @@ from typing import Final, final
 
 from tormagd.control.assembly.build import Core
 from tormagd.control.core import Stepper
-from tormagd.control.move.actuator import Actuator, Drive
-from tormagd.control.move.reference import Reference, target_of
+from tormagd.control.move.actuator import Actuator, Drive, Reference, target_of
 from tormagd.control.records import Measured, Plan
 from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement

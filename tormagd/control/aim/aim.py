@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, final
 import numpy as np
 
 from tormagd.config import Config
-from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, lawful_mT, least_mm
+from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, least_mm
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.strength import DeviceFit
@@ -55,7 +55,6 @@ class Element(NamedTuple):
 class Aim:
     """The last stage of planning: turns the force into a field, the field into a gap, and both into a plan."""
 
-    number: int = 0
     element_mT: float = 0.0
     "Of several fields that give a force, the nearest to this is taken."
     question: Question | None = None
@@ -75,8 +74,7 @@ class Aim:
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open and no setpoint."""
         field_mT = self._element.field.field_mT(self._range_mm[1])
-        self.number, self.element_mT = number, field_mT - lag_mT
-        min_N = self._portrait.min_N
+        self.element_mT, min_N = field_mT - lag_mT, self._portrait.min_N
         self.answer = Answer(now_s, FieldSolution(self.element_mT, min_N, 1.0, 0, _INSIDE))
         return Plan(number, now_s, None, None, min_N, None, field_mT, self._range_mm[1], 0.0, 1.0, (Limit.NO_SETPOINT,))
 
@@ -88,27 +86,29 @@ class Aim:
         belief: Belief,
         memory: ElementMemory,
         measured: Measured | None,
-        before: Plan | None = None,
+        before: Plan,
+        is_followed: bool,
     ) -> Plan:
-        """Return the next plan, which the gap reaches from the plan `before`."""
+        """Return the next plan, which a gap that follows them reaches from the plan `before`."""
         device = belief.device
         curve, outside = self._element.nominal.planned(None if ask.asked_N is None else setpoint, measured)
         wanted_N = device.model_N(ask.path_N[0])
         solution = self._solution(now_s, curve, wanted_N)
-        element_mT = lawful_mT(self._element.law, wanted_N, solution.field_mT)
+        law = self._element.law
+        element_mT = solution.field_mT if law is None else law.held_mT(solution.field_mT, wanted_N)
         if element_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = within(self._element.field.gap_mm(field_mT), self._range_mm)
-        if before is not None:
+        if is_followed:
             wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
         min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
-        self.number += 1
         self.element_mT = field_mT - memory.lag_mT
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
         gaps_mm = max(wanted_mm, min_mm), min_mm
-        return self._plan(now_s, setpoint, ask, belief, field_mT, gaps_mm, solution.confidence, limits, outside)
+        number = before.number + 1
+        return self._plan(number, now_s, setpoint, ask, belief, field_mT, gaps_mm, solution.confidence, limits, outside)
 
     def _reached_mm(self, wanted_mm: float, before: Plan, now_s: float, ask: Ask, device: DeviceFit) -> float:
         """Return how far the gap gets from the plan `before`, besides what the setpoint leaps."""
@@ -135,6 +135,7 @@ class Aim:
 
     def _plan(
         self,
+        number: int,
         now_s: float,
         setpoint: TimedSetpoint | None,
         ask: Ask,
@@ -148,7 +149,7 @@ class Aim:
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
-            number=self.number,
+            number=number,
             time_s=now_s,
             setpoint_N=ask.asked_N,
             setpoint_age_s=ask.age_s,
