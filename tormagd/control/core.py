@@ -192,7 +192,7 @@ class Stepper:
         except DomainError:
             return self._begin_anew()
         self.watch.update(dt_s, measured, self.move.reference, drive.left_motor, drive.right_motor)
-        limits = (*drive.limits, *self.watch.limits(now_s, measurement, measured, self.measure.sight))
+        limits = drive.limits + self.watch.limits(now_s, measurement, measured, self.measure.sight)
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
     def _begin_anew(self) -> Duty:

@@ -135,8 +135,8 @@ class Nominal:
         curve = self.curve(displacement_mm, rate_mm_s)
         known_mm, known_mm_s = curve.displacement_mm, curve.rate_mm_s
         return curve, (
-            *((Outside(FEATURES[0], displacement_mm, known_mm),) if known_mm != displacement_mm else ()),
-            *((Outside(FEATURES[1], rate_mm_s, known_mm_s),) if known_mm_s != rate_mm_s else ()),
+            ((Outside(FEATURES[0], displacement_mm, known_mm),) if known_mm != displacement_mm else ())
+            + ((Outside(FEATURES[1], rate_mm_s, known_mm_s),) if known_mm_s != rate_mm_s else ())
         )
 
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:

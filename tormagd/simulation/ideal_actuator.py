@@ -59,7 +59,7 @@ class IdealCarriages(Actuator):
         gap_mm = min(max(wanted_mm, before_mm - closed_mm), before_mm + opened_mm)
         put_gap(self._plant, gap_mm)
         self.reference = Reference(gap_mm, (gap_mm - before_mm) / dt_s)
-        return Drive(0.0, 0.0, 0.0, 0.0, [] if gap_mm == wanted_mm else [Limit.RATE])
+        return Drive(0.0, 0.0, 0.0, 0.0, () if gap_mm == wanted_mm else (Limit.RATE,))
 
 
 def ideal_stepper(core: Core, plant: Plant) -> Stepper:

@@ -179,11 +179,11 @@ class Aim:
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
         limits = (
-            *ask.limits,
-            *believed,
-            *((Limit.MODEL_RANGE,) if outside else ()),
-            *((Limit.CEILING,) if is_held else ()),
-            *((Limit.LOW_CONFIDENCE,) if solution.confidence < self._low_confidence else ()),
+            ask.limits
+            + believed
+            + ((Limit.MODEL_RANGE,) if outside else ())
+            + ((Limit.CEILING,) if is_held else ())
+            + ((Limit.LOW_CONFIDENCE,) if solution.confidence < self._low_confidence else ())
         )
         # where nobody asks for a force, none is held back for being too low
         if solution.reach is _INSIDE or (ask.asked_N is None and solution.reach is not Reach.ABOVE):

@@ -39,7 +39,7 @@ class Drive(Value):
     """The duties of one tick, and the limits that held the gap back."""
 
     def __init__(
-        self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: list[Limit]
+        self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: tuple[Limit, ...]
     ) -> None:
         self.left_duty: Final = left_duty
         self.right_duty: Final = right_duty
