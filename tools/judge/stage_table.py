@@ -320,23 +320,14 @@ def skill(stages: list[Skill], draw: Draw) -> object:
 def aim() -> list[Any]:
     made, believe = core(), planner().believe
     begun = Aim(CONFIG, made.scene, made.element)
-    before = begun.begin(BEGINS_S, 0, 0.0)
-    return [begun, believe.memory, believe.update(BEGINS_S, None), before]
+    begun.begin(BEGINS_S, 0, 0.0)
+    return [begun, believe.memory, believe.update(BEGINS_S, None)]
 
 
 def aiming(stage: list[Any], draw: Draw) -> object:
-    begun, remembered, believed, before = stage
+    begun, remembered, believed = stage
     asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), 1.2)
-    return begun.update(
-        draw.now_s,
-        setpoint(usual(draw.now_s)),
-        asked,
-        believed,
-        remembered,
-        measured(draw),
-        before,
-        is_followed=False,
-    )
+    return begun.update(draw.now_s, setpoint(usual(draw.now_s)), asked, believed, remembered, measured(draw))
 
 
 def floors(_: object, draw: Draw) -> object:

@@ -66,7 +66,8 @@ class Planner:
         # at the open gap the element's field lags and gives more than the portrait says
         device = belief.device.relaxed(self._portrait.min_N - self.believe.memory.open_N())
         ask = self.governor.update(now_s, setpoint, device, belief.lag_s, travel, held_N)
-        plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured, self.planned, is_followed)
+        before = self.planned if is_followed else None
+        plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured, before)
         # what is learned of the carriages' delay acts on the next plan
         self.believe.learn_lag(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan
@@ -94,17 +95,20 @@ class Stepper:
     """The driving half of the core: turns measurements and plans into duties, and latches faults."""
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
-        position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s = now_s
         self.safety = SafetyState()
-        slides = scene.element == "torque"
-        home_mm, full_mm_s = scene.insert.gap_open_mm / 2.0, full_speed_mm_s(config.motor)
-        self.measure = Measure(home_mm, position.derivative_filter_s, slides, full_mm_s, period_s)
+        self._period_s: Final = 1.0 / config.rates.control_hz
+        self.measure = Measure(
+            home_mm=scene.insert.gap_open_mm / 2.0,
+            derivative_filter_s=config.position.derivative_filter_s,
+            turns=scene.element == "torque",
+            full_speed_mm_s=full_speed_mm_s(config.motor),
+            period_s=self._period_s,
+        )
         self.homing = Homing(ceiling_N(scene))
         self.opening = Opening(config, scene)
         self.watch = Watch(config, scene)
         self.move: Actuator = Carriages(config, scene) if move is None else move
-        self._period_s: Final = period_s
 
     @property
     def measured(self) -> Measured | None:

@@ -139,20 +139,21 @@ def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
 def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm: float) -> bool:
     """Tell whether an end switch contradicts its carriage's place."""
     inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
-    left_open, left_closed = switches & _LEFT_OPEN != 0, switches & _LEFT_CLOSED != 0
-    right_open, right_closed = switches & _RIGHT_OPEN != 0, switches & _RIGHT_CLOSED != 0
-    return _is_contradicted(
-        measured.left_mm, measured.left_mm_s, left_open, left_closed, inner_mm, home_mm
-    ) or _is_contradicted(measured.right_mm, measured.right_mm_s, right_open, right_closed, inner_mm, home_mm)
+    is_left_wrong = _is_contradicted(
+        measured.left_mm, measured.left_mm_s, switches & _LEFT_OPEN, switches & _LEFT_CLOSED, inner_mm, home_mm
+    )
+    return is_left_wrong or _is_contradicted(
+        measured.right_mm, measured.right_mm_s, switches & _RIGHT_OPEN, switches & _RIGHT_CLOSED, inner_mm, home_mm
+    )
 
 
 def _is_contradicted(
-    at_mm: float, speed_mm_s: float, is_open: bool, is_closed: bool, inner_mm: float, home_mm: float
+    at_mm: float, speed_mm_s: float, is_open: int, is_closed: int, inner_mm: float, home_mm: float
 ) -> bool:
     moved_mm = TOLD_S * abs(speed_mm_s)
     near_mm = OPEN_SWITCH_MM + moved_mm
     is_elsewhere = at_mm < home_mm - near_mm if is_open else at_mm > home_mm + near_mm
-    return is_elsewhere or (is_closed and at_mm > inner_mm + moved_mm)
+    return is_elsewhere or (is_closed != 0 and at_mm > inner_mm + moved_mm)
 
 
 @final

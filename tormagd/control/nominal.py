@@ -130,7 +130,8 @@ class Nominal:
         """Return the force over the field for the motion to plan for, and what of it is out of range."""
         if not self._has_rate:
             return self.only, ()
-        told_mm, told_mm_s = (None, None) if setpoint is None else (setpoint.displacement_mm, setpoint.rate_mm_s)
+        told_mm = None if setpoint is None else setpoint.displacement_mm
+        told_mm_s = None if setpoint is None else setpoint.rate_mm_s
         displacement_mm, rate_mm_s = self.contact.planned(told_mm, told_mm_s, measured)
         curve = self.curve(displacement_mm, rate_mm_s)
         known_mm, known_mm_s = curve.displacement_mm, curve.rate_mm_s

@@ -218,7 +218,7 @@ def test_the_most_open_of_the_guards_wins_at_a_speed_that_there_is(
     belief = Belief(device, device, unseen, 0.0, None, (), 0.0)
     planner = core.planner()
     ask = Ask(asked_N, [asked_N, *[0.5] * 6], None, ())
-    plan = planner.aim.update(0.1, None, ask, belief, planner.believe.memory, None, planner.planned, is_followed=False)
+    plan = planner.aim.update(0.1, None, ask, belief, planner.believe.memory, None)
     ceiling_N = CEILING * core.scene.force.most_N
     for guard in (device, unseen):
         assert guard is None or plan.gap_mm >= ceiling_mm(core.portrait, guard, ceiling_N, CONFIG.trim)

@@ -55,6 +55,7 @@ class Element(NamedTuple):
 class Aim:
     """The last stage of planning: turns the force into a field, the field into a gap, and both into a plan."""
 
+    number: int = 0
     element_mT: float = 0.0
     "Of several fields that give a force, the nearest to this is taken."
     question: Question | None = None
@@ -74,7 +75,8 @@ class Aim:
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """Begin at `now_s`, and return a plan with the gap open and no setpoint."""
         field_mT = self._element.field.field_mT(self._range_mm[1])
-        self.element_mT, min_N = field_mT - lag_mT, self._portrait.min_N
+        self.number, self.element_mT = number, field_mT - lag_mT
+        min_N = self._portrait.min_N
         self.answer = Answer(now_s, FieldSolution(self.element_mT, min_N, 1.0, 0, _INSIDE))
         return Plan(number, now_s, None, None, min_N, None, field_mT, self._range_mm[1], 0.0, 1.0, (Limit.NO_SETPOINT,))
 
@@ -86,33 +88,28 @@ class Aim:
         belief: Belief,
         memory: ElementMemory,
         measured: Measured | None,
-        before: Plan,
-        is_followed: bool,
+        before: Plan | None = None,
     ) -> Plan:
-        """Return the next plan, which a gap that follows them reaches from the plan `before`."""
+        """Return the next plan, which the gap reaches from the plan `before`."""
         device = belief.device
         curve, outside = self._element.nominal.planned(None if ask.asked_N is None else setpoint, measured)
         wanted_N = device.model_N(ask.path_N[0])
         solution = self._solution(now_s, curve, wanted_N)
         law = self._element.law
         element_mT = solution.field_mT if law is None else law.held_mT(solution.field_mT, wanted_N)
-        if element_mT != solution.field_mT:
-            outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
+        outside += (Outside(FEATURES[2], solution.field_mT, element_mT),) if element_mT != solution.field_mT else ()
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = within(self._element.field.gap_mm(field_mT), self._range_mm)
-        if is_followed:
-            wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
+        wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
         min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
         self.element_mT = field_mT - memory.lag_mT
-        limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
-        gaps_mm = max(wanted_mm, min_mm), min_mm
-        number = before.number + 1
-        return self._plan(number, now_s, setpoint, ask, belief, field_mT, gaps_mm, solution.confidence, limits, outside)
+        self.number += 1
+        return self._plan(now_s, setpoint, ask, belief, field_mT, wanted_mm, min_mm, solution, outside)
 
-    def _reached_mm(self, wanted_mm: float, before: Plan, now_s: float, ask: Ask, device: DeviceFit) -> float:
+    def _reached_mm(self, wanted_mm: float, before: Plan | None, now_s: float, ask: Ask, device: DeviceFit) -> float:
         """Return how far the gap gets from the plan `before`, besides what the setpoint leaps."""
-        if before.setpoint_N is None or ask.asked_N is None:
+        if before is None or before.setpoint_N is None or ask.asked_N is None:
             return wanted_mm
         portrait = self._portrait
         leap_mm = abs(portrait.gap_for_mm(ask.asked_N, device) - portrait.gap_for_mm(before.setpoint_N, device))
@@ -135,34 +132,33 @@ class Aim:
 
     def _plan(
         self,
-        number: int,
         now_s: float,
         setpoint: TimedSetpoint | None,
         ask: Ask,
         belief: Belief,
         field_mT: float,
-        gaps_mm: tuple[float, float],
-        confidence: float,
-        limits: tuple[Limit, ...],
+        wanted_mm: float,
+        min_mm: float,
+        solution: FieldSolution,
         outside: tuple[Outside, ...],
     ) -> Plan:
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
         model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
-            number=number,
+            number=self.number,
             time_s=now_s,
             setpoint_N=ask.asked_N,
             setpoint_age_s=ask.age_s,
             governed_N=ask.force_N,
             predicted_N=belief.predicted_N,
             field_mT=field_mT,
-            gap_mm=gaps_mm[0],
+            gap_mm=max(wanted_mm, min_mm),
             gap_speed_mm_s=speed_mm_s,
-            confidence=confidence,
-            limits=limits,
+            confidence=solution.confidence,
+            limits=self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution),
             gap_acceleration_mm_s2=acceleration_mm_s2,
             foresight=ask.foresight,
-            min_gap_mm=gaps_mm[1],
+            min_gap_mm=min_mm,
             outside=outside,
             sensor_doubted_s=belief.sensor_doubted_s,
             trim=ask.force_N / model_N if model_N > 0.0 else belief.at_speed.scale,

@@ -70,10 +70,9 @@ class PortraitSearch:
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
         field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
-        min_N, max_N = shown.min_N, shown.max_N
-        if min_N <= force_N <= max_N:
+        if shown.min_N <= force_N <= shown.max_N:
             return FieldSolution(field_mT, force_N, 1.0, 1, Reach.INSIDE)
-        nearest_N, reach = (min_N, Reach.BELOW) if force_N < min_N else (max_N, Reach.ABOVE)
+        nearest_N, reach = (shown.min_N, Reach.BELOW) if force_N < shown.min_N else (shown.max_N, Reach.ABOVE)
         return FieldSolution(field_mT, nearest_N, curve.confidence(field_mT, force_N - nearest_N), 1, reach)
 
 
@@ -86,7 +85,6 @@ class LawOfField:
         self.fields_mT: Final = fields_mT
 
     def held_mT(self, field_mT: float, force_N: float) -> float:
-        """Return `field_mT`, held near what the law says of `force_N`."""
         law_mT = interpolated(force_N, self._rising_N, self.fields_mT)
         return min(max(field_mT, (1.0 - LAW_SHARE) * law_mT), (1.0 + LAW_SHARE) * law_mT)
 

@@ -174,7 +174,7 @@ class Opening:
         self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
 
     def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
-        """Look at the device once, and set `faults`: none while it is driven, or homes."""
+        """Look at the device once, and set `faults`."""
         number = safety.request_number
         if self.faults:
             self.told_request, self.faults = number, ()

@@ -32,7 +32,7 @@ class Explanation(NamedTuple):
     "Many faults hide from a device at rest."
     position: Position = Position.KEPT
     hazard: Literal["SHUT", "CLOSES", "OPENS", "MISLED", "WORN", "NONE", ""] = ""
-    "The name of the conformance kit's `Hazard` that the code controls; NONE where it tells what the device can do."
+    "The `Hazard` that the code controls; NONE: it tells what the device can do."
 
     @property
     def clears(self) -> str:
