@@ -332,6 +332,7 @@ def aiming(stage: list[Any], draw: Draw) -> object:
 
 def floors(_: object, draw: Draw) -> object:
     element = core().element
+    assert element.law is not None, "a brake has one"
     return [
         ceiling_mm(element.portrait, UNSEEN, draw(2.5), BOUNDS),
         element.law.held_mT(draw.bounded(200.0), draw(1.2)),
