@@ -97,7 +97,8 @@ class Aim:
         solution = self._solution(now_s, curve, wanted_N)
         law = self._element.law
         element_mT = solution.field_mT if law is None else law.held_mT(solution.field_mT, wanted_N)
-        outside += (Outside(FEATURES[2], solution.field_mT, element_mT),) if element_mT != solution.field_mT else ()
+        if element_mT != solution.field_mT:
+            outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = within(self._element.field.gap_mm(field_mT), self._range_mm)
