@@ -18,10 +18,10 @@ from hostile import messages
 from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
 from tormagd.config import Config, Device
-from tormagd.control.assembly.build import Core
+from tormagd.control.assembly.build import SOURCES, Core, sources_hash
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
-from tormagd.record.black_box import SOURCES, BlackBoxFile, read_black_box, sources_hash, write_black_box
+from tormagd.record.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.record.journal import ANSWER, CONFIRM, FORMAT, MISSING
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd.record.replay.rerun import ReplayError, differences, rebuilt, recorded, rerun, ticks_of
@@ -233,7 +233,7 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
 def test_the_sources_hash_is_of_every_room(monkeypatch: pytest.MonkeyPatch) -> None:
     known = sources_hash()
     for room in SOURCES:
-        monkeypatch.setattr("tormagd.record.black_box.SOURCES", [other for other in SOURCES if other != room])
+        monkeypatch.setattr("tormagd.control.assembly.build.SOURCES", [other for other in SOURCES if other != room])
         assert sources_hash() != known, room
 
 

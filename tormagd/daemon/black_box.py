@@ -21,12 +21,11 @@ import msgspec
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import Config
-from tormagd.control.assembly.build import Core
+from tormagd.control.assembly.build import Core, platform_name, sources_hash
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import ChildProcess
 from tormagd.hardware.connection import Connection
-from tormagd.record.black_box import platform_name, sources_hash
 from tormagd.record.journal import FORMAT, MISSING, Journal, core_hash, packed
 from tormagd.record.keeper import REQUEST, Begin, End, Part, Ring, Write, Written, box_path, in_shared_memory
 from tormagd.record.telemetry import COLUMNS, Moment

@@ -4,15 +4,12 @@ Each message of `/core` is one part that the daemon handed over. The metadata sa
 runs such a file, and compares what people see, `/ticks` and `/frames`, with what `/core` gives.
 """
 
-import hashlib
-import platform
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 from mcap.records import Message
 
 from tormagd.ground.files import in_place_of
@@ -29,9 +26,6 @@ from tormagd.record.writer import (
 )
 from tormagd_client.messages import Telemetry
 
-ROOT = Path(__file__).parents[2]
-SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("element", "scenes", "hardware", "control")))
-"The rooms of all that `plan` and `step` run."
 MAX_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
 "Bounds on what is read of one file, a minute of 1 kHz; what comes after is passed over."
 NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
@@ -46,21 +40,6 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
     "False for a file that was cut short, or is longer than what is read: entries up to there are there."
     odd: str = ""
     """The first message of `/ticks` or `/frames` that `/core` does not give, or why an entry of `/core` gives none."""
-
-
-def sources_hash() -> str:
-    """Return the SHA-256 of all sources that `plan` and `step` run."""
-    digest = hashlib.sha256()
-    for room in SOURCES:
-        for path in sorted((ROOT / room).glob("**/*.py")):
-            digest.update(f"{path.relative_to(ROOT).as_posix()} {path.stat().st_size}\n".encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def platform_name() -> str:
-    """Return what else the bits of a result depend on: processor, Python and NumPy."""
-    return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
 def write_black_box(path: Path, header: dict[str, str], parts: Iterable[bytes]) -> None:

@@ -3,7 +3,9 @@
 The daemon, the virtual-time simulation and the tests build the core here, so that all of them run the same one.
 """
 
+import hashlib
 import math
+import platform
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +36,9 @@ from tormagd_client.endpoints import ConfigError
 
 MIN_PHASE_MARGIN_DEG = 30.0
 MIN_GAIN_MARGIN_DB = 4.0
+ROOT = Path(__file__).parents[3]
+SOURCES = ("firmware_protocol", "tormagd/element", "tormagd/scenes", "tormagd/hardware", "tormagd/control")
+"The rooms of all that `plan` and `step` run."
 SENSED_N = 0.001
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "Friction holds the gap to within four counts of the encoders."
@@ -135,6 +140,21 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     law = _law(scene, reach, field) if contact.slides else None
     memory = model.metadata.memory if terms.memory else NO_MEMORY
     return Element(nominal, memory, field, reach, search, law, choice.solver in BESIDE_PLANS), choice
+
+
+def sources_hash() -> str:
+    """Return the SHA-256 of all sources that `plan` and `step` run."""
+    digest = hashlib.sha256()
+    for room in SOURCES:
+        for path in sorted((ROOT / room).glob("**/*.py")):
+            digest.update(f"{path.relative_to(ROOT).as_posix()} {path.stat().st_size}\n".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def platform_name() -> str:
+    """Return what else the bits of a result depend on: processor, Python and NumPy."""
+    return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
 def _brake(scene: Scene) -> tuple[ElementContact, FieldOfGap, float]:

@@ -14,7 +14,7 @@ import msgspec
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import Config, checked, load_config
-from tormagd.control.assembly.build import Core, build_core
+from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import PLAN_ERRORS
@@ -25,7 +25,7 @@ from tormagd.element.inverse.solution import Answer
 from tormagd.ground.plain_values import packed, plain, restore, restored
 from tormagd.hardware.measurement import Measurement
 from tormagd.record import journal
-from tormagd.record.black_box import BlackBoxFile, platform_name, read_black_box, sources_hash
+from tormagd.record.black_box import BlackBoxFile, read_black_box
 from tormagd.record.journal import FORMAT, KNOWN, core_hash
 from tormagd.record.replay.conversation import Conversation, Found, differing
 from tormagd.record.telemetry import COLUMNS, Moment, TickRecord, measurement_of
