@@ -28,7 +28,7 @@ COMPILED = {
         *("serial_port", "streams", "link", "link_statistics", "measurement", "connection"),
     ),
     "tormagd/control/safety": ("operating_state",),
-    "tormagd/control": (*("interpolation", "records", "contact", "nominal", "sight", "plausible", "measure", "core"),),
+    "tormagd/control": (*("interpolation", "records", "nominal", "measure", "core"),),
     "tormagd/control/assembly": ("conditions",),
     "tormagd/record": ("journal", "telemetry"),
     "tormagd/simulation": (

@@ -6,11 +6,10 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
+from tormagd.control.measure import BLIND_S, LEAP_MM
 from tormagd.control.move.watch import STARTING_S
-from tormagd.control.plausible import LEAP_MM
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import CLEARING_S, OperatingState
-from tormagd.control.sight import BLIND_S
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.measurement import DeviceRequest
 

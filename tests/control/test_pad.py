@@ -7,9 +7,9 @@ import pytest
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import SEVERAL_BRANCHES, Core, build_core, choose_solver
-from tormagd.control.contact import PRESSED, Pressing
 from tormagd.control.core import Planner
 from tormagd.control.measure import Measure
+from tormagd.control.nominal import PRESSED, Pressing
 from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import Turn
@@ -44,9 +44,9 @@ def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = 
 
 def test_a_finger_on_its_way_is_planned_for_at_the_scenes_depth() -> None:
     contact = Pressing(DEPTH_MM)
-    fingers, own = (None, pressed(1.0, 1.0), pressed(1.9, -0.5)), TimedSetpoint(3.5, 0.0, 0.1, 1.5, 0.25)
-    assert [contact.planned(None, finger) for finger in fingers] == [(DEPTH_MM, 0.0), (DEPTH_MM, 0.0), (1.9, -0.5)]
-    assert contact.planned(own, pressed(1.9)) == (1.5, 0.25)
+    fingers = None, pressed(1.0, 1.0), pressed(1.9, -0.5)
+    assert [contact.planned(None, None, each) for each in fingers] == [(DEPTH_MM, 0.0), (DEPTH_MM, 0.0), (1.9, -0.5)]
+    assert contact.planned(1.5, 0.25, pressed(1.9)) == (1.5, 0.25)
     assert [contact.is_known(pressed(share * PRESSED * DEPTH_MM)) for share in (0.99, 1.0)] == [False, True]
     assert not contact.slides
 

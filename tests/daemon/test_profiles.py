@@ -9,10 +9,9 @@ import pytest
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
-from tormagd.control.assembly.profile import ProfileError, profile_of
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.daemon.profiles import ProfileFolder, Profiles
+from tormagd.daemon.profiles import ProfileError, ProfileFolder, Profiles, profile_of
 
 MODEL = "ab" * 32
 BOUNDS = Config().trim

@@ -10,7 +10,7 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import Core
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Stepper
-from tormagd.control.move.reference import Reference
+from tormagd.control.move.actuator import Reference
 from tormagd.control.records import Duty, Outside, Plan
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import OperatingState, SafetyState

@@ -16,9 +16,8 @@ from pathlib import Path
 import pytest
 
 from tormagd.config import Config, load_calibration, load_config
-from tormagd.control.assembly.profile import ProfileError
 from tormagd.ctl.waveform import read_csv
-from tormagd.daemon.profiles import ProfileFolder
+from tormagd.daemon.profiles import ProfileError, ProfileFolder
 from tormagd.element.model.model_file import ModelFileError, load_model
 from tormagd.ground.files import in_place_of, new_file, read_bounded
 from tormagd.ground.force_file import read_forces

@@ -18,7 +18,7 @@ from hostile import messages
 from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
 from tormagd.config import Config, Device
-from tormagd.control.assembly.build import Core
+from tormagd.control.assembly.build import SOURCES, Core, sources_hash
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.record.black_box import BlackBoxFile, read_black_box, write_black_box
@@ -228,6 +228,13 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
     write_black_box(tmp_path / "edited.mcap", box.header, [msgspec.msgpack.encode(head)])
     monkeypatch.undo()
     assert read_black_box(tmp_path / "edited.mcap").odd.startswith(said)
+
+
+def test_the_sources_hash_is_of_every_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = sources_hash()
+    for room in SOURCES:
+        monkeypatch.setattr("tormagd.control.assembly.build.SOURCES", [other for other in SOURCES if other != room])
+        assert sources_hash() != known, room
 
 
 def test_what_is_not_as_it_was_is_told(box: BlackBoxFile, path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tormagd.config import Config, Rates, load_config
-from tormagd.control.assembly.build import Core, at_rates_of, build_core
+from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.features import FEATURES
@@ -23,6 +23,7 @@ from tormagd.scenes.measured import (
     OperatingPoint,
     Served,
     allowed_N,
+    at_rates_of,
     measured,
     served_like,
 )

@@ -15,9 +15,10 @@ from judge.touching import Touch
 from machines.host import Host
 
 from tormagd.config import Config, Rates
-from tormagd.control.assembly.build import at_rates_of, build_core
+from tormagd.control.assembly.build import build_core
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.ctl.outcome import CommandError, Exit
+from tormagd.scenes.measured import at_rates_of
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation import patient
 from tormagd.simulation.hand import FeltHand, parse_hand

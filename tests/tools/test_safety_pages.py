@@ -89,12 +89,13 @@ def test_no_row_is_red_but_those_that_are_known() -> None:
 def test_a_row_that_loses_what_it_is_made_of_turns_red(monkeypatch: pytest.MonkeyPatch) -> None:
     gone = Fault.DEVICE_SKEW
     monkeypatch.setattr(risk, "FAULTS", {code: row for code, row in FAULTS.items() if code is not gone})
-    monkeypatch.setattr(risk, "LIMITS_OF", {})
+    unstated = {code: row._replace(hazard="") for code, row in LIMITS.items() if row.hazard != "NONE"}
+    monkeypatch.setattr(risk, "LIMITS", LIMITS | unstated)
     monkeypatch.setattr(risk, "MATRIX", [row for row in MATRIX if row.device != "overheated"])
     named = named_tests(safety_pages.ROOT / "tests")
     red = red_rows(risk.rows(named, [cell | {"safe": "CLOCK" not in cell["limits"]} for cell in CELLS], {}))
     assert (red[f"fault.{gone}"], red["fault.DEVICE_TEMPERATURE"], red["limit.CLOCK"], red["limit.STALE"]) == (
-        ("control", "code"),
+        ("hazard", "control", "code"),
         ("evidence",),
         ("hazard", "evidence"),
         ("hazard",),

@@ -17,8 +17,8 @@ import msgspec
 from firmware_protocol.conformance.check import Hazard
 from firmware_protocol.conformance.examination import CHECKS
 from judge.injections import MATRIX
-from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation
-from tormagd.control.safety.hazards import CAUSES, FAULTS_OF, HARMLESS, HARMS, LIMITS_OF
+from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
+from tormagd.control.safety.hazards import CAUSES, HARMS
 from tormagd.ground.toml_file import convert
 
 BEHAVIOUR = (
@@ -104,7 +104,7 @@ class Row(NamedTuple):
 
 def rows(named: Named, cells: Sequence[Mapping[str, Any]], judged: Mapping[str, Judged]) -> list[Row]:
     told = _told(cells)
-    made = [*_of_codes("fault", FAULTS_OF, FAULTS, named, told), *_of_codes("limit", LIMITS_OF, LIMITS, named, told)]
+    made = [*_of_codes("fault", Fault, FAULTS, named, told), *_of_codes("limit", Limit, LIMITS, named, told)]
     made += [*_of_causes(named, told), *_of_kit(named)]
     if unknown := judged.keys() - {row.name for row in made}:
         raise ValueError(f"{min(unknown)}: no row of the risk page has this name; take it out, or rename it")
@@ -131,21 +131,25 @@ def _told(cells: Sequence[Mapping[str, Any]]) -> Counter[str]:
 
 
 def _of_codes(
-    kind: str, hazards: Mapping[Hazard, str], table: Mapping[Any, Explanation], named: Named, told: Counter[str]
+    kind: str, codes: Iterable[str], table: Mapping[Any, Explanation], named: Named, told: Counter[str]
 ) -> Iterator[Row]:
-    of_code = {name: hazard for hazard, names in hazards.items() for name in names.split()}
-    for code in dict.fromkeys((*of_code, *(str(code) for code in table if code not in HARMLESS.split()))):
+    for code in (code for code in codes if code not in _harmless(table)):
         name, row = f"{kind}.{code}", table.get(code)
         files = named.get(name, Counter[str]()).copy()
         if code not in FAULTS or code not in LIMITS:  # otherwise a word may mean either
             files[WORDED] += named.get(code, Counter())[WORDED]
-        tests, evidence, hazard = _listed(files), _in_cells(told[name]), of_code.get(code)
+        tests, evidence = _listed(files), _in_cells(told[name])
         if row is None:
-            yield Row(name, hazard, "", "", "", tests, evidence)
+            yield Row(name, None, "", "", "", tests, evidence)
         else:
+            hazard = Hazard[row.hazard] if row.hazard else None
             shows = "" if row.shows == "at once" else f", {row.shows}"
             control = f"{row.reaction} within {row.safe_ms:,.0f} ms{shows}"
             yield Row(name, hazard, row.cause, control, code, tests, evidence)
+
+
+def _harmless(table: Mapping[Any, Explanation]) -> list[str]:
+    return [code for code, row in table.items() if row.hazard == "NONE"]
 
 
 def _of_causes(named: Named, told: Counter[str]) -> Iterator[Row]:
@@ -210,7 +214,7 @@ code, a test or evidence is missing. Severity and probability are a person's, fr
 
 def page(rows: Sequence[Row]) -> str:
     """Return the page, which needs no other file."""
-    harmless = ", ".join(HARMLESS.split())
+    harmless = ", ".join(_harmless(LIMITS))
     says = f"<p>{len(rows)} rows, {len(red_rows(rows))} of them red. Limits without a hazard: {harmless}.</p>\n"
     return _HEAD + says + "".join(_of_hazard(hazard, rows) for hazard in (*Hazard, None)) + "</body>\n</html>\n"
 

@@ -18,7 +18,7 @@ from firmware_protocol.codec import (
 from judge.stages import Draw, Stage
 from tormagd.config import Config, Motor, Position
 from tormagd.control.aim.aim import Aim
-from tormagd.control.aim.portrait import Portrait, PortraitSearch, ceiling_mm, lawful_mT
+from tormagd.control.aim.portrait import Portrait, PortraitSearch, ceiling_mm
 from tormagd.control.ask.forecast import Forecast, Skill
 from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.path import TIMES_S, nearest_path_mm
@@ -34,23 +34,19 @@ from tormagd.control.believe.sensor import SensorTrust
 from tormagd.control.believe.sensor_zero import SensorZero
 from tormagd.control.believe.slow_friction import SlowFriction
 from tormagd.control.believe.strength import UNSEEN, Anchor, DeviceFit, adapting_s, observe
-from tormagd.control.contact import Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.interpolation import Rising, at_step, interpolated, low_pass
-from tormagd.control.measure import Measure
-from tormagd.control.move.carriages import Carriages
-from tormagd.control.move.homing import Homing
+from tormagd.control.measure import Measure, Sight, is_contradicted, is_outside, leap_between
+from tormagd.control.move.actuator import Reference, target_of
+from tormagd.control.move.carriages import Carriages, follow
 from tormagd.control.move.motor import full_speed_mm_s, margins
-from tormagd.control.move.opening import Opening
 from tormagd.control.move.pid import Pid
-from tormagd.control.move.reference import Reference, follow, target_of
+from tormagd.control.move.routines import Homing, Opening
 from tormagd.control.move.watch import Watch
-from tormagd.control.nominal import FieldOfGap
-from tormagd.control.plausible import is_contradicted, is_outside, leap_between
+from tormagd.control.nominal import FieldOfGap, Pressing, Sliding
 from tormagd.control.records import Ask, GapSpeeds, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import Conditions, SafetyState, command
-from tormagd.control.sight import Sight
 from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, named
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
 from tormagd.element.model.model_file import load_model, model_path
@@ -336,9 +332,10 @@ def aiming(stage: list[Any], draw: Draw) -> object:
 
 def floors(_: object, draw: Draw) -> object:
     element = core().element
+    assert element.law is not None, "a brake has one"
     return [
         ceiling_mm(element.portrait, UNSEEN, draw(2.5), BOUNDS),
-        lawful_mT(element.law, draw(1.2), draw.bounded(200.0)),
+        element.law.held_mT(draw.bounded(200.0), draw(1.2)),
     ]
 
 
@@ -420,7 +417,7 @@ def opening(stage: Opening, draw: Draw) -> object:
 
 def watch(stage: Watch, draw: Draw) -> object:
     seen, said, seeing = measured(draw), measurement(draw), Sight(PERIOD_S)
-    stage.update(PERIOD_S, seen, draw(80.0), draw(0.1), draw(0.1))
+    stage.update(PERIOD_S, seen, Reference(draw(80.0)), draw(0.1), draw(0.1))
     faults = stage.faults(draw.now_s, SafetyState(), said, seen, seeing, None, draw(0.0))
     return [*faults, *stage.limits(draw.now_s, said, seen, seeing)]
 
@@ -453,7 +450,10 @@ def field(stage: FieldOfGap, draw: Draw) -> object:
 
 def contact(stages: list[Any], draw: Draw) -> object:
     seen, asked = measured(draw), setpoint(draw)
-    return [[*each.planned(asked, seen), *each.motion_now(seen), each.is_known(seen)] for each in stages]
+    return [
+        [*each.planned(asked.displacement_mm, asked.rate_mm_s, seen), *each.motion_now(seen), each.is_known(seen)]
+        for each in stages
+    ]
 
 
 def curve(_: object, draw: Draw) -> object:
@@ -541,7 +541,7 @@ def stages() -> list[Stage]:
         Stage("move/pid", lambda: Pid(position), pid),
         Stage("move/reference", lambda: [Reference(80.0)], reference, PLANNED, PERIOD_S),
         Stage("move/motor", lambda: None, motor, CONFIGURATION),
-        Stage("move/homing", lambda: Homing(2.6), homing, MEASUREMENT, PERIOD_S),
+        Stage("move/routines", lambda: Homing(2.6), homing, MEASUREMENT, PERIOD_S),
         Stage("move/opening", lambda: Opening(CONFIG, made.scene), opening, MEASUREMENT, PERIOD_S),
         Stage("move/watch", lambda: Watch(CONFIG, made.scene), watch, MEASUREMENT, PERIOD_S),
         Stage("filter", lambda: [0.0], filtered, MEASUREMENT),

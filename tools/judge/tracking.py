@@ -44,9 +44,9 @@ from tormag_lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake
 from tormag_lab.told import lines
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
-from tormagd.control.assembly.profile import profile_of
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
+from tormagd.daemon.profiles import profile_of
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 

@@ -21,9 +21,8 @@ from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.measure import Measure
 from tormagd.control.move.actuator import Actuator
 from tormagd.control.move.carriages import Carriages
-from tormagd.control.move.homing import Homing
 from tormagd.control.move.motor import full_speed_mm_s, gap_speeds
-from tormagd.control.move.opening import Opening
+from tormagd.control.move.routines import Homing, Opening
 from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
@@ -96,18 +95,20 @@ class Stepper:
     """The driving half of the core: turns measurements and plans into duties, and latches faults."""
 
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
-        position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s = now_s
         self.safety = SafetyState()
-        slides = scene.element == "torque"
-        home_mm, full_mm_s = scene.insert.gap_open_mm / 2.0, full_speed_mm_s(config.motor)
-        self.measure = Measure(home_mm, position.derivative_filter_s, slides, full_mm_s, period_s)
-        self._ceiling_N: Final = ceiling_N(scene)
-        self.homing = Homing(self._ceiling_N)
+        self._period_s: Final = 1.0 / config.rates.control_hz
+        self.measure = Measure(
+            home_mm=scene.insert.gap_open_mm / 2.0,
+            derivative_filter_s=config.position.derivative_filter_s,
+            turns=scene.element == "torque",
+            full_speed_mm_s=full_speed_mm_s(config.motor),
+            period_s=self._period_s,
+        )
+        self.homing = Homing(ceiling_N(scene))
         self.opening = Opening(config, scene)
         self.watch = Watch(config, scene)
         self.move: Actuator = Carriages(config, scene) if move is None else move
-        self._period_s: Final = period_s
 
     @property
     def measured(self) -> Measured | None:
@@ -169,15 +170,13 @@ class Stepper:
         shown = self.watch.faults(
             now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
         )
-        if self.safety.is_driven:
-            self.opening.rest(self.safety.request_number)
-        else:
+        if not self.safety.is_driven:
             self.homing.update(now_s, measurement)
-            is_placed = measured.is_homed and not self.safety.needs_homing
-            is_blind = measure.sight.is_blind or measure.leap is not None
-            self.opening.update(measurement, is_placed, is_blind, self.safety)
-            shown = self.homing.faults + self.opening.faults + shown
-        self.safety = latch(self.safety, shown)
+            shown = self.homing.faults + shown
+        is_placed = measured.is_homed and not self.safety.needs_homing
+        is_blind = measure.sight.is_blind or measure.leap is not None
+        self.opening.update(measurement, is_placed, is_blind, self.safety)
+        self.safety = latch(self.safety, self.opening.faults + shown)
         if not self.safety.needs_homing:
             return measured
         self.safety = homed_again(self.safety, measurement.is_homed)
@@ -196,15 +195,14 @@ class Stepper:
             drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
         except DomainError:
             return self._begin_anew()
-        self.watch.update(dt_s, measured, self.move.reference_mm, drive.left_motor, drive.right_motor)
-        limits = (*drive.limits, *self.watch.limits(now_s, measurement, measured, self.measure.sight))
+        self.watch.update(dt_s, measured, self.move.reference, drive.left_motor, drive.right_motor)
+        limits = drive.limits + self.watch.limits(now_s, measurement, measured, self.measure.sight)
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
     def _begin_anew(self) -> Duty:
         """Latch NOT_FINITE, forget all motion, and stop driving."""
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()
-        self.homing = Homing(self._ceiling_N)
         self.watch.begin(math.inf)
         self.watch.rest()
         self.move.forget()

@@ -1,11 +1,17 @@
-"""Positions, speeds and the handle's motion from a device's measurements, with their plausibility and age."""
+"""The first stage: positions, speeds and the handle's motion from a device's measurements, how plausible and how old.
 
+sight      the loop is blind while the device is silent, and right after a stall of the loop: a State is sent only in
+           answer to a Drive, so the State that waits after a stall is as old as the stall
+plausible  no encoder takes a step that no motor makes, shows a place that does not exist, or contradicts an end switch
+"""
+
+import math
 from typing import Final, final
 
+from firmware_protocol.codec import Switches
+from firmware_protocol.value import Value
 from tormagd.control.interpolation import low_pass
-from tormagd.control.plausible import Leap, leap_between
 from tormagd.control.records import Handle, Measured
-from tormagd.control.sight import Sight
 from tormagd.element.model.displacement import MOVING_MM_S, Turn
 from tormagd.hardware.measurement import Measurement
 
@@ -18,6 +24,136 @@ FAST_MM_S: Final = 2.0 * MOVING_MM_S
 "Friction hardly depends on the rate above this."
 MIN_DT_S: Final = 5e-6
 "Half a step of the device's clock: a shorter time gives no speed."
+BLIND_S: Final = 0.005
+BLIND_PERIODS: Final = 5.0
+"Without a new State for longer than both, the carriages' places are too uncertain to drive them."
+UNSENSED_S: Final = 0.02
+"Without a new Sense for longer than both, force and handle are not measured."
+SHOWN_S: Final = 0.1
+LEAP_SPEEDS: Final = 3.0
+"Neither a motor nor the magnets' pull moves a carriage faster than this many times the motor's full speed."
+LEAP_MM: Final = 0.1
+"Backlash, a screw that springs back and the encoder's resolution come to less than this."
+OVERRUN_MM: Final = 2.5
+"A carriage overruns its switches or its closed end by less than this."
+CLOSED_END_MM: Final = 45.0
+"The device's smallest gap: another scene may have left the carriages closer than this scene closes."
+OPEN_SWITCH_MM: Final = 0.4
+"An open switch switches this near the zero that homing found there to within 0.3 mm."
+CLOSED_SWITCH_MM: Final = 1.0
+"A closed switch closes this near the closed end: the stroke is known to 2 %."
+TOLD_S: Final = 0.02
+"The carriages' places and the switches' word may be this far apart in time."
+
+_LEFT_OPEN: Final = int(Switches.LEFT_OPEN)
+_RIGHT_OPEN: Final = int(Switches.RIGHT_OPEN)
+_LEFT_CLOSED: Final = int(Switches.LEFT_CLOSED)
+_RIGHT_CLOSED: Final = int(Switches.RIGHT_CLOSED)
+
+
+@final
+class Sight:
+    """Whether the loop is blind, told from the times of steps and of new States."""
+
+    seen_s: float = math.inf
+    "inf before the first State."
+    stalled_s: float = -math.inf
+    stall_s: float = 0.0
+    "Length of the last stall, or of the longest within SHOWN_S of each other."
+    is_blind: bool = False
+    was_blind: bool = False
+
+    def __init__(self, period_s: float) -> None:
+        self._blind_s: Final = max(BLIND_S, BLIND_PERIODS * period_s)
+
+    def has_stalled(self, now_s: float) -> bool:
+        return now_s - self.stalled_s < SHOWN_S
+
+    def is_waiting(self, now_s: float) -> bool:
+        """Tell whether the answer to the first Drive after a stall may still be on its way."""
+        return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
+
+    def update(self, last_s: float, now_s: float, is_new: bool) -> None:
+        stall_s, self.was_blind = now_s - last_s, self.is_blind
+        if stall_s > self._blind_s:
+            before_s = self.stall_s if self.has_stalled(now_s) else 0.0
+            self.seen_s, self.stalled_s, self.stall_s, self.is_blind = now_s, now_s, max(stall_s, before_s), True
+        elif is_new:
+            self.seen_s, self.is_blind = now_s, False
+        elif now_s - self.seen_s > self._blind_s:
+            self.is_blind = True
+
+
+def unsensed_s(period_s: float) -> float:
+    return max(UNSENSED_S, BLIND_PERIODS * period_s)
+
+
+@final
+class Leap(Value):
+    """A step of the encoders that no carriage can make."""
+
+    def __init__(
+        self,
+        seen_s: float,
+        left_mm: float,
+        right_mm: float,
+        within_s: float,
+        left_from_mm: float,
+        right_from_mm: float,
+    ) -> None:
+        self.seen_s: Final = seen_s
+        self.left_mm: Final = left_mm
+        self.right_mm: Final = right_mm
+        self.within_s: Final = within_s
+        self.left_from_mm: Final = left_from_mm
+        self.right_from_mm: Final = right_from_mm
+
+    def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
+        """Tell whether both carriages can have come to where they read from before the step."""
+        max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
+        return (
+            abs(measured.left_mm - self.left_from_mm) <= max_mm
+            and abs(measured.right_mm - self.right_from_mm) <= max_mm
+        )
+
+    def __str__(self) -> str:
+        return f"left {self.left_mm:+.2f} mm, right {self.right_mm:+.2f} mm within {self.within_s * 1e3:.1f} ms"
+
+
+def leap_between(
+    last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
+) -> Leap | None:
+    left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
+    within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
+    max_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
+    if -max_mm <= left_mm <= max_mm and -max_mm <= right_mm <= max_mm:
+        return None
+    return Leap(now_s, left_mm, right_mm, within_s, last.left_mm, last.right_mm)
+
+
+def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
+    min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
+    return not (min_mm <= measured.left_mm <= max_mm and min_mm <= measured.right_mm <= max_mm)
+
+
+def is_contradicted(measured: Measured, switches: int, closed_mm: float, open_mm: float) -> bool:
+    """Tell whether an end switch contradicts its carriage's place."""
+    inner_mm, home_mm = min(closed_mm, CLOSED_END_MM) / 2.0 + CLOSED_SWITCH_MM, open_mm / 2.0
+    is_left_wrong = _is_contradicted(
+        measured.left_mm, measured.left_mm_s, switches & _LEFT_OPEN, switches & _LEFT_CLOSED, inner_mm, home_mm
+    )
+    return is_left_wrong or _is_contradicted(
+        measured.right_mm, measured.right_mm_s, switches & _RIGHT_OPEN, switches & _RIGHT_CLOSED, inner_mm, home_mm
+    )
+
+
+def _is_contradicted(
+    at_mm: float, speed_mm_s: float, is_open: int, is_closed: int, inner_mm: float, home_mm: float
+) -> bool:
+    moved_mm = TOLD_S * abs(speed_mm_s)
+    near_mm = OPEN_SWITCH_MM + moved_mm
+    is_elsewhere = at_mm < home_mm - near_mm if is_open else at_mm > home_mm + near_mm
+    return is_elsewhere or (is_closed != 0 and at_mm > inner_mm + moved_mm)
 
 
 @final
@@ -64,12 +200,9 @@ class Measure:
     def forget(self) -> None:
         self.measured, self.leap, self.sight = None, None, Sight(self._period_s)
 
-    def begin(self, measurement: Measurement) -> None:
+    def begin(self, measurement: Measurement) -> Measured:
         """Replace the newest record by one of `measurement` at rest."""
-        self.measured = self._first(measurement)
-
-    def _first(self, measurement: Measurement) -> Measured:
-        return Measured(
+        self.measured = Measured(
             number=measurement.number,
             is_homed=measurement.is_homed,
             device_time_s=measurement.device_time_s,
@@ -83,10 +216,11 @@ class Measure:
             sensed_s=measurement.sensed_s,
             handle_time_s=measurement.device_time_s,
         )
+        return self.measured
 
     def _measured(self, last: Measured | None, measurement: Measurement) -> Measured:
         if last is None:
-            return self._first(measurement)
+            return self.begin(measurement)
         dt_s = measurement.device_time_s - last.device_time_s
         if measurement.number == last.number or dt_s < MIN_DT_S:
             return last
@@ -120,9 +254,6 @@ class Measure:
         # friction has one level at 42 and 300 mm/s and another at 4: a greater rate before counts as FAST_MM_S
         from_mm_s = min(before.sliding_mm_s, max(abs(rate_mm_s), FAST_MM_S))
         sliding_mm_s = from_mm_s + slid * (abs(rate_mm_s) - from_mm_s)
-        if not self._turns:
-            return Handle(max(position_mm, 0.0), rate_mm_s, before.turn, sliding_mm_s, quick_mm_s)
-        turn = before.turn.moved_to(position_mm)
-        onward = turn.direction
-        displacement_mm = turn.displacement_mm(position_mm)
-        return Handle(displacement_mm, onward * rate_mm_s, turn, sliding_mm_s, onward * quick_mm_s)
+        turn = before.turn.moved_to(position_mm) if self._turns else before.turn
+        displacement_mm = turn.displacement_mm(position_mm) if self._turns else max(position_mm, 0.0)
+        return Handle(displacement_mm, turn.direction * rate_mm_s, turn, sliding_mm_s, turn.direction * quick_mm_s)

@@ -1,15 +1,80 @@
-"""The nominal device: the field of a gap, and the model's force over the field for the handle's motion."""
+"""The nominal device: contact of hand and element, the field of a gap, and the model's force over the field.
+
+Each kind of contact states, in the model's terms, the motion that the model is asked for, `planned` ahead (a publisher
+may have told its own) and `motion_now`, and whether the latter `is_known`. Its `displacement_mm` and `rate_mm_s` are
+the motion that the portrait is drawn for. Where it `slides`, friction makes the force.
+"""
 
 import math
-from typing import Final, final
+from typing import Final, TypeAlias, final
 
-from tormagd.control.contact import ElementContact
 from tormagd.control.records import Measured, Outside, TimedSetpoint
+from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S
 from tormagd.element.model.features import FEATURES
 from tormagd.element.model.force_curve import ForceCurve, within
 from tormagd.element.model.model_file import ForceModel
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import PowerFieldLaw, flux_density_T
+
+ROLLER_RATE_MM_S: Final = 42.0
+"The thesis turns at 20 rpm; the portrait is drawn for a handle in motion."
+CREEP_MM_S: Final = 0.5
+"A slower handle is planned for at this rate, because its friction is static."
+GONE_BACK_MM: Final = 0.01
+"A handle that has gone back by more (just over one encoder count) may be turning."
+PRESSED: Final = 0.9
+"A finger that is less deep than this share of the scene's depth is on its way in or out."
+
+
+@final
+class Sliding:
+    """The sliding handle of a brake. Plans take it as moving, with its friction mobilised."""
+
+    displacement_mm: Final[float] = MOBILISED_MM
+    rate_mm_s: Final[float] = ROLLER_RATE_MM_S
+    slides: Final[bool] = True
+
+    def planned(self, told_mm: float | None, told_mm_s: float | None, measured: Measured | None) -> tuple[float, float]:
+        rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
+        # the device's fit is learned at the measured rate; at the stated rate it would describe another device
+        if told_mm_s is not None and (measured is None or not self.is_known(measured)):
+            rate_mm_s = abs(told_mm_s)
+        return MOBILISED_MM if told_mm is None else told_mm, max(rate_mm_s, CREEP_MM_S)
+
+    def motion_now(self, measured: Measured) -> tuple[float, float]:
+        return MOBILISED_MM, abs(measured.handle.rate_mm_s)
+
+    def is_known(self, measured: Measured) -> bool:
+        """Tell whether friction is mobilised, so that the model can give the present force."""
+        handle = measured.handle
+        gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
+        return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
+
+
+@final
+class Pressing:
+    """A finger that presses into a pad. Until `is_known`, the force is planned for the scene's depth, at rest."""
+
+    rate_mm_s: Final[float] = 0.0
+    slides: Final[bool] = False
+
+    def __init__(self, depth_mm: float) -> None:
+        self.displacement_mm: Final = depth_mm
+
+    def planned(self, told_mm: float | None, told_mm_s: float | None, measured: Measured | None) -> tuple[float, float]:
+        depth_mm, rate_mm_s = self.displacement_mm, 0.0
+        if measured is not None and self.is_known(measured):
+            depth_mm, rate_mm_s = self.motion_now(measured)
+        return depth_mm if told_mm is None else told_mm, rate_mm_s if told_mm_s is None else told_mm_s
+
+    def motion_now(self, measured: Measured) -> tuple[float, float]:
+        return measured.handle.displacement_mm, measured.handle.rate_mm_s
+
+    def is_known(self, measured: Measured) -> bool:
+        return measured.handle.displacement_mm >= PRESSED * self.displacement_mm
+
+
+ElementContact: TypeAlias = Sliding | Pressing
 
 
 @final
@@ -56,10 +121,8 @@ class Nominal:
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        if not self._has_rate:
-            return self.only
         displacement_mm, rate_mm_s = self.contact.motion_now(measured)
-        return self.curve(displacement_mm, rate_mm_s)
+        return self.curve(displacement_mm, rate_mm_s) if self._has_rate else self.only
 
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
@@ -67,14 +130,15 @@ class Nominal:
         """Return the force over the field for the motion to plan for, and what of it is out of range."""
         if not self._has_rate:
             return self.only, ()
-        displacement_mm, rate_mm_s = self.contact.planned(setpoint, measured)
+        told_mm = None if setpoint is None else setpoint.displacement_mm
+        told_mm_s = None if setpoint is None else setpoint.rate_mm_s
+        displacement_mm, rate_mm_s = self.contact.planned(told_mm, told_mm_s, measured)
         curve = self.curve(displacement_mm, rate_mm_s)
-        outside: tuple[Outside, ...] = ()
-        if curve.displacement_mm != displacement_mm:
-            outside = (Outside(FEATURES[0], displacement_mm, curve.displacement_mm),)
-        if curve.rate_mm_s != rate_mm_s:
-            outside = (*outside, Outside(FEATURES[1], rate_mm_s, curve.rate_mm_s))
-        return curve, outside
+        known_mm, known_mm_s = curve.displacement_mm, curve.rate_mm_s
+        return curve, (
+            ((Outside(FEATURES[0], displacement_mm, known_mm),) if known_mm != displacement_mm else ())
+            + ((Outside(FEATURES[1], rate_mm_s, known_mm_s),) if known_mm_s != rate_mm_s else ())
+        )
 
     def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from tormagd.control.assembly.conditions import is_busy, is_homed
 from tormagd.control.core import Stepper
-from tormagd.control.move.opening import is_open
+from tormagd.control.move.routines import is_open
 from tormagd.control.records import Duty, Plan
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import (

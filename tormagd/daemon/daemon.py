@@ -12,7 +12,6 @@ import msgspec
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.control.assembly.profile import gains_of
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.daemon.answers import Answers
@@ -24,7 +23,7 @@ from tormagd.daemon.commands import Commands
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.profiles import ProfileFolder, Profiles, state_folder
+from tormagd.daemon.profiles import ProfileFolder, Profiles, gains_of, state_folder
 from tormagd.daemon.rate_group import ERROR_PERIODS, Histogram
 from tormagd.daemon.realtime import Heartbeat, freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread

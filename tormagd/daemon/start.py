@@ -10,7 +10,7 @@ import msgspec
 import uvloop
 
 from tormagd.config import Config, load_config
-from tormagd.control.assembly.build import Core, approaches_s, at_rates_of, build_core, least_resolution_N
+from tormagd.control.assembly.build import STANDBY_N, Core, build_core, least_resolution_N
 from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.daemon import Daemon
 from tormagd.daemon.profiles import state_folder
@@ -20,6 +20,7 @@ from tormagd.ground.access_keys import KeyRing
 from tormagd.ground.terminal import write_answer, write_line
 from tormagd.ground.toml_file import placed
 from tormagd.hardware.backend import Backend, choose, installed
+from tormagd.scenes.measured import at_rates_of
 from tormagd.scenes.scene import load_scene
 from tormagd_client.endpoints import ENDPOINTS, ConfigError
 from tormagd_client.printable import printable
@@ -90,8 +91,18 @@ def _resolved(config: Config, core: Core, options: msgspec.Struct) -> str:
             "least_resolution_N": least_resolution_N(core.portrait, core.scene.force.most_N),
             "missed_rms_N": None if core.missed is None else core.missed.rms_N,
             "missed_share": None if core.missed is None else core.missed.share,
-            "approaches_s": approaches_s(core),
+            "approaches_s": _approaches_s(core),
         },
         "backends": {name: reason or "loads" for name, reason in installed().items()},
     }
     return msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode()
+
+
+def _approaches_s(core: Core) -> list[tuple[float, float]]:
+    """Return forces at which a brake may wait, N, and how long the gap takes from there to the middle force, s."""
+    if core.scene.element == "tactile":
+        return []
+    reach, force = core.portrait, core.scene.force
+    waits_N = [max(force.waiting_N, reach.min_N), *(reach.min_N + share * STANDBY_N for share in (1 / 3, 2 / 3, 1.0))]
+    middle_mm = reach.gap_mm_at((waits_N[0] + force.most_N) / 2.0)
+    return [(wait_N, (reach.gap_mm_at(wait_N) - middle_mm) / core.gap_speeds.sure_mm_s) for wait_N in waits_N]

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from tormagd.config import Config
-from tormagd.control.assembly.belief import beliefs
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Limit
 from tormagd.daemon.beat import Beat
@@ -22,7 +21,7 @@ from tormagd.daemon.rate_group import Histogram, RateGroup
 from tormagd.daemon.verdict import CANNOT, ForceDelay, Judged, judged
 from tormagd.record.force_following import Following
 from tormagd.record.journal import TOLD
-from tormagd.record.telemetry import Moment, snapshot
+from tormagd.record.telemetry import Moment, beliefs, snapshot
 from tormagd.record.ticks import encode_ticks
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, VERSION, Motion, Telemetry, Verdict
 

@@ -16,8 +16,8 @@ from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor_zero import Level
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner, Stepper
-from tormagd.control.move.reference import Reference
-from tormagd.control.plausible import Leap
+from tormagd.control.measure import Leap
+from tormagd.control.move.actuator import Reference
 from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState

@@ -10,8 +10,10 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from tormagd.config import Config
 from tormagd.ground.files import read_bounded
-from tormagd.scenes.scene import Bandwidth, Scene, scene_path
+from tormagd.scenes.scene import MIN_CONTROL_HZ, Bandwidth, Scene, scene_path
+from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import require
 
 TOLERATED = 0.8
@@ -178,3 +180,19 @@ def measured(scene: Scene, name: str) -> MeasuredScene | None:
         if found.fingerprint == scene.fingerprint:
             return found
     return None
+
+
+def at_rates_of(scene: Scene, config: Config) -> Config:
+    if not config.rates.of_scene:
+        return config
+    found = measured(scene, config.scene)
+    least, chosen = scene.bandwidth, scene.bandwidth if found is None else found.chosen.way
+    rates = msgspec.structs.replace(
+        config.rates,
+        control_hz=max(least.control_hz, chosen.control_hz, MIN_CONTROL_HZ),
+        inference_hz=max(least.inference_hz, chosen.inference_hz),
+    )
+    try:
+        return msgspec.structs.replace(config, rates=rates)
+    except ValueError as error:
+        raise ConfigError(f"scene {scene.name}: rates.of_scene: {error}") from error

@@ -16,7 +16,7 @@ from firmware_protocol.value import Value
 from tormagd.config import Config
 from tormagd.control.assembly.conditions import conditions
 from tormagd.control.core import Planner, Stepper
-from tormagd.control.move.reference import Reference
+from tormagd.control.move.actuator import Reference
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState
 from tormagd.element.inverse.solution import Question

@@ -9,8 +9,7 @@ from typing import Final, final
 
 from tormagd.control.assembly.build import Core
 from tormagd.control.core import Stepper
-from tormagd.control.move.actuator import Actuator, Drive
-from tormagd.control.move.reference import Reference, target_of
+from tormagd.control.move.actuator import Actuator, Drive, Reference, target_of
 from tormagd.control.records import Measured, Plan
 from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement
@@ -60,7 +59,7 @@ class IdealCarriages(Actuator):
         gap_mm = min(max(wanted_mm, before_mm - closed_mm), before_mm + opened_mm)
         put_gap(self._plant, gap_mm)
         self.reference = Reference(gap_mm, (gap_mm - before_mm) / dt_s)
-        return Drive(0.0, 0.0, 0.0, 0.0, [] if gap_mm == wanted_mm else [Limit.RATE])
+        return Drive(0.0, 0.0, 0.0, 0.0, () if gap_mm == wanted_mm else (Limit.RATE,))
 
 
 def ideal_stepper(core: Core, plant: Plant) -> Stepper:

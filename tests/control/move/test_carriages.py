@@ -6,9 +6,9 @@ import pytest
 
 from firmware_protocol.codec import DriveMode, Switches
 from tormagd.config import Config
-from tormagd.control.move.carriages import EXCHANGE_S, MAX_ACCELERATION_SCALE
+from tormagd.control.move.actuator import CARRY_S
+from tormagd.control.move.carriages import APPROACH_S, EXCHANGE_S, MAX_ACCELERATION_SCALE
 from tormagd.control.move.motor import electrical_time_s, pull_V
-from tormagd.control.move.reference import APPROACH_S, CARRY_S
 from tormagd.control.safety.codes import Limit
 
 CONFIG = Config()

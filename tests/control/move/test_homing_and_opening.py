@@ -4,8 +4,7 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Config
-from tormagd.control.move.homing import BACKS_OFF_MM, LONGEST_S, Homing
-from tormagd.control.move.opening import LATE_S, OPEN_MM, Opening, is_open
+from tormagd.control.move.routines import BACKS_OFF_MM, LATE_S, LONGEST_S, OPEN_MM, Homing, Opening, is_open
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import SafetyState, latch
 from tormagd.hardware.measurement import DeviceRequest

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 
 from tormagd.config import Config, Position
+from tormagd.control.move.actuator import Reference
+from tormagd.control.move.carriages import Expected, follow
 from tormagd.control.move.motor import full_speed_mm_s
-from tormagd.control.move.reference import Expected, Reference, follow
 from tormagd.control.records import GapSpeeds
 
 DT_S = 1e-3

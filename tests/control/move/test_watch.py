@@ -5,9 +5,9 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Config
+from tormagd.control.measure import UNSENSED_S
 from tormagd.control.move.watch import SENSE_FAULT_S, STARTING_S, STATUS_FAULT_S
 from tormagd.control.safety.codes import Fault, Limit
-from tormagd.control.sight import UNSENSED_S
 from tormagd.hardware.link_statistics import LinkQuality
 
 PERIOD_S = 1e-3

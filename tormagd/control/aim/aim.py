@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, final
 import numpy as np
 
 from tormagd.config import Config
-from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, lawful_mT, least_mm
+from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, least_mm
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.strength import DeviceFit
@@ -95,24 +95,22 @@ class Aim:
         curve, outside = self._element.nominal.planned(None if ask.asked_N is None else setpoint, measured)
         wanted_N = device.model_N(ask.path_N[0])
         solution = self._solution(now_s, curve, wanted_N)
-        element_mT = lawful_mT(self._element.law, wanted_N, solution.field_mT)
+        law = self._element.law
+        element_mT = solution.field_mT if law is None else law.held_mT(solution.field_mT, wanted_N)
         if element_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = within(self._element.field.gap_mm(field_mT), self._range_mm)
-        if before is not None:
-            wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
+        wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
         min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
-        self.number += 1
         self.element_mT = field_mT - memory.lag_mT
-        limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
-        gaps_mm = max(wanted_mm, min_mm), min_mm
-        return self._plan(now_s, setpoint, ask, belief, field_mT, gaps_mm, solution.confidence, limits, outside)
+        self.number += 1
+        return self._plan(now_s, setpoint, ask, belief, field_mT, wanted_mm, min_mm, solution, outside)
 
-    def _reached_mm(self, wanted_mm: float, before: Plan, now_s: float, ask: Ask, device: DeviceFit) -> float:
+    def _reached_mm(self, wanted_mm: float, before: Plan | None, now_s: float, ask: Ask, device: DeviceFit) -> float:
         """Return how far the gap gets from the plan `before`, besides what the setpoint leaps."""
-        if before.setpoint_N is None or ask.asked_N is None:
+        if before is None or before.setpoint_N is None or ask.asked_N is None:
             return wanted_mm
         portrait = self._portrait
         leap_mm = abs(portrait.gap_for_mm(ask.asked_N, device) - portrait.gap_for_mm(before.setpoint_N, device))
@@ -140,9 +138,9 @@ class Aim:
         ask: Ask,
         belief: Belief,
         field_mT: float,
-        gaps_mm: tuple[float, float],
-        confidence: float,
-        limits: tuple[Limit, ...],
+        wanted_mm: float,
+        min_mm: float,
+        solution: FieldSolution,
         outside: tuple[Outside, ...],
     ) -> Plan:
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
@@ -155,13 +153,13 @@ class Aim:
             governed_N=ask.force_N,
             predicted_N=belief.predicted_N,
             field_mT=field_mT,
-            gap_mm=gaps_mm[0],
+            gap_mm=max(wanted_mm, min_mm),
             gap_speed_mm_s=speed_mm_s,
-            confidence=confidence,
-            limits=limits,
+            confidence=solution.confidence,
+            limits=self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution),
             gap_acceleration_mm_s2=acceleration_mm_s2,
             foresight=ask.foresight,
-            min_gap_mm=gaps_mm[1],
+            min_gap_mm=min_mm,
             outside=outside,
             sensor_doubted_s=belief.sensor_doubted_s,
             trim=ask.force_N / model_N if model_N > 0.0 else belief.at_speed.scale,
@@ -178,11 +176,11 @@ class Aim:
         solution: FieldSolution,
     ) -> tuple[Limit, ...]:
         limits = (
-            *ask.limits,
-            *believed,
-            *((Limit.MODEL_RANGE,) if outside else ()),
-            *((Limit.CEILING,) if is_held else ()),
-            *((Limit.LOW_CONFIDENCE,) if solution.confidence < self._low_confidence else ()),
+            ask.limits
+            + believed
+            + ((Limit.MODEL_RANGE,) if outside else ())
+            + ((Limit.CEILING,) if is_held else ())
+            + ((Limit.LOW_CONFIDENCE,) if solution.confidence < self._low_confidence else ())
         )
         # where nobody asks for a force, none is held back for being too low
         if solution.reach is _INSIDE or (ask.asked_N is None and solution.reach is not Reach.ABOVE):

@@ -15,6 +15,10 @@ from tormagd.element.model.force_curve import ForceCurve
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
+CEILING: Final = 1.25
+"The gap stays where the device surely gives no more than this many times the scene's greatest force."
+LAW_SHARE: Final = 0.12
+"On sample 1 the search's field differs from the force law's by 1 to 11%."
 
 
 @final
@@ -27,16 +31,10 @@ class Portrait:
         self.gap_mm: Final = gap_mm
         self.force_N: Final = force_N
         self.slope_N_mm: Final = slope_N_mm
+        self.min_N: Final = force_N[0]
+        self.max_N: Final = force_N[-1]
         self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
         self._rising_N: Final = Rising(force_N)
-
-    @property
-    def min_N(self) -> float:
-        return self.force_N[0]
-
-    @property
-    def max_N(self) -> float:
-        return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
         return interpolated(force_N, self._rising_N, self.slope_N_mm)
@@ -72,10 +70,9 @@ class PortraitSearch:
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
         field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
-        min_N, max_N = shown.min_N, shown.max_N
-        if min_N <= force_N <= max_N:
+        if shown.min_N <= force_N <= shown.max_N:
             return FieldSolution(field_mT, force_N, 1.0, 1, Reach.INSIDE)
-        nearest_N, reach = (min_N, Reach.BELOW) if force_N < min_N else (max_N, Reach.ABOVE)
+        nearest_N, reach = (shown.min_N, Reach.BELOW) if force_N < shown.min_N else (shown.max_N, Reach.ABOVE)
         return FieldSolution(field_mT, nearest_N, curve.confidence(field_mT, force_N - nearest_N), 1, reach)
 
 
@@ -87,8 +84,9 @@ class LawOfField:
         self._rising_N: Final = Rising(force_N)
         self.fields_mT: Final = fields_mT
 
-    def field_mT(self, force_N: float) -> float:
-        return interpolated(force_N, self._rising_N, self.fields_mT)
+    def held_mT(self, field_mT: float, force_N: float) -> float:
+        law_mT = interpolated(force_N, self._rising_N, self.fields_mT)
+        return min(max(field_mT, (1.0 - LAW_SHARE) * law_mT), (1.0 + LAW_SHARE) * law_mT)
 
 
 def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
@@ -99,12 +97,6 @@ def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, fl
     slopes: list[float] = np.abs(np.gradient(forces_N, gaps)).tolist()
     force_N: list[float] = forces_N.tolist()
     return Portrait(gap_mm, force_N, slopes)
-
-
-CEILING: Final = 1.25
-"The gap stays where the device surely gives no more than this many times the scene's greatest force."
-LAW_SHARE: Final = 0.12
-"On sample 1 the search's field differs from the force law's by 1 to 11%."
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Trim) -> float:
@@ -118,10 +110,3 @@ def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Trim)
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: Trim) -> float:
     """Return the least gap at which the device surely gives no more than `ceiling_N`."""
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
-
-
-def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:
-    if law is None:
-        return field_mT
-    law_mT = law.field_mT(wanted_N)
-    return min(max(field_mT, (1.0 - LAW_SHARE) * law_mT), (1.0 + LAW_SHARE) * law_mT)

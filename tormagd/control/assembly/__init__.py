@@ -1,1 +1,1 @@
-"""Assembly: the core built for a scene, the conditions of commands, and the core's journal, profile and beliefs."""
+"""Assembly: the core built for a scene, and the conditions of commands."""

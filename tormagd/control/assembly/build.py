@@ -18,10 +18,9 @@ from tormagd.config import Config
 from tormagd.control.aim.aim import Element
 from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, PortraitSearch, portrait
 from tormagd.control.assembly.renderable import Missed, missed
-from tormagd.control.contact import PRESSED, ElementContact, Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.move.motor import Margins, gap_speeds, margins, most_closing_mm_s, pull_V
-from tormagd.control.nominal import FieldOfGap, Nominal
+from tormagd.control.nominal import PRESSED, ElementContact, FieldOfGap, Nominal, Pressing, Sliding
 from tormagd.control.records import GapSpeeds
 from tormagd.element.inverse.choice import BESIDE_PLANS, Choice, build, mean_error_N, named
 from tormagd.element.model.features import FEATURES
@@ -31,14 +30,15 @@ from tormagd.element.physics.errors import DomainError, require
 from tormagd.element.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
 from tormagd.element.physics.force import Geometry, brake_force_N
 from tormagd.element.physics.inserts import insert
-from tormagd.scenes.measured import measured
-from tormagd.scenes.scene import AND_UNMET, AUTO, MIN_CONTROL_HZ, Finger, Scene, load_scene, scene_path
+from tormagd.scenes.scene import AND_UNMET, AUTO, Finger, Scene, load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
 MIN_PHASE_MARGIN_DEG = 30.0
 MIN_GAIN_MARGIN_DB = 4.0
-SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("element", "scenes", "hardware", "control")))
+ROOT = Path(__file__).parents[3]
+SOURCES = ("firmware_protocol", "tormagd/element", "tormagd/scenes", "tormagd/hardware", "tormagd/control")
+"The rooms of all that `plan` and `step` run."
 SENSED_N = 0.001
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "Friction holds the gap to within four counts of the encoders."
@@ -144,10 +144,10 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
 
 def sources_hash() -> str:
     """Return the SHA-256 of all sources that `plan` and `step` run."""
-    root, digest = Path(__file__).parents[2], hashlib.sha256()
+    digest = hashlib.sha256()
     for room in SOURCES:
-        for path in sorted((root / room).glob("**/*.py")):
-            digest.update(f"{path.relative_to(root).as_posix()} {path.stat().st_size}\n".encode())
+        for path in sorted((ROOT / room).glob("**/*.py")):
+            digest.update(f"{path.relative_to(ROOT).as_posix()} {path.stat().st_size}\n".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -251,22 +251,6 @@ def _out_of_reach(scene: Scene, reach: Portrait) -> Iterator[str]:
         )
 
 
-def at_rates_of(scene: Scene, config: Config) -> Config:
-    if not config.rates.of_scene:
-        return config
-    found = measured(scene, config.scene)
-    least, chosen = scene.bandwidth, scene.bandwidth if found is None else found.chosen.way
-    rates = msgspec.structs.replace(
-        config.rates,
-        control_hz=max(least.control_hz, chosen.control_hz, MIN_CONTROL_HZ),
-        inference_hz=max(least.inference_hz, chosen.inference_hz),
-    )
-    try:
-        return msgspec.structs.replace(config, rates=rates)
-    except ValueError as error:
-        raise ConfigError(f"scene {scene.name}: rates.of_scene: {error}") from error
-
-
 def _slowed(config: Config, scene: Scene) -> Config:
     """Return the configuration with a gap no faster than the scene lets it move. Raises ConfigError."""
     most, asked_mm_s = gap_speeds(config), scene.insert.gap_speed_mm_s
@@ -279,16 +263,6 @@ def _slowed(config: Config, scene: Scene) -> Config:
         return config
     slowed = {"gap_speed_mm_s": min(most.opening_mm_s, asked_mm_s), "closing_mm_s": min(most.closing_mm_s, asked_mm_s)}
     return msgspec.structs.replace(config, position=msgspec.structs.replace(config.position, **slowed))
-
-
-def approaches_s(core: Core) -> list[tuple[float, float]]:
-    """Return forces at which a brake may wait, N, and how long the gap takes from there to the middle force, s."""
-    if core.scene.element == "tactile":
-        return []
-    reach, force = core.portrait, core.scene.force
-    waits_N = [max(force.waiting_N, reach.min_N), *(reach.min_N + share * STANDBY_N for share in (1 / 3, 2 / 3, 1.0))]
-    middle_mm = reach.gap_mm_at((waits_N[0] + force.most_N) / 2.0)
-    return [(wait_N, (reach.gap_mm_at(wait_N) - middle_mm) / core.gap_speeds.sure_mm_s) for wait_N in waits_N]
 
 
 def least_resolution_N(reach: Portrait, most_N: float) -> float:
@@ -361,9 +335,7 @@ def _too_sudden(config: Config, scene: Scene, reach: Portrait) -> Iterator[str]:
 
 
 def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    wanted = scene.solver
-    if wanted.name == AUTO:
-        if not scene.terms.rate:
-            return IN_PORTRAIT
-        return BY_NEWTON if rises else SEVERAL_BRANCHES
-    return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)
+    wanted, searched = scene.solver, BY_NEWTON if rises else SEVERAL_BRANCHES
+    if wanted.name != AUTO:
+        return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)
+    return searched if scene.terms.rate else IN_PORTRAIT

@@ -19,10 +19,10 @@ from tormagd.control.believe.sensor import DOUBTED_S, KNOWN_N, NAMED_S, SLACK_N,
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
 from tormagd.control.believe.strength import MIDDLE_N, SURE, UNSEEN, Anchor, DeviceFit, adapting_s, observe
+from tormagd.control.measure import unsensed_s
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Belief, Measured
 from tormagd.control.safety.codes import Limit
-from tormagd.control.sight import unsensed_s
 from tormagd.element.model.displacement import MOVING_MM_S
 from tormagd.scenes.scene import Scene
 

@@ -1,13 +1,24 @@
 """The interface to what moves the gap: a plan in, two duties out, and what is known of the motion."""
 
-import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.control.move.reference import Reference
 from tormagd.control.records import Measured, Plan
 from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement
+
+CARRY_S: Final = 0.012
+"A plan's gap is carried on for no more than three inference periods."
+
+
+@final
+class Reference(Value):
+    """A place to drive the gap to, with its speed and acceleration."""
+
+    def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, acceleration_mm_s2: float = 0.0) -> None:
+        self.gap_mm: Final = gap_mm
+        self.speed_mm_s: Final = speed_mm_s
+        self.acceleration_mm_s2: Final = acceleration_mm_s2
 
 
 @final
@@ -28,7 +39,7 @@ class Drive(Value):
     """The duties of one tick, and the limits that held the gap back."""
 
     def __init__(
-        self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: list[Limit]
+        self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: tuple[Limit, ...]
     ) -> None:
         self.left_duty: Final = left_duty
         self.right_duty: Final = right_duty
@@ -47,10 +58,6 @@ class Actuator:
 
     def __init__(self) -> None:
         self.acted = Acted()
-
-    @property
-    def reference_mm(self) -> float:
-        return math.nan if self.reference is None else self.reference.gap_mm
 
     def begin(self, gap_mm: float) -> None:
         """Begin to drive at the gap `gap_mm`, at rest."""
@@ -86,3 +93,16 @@ class Actuator:
         self.stop()
         self.lose_device()
         self.acted.not_finite += 1
+
+
+def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
+    """Return where `plan` leads `lag_s` from now, when the present duty takes effect."""
+    age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + lag_s
+    gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
+    speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
+    acceleration_mm_s2 = plan.gap_acceleration_mm_s2
+    if gap_mm < floor_mm:
+        gap_mm, speed_mm_s, acceleration_mm_s2 = floor_mm, max(speed_mm_s, 0.0), max(acceleration_mm_s2, 0.0)
+    if gap_mm > open_mm:
+        gap_mm, speed_mm_s, acceleration_mm_s2 = open_mm, min(speed_mm_s, 0.0), min(acceleration_mm_s2, 0.0)
+    return Reference(gap_mm, speed_mm_s, acceleration_mm_s2)

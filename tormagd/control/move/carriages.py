@@ -10,10 +10,10 @@ import math
 from typing import Final, final
 
 from tormagd.config import Config
-from tormagd.control.move.actuator import Actuator, Drive
+from tormagd.control.interpolation import low_pass
+from tormagd.control.move.actuator import Actuator, Drive, Reference, target_of
 from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, gap_speeds, mechanical_time_s, pull_V
 from tormagd.control.move.pid import Pid
-from tormagd.control.move.reference import Expected, Reference, follow, target_of
 from tormagd.control.records import GapSpeeds, Measured, Plan
 from tormagd.control.safety.codes import Limit
 from tormagd.hardware.measurement import Measurement
@@ -33,6 +33,61 @@ SCALE_PER_MM_S: Final = 100.0
 "Growth per second and mm that carriages are ahead while acceleration limits them."
 LAGGING_MM: Final = 0.1
 "The speed limit is reported as RATE where the reference is this far behind its target."
+APPROACH_S: Final = 0.01
+"With less the reference would chase every quantum of its target."
+MIN_BRAKING: Final = 0.2
+"Share of the acceleration that is left to brake with, however hard the target turns."
+
+
+def follow(
+    acceleration_mm_s2: float,
+    reference: Reference,
+    target: Reference,
+    dt_s: float,
+    speeds: GapSpeeds,
+    floor_mm: float = -math.inf,
+) -> tuple[Reference, bool, bool]:
+    """Return the reference `dt_s` later, and whether its speed and its acceleration held it back."""
+    distance = target.gap_mm - reference.gap_mm
+    relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
+    relative = max(relative, MIN_BRAKING * acceleration_mm_s2)
+    closing = math.copysign(_stopping_mm_s(abs(distance), relative, dt_s), distance)
+    wanted = target.speed_mm_s + closing
+    wanted = max(wanted, -_stopping_mm_s(max(reference.gap_mm - floor_mm, 0.0), acceleration_mm_s2, dt_s))
+    bounded = min(max(wanted, -speeds.sure_mm_s), speeds.opening_mm_s)
+    share = min(abs(reference.speed_mm_s) / speeds.no_load_mm_s, 1.0)
+    speeding_up = acceleration_mm_s2 * (1.0 - share)
+    braking = acceleration_mm_s2 * (1.0 + share if reference.speed_mm_s * distance < 0.0 else 1.0)
+    up, down = (speeding_up, braking) if reference.speed_mm_s > 0.0 else (braking, speeding_up)
+    asked = (bounded - reference.speed_mm_s) / dt_s
+    chosen = min(max(asked, -down), up)
+    speed = reference.speed_mm_s + chosen * dt_s
+    return Reference(reference.gap_mm + speed * dt_s, speed, chosen), bounded != wanted, chosen != asked
+
+
+def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> float:
+    """Return the greatest speed from which `distance_mm` suffices to stop in steps of `dt_s`."""
+    change = braking_mm_s2 * dt_s
+    fastest = (math.sqrt(change * change + 8.0 * braking_mm_s2 * distance_mm) - change) / 2.0
+    return min(fastest, distance_mm / max(APPROACH_S, dt_s))
+
+
+@final
+class Expected:
+    """Where the carriages are expected: the reference with its jerk limited."""
+
+    gap_mm: float = 0.0
+    speed_mm_s: float = 0.0
+    filtered_mm_s: float = 0.0
+    "Filtered like the measured speeds."
+
+    def begin(self, gap_mm: float, speed_mm_s: float = 0.0) -> None:
+        self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
+
+    def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
+        self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
+        self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)
+        self.filtered_mm_s = low_pass(self.filtered_mm_s, self.speed_mm_s, dt_s, filter_s)
 
 
 @final
@@ -44,7 +99,6 @@ class Carriages(Actuator):
         self.left, self.right = Pid(position), Pid(position)
         self._position: Final = position
         self._duty_limit: Final = position.duty_limit
-        self._derivative_time_s: Final = position.derivative_time_s
         self._derivative_filter_s: Final = position.derivative_filter_s
         self._synchronisation: Final = position.synchronisation
         self._gap_acceleration_mm_s2: Final = position.gap_acceleration_mm_s2
@@ -85,9 +139,8 @@ class Carriages(Actuator):
         # a homed carriage may be found beyond the closed end
         nearest_mm = max(self.reference.gap_mm, self._closed_mm)
         pull = pull_V(self._pull_V, nearest_mm) / self._supply_V if self._has_motor else 0.0
-        limits: list[Limit] = []
-        reference, is_slewed = self._follow(
-            self.reference, now_s, dt_s, plan, self._speeds(pull, measured), measured, is_over, limits
+        reference, is_late, is_slewed = self._follow(
+            self.reference, now_s, dt_s, plan, self._speeds(pull, measured), measured, is_over
         )
         self.reference = reference
         # each carriage also takes half of the skew as an error, so that the faster one waits
@@ -104,7 +157,8 @@ class Carriages(Actuator):
         # at its open switch the firmware gives a carriage no opening duty: the loop must neither wind up nor saturate
         left = self.left.update(left_mm, left_mm_s, ahead, dt_s, measurement.is_left_open)
         right = self.right.update(right_mm, right_mm_s, ahead, dt_s, measurement.is_right_open)
-        return self._drive(left, right, measurement.supply_V, limits)
+        held = ((Limit.OVER_FORCE,) if is_over else ()) + ((Limit.RATE,) if is_late else ())
+        return self._drive(left, right, measurement.supply_V, held)
 
     def _follow(
         self,
@@ -115,27 +169,26 @@ class Carriages(Actuator):
         speeds: GapSpeeds,
         measured: Measured,
         is_over: bool,
-        limits: list[Limit],
-    ) -> tuple[Reference, bool]:
-        """Return the reference `dt_s` later, and whether its acceleration limit acted."""
+    ) -> tuple[Reference, bool, bool]:
+        """Return the reference `dt_s` later, whether its speed limit keeps it behind, and whether that of its
+        acceleration acted.
+        """
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
             target = target_of(plan, now_s, self._lag_s, floor_mm, self._open_mm)
         if is_over:
             target = Reference(self._open_mm)
-            limits.append(Limit.OVER_FORCE)
         ahead_mm, wanted_mm = self.expected.gap_mm - measured.gap_mm, target.gap_mm - measured.gap_mm
         is_wrong_way = reference.speed_mm_s * wanted_mm < 0.0
         if is_wrong_way and ahead_mm * wanted_mm < 0.0 and abs(ahead_mm) > LAGGING_MM:
             reference = self._begun_at(measured)
         max_mm_s2 = self.acceleration_scale * self._gap_acceleration_mm_s2
         reference, is_limited, is_slewed = follow(max_mm_s2, reference, target, dt_s, speeds, floor_mm)
-        if plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
-            limits.append(Limit.RATE)
+        is_late = plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM
         self.acted.rate += is_limited
         self.acted.slew += is_slewed
-        return reference, is_slewed
+        return reference, is_late, is_slewed
 
     def _begun_at(self, measured: Measured) -> Reference:
         most_mm_s = self._gap_speeds.no_load_mm_s
@@ -159,7 +212,7 @@ class Carriages(Actuator):
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
             return
         # a carriage that did not get as far as it should is not ahead because it need not come back as far
-        behind_mm = error_mm + self._derivative_time_s * error_mm_s
+        behind_mm = error_mm + self._position.derivative_time_s * error_mm_s
         ahead_mm = -math.copysign(1.0, reference.speed_mm_s) * behind_mm
         scale = self.acceleration_scale + SCALE_PER_MM_S * ahead_mm * dt_s
         self.acceleration_scale = min(max(scale, 1.0), MAX_ACCELERATION_SCALE)
@@ -177,12 +230,10 @@ class Carriages(Actuator):
         inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
         return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
-    def _drive(self, left: float, right: float, supply_V: float, limits: list[Limit]) -> Drive:
+    def _drive(self, left: float, right: float, supply_V: float, held: tuple[Limit, ...]) -> Drive:
         is_saturated = self.left.is_saturated or self.right.is_saturated
-        if is_saturated:
-            limits.append(Limit.SATURATED)
         scale, limit = self._supply_V / max(supply_V, 0.5 * self._supply_V), self._duty_limit
         left_duty, right_duty = left * scale, right * scale
         self.acted.range += is_saturated or max(abs(left_duty), abs(right_duty)) > limit
         left_duty, right_duty = min(max(left_duty, -limit), limit), min(max(right_duty, -limit), limit)
-        return Drive(left_duty, right_duty, left, right, limits)
+        return Drive(left_duty, right_duty, left, right, held + ((Limit.SATURATED,) if is_saturated else ()))

@@ -6,12 +6,12 @@ from typing import Final, final
 from firmware_protocol.codec import DeviceMode
 from tormagd.config import Config
 from tormagd.control.believe.strength import SCALE_SD
+from tormagd.control.measure import Leap, Sight, is_contradicted, is_outside, unsensed_s
+from tormagd.control.move.actuator import Reference
 from tormagd.control.move.motor import delay_margin_s
-from tormagd.control.plausible import Leap, is_contradicted, is_outside
 from tormagd.control.records import Measured
 from tormagd.control.safety.codes import Fault, Limit, device_faults
 from tormagd.control.safety.operating_state import Conditions, SafetyState
-from tormagd.control.sight import Sight, unsensed_s
 from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.scene import Scene
 
@@ -73,20 +73,20 @@ class Watch:
     right_duty: float = 0.0
 
     def __init__(self, config: Config, scene: Scene) -> None:
-        limits, device, period_s = config.limits, config.device, 1.0 / config.rates.control_hz
+        limits, period_s = config.limits, 1.0 / config.rates.control_hz
         bears_s = delay_margin_s(config.motor, config.position, period_s)
-        self._max_apart_mm: Final = limits.skew_fault_mm
-        self._max_round_trip_s: Final = period_s + TOO_SLOW_SHARE * bears_s
-        self._slow_s: Final = period_s + SLOW_SHARE * bears_s
-        self._period_s: Final = period_s
-        self._unsensed_s: Final = unsensed_s(period_s)
+        self._skew_fault_mm: Final = limits.skew_fault_mm
         self._skew_warning_mm: Final = limits.skew_warning_mm
         self._following_error_mm: Final = limits.following_error_mm
         self._following_time_s: Final = limits.following_time_s
         self._no_motion_duty: Final = limits.no_motion_duty
         self._no_motion_time_s: Final = limits.no_motion_time_s
-        self._measurement_timeout_s: Final = device.measurement_timeout_ms * 1e-3
-        self._longest_own_stall_s: Final = STALL_SHARE * device.command_timeout_ms * 1e-3
+        self._max_round_trip_s: Final = period_s + TOO_SLOW_SHARE * bears_s
+        self._slow_s: Final = period_s + SLOW_SHARE * bears_s
+        self._period_s: Final = period_s
+        self._unsensed_s: Final = unsensed_s(period_s)
+        self._measurement_timeout_s: Final = config.device.measurement_timeout_ms * 1e-3
+        self._longest_own_stall_s: Final = STALL_SHARE * config.device.command_timeout_ms * 1e-3
         self._range_mm: Final = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
         self._slides: Final = scene.element == "torque"
         # devices not yet seen differ by SCALE_SD: a scene that tolerates that does without the sensor
@@ -100,7 +100,7 @@ class Watch:
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
-            most_apart_mm=self._max_apart_mm,
+            most_apart_mm=self._skew_fault_mm,
             most_round_trip_s=self._max_round_trip_s,
             most_clock_drift=CLOCK_FAULT,
         )
@@ -121,39 +121,37 @@ class Watch:
         leap: Leap | None,
         sensor_doubted_s: float,
     ) -> tuple[Fault, ...]:
-        faults = self._of_device(now_s, safety, measurement, sight)
+        shown = self._of_device(now_s, safety, measurement, sight)
         if leap is not None:
-            if measurement.reported_s > leap.seen_s:  # the device was not reset in between: its Status would say so
-                faults.append(Fault.ENCODER)
+            # the device was not reset in between: its Status would say so
+            shown += (Fault.ENCODER,) if measurement.reported_s > leap.seen_s else ()
         elif not safety.needs_homing and self._is_misplaced(measurement, measured, sight):
-            faults.append(Fault.OUT_OF_STROKE)
-        if safety.is_driven:
-            faults += self._of_link(now_s, measurement, sight)
-            if leap is None:  # after a leap positions say nothing about the motion
-                faults += self._of_motion(measured, sensor_doubted_s)
-                if measurement.mode is not _DEVICE_RUN and not faults and now_s - self.enabled_s > STARTING_S:
-                    faults.append(Fault.DEVICE_NOT_RUNNING)
-        return tuple(faults)
+            shown += (Fault.OUT_OF_STROKE,)
+        if not safety.is_driven:
+            return shown
+        shown += self._of_link(now_s, measurement, sight)
+        if leap is not None:  # after it positions say nothing about the motion
+            return shown
+        shown += self._of_motion(measured, sensor_doubted_s)
+        is_running = measurement.mode is _DEVICE_RUN or now_s - self.enabled_s <= STARTING_S
+        return shown if shown or is_running else (Fault.DEVICE_NOT_RUNNING,)
 
-    def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
-        limits: list[Limit] = []
-        if abs(measured.skew_mm) > self._skew_warning_mm:
-            limits.append(Limit.SKEW)
-        if sight.has_stalled(now_s):
-            limits.append(Limit.HOST_STALL)
-        if now_s - measurement.sensed_s > self._unsensed_s:
-            limits.append(Limit.SENSE_STALE)
+    def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> tuple[Limit, ...]:
         link = measurement.link
-        if link.is_lossy or link.round_trip_s > self._slow_s:
-            limits.append(Limit.LINK_DEGRADED)
-        if abs(link.clock_drift) > CLOCK_OFF:
-            limits.append(Limit.CLOCK)
-        return limits
+        return (
+            ((Limit.SKEW,) if abs(measured.skew_mm) > self._skew_warning_mm else ())
+            + ((Limit.HOST_STALL,) if sight.has_stalled(now_s) else ())
+            + ((Limit.SENSE_STALE,) if now_s - measurement.sensed_s > self._unsensed_s else ())
+            + ((Limit.LINK_DEGRADED,) if link.is_lossy or link.round_trip_s > self._slow_s else ())
+            + ((Limit.CLOCK,) if abs(link.clock_drift) > CLOCK_OFF else ())
+        )
 
-    def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
-        """Count one tick of driving with these duties towards `reference_mm`."""
-        is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
-        self.straying_s = self.straying_s + dt_s if is_astray else 0.0
+    def update(
+        self, dt_s: float, measured: Measured, reference: Reference | None, left_duty: float, right_duty: float
+    ) -> None:
+        """Count one tick of driving with these duties towards `reference`."""
+        off_mm = 0.0 if reference is None else abs(reference.gap_mm - measured.gap_mm)
+        self.straying_s = self.straying_s + dt_s if off_mm > self._following_error_mm else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
         is_over = measured.force_N > self._ceiling_N and is_felt
         self.over_s = self.over_s + dt_s if is_over else max(self.over_s - OVER_FADES * dt_s, 0.0)
@@ -166,15 +164,17 @@ class Watch:
         """Count one tick without duties."""
         self.left_duty = self.right_duty = 0.0
 
-    def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
+    def _of_device(
+        self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight
+    ) -> tuple[Fault, ...]:
         """Return the faults that the device reports, except while they are being cleared."""
         shown: int = measurement.faults
         if not shown or now_s < safety.clearing_until_s:
-            return []
+            return ()
         is_ours = Fault.HOST_STALL in safety.faults or (
             sight.has_stalled(now_s) and sight.stall_s > self._longest_own_stall_s
         )
-        return list(device_faults(measurement.faults, is_host_stall=is_ours))
+        return device_faults(measurement.faults, is_host_stall=is_ours)
 
     def _is_misplaced(self, measurement: Measurement, measured: Measured, sight: Sight) -> bool:
         # switches come with Status: with an older Status or State they are of another place
@@ -184,48 +184,40 @@ class Watch:
         is_elsewhere = is_told and is_contradicted(measured, switches, closed_mm, open_mm)
         return measured.is_homed and (is_elsewhere or is_outside(measured, closed_mm, open_mm))
 
-    def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
-        faults: list[Fault] = []
-        # the next tick could be a period late
-        at_s = now_s + self._period_s / 2.0
-        if not sight.is_waiting(now_s):
-            # a State that has just come over a slow line is old too, and a loop around such a delay would swing
-            if at_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s:
-                faults.append(Fault.MEASUREMENT_STALE)
-            if at_s - measurement.sensed_s > self._sense_fault_s:
-                faults.append(Fault.SENSE_STALE)
-            if at_s - measurement.reported_s > STATUS_FAULT_S:
-                faults.append(Fault.STATUS_STALE)
-        if measurement.link.round_trip_s > self._max_round_trip_s:
-            faults.append(Fault.LINK_DEGRADED)
-        if abs(measurement.link.clock_drift) > CLOCK_FAULT:
-            faults.append(Fault.CLOCK)
-        return faults
+    def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> tuple[Fault, ...]:
+        # the next tick could be a period late; after a stall the answer may still be on its way
+        at_s = -math.inf if sight.is_waiting(now_s) else now_s + self._period_s / 2.0
+        # a State that has just come over a slow line is old too, and a loop around such a delay would swing
+        old_s, link = at_s - measurement.received_s + measurement.delay_s, measurement.link
+        return (
+            ((Fault.MEASUREMENT_STALE,) if old_s > self._measurement_timeout_s else ())
+            + ((Fault.SENSE_STALE,) if at_s - measurement.sensed_s > self._sense_fault_s else ())
+            + ((Fault.STATUS_STALE,) if at_s - measurement.reported_s > STATUS_FAULT_S else ())
+            + ((Fault.LINK_DEGRADED,) if link.round_trip_s > self._max_round_trip_s else ())
+            + ((Fault.CLOCK,) if abs(link.clock_drift) > CLOCK_FAULT else ())
+        )
 
-    def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
-        faults: list[Fault] = []
-        is_skewed = abs(measured.skew_mm) > self._max_apart_mm
-        is_still = self.still_s > self._no_motion_time_s
-        if self.opposed_s > (WENT_AGAINST_S if is_skewed or is_still else OPPOSED_S):
-            faults.append(Fault.WRONG_DIRECTION)
-        if is_skewed:
-            faults.append(Fault.SKEW)
-        if self.straying_s > self._following_time_s:
-            faults.append(Fault.FOLLOWING_ERROR)
-        if self.over_s > OVER_FAULT_S and self._slides:  # on a pad the finger itself may press this hard
-            faults.append(Fault.OVER_FORCE)
-        if sensor_doubted_s > self._sensor_fault_s:
-            faults.append(Fault.SENSOR)
-        if is_still:
-            faults.append(Fault.NO_MOTION)
-        return faults
+    def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> tuple[Fault, ...]:
+        is_skewed, is_still = abs(measured.skew_mm) > self._skew_fault_mm, self.still_s > self._no_motion_time_s
+        opposed_s = WENT_AGAINST_S if is_skewed or is_still else OPPOSED_S
+        # on a pad the finger itself may press hard
+        over_s = self.over_s if self._slides else 0.0
+        return (
+            ((Fault.WRONG_DIRECTION,) if self.opposed_s > opposed_s else ())
+            + ((Fault.SKEW,) if is_skewed else ())
+            + ((Fault.FOLLOWING_ERROR,) if self.straying_s > self._following_time_s else ())
+            + ((Fault.OVER_FORCE,) if over_s > OVER_FAULT_S else ())
+            + ((Fault.SENSOR,) if sensor_doubted_s > self._sensor_fault_s else ())
+            + ((Fault.NO_MOTION,) if is_still else ())
+        )
 
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
         """Tell whether a carriage stands still although it is driven the same way as a step before."""
         # a duty that reverses before the carriage could move drives it nowhere
         left, right = left_duty * math.copysign(1.0, self.left_duty), right_duty * math.copysign(1.0, self.right_duty)
-        is_left_still = left > self._no_motion_duty and abs(measured.left_mm_s) < STILL_MM_S
-        return is_left_still or (right > self._no_motion_duty and abs(measured.right_mm_s) < STILL_MM_S)
+        least = self._no_motion_duty
+        is_left_still = left > least and abs(measured.left_mm_s) < STILL_MM_S
+        return is_left_still or (right > least and abs(measured.right_mm_s) < STILL_MM_S)
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
         least = self._no_motion_duty

@@ -1,7 +1,7 @@
 """Faults and limits by their codes. A *fault* is latched and needs a clear. A *limit* says: running, but held back."""
 
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from firmware_protocol.codec import DeviceFault
 
@@ -31,6 +31,8 @@ class Explanation(NamedTuple):
     shows: str = "at once"
     "Many faults hide from a device at rest."
     position: Position = Position.KEPT
+    hazard: Literal["SHUT", "CLOSES", "OPENS", "MISLED", "WORN", "NONE", ""] = ""
+    "The `Hazard` that the code controls; NONE: it tells what the device can do."
 
     @property
     def clears(self) -> str:
@@ -112,7 +114,7 @@ class Limit(StrEnum):
 
 FAULTS: dict[Fault, Explanation] = {
     Fault.STOPPED: Explanation(
-        "somebody gave the stop command", "tormagctl arm when it is safe to go on", Reaction.OPENING, 100.0, "at once"
+        "somebody gave the stop command", "tormagctl arm when it is safe to go on", Reaction.OPENING, hazard="SHUT"
     ),
     Fault.HOST_STALL: Explanation(
         "the control loop stopped for more than the device's 50 ms timeout, so the device opened the gap",
@@ -121,6 +123,7 @@ FAULTS: dict[Fault, Explanation] = {
         51.0,
         "once the loop runs again; the device opens before that",
         Position.LOST_THERE,
+        hazard="SHUT",
     ),
     Fault.LINK_LOST: Explanation(
         "the device stopped answering, or its port disappeared",
@@ -129,6 +132,7 @@ FAULTS: dict[Fault, Explanation] = {
         51.0,
         "at once; the device opens by itself, the daemon knows after 80 ms",
         Position.LOST_THERE,
+        hazard="SHUT",
     ),
     Fault.PLAN_FAILED: Explanation(
         "no gap could be planned: the model or the search refused a number, or the search was too slow",
@@ -136,6 +140,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         100.0,
         "at once",
+        hazard="SHUT",
     ),
     Fault.NOT_FINITE: Explanation(
         "the loop computed a number that is not finite",
@@ -143,6 +148,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         100.0,
         "at once",
+        hazard="CLOSES",
     ),
     Fault.WRONG_DIRECTION: Explanation(
         "a carriage moved against its drive for 0.1 s, or for 3 mm while homing",
@@ -151,6 +157,7 @@ FAULTS: dict[Fault, Explanation] = {
         200.0,
         "while a carriage moves",
         Position.LOST_HERE,
+        hazard="CLOSES",
     ),
     Fault.DEVICE_SCHEMA_MISMATCH: Explanation(
         "daemon and firmware use different protocol versions",
@@ -159,6 +166,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at the first Hello",
         Position.LOST_THERE,
+        hazard="MISLED",
     ),
     Fault.DEVICE_SUPPLY: Explanation(
         "the supply voltage is out of range",
@@ -167,6 +175,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at once",
         Position.LOST_THERE,
+        hazard="SHUT",
     ),
     Fault.DEVICE_TEMPERATURE: Explanation(
         "the device is too hot",
@@ -175,6 +184,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at once",
         Position.LOST_THERE,
+        hazard="WORN",
     ),
     Fault.DEVICE_COMMAND_TIMEOUT: Explanation(
         "the device received no valid drive command for 50 ms and opened the gap",
@@ -183,6 +193,7 @@ FAULTS: dict[Fault, Explanation] = {
         51.0,
         "at once",
         Position.LOST_THERE,
+        hazard="SHUT",
     ),
     Fault.DEVICE_OVERCURRENT: Explanation(
         "a motor drew too much current",
@@ -191,6 +202,7 @@ FAULTS: dict[Fault, Explanation] = {
         500.0,
         "while a blocked carriage is driven",
         Position.LOST_THERE,
+        hazard="WORN",
     ),
     Fault.DEVICE_END_STOP: Explanation(
         "a carriage reached its closed end stop",
@@ -199,6 +211,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at once",
         Position.LOST_THERE,
+        hazard="WORN",
     ),
     Fault.DEVICE_SKEW: Explanation(
         "the device measured its carriages over 2 mm apart",
@@ -207,6 +220,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at once",
         Position.LOST_THERE,
+        hazard="WORN",
     ),
     Fault.DEVICE_UNCOMMANDED_MOTION: Explanation(
         "a carriage moved with its drive off",
@@ -215,6 +229,7 @@ FAULTS: dict[Fault, Explanation] = {
         300.0,
         "while drives are off, or open",
         Position.LOST_THERE,
+        hazard="CLOSES",
     ),
     Fault.DEVICE_HOMING_FAILED: Explanation(
         "a home switch was not found in time",
@@ -223,6 +238,7 @@ FAULTS: dict[Fault, Explanation] = {
         12000.0,
         "while it homes",
         Position.LOST_THERE,
+        hazard="MISLED",
     ),
     Fault.DEVICE_RETRACT_FAILED: Explanation(
         "the device could not open the gap",
@@ -231,6 +247,7 @@ FAULTS: dict[Fault, Explanation] = {
         6000.0,
         "while it opens",
         Position.LOST_THERE,
+        hazard="SHUT",
     ),
     Fault.HOMING: Explanation(
         "homing took over 12 s, missed a switch, or backed off from one that stays closed",
@@ -239,6 +256,7 @@ FAULTS: dict[Fault, Explanation] = {
         12100.0,
         "while it homes",
         Position.LOST_HERE,
+        hazard="MISLED",
     ),
     Fault.ENCODER: Explanation(
         "an encoder moved three times faster than any motor can: it lost or added counts",
@@ -247,6 +265,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at once",
         Position.LOST_HERE,
+        hazard="MISLED",
     ),
     Fault.OUT_OF_STROKE: Explanation(
         "a homed carriage reads over 2.5 mm outside its stroke or over 0.4 mm from its switch: counts are lost, "
@@ -256,6 +275,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at once",
         Position.LOST_HERE,
+        hazard="MISLED",
     ),
     Fault.MEASUREMENT_STALE: Explanation(
         "no State came for `device.measurement_timeout_ms`, 50 ms, or too late to close the loop",
@@ -263,6 +283,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         52.0,
         "at once; 50 ms of nothing, which begin with a tick, and a tick to tell the device",
+        hazard="MISLED",
     ),
     Fault.SENSE_STALE: Explanation(
         "the device sent no Sense for 100 ms, so the force and the handle that the scene needs are unknown",
@@ -270,6 +291,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         102.0,
         "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
+        hazard="MISLED",
     ),
     Fault.STATUS_STALE: Explanation(
         "the device sent no Status for 100 ms, so its faults, switches and supply are unknown",
@@ -277,6 +299,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         102.0,
         "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
+        hazard="MISLED",
     ),
     Fault.LINK_DEGRADED: Explanation(
         "the device answers too late: over 0.8 of the delay that makes the position loop swing, 11 ms at 1 kHz",
@@ -285,6 +308,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         500.0,
         "over some round trips",
+        hazard="CLOSES",
     ),
     Fault.CLOCK: Explanation(
         "the device's clock is over 10 % off or stopped, so its speeds and timeouts are wrong",
@@ -292,6 +316,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         4000.0,
         "over some seconds",
+        hazard="MISLED",
     ),
     Fault.SKEW: Explanation(
         "the carriages are over `limits.skew_fault_mm` apart, 1 mm",
@@ -300,6 +325,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "while a carriage moves",
         Position.LOST_HERE,
+        hazard="WORN",
     ),
     Fault.FOLLOWING_ERROR: Explanation(
         "the gap did not follow its reference for `limits.following_time_s`, 0.25 s",
@@ -308,6 +334,7 @@ FAULTS: dict[Fault, Explanation] = {
         1000.0,
         "while the gap is to move",
         Position.LOST_HERE,
+        hazard="SHUT",
     ),
     Fault.OVER_FORCE: Explanation(
         "on a brake the measured force exceeded 1.25 times the scene's most_N, and 0.1 N, for 100 ms or often",
@@ -315,6 +342,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         150.0,
         "while the handle moves",
+        hazard="CLOSES",
     ),
     Fault.SENSOR: Explanation(
         "for over 2 s of sliding the force sensor, which the scene needs, read what no device gives",
@@ -322,6 +350,7 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         3000.0,
         "over 2 s of sliding",
+        hazard="MISLED",
     ),
     Fault.NO_MOTION: Explanation(
         "a carriage away from its open switch was driven for `limits.no_motion_time_s`, 60 ms, and its encoder "
@@ -331,6 +360,7 @@ FAULTS: dict[Fault, Explanation] = {
         250.0,
         "while a carriage is driven: 60 ms of a duty that moves one, which takes a following error to come about",
         Position.LOST_HERE,
+        hazard="SHUT",
     ),
     Fault.NOT_OPENING: Explanation(
         "the gap should be open, but a carriage that stopped, reversed or was too slow is 0.35 s late",
@@ -339,6 +369,7 @@ FAULTS: dict[Fault, Explanation] = {
         500.0,
         "while it is to be open",
         Position.LOST_HERE,
+        hazard="SHUT",
     ),
     Fault.DEVICE_NOT_RUNNING: Explanation(
         "the device stopped taking drive commands, as after a reset",
@@ -347,6 +378,7 @@ FAULTS: dict[Fault, Explanation] = {
         100.0,
         "at once",
         Position.LOST_THERE,
+        hazard="SHUT",
     ),
 }
 
@@ -357,6 +389,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="NONE",
     ),
     Limit.STALE: Explanation(
         "the newest setpoint is older than its valid_for_ms; the force decays to F_min",
@@ -364,6 +397,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         110.0,
         "after `valid_for_ms`, 100 ms in the matrix",
+        hazard="OPENS",
     ),
     Limit.OTHER_SOURCE: Explanation(
         "another source also sends setpoints, but does not hold the brake",
@@ -371,6 +405,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         100.0,
         "at once",
+        hazard="CLOSES",
     ),
     Limit.SOURCE_LOSS: Explanation(
         "over 5 % of the setpoints are lost on the way",
@@ -378,6 +413,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         2000.0,
         "over a second",
+        hazard="MISLED",
     ),
     Limit.SOURCE_SELDOM: Explanation(
         "setpoints are rarer than the scene states, or than 20 a second",
@@ -385,6 +421,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         2000.0,
         "over a second",
+        hazard="MISLED",
     ),
     Limit.SOURCE_LATE: Explanation(
         "setpoints arrive older than the scene's budget.delay_ms",
@@ -392,6 +429,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         2000.0,
         "over a second",
+        hazard="MISLED",
     ),
     Limit.SOURCE_JITTER: Explanation(
         "setpoint delays vary by over 20 ms",
@@ -399,6 +437,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         2000.0,
         "over a second",
+        hazard="MISLED",
     ),
     Limit.TAKEOVER: Explanation(
         "the force ramps to the setpoint, because it followed nobody or another publisher before",
@@ -406,6 +445,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="OPENS",
     ),
     Limit.RANGE: Explanation(
         "the setpoint is outside the scene's range",
@@ -413,6 +453,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="CLOSES",
     ),
     Limit.STANDBY: Explanation(
         "the setpoint is below the force at which the scene waits, force.standby_N",
@@ -420,6 +461,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="NONE",
     ),
     Limit.F_MIN: Explanation(
         "the setpoint is below what the open gap gives",
@@ -427,6 +469,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="NONE",
     ),
     Limit.F_MAX: Explanation(
         "the setpoint is above what the closed gap gives",
@@ -434,6 +477,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="NONE",
     ),
     Limit.RATE: Explanation(
         "the setpoint changes faster than the carriages travel",
@@ -441,6 +485,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="NONE",
     ),
     Limit.LOW_CONFIDENCE: Explanation(
         "the model was asked outside its training",
@@ -448,6 +493,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         100.0,
         "at once",
+        hazard="MISLED",
     ),
     Limit.TRIM: Explanation(
         "the measured force is further from the model than the trim may correct",
@@ -455,6 +501,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         1000.0,
         "while the handle slides",
+        hazard="MISLED",
     ),
     Limit.MODEL_RANGE: Explanation(
         "the model would have been asked outside what it knows, so it was asked the nearest that it knows",
@@ -462,6 +509,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="MISLED",
     ),
     Limit.CEILING: Explanation(
         "the gap is held where this device, as far as known, cannot exceed the scene's greatest force",
@@ -469,6 +517,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.LIMITED,
         100.0,
         "at once",
+        hazard="CLOSES",
     ),
     Limit.OVER_FORCE: Explanation(
         "the measured force is over what the scene allows; the gap opens",
@@ -476,6 +525,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.OPENING,
         100.0,
         "while the handle moves",
+        hazard="CLOSES",
     ),
     Limit.SENSOR: Explanation(
         "the force sensor is stuck or reads what no device gives at this gap; nothing is learned from it",
@@ -483,6 +533,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         1000.0,
         "while the handle slides",
+        hazard="MISLED",
     ),
     Limit.DEVICE_OR_SENSOR: Explanation(
         "the readings differ from what the device first showed by more than trim.leash: the device changed or the "
@@ -491,6 +542,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         500.0,
         "while the handle slides",
+        hazard="MISLED",
     ),
     Limit.SENSOR_ZERO: Explanation(
         "the handle's reversals show that the force sensor is far off its zero; its readings are corrected",
@@ -498,6 +550,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         5000.0,
         "at reversals of the handle",
+        hazard="MISLED",
     ),
     Limit.OFFSET_UNKNOWN: Explanation(
         "the handle has not reversed for so long that the sensor's zero may have drifted; only what that does not "
@@ -506,6 +559,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         480100.0,
         "while the handle turns one way",
+        hazard="MISLED",
     ),
     Limit.HANDLE_LOST: Explanation(
         "the handle's encoder does not move although the force shows that the shaft does; nothing is learned",
@@ -513,6 +567,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         2000.0,
         "while the force rises by 0.15 N or more",
+        hazard="MISLED",
     ),
     Limit.SATURATED: Explanation(
         "a motor has no more voltage to give",
@@ -520,6 +575,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         100.0,
         "while a carriage is driven",
+        hazard="NONE",
     ),
     Limit.SKEW: Explanation(
         "the carriages are over `limits.skew_warning_mm` apart",
@@ -527,6 +583,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         100.0,
         "while a carriage moves",
+        hazard="WORN",
     ),
     Limit.HOST_STALL: Explanation(
         "the control loop stopped for 5 to 50 ms; the gap was held until the device answered",
@@ -534,6 +591,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         51.0,
         "once the loop runs again",
+        hazard="OPENS",
     ),
     Limit.DEVICE_SILENT: Explanation(
         "the device has sent no new state for 5 to 50 ms; the gap is held until it does",
@@ -541,6 +599,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         51.0,
         "at once",
+        hazard="OPENS",
     ),
     Limit.SENSE_STALE: Explanation(
         "the device sent no Sense for 20 ms: force and handle are unknown, and nothing is learned",
@@ -548,6 +607,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         51.0,
         "at once",
+        hazard="MISLED",
     ),
     Limit.ENCODER: Explanation(
         "an encoder jumped; the gap is held until the device says whether it was reset",
@@ -555,6 +615,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         100.0,
         "at once",
+        hazard="OPENS",
     ),
     Limit.LINK_DEGRADED: Explanation(
         "the link loses or damages over 2 % of the messages, or is slower than 0.4 of what the loop bears, 6 ms "
@@ -563,6 +624,7 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         1000.0,
         "over some hundred messages",
+        hazard="MISLED",
     ),
     Limit.CLOCK: Explanation(
         "the device's clock is over 1 % off, and so are all speeds and its timeouts",
@@ -570,12 +632,14 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         4000.0,
         "over some seconds",
+        hazard="MISLED",
     ),
     Limit.NO_BLACK_BOX: Explanation(
         "the process that writes black boxes has ended, and another one begins; nothing is held back",
         "see the daemon's log if it stays",
         Reaction.HELD,
         200.0,
+        hazard="NONE",
     ),
 }
 

@@ -1,4 +1,4 @@
-"""Which hazardous situation each code controls, and causes that no code names, in the terms of ISO 14971.
+"""What harm may come of each hazard, and causes that no code names, in the terms of ISO 14971.
 
 It is written for a person who analyses the risk of a device, and certifies nothing.
 """
@@ -15,24 +15,6 @@ HARMS: Final[dict[Hazard, str]] = {
     Hazard.WORN: "none at once; the device fails later",
 }
 "The harm that may come of each."
-FAULTS_OF: Final[dict[Hazard, str]] = {
-    Hazard.SHUT: "STOPPED HOST_STALL LINK_LOST PLAN_FAILED DEVICE_SUPPLY DEVICE_COMMAND_TIMEOUT DEVICE_RETRACT_FAILED "
-    "FOLLOWING_ERROR NO_MOTION NOT_OPENING DEVICE_NOT_RUNNING",
-    Hazard.CLOSES: "NOT_FINITE WRONG_DIRECTION DEVICE_UNCOMMANDED_MOTION LINK_DEGRADED OVER_FORCE",
-    Hazard.MISLED: "DEVICE_SCHEMA_MISMATCH DEVICE_HOMING_FAILED HOMING ENCODER OUT_OF_STROKE MEASUREMENT_STALE "
-    "SENSE_STALE STATUS_STALE CLOCK SENSOR",
-    Hazard.WORN: "DEVICE_TEMPERATURE DEVICE_OVERCURRENT DEVICE_END_STOP DEVICE_SKEW SKEW",
-}
-"The faults that control it, by name."
-LIMITS_OF: Final[dict[Hazard, str]] = {
-    Hazard.CLOSES: "OTHER_SOURCE RANGE CEILING OVER_FORCE",
-    Hazard.OPENS: "STALE TAKEOVER HOST_STALL DEVICE_SILENT ENCODER",
-    Hazard.MISLED: "SOURCE_LOSS SOURCE_SELDOM SOURCE_LATE SOURCE_JITTER LOW_CONFIDENCE TRIM MODEL_RANGE SENSOR "
-    "DEVICE_OR_SENSOR SENSOR_ZERO OFFSET_UNKNOWN HANDLE_LOST SENSE_STALE LINK_DEGRADED CLOCK",
-    Hazard.WORN: "SKEW",
-}
-HARMLESS: Final = "NO_SETPOINT STANDBY F_MIN F_MAX RATE SATURATED NO_BLACK_BOX"
-"They tell what the device can do, and control no hazard."
 
 
 class Cause(NamedTuple):

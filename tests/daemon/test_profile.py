@@ -9,7 +9,10 @@ import pytest
 from hypothesis import example, given, strategies as st
 
 from tormagd.config import Config
-from tormagd.control.assembly.profile import (
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.carriage_lag import MAX_LAG_S
+from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
+from tormagd.daemon.profiles import (
     MAX_BYTES,
     ZERO_LASTS_S,
     Profile,
@@ -18,9 +21,6 @@ from tormagd.control.assembly.profile import (
     profile_of,
     read_profile,
 )
-from tormagd.control.believe.believe import Learned
-from tormagd.control.believe.carriage_lag import MAX_LAG_S
-from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
 
 OF = {"serial_number": 7, "insert": "MRE-50-40", "model": "ab" * 32}
 BOUNDS = Config().trim
