@@ -125,8 +125,8 @@ class Host:
         self.drive_s = self._next_s = line.port.now_s()
         self.counter = 0
         self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
-        self.stalled_s = 0.0
-        """The greatest lateness of this process since `begin`."""
+        self.stalled_s = self.late_s = 0.0
+        """This process's greatest lateness since `begin`, and at all."""
 
     @property
     def now_s(self) -> float:
@@ -288,7 +288,7 @@ class Host:
                 self.refused[f"{type(message).__name__}: a host's message"] += 1
         late_s = self.now_s - self._next_s
         if late_s > PERIOD_S:  # missed beats are not made up for by a burst
-            self.stalled_s = max(self.stalled_s, late_s)
+            self.stalled_s, self.late_s = max(self.stalled_s, late_s), max(self.late_s, late_s)
             self._next_s += late_s
 
     def _take(self, heard: Heard) -> None:

@@ -1400,6 +1400,17 @@ def test_a_check_that_this_computer_spoiled_is_tried_again() -> None:
     assert "ms late meanwhile" not in seen, "the last attempt was not late, and is the one that counts"
 
 
+def test_what_is_judged_by_all_that_was_heard_says_how_late_this_computer_ever_was() -> None:
+    names = ("silence_is_noticed", "every_drive_answered", "clock_runs_on")
+    result = run(Host(serial_line(wire=Asleep, faults=["clock=+2%"])), [named(name) for name in names])[-1]
+    assert "ms late meanwhile" in result.seen
+
+
+def test_a_handle_that_turns_one_way_only_is_not_judged() -> None:
+    host = Host(SerialLine(Wire(VirtualDevice(NEAR_HOME, SteadyHand()))))
+    assert run(host, [named("every_drive_answered"), named("handle_runs_on")])[-1].passed is None
+
+
 class Pausing(Wire):
     held = b""
 
