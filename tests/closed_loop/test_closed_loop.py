@@ -4,7 +4,6 @@ All data here are synthetic: the device is the simulator's, the pulse is a formu
 """
 
 import math
-import statistics
 from collections.abc import Callable
 
 import numpy as np
@@ -21,16 +20,6 @@ from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
 from tormagd.simulation.hand import PressingHand, RecordedHand, ReversingHand
 
 OPEN_MM = 95.0
-LEAD_IN_S = 0.7
-"A ramp to the first force of the pulse, and a hold there."
-
-
-def pulse_N(time_s: float) -> float:
-    """A synthetic pulse of 1.2 Hz, steep to rise and slow to fall, behind a ramp and a hold."""
-    if time_s < LEAD_IN_S:
-        return min(0.6 + 2.0 * time_s, 1.4)
-    phase = 2.0 * math.pi * 1.2 * (time_s - LEAD_IN_S)
-    return 1.4 + 0.15 * (1.0 - math.cos(phase + 0.4 * math.sin(phase)))
 
 
 def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
@@ -38,32 +27,8 @@ def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: flo
     return list(loop.run(duration_s, stream(times + loop.now_s, np.array([force_N(time) for time in times]))))
 
 
-def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: float) -> float:
-    """Return the error of the true force against the force asked, from `from_s` after the first tick."""
-    start_s = samples[0].time_s
-    errors = [
-        sample.truth.force_N - force_N(sample.time_s - start_s)
-        for sample in samples
-        if sample.time_s - start_s >= from_s
-    ]
-    return float(np.sqrt(np.mean(np.square(errors))))
-
-
 def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
     return samples[-1].safety.faults
-
-
-@pytest.mark.parametrize(
-    ("plant", "from_s", "within_N", "trim"),
-    [("sample_1", 0.0, 0.03, 1.0), ("sample_2", 1.5, 0.05, 0.8), ("sample_3", 1.5, 0.05, 0.85)],
-)
-def test_a_pulse_is_rendered(arm, plant: str, from_s: float, within_N: float, trim: float) -> None:
-    samples = publish(arm(plant), pulse_N, LEAD_IN_S + 2.5)
-    assert faults_of(samples) == ()
-    assert rms_N(samples, pulse_N, LEAD_IN_S + from_s) <= within_N
-    assert samples[-1].plan.trim == pytest.approx(trim, abs=0.15)
-    # once it has arrived, nothing holds the force back
-    assert not any(sample.plan.limits for sample in samples[-1_000:])
 
 
 def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
@@ -103,35 +68,6 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
     # disabled is not a fault: it can be armed again without homing
     armed.command("enable")
     assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
-
-
-# -- faults; others are rows of the fault matrix
-
-
-def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
-    loop = arm(faults=["worn_gearbox@2.5"])
-    publish(loop, lambda time_s: 1.6, 1.5)
-    closed_mm = loop.simulated.truth.gap_mm
-    for _ in range(2_500):
-        loop.skip()
-        assert loop.simulated.truth.gap_mm > closed_mm - 1.0
-    assert loop.simulated.truth.gap_mm > OPEN_MM - 2.0
-
-
-# -- the second plant, whose laws differ
-
-
-def test_a_force_is_found_on_a_plant_of_other_structure(
-    arm: Callable[..., ClosedLoop], render: Callable[[ClosedLoop, float, float], list[Sample]]
-) -> None:
-    loop = arm("second")
-    for asked_N in (0.8, 2.0, 1.2):
-        samples = render(loop, asked_N, 3.0)
-        assert samples[-1].safety.faults == ()
-        felt_N = [sample.truth.force_N for sample in samples[-500:]]
-        assert statistics.fmean(felt_N) == pytest.approx(asked_N, abs=0.05)
-        assert max(felt_N) < asked_N + 0.1
-        assert Limit.MODEL_RANGE not in samples[-1].plan.limits
 
 
 @pytest.mark.parametrize(("is_every", "planned"), [(True, 500), (False, 100)])

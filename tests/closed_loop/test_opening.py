@@ -68,14 +68,6 @@ def test_a_retract_that_does_not_begin_is_named(closed: Opens, bus: str, ends: C
     assert loop.simulated.truth.gap_mm < HALF_MM + 2.0
 
 
-@pytest.mark.parametrize(("bus", "percent"), [("serial", -100), ("can", -200)])
-def test_motors_that_do_not_open_or_press_shut_are_named(closed: Opens, bus: str, percent: int) -> None:
-    loop = closed(bus, faults=[f"opening={percent}%"])
-    loop.command("disable")
-    faults = next(sample.safety.faults for sample in loop.hold(CLOSED_MM, NAMED_S) if sample.safety.faults)
-    assert set(faults) & {Fault.NOT_OPENING, Fault.DEVICE_RETRACT_FAILED, Fault.DEVICE_UNCOMMANDED_MOTION}
-
-
 def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_and_opened(make: Opens) -> None:
     loop = make(planned=False)
     firmware = loop.simulated.firmware

@@ -1,8 +1,9 @@
-"""Stalls of daemon and device against the simulated device, and a force below the least one, in virtual time."""
+"""Stalls of daemon and line against the simulated device, and a force below the least one, in virtual time."""
 
 from collections.abc import Iterable
 
 import pytest
+from bad_lines import BadSerialLine, stopped_until
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.control.safety.codes import Fault, Limit
@@ -30,29 +31,11 @@ def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
     return forces_N
 
 
-class Stopped:
-    """A device whose process is stopped: what comes waits for it, and its own time stands still."""
-
-    def __init__(self, loop: ClosedLoop, stop_ms: int) -> None:
-        self._device, self._behind_s, self.until_s = loop.port.device, stop_ms * 1e-3, loop.now_s + stop_ms * 1e-3
-        self._waiting: list[bytes] = []
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._device, name)
-
-    def transmit(self, now_s: float) -> object:
-        if now_s < self.until_s:
-            return b""
-        for data in self._waiting:
-            self._device.receive(now_s - self._behind_s, data)
-        self._waiting.clear()
-        return self._device.transmit(now_s - self._behind_s)
-
-    def receive(self, now_s: float, data: bytes) -> None:
-        if now_s < self.until_s:
-            self._waiting.append(data)
-        else:
-            self._device.receive(now_s - self._behind_s, data)
+def stop_the_line(loop: ClosedLoop, stop_ms: int) -> None:
+    """Let all that is said wait in the line for so long, both ways."""
+    line, until_s = BadSerialLine(loop.port.device), loop.now_s + stop_ms * 1e-3
+    line.spoil(lambda: stopped_until(until_s))
+    loop.port.device = line
 
 
 def limits_of(samples: Iterable[Sample]) -> set[Limit]:
@@ -98,10 +81,10 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
 
 
 @pytest.mark.parametrize("stop_ms", [4, *SHORT_MS[1:]])
-def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(
+def test_a_line_that_stands_still_for_less_than_the_timeout_is_waited_for(
     holding: ClosedLoop, stop_ms: int, render
 ) -> None:
-    holding.port.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
+    stop_the_line(holding, stop_ms)
     samples = render(holding, FORCE_N, 0.6)
     assert samples[-1].safety.faults == ()
     assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 4)
@@ -110,8 +93,8 @@ def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(
 
 
 @pytest.mark.parametrize("stop_ms", LONG_MS)
-def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLoop, stop_ms: int, render) -> None:
-    holding.port.device = Stopped(holding, stop_ms)  # type: ignore[assignment]
+def test_a_line_that_stands_still_for_longer_is_a_silent_device(holding: ClosedLoop, stop_ms: int, render) -> None:
+    stop_the_line(holding, stop_ms)
     samples = render(holding, FORCE_N, 2.0)
     assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
     assert Fault.HOST_STALL not in samples[-1].safety.faults

@@ -58,16 +58,24 @@ def reordering(share: float) -> Transfer:
     return carry
 
 
-def delaying(delay_s: float) -> Transfer:
+def _due(due_s: Callable[[float], float]) -> Transfer:
     waiting: list[tuple[float, bytes]] = []
 
     def carry(now_s: float, units: list[bytes]) -> list[bytes]:
-        waiting.extend((now_s + delay_s, unit) for unit in units)
-        out = [unit for due_s, unit in waiting if due_s <= now_s]
-        waiting[:] = [(due_s, unit) for due_s, unit in waiting if due_s > now_s]
+        waiting.extend((due_s(now_s), unit) for unit in units)
+        out = [unit for each_s, unit in waiting if each_s <= now_s]
+        waiting[:] = [(each_s, unit) for each_s, unit in waiting if each_s > now_s]
         return out
 
     return carry
+
+
+def delaying(delay_s: float) -> Transfer:
+    return _due(lambda now_s: now_s + delay_s)
+
+
+def stopped_until(until_s: float) -> Transfer:
+    return _due(lambda now_s: max(now_s, until_s))
 
 
 DeviceT = TypeVar("DeviceT", bound=SerialDevice | CanDevice)
