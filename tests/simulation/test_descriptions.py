@@ -12,7 +12,7 @@ from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
 from tormagd.simulation.faults import KNOWN, SIZED, Fault, FaultError, parse_fault
 from tormagd.simulation.hand import HandError, PressingHand, ReversingHand, SteadyHand, parse_hand
-from tormagd.simulation.parameters import PlantError, load_plant, plant_names, with_insert
+from tormagd.simulation.parameters import PlantError, changed, load_plant, plant_names, with_insert
 
 SAMPLE_1_TEXT, SECOND_TEXT = (
     resources.files("tormagd.simulation").joinpath(f"plants/{name}.toml").read_text(encoding="utf-8")
@@ -42,14 +42,10 @@ def test_the_three_samples_of_the_plant_card_are_packaged() -> None:
     assert [sum(plant.relaxation.fractions) for plant in plants] == pytest.approx([0.13, 0.18, 0.17])
 
 
-def test_a_plant_loads_from_a_file_as_by_name(tmp_path) -> None:
-    path = written(tmp_path, SAMPLE_1_TEXT)
-    assert load_plant(path) == load_plant(str(path)) == load_plant("sample_1")
-
-
-def test_assumptions_can_be_overridden_one_by_one(tmp_path) -> None:
-    plant = load_plant(written(tmp_path, SAMPLE_1_TEXT + "\n[assumed]\nretract_mm_s = 5.0\n"))
-    assert (plant.assumed.retract_mm_s, plant.assumed.homing_mm_s) == (5.0, load_plant("sample_1").assumed.homing_mm_s)
+def test_a_plant_loads_from_a_file_as_by_name_and_each_assumption_may_be_another(tmp_path) -> None:
+    assert load_plant(written(tmp_path, SAMPLE_1_TEXT)) == load_plant("sample_1")
+    slower = load_plant(written(tmp_path, SAMPLE_1_TEXT + "\n[assumed]\nretract_mm_s = 5.0\n"))
+    assert slower == changed(load_plant("sample_1"), "assumed", retract_mm_s=5.0)
 
 
 @pytest.mark.parametrize(
@@ -113,14 +109,6 @@ def test_a_pads_file_is_read_as_strictly_as_any(tmp_path: Path, text: str, said:
     good = "cip_percent = 45.0\nmodulus_kPa = 281.0\nfull_field_modulus_kPa = 592.0\nbreakdown = 0.85\n"
     keys = "".join(line + "\n" for line in good.splitlines() if line.split(" ")[0] not in text)
     refused(tmp_path, text.replace("[pad]\n", f"[pad]\n{keys}"), said)
-
-
-def test_a_missing_plant_names_the_known_ones(tmp_path) -> None:
-    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    known = "sample_1, sample_2, sample_3"
-    for plant, said in ((tmp_path / "none.toml", known), ("sample_9", known), (tmp_path / "binary.toml", "not UTF-8")):
-        with pytest.raises(PlantError, match=said):
-            load_plant(plant)
 
 
 def test_another_insert_keeps_what_the_sample_is_off_its_kind() -> None:

@@ -7,22 +7,18 @@ from devices import SAMPLES
 from virtual_port import VirtualPort
 
 from firmware_protocol.codec import (
-    PROTOCOL_VERSION,
-    SCHEMA_HASH,
     Clear,
     DeviceFault,
     DeviceMode,
     DriveMode,
-    Hello,
     Home,
-    Sense,
     State,
     Switches,
 )
 from firmware_protocol.conformance.host import Beat, Host
 from firmware_protocol.conformance.line import SerialLine
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.faults import KNOWN, SIZED, parse_fault
+from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, standing
 
@@ -194,32 +190,3 @@ def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int
     while DeviceFault.RETRACT_FAILED not in host.status.faults:
         host.pass_time(0.01)
         assert host.now_s - started_s < within_s
-
-
-def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open() -> None:
-    host = running(["worn_gearbox@3.5", "supply_loss@3.5"], gap_mm=47.0, plant="sample_3")
-    host.run_until(3.5)
-    while DeviceFault.UNCOMMANDED_MOTION not in host.status.faults:
-        host.beat(None)
-        assert host.now_s < 5.0
-    assert host.status.mode is DeviceMode.RETRACTING
-    assert DeviceFault.RETRACT_FAILED not in host.status.faults
-
-
-def test_a_device_that_is_mended_homes_as_a_healthy_one() -> None:
-    passing = ("frozen", "reset", "encoder_jump", "encoder_jump_left")
-    lasting = [f"{name}=+20%" if name in SIZED else name for name in KNOWN if name not in passing]
-    mended, healthy = Bench(f"{fault}@0.1" for fault in lasting), Bench()
-    mended.pass_time(0.2)
-    healthy.pass_time(0.2)
-    assert mended.device.firmware.faults
-    mended.device.mend()
-    for host in (mended, healthy):
-        for message in (Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1), Clear(2), Home(3)):
-            host.send(message)
-        host.pass_time(5.8, DriveMode.OFF)
-        host.pass_time(0.04)  # two Statuses
-    assert mended.status == healthy.status
-    assert Switches.HOMED in mended.status.switches
-    assert mended.last(State).left_position_mm == pytest.approx(healthy.last(State).left_position_mm, abs=0.01)
-    assert mended.last(Sense).handle_position_mm == healthy.last(Sense).handle_position_mm
