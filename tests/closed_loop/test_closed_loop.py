@@ -17,7 +17,7 @@ from tormagd.control.safety.codes import Fault, Limit
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
 from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
-from tormagd.simulation.hand import PressingHand, RecordedHand, ReversingHand
+from tormagd.simulation.hand import RecordedHand, ReversingHand, pressing
 
 OPEN_MM = 95.0
 
@@ -93,7 +93,7 @@ def pad_core() -> Core:
 @pytest.mark.parametrize("plant", ["pad_1", "pad_2"])
 def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
     time_s, force_N = asked(SCENE.signal, scene_path("radial_pulse").parent, (3.2, 3.9), PULSE_S, 100)
-    loop = arm(plant, PressingHand(2.0), core=pad_core, config=CONFIG)
+    loop = arm(plant, pressing(2.0), core=pad_core, config=CONFIG)
 
     def publish(now_s: float) -> TimedSetpoint:
         stamp_s = math.floor(100.0 * now_s) / 100.0

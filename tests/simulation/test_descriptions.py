@@ -11,7 +11,7 @@ import pytest
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
 from tormagd.simulation.faults import KNOWN, SIZED, Fault, FaultError, parse_fault
-from tormagd.simulation.hand import HandError, PressingHand, ReversingHand, SteadyHand, parse_hand
+from tormagd.simulation.hand import HandError, ReversingHand, SteadyHand, parse_hand, pressing
 from tormagd.simulation.parameters import PlantError, changed, load_plant, plant_names, with_insert
 
 SAMPLE_1_TEXT, SECOND_TEXT = (
@@ -133,7 +133,7 @@ def test_the_default_hand_turns_the_roller_at_42_mm_s() -> None:
     hand = parse_hand("steady")
     assert hand == SteadyHand(20.0)
     assert hand.position_mm(10.0) / 10.0 == pytest.approx(41.888, abs=1e-3)
-    assert [parse_hand(spec) for spec in ("pressing", "pressing=3.5")] == [PressingHand(2.0), PressingHand(3.5)]
+    assert [parse_hand(spec) for spec in ("pressing", "pressing=3.5")] == [pressing(2.0), pressing(3.5)]
     assert parse_hand("steady=-10").position_mm(1.0) == pytest.approx(-20.944, abs=1e-3)
 
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 from tormagd.element.physics.force import TORMAG, brake_force_N
 from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import TorqueElement
-from tormagd.simulation.hand import PressingHand, ReversingHand, SteadyHand
+from tormagd.simulation.hand import ReversingHand, SteadyHand, pressing
 from tormagd.simulation.parameters import PlantError, PlantParameters, changed, load_plant, standing
 from tormagd.simulation.plant import SUBSTEP_S, Plant, element_of
 from tormagd.simulation.second_element import SecondElement
@@ -349,7 +349,7 @@ def test_a_held_pad_relaxes() -> None:
 
 
 def test_the_device_feels_the_finger() -> None:
-    plant = Plant(load_plant("pad_1"), PressingHand(1.5), seed=1)
+    plant = Plant(load_plant("pad_1"), pressing(1.5), seed=1)
     plant.advance(9.0)
     assert (plant.truth.handle_mm, plant.truth.force_N) == (0.0, 0.0)
     plant.advance(5.0)

@@ -64,17 +64,6 @@ class ReversingHand(Value):
 
 
 @final
-class PressingHand(Value):
-    """The finger of the thesis's pulse experiment, which presses into the pad at 1 mm/s."""
-
-    def __init__(self, depth_mm: float = DEFAULT_DEPTH_MM) -> None:
-        self.depth_mm: Final = depth_mm
-
-    def position_mm(self, time_s: float) -> float:
-        return min(max(PRESSING_MM_S * (time_s - PRESSES_AT_S), 0.0), self.depth_mm)
-
-
-@final
 class RecordedHand(Value):
     """Recorded motion, linear between its points, standing before and after them."""
 
@@ -107,6 +96,11 @@ class StrokingHand(Value):
         phase_s = math.fmod(max(time_s - PRESSES_AT_S, 0.0), 2.0 * half_s)
         pushed_mm, withdrawn_mm = self.push_mm_s * phase_s, max(self.push_mm_s * (phase_s - half_s), 0.0)
         return max(min(pushed_mm, self.reach_mm) - withdrawn_mm, 0.0)
+
+
+def pressing(depth_mm: float = DEFAULT_DEPTH_MM) -> StrokingHand:
+    """Return the finger of the thesis's pulse experiment, which presses into the pad at 1 mm/s and stays there."""
+    return StrokingHand(PRESSING_MM_S, depth_mm, math.inf)
 
 
 @final
@@ -189,9 +183,9 @@ def _root(function: Callable[[float], float], start: float, slope: float) -> flo
 _SIZED: dict[str, tuple[Callable[..., Hand], float, float]] = {
     "steady": (SteadyHand, -300.0, 300.0),
     "reversing": (ReversingHand, 0.1, 1000.0),
-    "pressing": (PressingHand, 0.1, 6.0),
+    "pressing": (pressing, 0.1, 6.0),
 }
-"Its class, and the least and greatest size."
+"What makes it, and the least and greatest size."
 _FELT: dict[str, tuple[float, float, float]] = {
     "mass_kg": (0.1, 0.001, 20.0),
     "stiffness_N_mm": (0.4, 0.0, 100.0),
