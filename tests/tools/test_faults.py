@@ -38,6 +38,7 @@ SAMPLED = (
     "every other Drive answered",
     "left open switch stuck",
     "setpoints of NaN",
+    "operator: disable, and the gap does not open",
     # no test in tests/closed_loop puts these into a pulse
     "motor supply fails",
     "left drag +50%",
