@@ -92,15 +92,6 @@ def test_a_line_that_stands_still_for_less_than_the_timeout_is_waited_for(
     assert max(abs(sample.truth.force_N - FORCE_N) for sample in samples) < ALLOWED_N
 
 
-@pytest.mark.parametrize("stop_ms", LONG_MS)
-def test_a_line_that_stands_still_for_longer_is_a_silent_device(holding: ClosedLoop, stop_ms: int, render) -> None:
-    stop_the_line(holding, stop_ms)
-    samples = render(holding, FORCE_N, 2.0)
-    assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
-    assert Fault.HOST_STALL not in samples[-1].safety.faults
-    assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.safety.faults)
-
-
 @pytest.mark.parametrize("force_N", [0.2, 0.5])
 def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(
     force_N: float, armed: ClosedLoop, render

@@ -9,11 +9,11 @@ import pytest
 from stand import Stand
 
 from tormagd.ctl.processes import end
-from tormagd_client import ClientError, RefusedError
+from tormagd_client import RefusedError
 
 
 class Rig(Stand):
-    """The processes of one test or of a module, and a client."""
+    """The processes of one test, and a client."""
 
     def __init__(self) -> None:
         self._processes = contextlib.ExitStack()
@@ -34,18 +34,6 @@ class Rig(Stand):
         self.ask(force_N)
         self.until(lambda status: abs((status["measured_cf"] or 0.0) - force_N) < 0.06, f"{force_N} N")
 
-    def make_neutral(self) -> None:
-        """Bring it to disabled, at rest and without a fault or setpoint; start it anew if that fails."""
-        try:
-            self.client.publish(0.0, 1.0)
-            if self.status()["operating_state"] != "FAULT":
-                self.client.request("disable")
-            self.until(lambda status: not status["is_busy"], "at rest")
-            if self.status()["faults"]:
-                self.client.request("clear-fault")
-        except (TimeoutError, ClientError):
-            self.start_again()
-
     def truth(self) -> "np.ndarray[Any, Any]":
         end(self.device)
         return np.genfromtxt(self.folder / "truth.csv", delimiter=",", names=True)
@@ -54,20 +42,7 @@ class Rig(Stand):
         self._processes.close()
 
 
-@pytest.fixture(scope="module")
-def shared_rig() -> Iterator[Rig]:
-    """A device and a daemon for a whole module, because they take a processor."""
-    with contextlib.closing(Rig()) as made:
-        yield made
-
-
 @pytest.fixture
-def rig(shared_rig: Rig) -> Rig:
-    shared_rig.make_neutral()
-    return shared_rig
-
-
-@pytest.fixture
-def new_rig() -> Iterator[Rig]:
+def rig() -> Iterator[Rig]:
     with contextlib.closing(Rig()) as made:
         yield made

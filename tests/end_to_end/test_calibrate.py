@@ -11,15 +11,15 @@ import pytest
 pytestmark = pytest.mark.live
 
 
-def test_an_interrupt_leaves_no_file_and_an_insert_is_swept(new_rig, tmp_path):
-    program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(new_rig.config), "--wait", "20", "--json"]
+def test_an_interrupt_leaves_no_file_and_an_insert_is_swept(rig, tmp_path):
+    program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(rig.config), "--wait", "20", "--json"]
     command = [*program, "calibrate", "--yes"]
-    an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, [*command, "--motors"], tmp_path / "log.csv")
-    new_rig.until(lambda status: status["setpoint_age_ms"] > 1_000.0, "nobody else publishes")
+    an_interrupt_opens_the_gap_and_leaves_no_file(rig, [*command, "--motors"], tmp_path / "log.csv")
+    rig.until(lambda status: status["setpoint_age_ms"] > 1_000.0, "nobody else publishes")
     out = tmp_path / "sweeps.csv"
     arguments = ("--insert", "MRE-50-40", "--out", str(out), "--rates", "1.0,1.4,1.0")
     # the sweep begins at the least force that this device has shown, and a rested one gives less than its model says
-    new_rig.until(lambda status: status["least_N"] < 0.6, "the device has shown itself")
+    rig.until(lambda status: status["least_N"] < 0.6, "the device has shown itself")
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stderr.count("turn the handle") == 3
@@ -28,7 +28,7 @@ def test_an_interrupt_leaves_no_file_and_an_insert_is_swept(new_rig, tmp_path):
     assert set(sweep) == {0.0, 1.0, 2.0}
     assert np.corrcoef(gap_mm, force_N)[0, 1] < -0.8
     assert np.mean(np.abs(rate_mm_s) > 5.0) > 0.3
-    is_disabled_and_open(new_rig)
+    is_disabled_and_open(rig)
 
 
 def an_interrupt_opens_the_gap_and_leaves_no_file(rig, command, out) -> None:

@@ -23,12 +23,12 @@ pytestmark = pytest.mark.live
 README = Path(__file__).parents[2] / "README.md"
 
 
-def test_a_daemon_that_is_killed_unplugged_and_ended(new_rig):
-    assert not new_rig.status()["profile"]["is_used"]
-    killed_it_leaves_a_whole_recording(new_rig)
-    started_again_it_says_why_the_device_has_opened(new_rig)
-    unplugged_it_names_the_loss_and_does_not_arm_again(new_rig)
-    told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(new_rig)
+def test_a_daemon_that_is_killed_unplugged_and_ended(rig):
+    assert not rig.status()["profile"]["is_used"]
+    killed_it_leaves_a_whole_recording(rig)
+    started_again_it_says_why_the_device_has_opened(rig)
+    unplugged_it_names_the_loss_and_does_not_arm_again(rig)
+    told_to_end_it_opens_the_gap_and_keeps_what_the_device_has_shown(rig)
 
 
 def killed_it_leaves_a_whole_recording(rig) -> None:

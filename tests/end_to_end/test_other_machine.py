@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tormagd.ctl.processes import end
 from tormagd_client.endpoints import ENDPOINTS
 
 pytestmark = pytest.mark.live
@@ -54,7 +55,6 @@ def two_machines() -> Iterator[list[tuple[str, ...]]]:
 class Machines:
     def __init__(self, folder: Path) -> None:
         self._stack = contextlib.ExitStack()
-        self.children: list[subprocess.Popen[str]] = []
         self.start_again(folder)
 
     def start_again(self, folder: Path) -> None:
@@ -86,7 +86,7 @@ class Machines:
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.children.append(made)
+        self._stack.callback(end, made, signal.SIGKILL)
         return made
 
     def ctl(self, who: str, *arguments: str) -> dict[str, Any]:
@@ -113,11 +113,6 @@ class Machines:
             assert time.monotonic() < until_s, f"not within {PATIENCE_S:g} s: {what}: {self.status()['peers']}"
 
     def close(self) -> None:
-        for child in self.children:
-            if child.poll() is None:
-                child.kill()
-                child.wait()
-        self.children = []
         self._stack.close()
 
 
