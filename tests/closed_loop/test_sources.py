@@ -1,4 +1,4 @@
-"""Several publishers, with clocks and ways of their own, at one brake: inbox, core and device in virtual time."""
+"""Whatever publishers send, with clocks and ways of their own, to one brake: inbox, core and device in virtual time."""
 
 import contextlib
 import math
@@ -8,67 +8,18 @@ from collections.abc import Callable
 from typing import Any
 
 import msgpack
-import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.config import Sources
 from tormagd.control.assembly.build import Core
-from tormagd.control.safety.codes import Limit
 from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.daemon.inbox import SetpointInbox
-from tormagd.simulation.closed_loop import ClosedLoop, Sample
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 
 REALTIME_NS = 1_800_000_000 * 10**9
 PERIOD_S = 0.002
-
-
-def send(inbox: SetpointInbox, source: str, seq: int, now_s: float, force_N: float) -> None:
-    """Send a setpoint of a millisecond ago."""
-    realtime_ns = REALTIME_NS + round(now_s * 1e9)
-    fields = {"v": 1, "source": source, "seq": seq, "stamp_ns": realtime_ns - 10**6, "servo_cf": force_N}
-    inbox.take(msgpack.packb(fields | {"valid_for_ms": 100.0}), now_s, realtime_ns)
-
-
-@pytest.mark.parametrize(
-    ("ends_s", "begins_s", "priority", "given_s", "passes_s", "state"),
-    [
-        (1.5, 1.0, (), math.inf, 1.6, "stale"),
-        (math.inf, 0.5, (), 1.0, 1.0, "refused"),
-        (math.inf, 1.0, ("b",), math.inf, 1.0, "refused"),
-    ],
-    ids=["the first is gone", "an operator gives it", "it goes first"],
-)
-def test_another_takes_over_along_the_ramp(
-    armed: ClosedLoop,
-    core: Core,
-    ends_s: float,
-    begins_s: float,
-    priority: tuple[str, ...],
-    given_s: float,
-    passes_s: float,
-    state: str,
-) -> None:
-    inbox, samples, start_s = SetpointInbox(Sources(priority=priority)), list[Sample](), armed.now_s
-    for tick in range(3_000):
-        since_s = 1e-3 * tick
-        for source, force_N, from_s, to_s in (("a", 1.6, 0.0, ends_s), ("b", 0.8, begins_s, math.inf)):
-            if tick % 2 and from_s <= since_s < to_s:
-                send(inbox, source, tick, armed.now_s, force_N)
-        if since_s == given_s:
-            inbox.give("b", armed.now_s)
-        samples.append(armed.tick(inbox.newest))
-    time_s, force = np.array([(each.time_s - start_s, each.truth.force_N) for each in samples]).T
-    assert force[(time_s >= 0.9) & (time_s <= min(ends_s, passes_s))] == pytest.approx(1.6, abs=0.05)
-    assert force[time_s >= passes_s + 0.6] == pytest.approx(0.8, abs=0.05)
-    is_passing = np.array([Limit.TAKEOVER in each.plan.limits for each in samples])
-    assert time_s[is_passing & (time_s > 0.9)][0] == pytest.approx(passes_s, abs=0.01)
-    assert ((force[:-50] - force[50:]) / 0.05).max() <= 1.25 * core.scene.force.release_N_s
-    assert inbox.report(armed.now_s).by_source["a"].state == state
-
-
-# -- whatever a publisher sends ----------------------------------------------------------------------------------------
 
 
 LAST = 2**63 - 1
