@@ -17,6 +17,8 @@ from tormagd.simulation.parameters import PlantError, PlantParameters
 
 MAX_STEP_SHARE: Final = 0.25
 "The samples stay under 0.07."
+ROUNDING: Final = 1e-6
+"Share of a substep by which sums of time steps may be off."
 
 
 def lead_m(load_N: float, backlash_m: float, stiffness_N_m: float) -> float:
@@ -65,6 +67,10 @@ class Axis:
         self.angle_rad = 0.0
         self.speed_rad_s = 0.0
         self.current_A = 0.0
+        self.voltage_V: float | None = None
+        "At the motor; None: its bridge is open."
+        self._early_V = 0.0
+        "What earlier voltages add to the mean over the substep that has begun."
         self.position_m = start_mm * 1e-3
         # at power-on the nut carries the whole attraction
         self.contact_N = attraction_N
@@ -77,6 +83,20 @@ class Axis:
     def wear(self, divisor: float) -> None:
         """Leave gearbox and screw this part of their friction when new."""
         self.gear_friction_Nm, self.screw_friction_m = self._new_gear_Nm / divisor, self._new_screw_m / divisor
+
+    def drive(self, share: float, voltage_V: float | None) -> None:
+        """Put another voltage at the motor when this share of a substep has passed."""
+        share = float(round(share)) if voltage_V is None else share
+        self._early_V += share * (self._applied_V(self.voltage_V) - self._applied_V(voltage_V))
+        self.voltage_V = voltage_V
+
+    def mean_V(self) -> float | None:
+        """Return the mean voltage over the substep that has begun; the next one begins with the voltage of now."""
+        early_V, self._early_V = self._early_V, 0.0
+        return None if self.voltage_V is None and not early_V else self._applied_V(self.voltage_V) + early_V
+
+    def _applied_V(self, voltage_V: float | None) -> float:
+        return self.back_emf_V if voltage_V is None else voltage_V
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
         # runs four times per simulated millisecond: hence local names
@@ -135,12 +155,15 @@ class Axis:
         ahead_m = nut_m - position_m
         self.contact_N = stiffness_N_m * (ahead_m - min(max(ahead_m, -backlash_m), backlash_m))
 
-    def shaft_after(self, age_s: float, voltage_V: float | None) -> tuple[float, float]:
+    def shaft_after(self, age_s: float) -> tuple[float, float]:
         """Return the screw's (angle_rad, current_A) at `age_s` after the last step."""
+        if age_s < ROUNDING * self._dt_s:
+            return self.angle_rad, self.current_A
         speed_rad_s = self.speed_rad_s
         angle_rad = self.angle_rad + age_s * speed_rad_s
-        if voltage_V is None:
+        if self.voltage_V is None:
             return angle_rad, 0.0
+        voltage_V = self.voltage_V + self._dt_s / age_s * self._early_V
         settled_A = (voltage_V - self._coupling_Nm_A * speed_rad_s) / self._resistance_Ohm
         current_A = settled_A + (self.current_A - settled_A) * math.exp(-age_s / self._electrical_time_s)
         limit_A = self._current_limit_A

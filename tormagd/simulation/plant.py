@@ -5,7 +5,7 @@ from collections import deque
 from typing import Final, Protocol, TypeAlias, final
 
 from firmware_protocol.value import Value
-from tormagd.simulation.axis import Axis
+from tormagd.simulation.axis import ROUNDING, Axis
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import FeltHand, Hand, HandError
 from tormagd.simulation.parameters import PlantParameters
@@ -20,8 +20,6 @@ ELEMENT_STEP_S: Final = 1e-3
 "The element's updates are exact over it."
 
 Element: TypeAlias = TorqueElement | PressedPad | SecondElement
-_ROUNDING: Final = 1e-6
-"Share of a substep by which sums of time steps may be off."
 
 
 @final
@@ -89,11 +87,6 @@ class Plant:
         self.handle_mm_s = 0.0
         self.force_sensor: Sensor = SimulatedSensor(parameters, random.Random(seed))
         self._target_s = 0.0
-        self._left_V: float | None = None
-        self._right_V: float | None = None
-        # what earlier voltages add to the mean over the substep that has begun
-        self._left_early_V = 0.0
-        self._right_early_V = 0.0
         self._substeps = 0
 
     @property
@@ -107,15 +100,8 @@ class Plant:
     @property
     def shafts(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Angle, rad since power-on, and current, A, of each screw now."""
-        left, right, left_V, right_V = self.left, self.right, self._left_V, self._right_V
         age_s = self._target_s - self.time_s
-        if age_s < _ROUNDING * self._substep_s:
-            return (left.angle_rad, left.current_A), (right.angle_rad, right.current_A)
-        early = self._substep_s / age_s
-        return (
-            left.shaft_after(age_s, None if left_V is None else left_V + early * self._left_early_V),
-            right.shaft_after(age_s, None if right_V is None else right_V + early * self._right_early_V),
-        )
+        return self.left.shaft_after(age_s), self.right.shaft_after(age_s)
 
     @property
     def truth(self) -> Truth:
@@ -138,27 +124,22 @@ class Plant:
     def drive(self, left_V: float | None, right_V: float | None) -> None:
         """Put these voltages at the motors; None opens a motor's bridge."""
         share = self._target_s / self._substep_s - self._substeps
-        self._left_early_V += _early_V(self.left, share, self._left_V, left_V)
-        self._right_early_V += _early_V(self.right, share, self._right_V, right_V)
-        self._left_V, self._right_V = left_V, right_V
+        self.left.drive(share, left_V)
+        self.right.drive(share, right_V)
 
     def advance(self, dt_s: float) -> None:
         """Let `dt_s` pass: run every substep that has become due."""
         self._target_s = target_s = self._target_s + dt_s
-        due = int(target_s / self._substep_s + _ROUNDING)
+        due = int(target_s / self._substep_s + ROUNDING)
         if due == self._substeps:
             return
         left, right, attraction, per_element = self.left, self.right, self._attraction, self._substeps_per_element
-        left_V, right_V = self._left_V, self._right_V
-        left_mean_V = _mean_V(left, left_V, self._left_early_V)
-        right_mean_V = _mean_V(right, right_V, self._right_early_V)
-        self._left_early_V = 0.0
-        self._right_early_V = 0.0
+        left_V, right_V = left.mean_V(), right.mean_V()
         for substep in range(self._substeps + 1, due + 1):
             pull_N = attraction.at((left.position_m + right.position_m) * 1e3)
-            left.step(left_mean_V, pull_N)
-            right.step(right_mean_V, pull_N)
-            left_mean_V, right_mean_V = left_V, right_V
+            left.step(left_V, pull_N)
+            right.step(right_V, pull_N)
+            left_V, right_V = left.voltage_V, right.voltage_V
             if substep % per_element == 0:
                 self._advance_element(substep * self._substep_s)
         self._substeps = due
@@ -191,19 +172,6 @@ def element_of(parameters: PlantParameters, gap_mm: float, dt_s: float) -> Eleme
     if parameters.second is not None:
         return SecondElement(parameters, gap_mm, dt_s)
     return TorqueElement(parameters, gap_mm, dt_s)
-
-
-def _applied_V(axis: Axis, voltage_V: float | None) -> float:
-    return axis.back_emf_V if voltage_V is None else voltage_V
-
-
-def _early_V(axis: Axis, share: float, before_V: float | None, voltage_V: float | None) -> float:
-    share = float(round(share)) if voltage_V is None else share
-    return share * (_applied_V(axis, before_V) - _applied_V(axis, voltage_V))
-
-
-def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None:
-    return None if voltage_V is None and not early_V else _applied_V(axis, voltage_V) + early_V
 
 
 @final
