@@ -152,9 +152,11 @@ class Served:
         self.device = CanDevice(MessageDevice(load_plant("sample_1"), SteadyHand(), seed=1))
         self.door = CanPort(self.device, path)
         self.now_s = 0.0
+        self.opened = contextlib.ExitStack()
+        self.opened.callback(self.door.close)
 
     def host(self) -> socket.socket:
-        host = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        host = self.opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
         host.settimeout(LIMIT_S)
         host.connect(self.door.address)
         self.exchange(0.0)
@@ -173,7 +175,7 @@ class Served:
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
     made = Served(tmp_path / "can")
-    with contextlib.closing(made.door):
+    with made.opened:
         yield made
 
 
@@ -197,13 +199,11 @@ def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
         served.exchange(0.002)
         while bad.recv(64):
             pass
-        bad.close()
     good.send(to_socket(CanFrame(0x081, encode(HELLO))))
     served.exchange(0.005)
     while (heard := from_socket(good.recv(64))) is not None and heard.frame.identifier != IDENTITY:
         assert heard.frame.identifier == STATUS
     assert heard is not None
-    good.close()
 
 
 def test_a_frame_carries_its_time_and_comes_back_where_its_sender_asks(
@@ -245,12 +245,10 @@ def test_no_more_hosts_than_a_bus_has_places(served: Served) -> None:
     again = served.host()
     served.exchange(0.03)
     assert from_socket(again.recv(64)) is not None
-    for host in (*hosts, late, again):
-        host.close()
 
 
 def test_a_host_that_does_not_read_holds_nobody_up(served: Served) -> None:
-    lazy, busy = served.host(), served.host()
+    _, busy = served.host(), served.host()
     busy.setblocking(False)
     heard = 0
     for tick in range(3_000):
@@ -260,8 +258,6 @@ def test_a_host_that_does_not_read_holds_nobody_up(served: Served) -> None:
             while busy.recv(64):
                 heard += 1
     assert heard > 100, "a Status every 20 ms"
-    lazy.close()
-    busy.close()
 
 
 DAMAGED_FRAMES = (
