@@ -15,67 +15,16 @@ from leaves import leaves
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core, build_core
-from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE
 from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.control.safety.operating_state import Conditions, RefusedError
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import RecordedHand, SteadyHand
+from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
 
 CONFIG = Config()
 SCENE = load_scene("coronary")
-
-
-AT_REST = RecordedHand((0.0,), (0.0,))
-"A handle that moves would bring a force over the scene's, and a fault."
-
-
-def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm) -> None:
-    lags_mm, overshoots_mm = [], []
-    for pull_V in (CONFIG.motor.pull_V, 0.0):
-        config = msgspec.structs.replace(CONFIG, motor=msgspec.structs.replace(CONFIG.motor, pull_V=pull_V))
-        loop = arm(hand=AT_REST, planned=False, config=config, core=build_core(config))
-        list(loop.hold(47.0, 2.5))
-        move = loop.stepper.move
-        seen = [
-            (abs(move.expected.gap_mm - sample.measured.gap_mm), sample.truth.gap_mm) for sample in loop.hold(70.0, 1.2)
-        ]
-        lags_mm.append(max(lag for lag, _ in seen))
-        overshoots_mm.append(max(gap for _, gap in seen) - 70.0)
-    assert lags_mm[0] < 0.1
-    assert lags_mm[0] < 0.3 * lags_mm[1]
-    assert overshoots_mm[0] < 0.01 < overshoots_mm[1]
-
-
-def test_a_step_knows_nothing_of_the_stroke_before_it(arm) -> None:
-    loop = arm(hand=AT_REST, planned=False)
-    list(loop.hold(57.0, 2.0))
-    assert max(abs(loop.stepper.move.left.integral), abs(loop.stepper.move.right.integral)) < 0.002
-    gaps_mm = [sample.measured.gap_mm for sample in (*loop.hold(58.0, 0.4), *loop.hold(57.8, 0.4))]
-    assert max(gaps_mm) < 58.0 + 1e-3
-    assert min(gaps_mm[400:]) > 57.8 - 0.005
-
-
-@pytest.mark.parametrize(
-    ("sample", "least", "most"),
-    [("sample_1", 1.0, 1.4), ("sample_2", 1.0, 1.0), ("sample_3", 1.6, MAX_ACCELERATION_SCALE)],
-)
-def test_lively_motors_are_asked_for_more_and_weak_ones_for_no_less(
-    arm, sample: str, least: float, most: float
-) -> None:
-    loop = arm(sample, AT_REST, planned=False)
-    for stroke in range(6):
-        list(loop.hold(60.0 if stroke % 2 else 80.0, 0.8))
-    move = loop.stepper.move
-    assert loop.stepper.safety.faults == ()
-    assert least <= move.acceleration_scale <= most
-    resting = [move.acceleration_scale for _ in loop.hold(80.0, 0.5)]
-    assert resting[-1] == resting[250]
-
-
-# -- rollovers ---------------------------------------------------------------------------------------------------------
 
 
 LASTS_S, BEFORE_S = 1.5, 0.7

@@ -2,10 +2,8 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import pytest
-from bad_lines import BadSerialLine, losing
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.control.safety.codes import Fault
@@ -68,16 +66,6 @@ def test_a_retract_that_does_not_begin_is_named(closed: Opens, bus: str, ends: C
     assert loop.simulated.truth.gap_mm < HALF_MM + 2.0
 
 
-def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_and_opened(make: Opens) -> None:
-    loop = make(planned=False)
-    firmware = loop.simulated.firmware
-    assert isinstance(firmware, Firmware)
-    firmware.homed, firmware._left_zero_mm, firmware._right_zero_mm = True, 7.5, 8.5
-    assert named_s(loop) <= NAMED_S + 0.1
-    list(loop.hold(CLOSED_MM, 2.0))
-    assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
-
-
 SAMPLES = {name: load_plant(name) for name in ("sample_1", "sample_2", "sample_3")}
 HEALTHY = {
     **{bus: (bus, SAMPLES["sample_1"]) for bus in ("serial", "can")},
@@ -106,13 +94,3 @@ def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
         list(loop.hold(gap_mm, closes_s))
         loop.command("disable")
         assert named_s(loop, seconds=opens_s) == math.inf
-
-
-@pytest.mark.parametrize("gap_mm", [50.0, 85.0])
-def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: float) -> None:
-    loop = closed("serial", gap_mm=gap_mm)
-    loop.port.device = line = BadSerialLine(loop.port.device)
-    line.spoil(partial(losing, 0.1))
-    loop.command("disable")
-    assert named_s(loop, seconds=4.0) == math.inf
-    assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
