@@ -40,18 +40,6 @@ def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
     assert sliding_N == pytest.approx([1.0] * len(sliding_N), abs=0.02)
 
 
-@pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-@pytest.mark.parametrize(("from_mm", "to_mm"), [(47.0, 95.0), (95.0, 47.0)], ids=["opening", "closing"])
-def test_a_gap_at_full_speed_turns_round_at_once(arm, sample: str, from_mm: float, to_mm: float) -> None:
-    loop = arm(sample, planned=False)
-    list(loop.hold(47.0, 0.7))
-    if from_mm > to_mm:
-        list(loop.hold(95.0, 0.3))
-    went_mm = np.array([abs(each.truth.gap_mm - to_mm) for each in loop.hold(to_mm, 0.2)])
-    assert went_mm.argmax() < 30, "ms"
-    assert went_mm.max() - went_mm[0] < 0.6
-
-
 def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
     publish(armed, lambda time_s: 1.2, 1.2)
     armed.command("pause")
