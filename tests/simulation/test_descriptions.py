@@ -10,6 +10,7 @@ import pytest
 
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
+from tormagd.ground.table import TableError
 from tormagd.simulation.faults import KNOWN, SIZED, Fault, FaultError, parse_fault
 from tormagd.simulation.hand import HandError, ReversingHand, SteadyHand, parse_hand, pressing
 from tormagd.simulation.parameters import PlantError, changed, load_plant, plant_names, with_insert
@@ -171,7 +172,7 @@ def test_a_recording_is_interpolated_and_held_at_its_ends(tmp_path) -> None:
 def test_a_bad_recording_is_refused_with_its_line(tmp_path, text: str, said: str) -> None:
     path = tmp_path / "hand.csv"
     path.write_text(text)
-    with pytest.raises(HandError, match=said):
+    with pytest.raises(TableError, match=said):
         parse_hand(str(path))
 
 
@@ -194,7 +195,7 @@ BAD_FAULTS = (
     ],
 )
 def test_a_bad_hand_or_fault_is_refused(read: Callable[[str], object], spec: str, said: str) -> None:
-    with pytest.raises(HandError if read is parse_hand else FaultError, match=said or r"\w"):
+    with pytest.raises((HandError, TableError) if read is parse_hand else FaultError, match=said or r"\w"):
         read(spec)
 
 

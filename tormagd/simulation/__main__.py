@@ -21,6 +21,7 @@ from tormagd.element.physics.errors import DomainError
 from tormagd.ground.command_line import add, option
 from tormagd.ground.files import new_file
 from tormagd.ground.scheduling import ask_for_fifo, ask_for_slices
+from tormagd.ground.table import TableError
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
 from tormagd.simulation.can_port import FOLDER_PREFIX, CanPort
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 truth = options.truth and resources.enter_context(_begun(options.truth))
             except FileExistsError as error:
                 command.error(printable(f"--truth {error.filename}: this exists; allowed is a new file"))
-            except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
+            except (PlantError, HandError, TableError, FaultError, DomainError, BuildError, OSError) as error:
                 command.error(printable(str(error)))
             if write_line(door.address, sys.stdout) is not None:
                 print(f"{command.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)

@@ -8,7 +8,6 @@ from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
 from tormagd.ground.force_file import read_motion
-from tormagd.ground.table import TableError
 
 ROLLER_RADIUS_MM: Final = 20.0
 DEFAULT_RPM: Final = 20.0
@@ -27,7 +26,7 @@ KNOWN = (
 
 
 class HandError(ValueError):
-    """A hand specification or recording that cannot be used."""
+    """A hand specification that cannot be used."""
 
 
 class Hand(Protocol):
@@ -198,7 +197,7 @@ _FELT: dict[str, tuple[float, float, float]] = {
 
 
 def parse_hand(spec: str) -> Hand:
-    """Return the hand that the command-line word `spec` stands for. Raises HandError."""
+    """Return the hand that the command-line word `spec` stands for. Raises HandError or TableError."""
     name, _, value = spec.partition("=")
     if name in _SIZED:
         hand, low, high = _SIZED[name]
@@ -206,7 +205,8 @@ def parse_hand(spec: str) -> Hand:
     if name == "felt":
         return _felt(spec, value)
     if spec.endswith(".csv"):
-        return read_recording(Path(spec))
+        times_s, positions_mm = read_motion(Path(spec))
+        return RecordedHand(tuple(times_s), tuple(positions_mm))
     raise HandError(f"hand {spec!r}: allowed are {KNOWN}")
 
 
@@ -230,12 +230,3 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
     if not low <= number <= high:
         raise HandError(f"hand {spec!r}: allowed are numbers from {low:g} to {high:g}")
     return number
-
-
-def read_recording(path: Path) -> RecordedHand:
-    """Read a hand's motion from a CSV file. Raises HandError."""
-    try:
-        times_s, positions_mm = read_motion(path)
-    except TableError as error:
-        raise HandError(str(error)) from error
-    return RecordedHand(tuple(times_s), tuple(positions_mm))

@@ -7,11 +7,15 @@ when its last bit would have.
 import gc
 import select
 import time
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, TextIO
+from collections.abc import Callable
+from typing import NamedTuple, TextIO, TypeAlias
 
-from tormagd.simulation.device import MessageDevice
+from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.can_port import CanPort
+from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.plant import Truth
+from tormagd.simulation.pty_port import PtyPort
+from tormagd.simulation.slcan_port import SlcanPort
 
 LATE_S = 2e-3
 "From here on a wake-up is late: two firmware ticks."
@@ -21,36 +25,10 @@ TRUTH_PERIOD_S = 1e-3
 TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C,kinetic_N\n"
 
 
-class PacedDevice(Protocol):
-    """A device with its wire; times are seconds from power-on and never fall."""
-
-    @property
-    def messages(self) -> MessageDevice:
-        """The device itself."""
-
-    @property
-    def next_event_s(self) -> float:
-        """When the device has something to do next; it may be past."""
-
-    def advance(self, now_s: float) -> None:
-        """Let time pass until `now_s`."""
-
-
-class Door(Protocol):
-    """Where hosts reach a device: a pseudo-terminal or a socket."""
-
-    @property
-    def address(self) -> str:
-        """What a host opens."""
-
-    def descriptors(self) -> Sequence[int]:
-        """Return the file descriptors to wait on for hosts."""
-
-    def exchange(self, now_s: float, readable: Sequence[int]) -> None:
-        """Hand the device what has come, and hosts what the device has sent by `now_s`."""
-
-    def close(self) -> None:
-        """Close everything that the door opened."""
+PacedDevice: TypeAlias = VirtualDevice | CanDevice
+"A device with its wire; times are seconds from power-on and never fall."
+Door: TypeAlias = PtyPort | SlcanPort | CanPort
+"Where hosts reach a device."
 
 
 class Punctuality(NamedTuple):
