@@ -7,7 +7,6 @@ import pytest
 
 from tormagd.simulation.hand import (
     FeltHand,
-    HandError,
     Impedance,
     RecordedHand,
     SteadyHand,
@@ -121,13 +120,11 @@ def test_a_stiff_hand_goes_where_it_means_to() -> None:
     )
 
 
-def test_it_moves_one_plant_and_no_pad() -> None:
+def test_it_moves_one_plant_only() -> None:
     hand = FeltHand(STROKE, WRIST)
     at_brake("sample_1", hand, 0.1)
     with pytest.raises(ValueError, match=r"time_s = 0\.001"):
         at_brake("sample_1", hand, 0.1)
-    with pytest.raises(HandError, match=r"felt.*pressing"):
-        Plant(load_plant("pad_1"), FeltHand(STROKE, WRIST))
 
 
 def test_a_felt_hand_of_the_command_line_strokes_once_the_device_is_homed() -> None:

@@ -179,14 +179,3 @@ def test_how_a_run_ends(
     assert (host.status.faults, truth.left_A, truth.right_A) == (latched, 0.0, 0.0)
     assert (truth.left_mm, truth.right_mm) == end_mm
     assert host.command(Clear) is (SUPPLY not in latched), "its cause lasts"
-
-
-@pytest.mark.parametrize(("percent", "within_s"), [(-100, 0.4), (-75, 3.5), (-200, 3.5)])
-def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int, within_s: float) -> None:
-    host = running([f"opening={percent}%@3.5"], gap_mm=52.0)
-    host.run_until(3.5)
-    started_s = host.now_s
-    host.beat(DriveMode.OFF)
-    while DeviceFault.RETRACT_FAILED not in host.status.faults:
-        host.pass_time(0.01)
-        assert host.now_s - started_s < within_s
