@@ -6,12 +6,10 @@ import itertools
 import math
 import os
 import select
-import signal
 import socket
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +28,7 @@ from firmware_protocol.codec import (
     encode,
 )
 from tormagd.config import Device, Rates
+from tormagd.ctl.processes import begun, end, first_line
 from tormagd.hardware.backend import choose
 from tormagd.simulation.__main__ import main
 from tormagd.simulation.can_bus import SimulatorBus
@@ -44,35 +43,10 @@ LIMIT_S = 20.0
 HELLO = Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)
 IDENTITY = can_identifier(FUNCTION[Identity])
 STATUS = can_identifier(FUNCTION[Status])
-Start = Callable[..., "subprocess.Popen[str]"]
 
 
 def descriptor(backend) -> int:
     return int(backend._fd)
-
-
-@pytest.fixture
-def start() -> Iterator[Start]:
-    with contextlib.ExitStack() as stack:
-
-        def begin(*arguments: str) -> "subprocess.Popen[str]":
-            command = [sys.executable, "-m", "tormagd.simulation", *arguments]
-            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-            stack.enter_context(process)
-            stack.callback(process.kill)
-            return process
-
-        yield begin
-
-
-def channel(process: "subprocess.Popen[str]") -> str:
-    return process.stdout.readline().strip()
-
-
-def ended(process: "subprocess.Popen[str]") -> None:
-    process.send_signal(signal.SIGTERM)
-    output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output) == (0, ""), errors
 
 
 def meet(device: Device) -> None:
@@ -86,17 +60,24 @@ def meet(device: Device) -> None:
             seen |= {type(message) for message in backend.receive()}
 
 
-def test_hosts_come_and_go_on_the_simulators_bus_and_the_truth_is_kept(start: Start, tmp_path: Path) -> None:
-    truth = tmp_path / "truth.csv"
-    process = start("--can", "--seed", "3", "--truth", str(truth))
-    path = channel(process)
+@pytest.fixture
+def stack() -> Iterator[contextlib.ExitStack]:
+    with contextlib.ExitStack() as made:
+        yield made
+
+
+def test_hosts_come_and_go_on_the_simulators_bus_and_the_truth_is_kept(
+    stack: contextlib.ExitStack, tmp_path: Path
+) -> None:
+    truth, simulator = tmp_path / "truth.csv", ("-m", "tormagd.simulation", "--can", "--seed", "3", "--truth")
+    process = begun(stack, tmp_path / "log", *simulator, str(truth))
+    path = first_line(process)
     is_granted = subprocess.run(["chrt", "--fifo", "1", "true"], capture_output=True).returncode == 0
     assert os.sched_getscheduler(process.pid) & os.SCHED_FIFO == is_granted * os.SCHED_FIFO
     assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
     for _ in range(2):
         meet(Device(backend="can", options={"interface": "tormagsim"}, port=path))
-    ended(process)
-    assert not Path(path).exists()
+    assert (end(process), process.stdout.read(), Path(path).exists()) == (0, "", False)
     with truth.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [
