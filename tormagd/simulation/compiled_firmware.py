@@ -149,27 +149,29 @@ class CompiledFirmware(ViewedFirmware):
         return ANSWERS[answer]
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-        length: int = _library().tormag_bridge_tick(self._device, time_s, seen(sensors), payload)
+        length, payload = self._report("tick", 1, time_s, seen(sensors))
         self._look()
-        _require_sent(length, sensors)
-        return _decoded(Status, payload.raw) if length else None
+        return _decoded(Status, payload) if length else None
 
     def status(self, sensors: Sensors) -> Status:
-        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-        _require_sent(_library().tormag_bridge_status(self._device, seen(sensors), payload), sensors)
-        return _decoded(Status, payload.raw)
+        _, payload = self._report("status", 1, seen(sensors))
+        return _decoded(Status, payload)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
-        result: int = _library().tormag_bridge_measurement(self._device, time_s, seen(sensors), payloads)
-        _require_sent(result, sensors)
-        return _decoded(State, payloads.raw[:MAX_PAYLOAD]), _decoded(Sense, payloads.raw[MAX_PAYLOAD:])
+        _, payloads = self._report("measurement", 2, time_s, seen(sensors))
+        return _decoded(State, payloads[:MAX_PAYLOAD]), _decoded(Sense, payloads[MAX_PAYLOAD:])
 
     def identity(self) -> Identity:
-        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-        _library().tormag_bridge_identity(self._device, payload)
-        return _decoded(Identity, payload.raw)
+        _, payload = self._report("identity", 1)
+        return _decoded(Identity, payload)
+
+    def _report(self, name: str, messages: int, *arguments: float | CSensors) -> tuple[int, bytes]:
+        """Return what a function of the bridge returns, and the payloads that it wrote."""
+        payloads = ctypes.create_string_buffer(messages * MAX_PAYLOAD)
+        result: int = getattr(_library(), f"tormag_bridge_{name}")(self._device, *arguments, payloads)
+        if result < 0:
+            raise EncodeError(f"{name} of {arguments}: a value has no step on the wire")
+        return result, payloads.raw
 
     def _look(self) -> None:
         view = View()
@@ -201,11 +203,6 @@ def seen(sensors: Sensors) -> CSensors:
         sensors.supply_V,
         sensors.temperature_C,
     )
-
-
-def _require_sent(result: int, sensors: Sensors) -> None:
-    if result < 0:
-        raise EncodeError(f"{sensors}: a value has no step on the wire")
 
 
 def _decoded(kind: type[M], payload: bytes) -> M:
