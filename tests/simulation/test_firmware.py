@@ -179,3 +179,13 @@ def test_how_a_run_ends(
     assert (host.status.faults, truth.left_A, truth.right_A) == (latched, 0.0, 0.0)
     assert (truth.left_mm, truth.right_mm) == end_mm
     assert host.command(Clear) is (SUPPLY not in latched), "its cause lasts"
+
+
+def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open() -> None:
+    host = running(["worn_gearbox@3.5", "supply_loss@3.5"], gap_mm=47.0, plant="sample_3")
+    host.run_until(3.5)
+    while DeviceFault.UNCOMMANDED_MOTION not in host.status.faults:
+        host.beat(None)
+        assert host.now_s < 5.0
+    assert host.status.mode is DeviceMode.RETRACTING
+    assert DeviceFault.RETRACT_FAILED not in host.status.faults
