@@ -52,12 +52,6 @@ def test_a_wrench_along_the_shaft_is_a_setpoint_for_the_time_of_its_header():
     assert translation.setpoint_of(wrench(1.4))["stamp_ns"] is None
 
 
-def test_a_force_that_pushes_is_refused_and_named():
-    fields = translation.setpoint_of(wrench(-0.2))
-    with pytest.raises(ValueError, match=r"servo_cf = -0\.2: allowed is 0\.\."):
-        Numbering("ros2").setpoint(valid_for_ms=100.0, **fields)
-
-
 def test_commands_are_those_of_the_daemon_and_others_are_named():
     assert translation.command_of(SimpleNamespace(string="home")) == "home"
     with pytest.raises(ValueError, match="'unhome': allowed are home, enable, disable, pause, resume"):

@@ -3,7 +3,6 @@
 import math
 import random
 
-import msgspec
 import pytest
 
 from firmware_protocol.codec import (
@@ -26,7 +25,7 @@ from firmware_protocol.framing import FrameDecoder, encode_frame
 from tormagd.simulation.can_device import DEVICE, MAX_WAITING, CanDevice, CanFrame, Delivery
 from tormagd.simulation.device import MessageDevice, Packet, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.parameters import changed, load_plant
 
 SAMPLE_1 = load_plant("sample_1")
 HELLO = encode_frame(FUNCTION[Hello], 0, encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)))
@@ -34,8 +33,8 @@ IDENTITY_BYTES = 1 + 2 + 8 + 2 + 1  # COBS, header, payload, CRC, delimiter
 
 
 def a_device(baud: int = 1_000_000, seed: int = 0, ppm: float = 0.0, jitter_us: float = 0.0) -> VirtualDevice:
-    timing = msgspec.structs.replace(SAMPLE_1.firmware, clock_ppm=ppm, reply_jitter_us=jitter_us)
-    return VirtualDevice(msgspec.structs.replace(SAMPLE_1, firmware=timing), SteadyHand(), seed=seed, baud=baud)
+    plant = changed(SAMPLE_1, "firmware", clock_ppm=ppm, reply_jitter_us=jitter_us)
+    return VirtualDevice(plant, SteadyHand(), seed=seed, baud=baud)
 
 
 @pytest.mark.parametrize("baud", [9600, 115_200, 1_000_000])
