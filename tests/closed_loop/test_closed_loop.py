@@ -1,6 +1,6 @@
-"""The daemon's core against the simulated device, in virtual time and through protocol bytes.
+"""The daemon's core against the simulated device, in virtual time and through protocol bytes (synthetic).
 
-All data here are synthetic: the device is the simulator's, the pulse is a formula.
+How exactly a force is followed is judged in tests/tools.
 """
 
 import math
@@ -13,26 +13,17 @@ from firmware_protocol.codec import DriveMode
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.records import TimedSetpoint
-from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
-from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
+from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.hand import RecordedHand, ReversingHand, pressing
 
 OPEN_MM = 95.0
 
 
-def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
-    times = np.arange(round(duration_s * rate_hz)) / rate_hz
-    return list(loop.run(duration_s, stream(times + loop.now_s, np.array([force_N(time) for time in times]))))
-
-
-def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
-    return samples[-1].safety.faults
-
-
-def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
-    samples = publish(arm(hand=ReversingHand()), lambda time_s: 1.0, 4.0, rate_hz=100)[1_500:]
+def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm, render) -> None:
+    samples = render(arm(hand=ReversingHand()), 1.0, 4.0)[1_500:]
     assert min(abs(sample.truth.handle_mm_s) for sample in samples) < 0.1
     assert all(-0.1 < sample.truth.kinetic_N - 1.0 < 0.08 for sample in samples)
     assert all(abs(sample.truth.force_N) < 1.08 for sample in samples)
@@ -40,22 +31,20 @@ def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
     assert sliding_N == pytest.approx([1.0] * len(sliding_N), abs=0.02)
 
 
-def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
-    publish(armed, lambda time_s: 1.2, 1.2)
+def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop, render) -> None:
+    render(armed, 1.2, 1.2)
     armed.command("pause")
     held_mm = armed.simulated.truth.gap_mm
-    assert all(
-        sample.truth.gap_mm == pytest.approx(held_mm, abs=0.3) for sample in publish(armed, lambda time_s: 1.8, 0.4)
-    )
+    assert all(sample.truth.gap_mm == pytest.approx(held_mm, abs=0.3) for sample in render(armed, 1.8, 0.4))
     armed.command("resume")
-    assert publish(armed, lambda time_s: 1.8, 0.8)[-1].truth.force_N == pytest.approx(1.8, abs=0.06)
+    assert render(armed, 1.8, 0.8)[-1].truth.force_N == pytest.approx(1.8, abs=0.06)
     armed.command("disable")
     opened = list(armed.run(2.2))
-    assert (opened[-1].truth.gap_mm, faults_of(opened)) == (pytest.approx(OPEN_MM, abs=0.3), ())
+    assert (opened[-1].truth.gap_mm, opened[-1].safety.faults) == (pytest.approx(OPEN_MM, abs=0.3), ())
     assert all(sample.output.mode is DriveMode.OFF for sample in opened)
     # disabled is not a fault: it can be armed again without homing
     armed.command("enable")
-    assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
+    assert render(armed, 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
 @pytest.mark.parametrize(("is_every", "planned"), [(True, 500), (False, 100)])

@@ -1,4 +1,4 @@
-"""Extremes of the loop on the simulated device: uneven screws and clocks, targets that flip, magnets that pull.
+"""Extremes of the loop on the simulated device: clocks that roll over, configurations at the ends of what is accepted.
 
 All data here are synthetic: the device is the simulator's.
 """
