@@ -131,6 +131,7 @@ RECOVERED = (
     ("force sensor reads nothing", "clear-fault, enable refused: sensor_doubted", ("enable",)),
     # what the device has latched comes back while its cause stands
     ("device too hot", "clear-fault, DEVICE_TEMPERATURE again", ("clear-fault", "home", "enable")),
+    ("motor supply fails", "clear-fault, DEVICE_SUPPLY again", ("clear-fault", "home", "enable")),
     ("handle's encoder lost", "HANDLE_LOST still told", ()),
 )
 
