@@ -11,7 +11,7 @@ import pytest
 
 from tormagd.config import Config, Device
 from tormagd.ctl.machine import Machine
-from tormagd.ctl.ports import Holder, ports, survey
+from tormagd.ctl.ports import ports, survey
 
 FTDI = SimpleNamespace(
     device="/dev/ttyUSB0", description="FT232R USB UART", vid=0x0403, pid=0x6001, serial_number="A50285BI"
@@ -28,10 +28,13 @@ def root(machine) -> Path:
 
 
 def test_the_configured_port_is_known_by_where_its_name_leads(root: Path) -> None:
-    board, chip = survey(Config(), Machine(root), [FTDI, ON_BOARD], []).serial
-    assert (chip.port, chip.usb_id, chip.serial_number) == ("/dev/ttyUSB0", "0403:6001", "A50285BI")
-    assert (chip.is_configured, chip.is_accessible, chip.latency_ms, chip.holders) == (True, True, 16, ())
-    assert (board.is_configured, board.usb_id, board.latency_ms) == (False, None, None)
+    board, chip = survey(Config(), Machine(root), [FTDI, ON_BOARD], [])["serial"]
+    assert chip == {
+        **{"port": "/dev/ttyUSB0", "description": "FT232R USB UART", "usb_id": "0403:6001"},
+        **{"serial_number": "A50285BI", "latency_ms": 16, "holders": []},
+        **{"is_configured": True, "is_accessible": True},
+    }
+    assert (board["is_configured"], board["usb_id"], board["latency_ms"]) == (False, None, None)
 
 
 def test_open_files_and_locks_name_the_holders(root: Path, machine) -> None:
@@ -41,26 +44,33 @@ def test_open_files_and_locks_name_the_holders(root: Path, machine) -> None:
     (root / "proc/locks").write_text(
         f"1: FLOCK  ADVISORY  WRITE 77 {inode} 0 EOF\n2: POSIX  ADVISORY  WRITE 4242 {inode} 0 EOF\n3: strange\n"
     )
-    _, chip = survey(Config(), Machine(root), [FTDI, ON_BOARD], []).serial
-    assert chip.holders == (Holder(77, "tormagd", True), Holder(4242, "minicom", False))
+    _, chip = survey(Config(), Machine(root), [FTDI, ON_BOARD], [])["serial"]
+    assert chip["holders"] == [
+        {"process_id": 77, "name": "tormagd", "is_locking": True},
+        {"process_id": 4242, "name": "minicom", "is_locking": False},
+    ]
 
 
 def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root: Path, machine) -> None:
     machine.write({"dev/pts/3": ""})
     (root / "dev/tormag").unlink()
     (root / "dev/tormag").symlink_to("pts/3")
-    (entry,) = survey(Config(), Machine(root), [], []).serial
-    assert (entry.port, entry.is_configured) == ("/dev/pts/3", True)
+    (entry,) = survey(Config(), Machine(root), [], [])["serial"]
+    assert (entry["port"], entry["is_configured"]) == ("/dev/pts/3", True)
     (root / "dev/pts/3").unlink()
-    assert survey(Config(), Machine(root), [], []).serial == ()
+    assert survey(Config(), Machine(root), [], [])["serial"] == []
 
 
 def test_can_channels_say_whether_they_are_up(root: Path, machine) -> None:
     machine.write({f"sys/class/net/{name}/operstate": state for name, state in (("can0", "up"), ("can1", "down"))})
     channels = (("socketcan", "can0"), ("socketcan", "can1"), ("udp_multicast", "239.74.163.2"))
     detected = [{"interface": interface, "channel": channel} for interface, channel in channels]
-    found = survey(Config(device=Device(port="can0")), Machine(root), [], detected).can
-    assert [(each.channel, each.is_up) for each in found] == [("can0", True), ("can1", False), ("239.74.163.2", None)]
+    found = survey(Config(device=Device(port="can0")), Machine(root), [], detected)["can"]
+    assert [(each["channel"], each["is_up"]) for each in found] == [
+        ("can0", True),
+        ("can1", False),
+        ("239.74.163.2", None),
+    ]
 
 
 def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(root: Path, machine) -> None:
@@ -69,8 +79,8 @@ def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(ro
     other = {"interface": "tormagsim", "channel": "/tmp/tormagsim-1/can"}
     for detected in ([other], [other, {"interface": "tormagsim", "channel": "/tmp/can"}]):
         found = survey(Config(device=device), Machine(root), [], detected)
-        assert found.serial == ()
-        assert [(each.channel, each.is_configured, each.is_up) for each in found.can] == [
+        assert found["serial"] == []
+        assert [(each["channel"], each["is_configured"], each["is_up"]) for each in found["can"]] == [
             ("/tmp/tormagsim-1/can", False, False),
             ("/tmp/can", True, True),
         ]
