@@ -49,16 +49,12 @@ ANSWERS: dict[str, list[Row]] = {
         ({}, {"operating_state": "FAULT", "is_connected": False}, 1, ["nothing could be sent"]),
         (SHUT, {"operating_state": "FAULT", "is_connected": True}, 4, ["is not open: STOPPED, NOT_OPENING: it stands"]),
     ],
-    "stop --no-wait": [({}, {"operating_state": "FAULT", "is_connected": True}, 0, ["the gap opens"])],
     "disable": [
         ({"is_open": True}, {"operating_state": "DISABLED"}, 0, ["disabled; the gap is open"]),
         (SHUT, {"operating_state": "DISABLED"}, 4, ["is not open: STOPPED, NOT_OPENING: it stands"]),
         (SHUT | {"is_busy": True}, {"operating_state": "DISABLED"}, 4, ["NOT_OPENING: it stands", "remove the insert"]),
-    ],
-    "disable --no-wait": [({}, {"operating_state": "DISABLED"}, 0, ["disabled; the gap opens"])],
-    "disable --timeout 0.1": [
-        ({"is_busy": True, "is_open": True}, {"operating_state": "DISABLED"}, 1, ["0.1 s the gap is not open: 70.0"]),
-        ({"gap_mm": None}, {"operating_state": "DISABLED"}, 1, ["after 0.1 s the gap is not known to be open"]),
+        ({"is_busy": True, "is_open": True}, {"operating_state": "DISABLED"}, 1, ["0.2 s the gap is not open: 70.0"]),
+        ({"gap_mm": None}, {"operating_state": "DISABLED"}, 1, ["after 0.2 s the gap is not known to be open"]),
     ],
     "take b": [
         ({}, {"source": "b", "instead_of": "a"}, 0, ["'b' holds the brake instead of 'a'"]),
@@ -110,8 +106,9 @@ ARGS = {
     [(command, *row) for command, rows in ANSWERS.items() for row in rows],
 )
 def test_what_a_daemon_answers_decides_the_exit_code_and_is_told(
-    fake_daemon, ctl, command, status, result, code, words
+    fake_daemon, ctl, monkeypatch, command, status, result, code, words
 ):
+    monkeypatch.setattr("tormagd.ctl.operate.OPENS_S", 0.2)
     fake_daemon.says(**status)
     plain = command.removeprefix("--json ")
     name = plain.split()[0]
@@ -293,32 +290,32 @@ def states(fake_daemon: Any, status_with: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("options", "sequence"),
+    "sequence",
     [
-        ((), [(False, False), (False, False), (False, True), (False, True), (True, False)]),
-        ((), [(True, False), (True, False), (False, True), (True, False)]),  # homed before: the old state is no answer
-        ((), [(False, False), (True, False)]),  # over between two looks
-        (("--no-wait",), [(False, False)]),
+        [(False, False), (False, False), (False, True), (False, True), (True, False)],
+        [(True, False), (True, False), (False, True), (True, False)],  # homed before: the old state is no answer
+        [(False, False), (True, False)],  # over between two looks
     ],
 )
-def test_home_waits_until_the_device_is_homed(fake_daemon, ctl, states, options, sequence):
+def test_home_waits_until_the_device_is_homed(fake_daemon, ctl, states, sequence):
     states(*sequence)
-    assert ("seconds" in ctl(*fake_daemon.at, "--json", "home", *options).ended(0).result) == (not options)
+    assert "seconds" in ctl(*fake_daemon.at, "--json", "home").ended(0).result
     assert fake_daemon.commands == ["status", "home", *["status"] * (len(sequence) - 1)]
 
 
 @pytest.mark.parametrize(
-    ("sequence", "timeout", "expected"),
+    ("sequence", "expected"),
     [
-        ([(False, False), (False, True), (False, False)], "5", "not_homed"),
-        ([(False, False), (False, True)], "0.15", "timeout"),
-        ([(True, False)], "5", "not_begun"),
+        ([(False, False), (False, True), (False, False)], "not_homed"),
+        ([(False, False), (False, True)], "timeout"),
+        ([(True, False)], "not_begun"),
     ],
 )
-def test_home_that_does_not_succeed_says_how(fake_daemon, ctl, monkeypatch, states, sequence, timeout, expected):
+def test_home_that_does_not_succeed_says_how(fake_daemon, ctl, monkeypatch, states, sequence, expected):
     monkeypatch.setattr("tormagd.ctl.operate.BEGIN_S", 0.2)
+    monkeypatch.setattr("tormagd.ctl.operate.HOMES_S", 1.0)
     states(*sequence)
-    ended = ctl(*fake_daemon.at, "--json", "home", "--timeout", timeout)
+    ended = ctl(*fake_daemon.at, "--json", "home")
     assert (ended.code, ended.error["code"]) == (1, expected)
 
 
@@ -487,31 +484,17 @@ def test_a_command_loads_only_what_it_needs(command, run_dir):
     assert ran.stderr.splitlines()[-1] == "[]"
 
 
-def test_a_black_box_is_fetched_once_it_is_written(fake_daemon, status_with, ctl, tmp_path):
-    original, copy = tmp_path / "20260101T000000.000Z-REQUEST.mcap", tmp_path / "mine.mcap"
-    original.write_bytes(b"what is in it")
-    fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": str(original)}}
-    boxes = [{"folder": str(tmp_path), "newest": newest} for newest in ("an older one", original.name)]
-    fake_daemon.in_turn("status", *(status_with(black_box=each) for each in boxes))
-    fetch = (*fake_daemon.at, "--json", "blackbox", str(copy))
-    assert ctl(*fetch).ended(0).result == {"file": str(copy), "original": str(original)}
-    assert copy.read_bytes() == b"what is in it"
-    asked = list(fake_daemon.commands)
-    assert (ctl(*fetch).code, fake_daemon.commands) == (2, asked)
-
-
-def test_a_black_box_that_cannot_be_had_says_why(fake_daemon, ctl, tmp_path):
-    fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/nowhere/a.mcap"}}
-    fake_daemon.says(black_box={"folder": "/nowhere", "refusal": "/nowhere/a.mcap: No space left on device"})
+def test_a_black_box_is_waited_for_until_it_is_written_or_cannot_be(fake_daemon, status_with, ctl):
     fetch = (*fake_daemon.at, "--json", "blackbox")
+    fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/boxes/new.mcap"}}
+    boxes = [{"folder": "/boxes", "newest": newest} for newest in ("an older one", "new.mcap")]
+    fake_daemon.in_turn("status", *(status_with(black_box=each) for each in boxes))
+    assert ctl(*fetch).ended(0).result == {"file": "/boxes/new.mcap"}
+    fake_daemon.says(black_box={"folder": "/boxes", "refusal": "/boxes/new.mcap: No space left on device"})
     error = ctl(*fetch).ended(1).error
     assert (error["code"], "No space left" in error["message"]) == ("not_written", True)
     fake_daemon.refuse("blackbox", "no_black_box")
     assert ctl(*fetch).error["code"] == "no_black_box"
-    fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/nowhere/b.mcap"}}
-    fake_daemon.says(black_box={"newest": "b.mcap"})
-    error = ctl(*fetch, str(tmp_path / "a.mcap")).ended(2).error
-    assert (error["code"], "/nowhere/b.mcap on the daemon's machine" in error["hint"]) == ("usage", True)
 
 
 # -- firmware ----------------------------------------------------------------------------------------------------------

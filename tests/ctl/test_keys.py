@@ -36,23 +36,14 @@ def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, ctl) -> N
     before = (keys / "server.key_secret").read_bytes()
     printed = ctl("--json", "keys", "generate", str(keys), "--observe", "screen").ended(0)
     assert [made["name"] for made in printed.result["made"]] == ["screen"]
-    for arguments in ((), ("--observe", "screen"), ("--publish", "server"), ("--client", "robot")):
+    for arguments in ((), ("--observe", "screen"), ("--publish", "server")):
         assert "exists: keys are never overwritten" in ctl("keys", "generate", str(keys), *arguments).ended(2).err
     assert (keys / "server.key_secret").read_bytes() == before
 
 
-def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, ctl) -> None:
-    printed = ctl("--json", "keys", "generate", str(tmp_path / "mine"), "--client", "robot").ended(0)
-    assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == ["robot.key", "robot.key_secret"]
-    (made,) = printed.result["made"]
-    shown = {"name": "robot", "fingerprint": made["fingerprint"]}
-    assert ctl("--json", "keys", "show", made["public"]).result["keys"] == [shown]
-    ctl("keys", "generate", str(tmp_path), "--client", "a", "--publish", "b").ended(2)
-    assert not list(tmp_path.glob("*.key*"))
-
-
 def test_a_folder_of_keys_is_shown(keys: Path, ctl) -> None:
-    assert ctl("keys", "show", str(keys / "publish")).ended(0).out.endswith("  robot\n")
+    (shown,) = ctl("--json", "keys", "show", str(keys / "publish/robot.key")).ended(0).result["keys"]
+    assert ctl("keys", "show", str(keys / "publish")).ended(0).out == f"{shown['fingerprint']}  robot\n"
 
 
 @pytest.fixture
@@ -77,20 +68,20 @@ def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
     mine, server = str(keys / "console.key_secret"), str(keys / "server.key")
     patient = ("--wait", "20")
     shown = (*patient, "--endpoint", guarded, "--key", mine, "--server-key", server, "--json")
-    assert ctl(*shown, "disable", "--no-wait").ended(0).result == {"operating_state": "DISABLED"}
+    assert ctl(*shown, "mark", "here").ended(0).result == {"operating_state": "DISABLED"}
     config = tmp_path / "client.toml"
     config.write_text(
         f'[endpoints]\ncontrol = "{guarded}"\n[endpoints.curve]\nclient_secret = "{mine}"\nserver_public = "{server}"\n'
     )
-    ctl(*patient, "--config", str(config), "disable", "--no-wait").ended(0)
+    ctl(*patient, "--config", str(config), "mark", "here").ended(0)
     monkeypatch.setenv(KEY, mine)
     monkeypatch.setenv(SERVER_KEY, server)
-    ctl(*patient, "--endpoint", guarded, "disable", "--no-wait").ended(0)
+    ctl(*patient, "--endpoint", guarded, "mark", "here").ended(0)
 
 
 def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(keys: Path, guarded: str, ctl) -> None:
     for arguments in ((), ("--key", str(keys / "robot.key_secret"), "--server-key", str(keys / "server.key"))):
-        error = ctl("--endpoint", guarded, "--wait", "0.3", "--json", *arguments, "disable", "--no-wait").ended(3).error
+        error = ctl("--endpoint", guarded, "--wait", "0.3", "--json", *arguments, "mark", "here").ended(3).error
         assert (error["code"], "--key and --server-key" in error["hint"]) == ("unreachable", True)
 
 

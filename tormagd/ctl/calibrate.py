@@ -26,6 +26,7 @@ from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
 from tormagd.ground.files import new_file
+from tormagd.ground.terminal import write_line
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
@@ -66,10 +67,9 @@ def calibrate_insert(
 def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
     """Ask for a moving handle, then play one sweep and return its ticks."""
     waveform = up_and_down(forces, rates_N_s[number])
-    label = f"sweep {number + 1} of {len(rates_N_s)}"
-    print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
+    sweep = f"sweep {number + 1} of {len(rates_N_s)}, {waveform.duration_s:.0f} s"
+    write_line(f"{sweep}: turn the handle to and fro {PACES[number % len(PACES)]}", sys.stderr)
     run.follow(handle_moved(forces.least_N))
-    run.progress.begin(label, waveform.duration_s)
     return run.play(waveform)
 
 
@@ -154,8 +154,8 @@ def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, 
             raise _not_kept(status.profile)
         known = known_of(config, status, scene_most_N)
         with armed(endpoints, client, known.force_N(0.0)) as run:
-            print("turn the handle to and fro, about 20 turns a minute, until the gap opens", file=sys.stderr)
-            run.progress.begin("device", 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES))
+            lasts_s = 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES)
+            write_line(f"{lasts_s:.0f} s: turn the handle to and fro, about 20 turns a minute", sys.stderr)
             run.follow(force_over_gap(known))
             mean, worst, *_ = run.follow(steps(known))
             status = client.status()
@@ -262,7 +262,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
                 "there, tormagctl doctor",
             )
         with armed(endpoints, client, waveform.least_N) as run:
-            run.progress.begin("motors", waveform.duration_s)
+            write_line(f"motors: {waveform.duration_s:.0f} s", sys.stderr)
             columns = run.play(waveform)
     log = motor_log(columns, side)
     rows = _saved(path, np.column_stack([log[name] for name in LOG_COLUMNS]), "%.6f", LOG_COLUMNS)

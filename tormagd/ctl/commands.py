@@ -75,23 +75,8 @@ def _operate(help_text: str) -> Command:
     return Command(help_text, "operate.operate", ("client", "command"))
 
 
-def _waiting(usual_s: float) -> tuple[Option, ...]:
-    return (
-        option(
-            "--timeout",
-            dest="timeout_s",
-            type=ABOVE_ZERO,
-            default=usual_s,
-            metavar="S",
-            help=f"wait this long ({usual_s:g})",
-        ),
-        option("--no-wait", dest="is_waiting", action="store_false", help="do not wait"),
-    )
-
-
 def _open_gap(help_text: str) -> Command:
-    # homing takes six seconds at most
-    return Command(help_text, "operate.open_gap", ("client", "command"), _waiting(10.0))
+    return Command(help_text, "operate.open_gap", ("client", "command"))
 
 
 COMMANDS = {
@@ -107,7 +92,6 @@ COMMANDS = {
         "clear faults, home and enable as needed; the force ramps up",
         "operate.arm",
         ("client",),
-        _waiting(30.0)[:1],
     ),
     "enable": _operate("start rendering force along a ramp"),
     "disable": _open_gap("open the gap and turn the drives off"),
@@ -131,7 +115,6 @@ COMMANDS = {
         "find the home switches of both carriages",
         "operate.home",
         ("client",),
-        _waiting(30.0),
     ),
     "send": Command(
         "publish setpoints: a synthetic shape, or times and forces of a file",
@@ -221,7 +204,6 @@ COMMANDS = {
         "have the daemon write the last half minute, as on a fault",
         "operate.black_box",
         ("client",),
-        (option("copy", type=Path, nargs="?", metavar="FILE.mcap", help="copy it to this file"),),
     ),
     "replay": Command(
         "run a black box again bit for bit, or with --set or --fault on the simulator",
@@ -399,11 +381,6 @@ COMMANDS = {
                     help=f"also make a client listed for {role}",
                 )
                 for role in ROLES
-            ),
-            option(
-                "--client",
-                metavar="NAME",
-                help="make only a client's pair, on its machine; send NAME.key to the daemon's",
             ),
         ),
         has_daemon=False,
