@@ -21,6 +21,7 @@ import pytest
 import zmq
 
 from tormagd.ctl.main import main
+from tormagd.scenes.scene import load_scene
 from tormagd_client.messages import (
     MOTION_TOPIC,
     VERDICT_TOPIC,
@@ -164,7 +165,7 @@ DESCRIPTION: dict[str, Any] = {
     "version": "0",
     "build": "compiled",
     "configuration": {"rates": {"control_hz": 1_000}},
-    "scene": {"name": "pulse", "force": {"least_N": 0.0, "most_N": 5.0}},
+    "scene": msgspec.to_builtins(load_scene("pulse")),
     "model": 16 * "0123",
     "profile": {"is_used": False, "age_s": None, "refusal": ""},
     "firmware": "1.0",

@@ -306,7 +306,7 @@ def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, ctl, tmp_path, a
     file.write_text("t_s,force_N\n0,1\n1,7\n")
     told = [str(file) if each == "FILE" else each for each in arguments]
     error = ctl(*fake_daemon.at, "--json", "send", *told).ended(1).error
-    assert error["message"] == f"{asked} N is asked: allowed is 0..5 N in scene pulse; nothing was sent"
+    assert error["message"] == f"{asked} N is asked: allowed is 0.5..2 N in scene pulse; nothing was sent"
     assert (error["code"], fake_daemon.setpoints) == ("out_of_range", [])
 
 

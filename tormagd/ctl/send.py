@@ -16,9 +16,10 @@ from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.ground.force_file import stated_columns
 from tormagd.ground.table import TableError
 from tormagd.ground.terminal import interrupted_by, write_line
+from tormagd.scenes.scene import Scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
-from tormagd_client.errors import UnreachableError
+from tormagd_client.errors import UnreachableError, not_understood
 from tormagd_client.messages import MAX_PREVIEW_SAMPLES, Description, Explained, Status
 from tormagd_client.wire import Pending, understood
 
@@ -32,32 +33,19 @@ SPOILING = ("RANGE", "F_MAX")
 "These mean another force than asked. F_MIN is not among them: 0 N asks for the device's least force."
 
 
-class Fate(msgspec.Struct, frozen=True):
-    """How many setpoints were taken, how often they were seen rendered, and what held them back."""
-
-    accepted: int
-    rendered_share: float | None
-    limits: tuple[str, ...]
-
-
 def require_range(known: Description, least_N: float, most_N: float) -> None:
     """Raise CommandError unless the daemon's scene allows forces from `least_N` to `most_N`."""
     try:
-        force = msgspec.convert(known.scene["force"], dict[str, Any])
-        allowed = msgspec.convert((force["least_N"], force["most_N"]), tuple[float, float])
-    except (KeyError, msgspec.ValidationError) as error:
-        raise CommandError(
-            Exit.UNREACHABLE,
-            "unintelligible",
-            f"the scene of tormagd {known.version} is not understood: {error}",
-            "install tormagd and tormagctl of the same version, and start the daemon again",
-        ) from error
-    if not allowed[0] <= least_N <= most_N <= allowed[1]:
+        scene = msgspec.convert(known.scene, Scene)
+    except ValueError as error:
+        raise not_understood("scene", error) from error
+    force = scene.force
+    if not force.least_N <= least_N <= most_N <= force.most_N:
         raise CommandError(
             Exit.REFUSED,
             "out_of_range",
-            f"{least_N:.12g}..{most_N:.12g} N is asked: allowed is {allowed[0]:.12g}..{allowed[1]:.12g} N "
-            f"in scene {known.scene.get('name', '-')}; nothing was sent",
+            f"{least_N:.12g}..{most_N:.12g} N is asked: allowed is {force.least_N:.12g}..{force.most_N:.12g} N "
+            f"in scene {scene.name}; nothing was sent",
             "ask within the range, or let the daemon run another scene",
         )
 
@@ -137,8 +125,10 @@ class StatusWatch:
             self._spoilt = held
         self._held = held
 
-    def finish(self, sent: int) -> Fate:
-        """Wait until the daemon has taken all `sent` setpoints, and return what became of them."""
+    def finish(self, sent: int) -> dict[str, Any]:
+        """Wait until the daemon has taken all `sent` setpoints, and return how many it took, how often they were seen
+        rendered, and what held them back.
+        """
         until_s = time.monotonic() + ARRIVAL_S
         while True:
             status = self._client.status(LAST_ANSWER_S)
@@ -160,7 +150,7 @@ class StatusWatch:
                 "look at the source in tormagctl status: another publisher of its name, or a loss on the way",
             )
         share_rendered = round(self._rendered / self._looks, 3) if self._looks else None
-        return Fate(accepted, share_rendered, tuple(self._limits))
+        return {"accepted": accepted, "rendered_share": share_rendered, "limits": list(self._limits)}
 
 
 def _accepted(status: Status, source: str) -> int:
@@ -222,15 +212,15 @@ def send(
                 is_interrupted,
                 watch,
             )
-            became = None if watch is None else watch.finish(done["sent"])
+            became = {} if watch is None else watch.finish(done["sent"])
     left_out = f", {done['skipped']} left out because this machine was late" if done["skipped"] else ""
     read = f"{what}: {'; '.join(waveform.told)}\n" if waveform.told else ""
     text = f"{read}sent {done['sent']} setpoints as {source!r} in {done['seconds']:.1f} s{left_out}; "
-    if became is None:
-        return Outcome({"source": source, "read": waveform.told, **done}, f"{text}whether they were taken is not known")
-    held = f", held by {', '.join(became.limits)} at times" if became.limits else ""
-    result = {"source": source, "read": waveform.told, **done, **msgspec.structs.asdict(became)}
-    return Outcome(result, f"{text}{became.accepted} taken and rendered{held}")
+    result = {"source": source, "read": waveform.told, **done, **became}
+    if watch is None:
+        return Outcome(result, f"{text}whether they were taken is not known")
+    held = f", held by {', '.join(became['limits'])} at times" if became["limits"] else ""
+    return Outcome(result, f"{text}{became['accepted']} taken and rendered{held}")
 
 
 def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> StatusWatch:
