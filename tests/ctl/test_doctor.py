@@ -62,7 +62,6 @@ CAPABLE = NOTHING | {"proc/self/status": f"Name:\tx\nCapEff:\t{1 << 23 | 1 << 14
 SWAPPING = {"proc/swaps": "Filename Type\n/dev/sda2 partition 1 0 -2\n"}
 CLOCK = "sys/devices/system/clocksource/clocksource0/current_clocksource"
 GROUPED = {"proc/sys/kernel/sched_autogroup_enabled": "1"}
-FORCED = {"proc/version": DYNAMIC, "sys/kernel/debug/sched/preempt": "none voluntary (full)"}
 
 
 def limited(memlock, rtprio):
@@ -70,11 +69,9 @@ def limited(memlock, rtprio):
 
 
 CASES = [
-    (checks.preemption, REALTIME, {"proc/version": DYNAMIC}, "warn", "dynamic, default"),
+    (checks.preemption, REALTIME, {"proc/version": DYNAMIC}, "warn", "PREEMPT_DYNAMIC"),
     (checks.preemption, REALTIME, {"proc/version": "Linux version 6.1 #1 SMP"}, "warn", "none or voluntary"),
-    (checks.preemption, REALTIME, {"proc/version": "Linux version 6.1 #1 SMP PREEMPT x"}, "warn", "full, but not"),
-    (checks.preemption, REALTIME, FORCED, "warn", "full in force"),
-    (checks.preemption, REALTIME, FORCED | {"sys/kernel/realtime": "1"}, "ok", "PREEMPT_RT"),
+    (checks.preemption, REALTIME, {"proc/version": DYNAMIC, "sys/kernel/realtime": "1"}, "ok", "PREEMPT_RT"),
     (
         checks.governor,
         REALTIME,

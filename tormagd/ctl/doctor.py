@@ -248,21 +248,11 @@ def preemption(config: Config, machine: Machine) -> Finding:
     """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT."""
     version = machine.text("/proc/version") or ""
     is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
-    # the model in force is in brackets or parentheses; only root can read it
-    active = re.search(r"[\[(](\w+)[\])]", machine.text("/sys/kernel/debug/sched/preempt") or "")
-    asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")
-    if is_real_time:
-        found = "PREEMPT_RT"
-    elif active:
-        found = f"dynamic, {active[1]} in force"
-    elif "PREEMPT_DYNAMIC" in version:
-        found = f"dynamic, {asked[1] if asked else 'default'} model"
-    else:
-        found = "full, but not PREEMPT_RT" if re.search(r"\bPREEMPT\b", version) else "none or voluntary"
+    model = re.search(r"\bPREEMPT\w*", version)
     return _finding(
         "preemption",
         is_real_time,
-        found,
+        "PREEMPT_RT" if is_real_time else model[0] if model else "none or voluntary",
         "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or boot with preempt=full",
     )
 

@@ -108,7 +108,7 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         change = ""
     elif loop == "control" and late_us.p99 > TICK_OVER_STEP * step.p99 and in_time > busy:
         change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
-    elif found.build == "interpreted":
+    elif found.build != "compiled":
         change = f"compile the core: {REMEDY}"
     else:
         change = f"a faster processor, or less than {hz} Hz"
