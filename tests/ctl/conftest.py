@@ -336,7 +336,7 @@ def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
             raise ChildProcessError(told.getvalue().strip().splitlines()[-1])
         return said.getvalue()
 
-    monkeypatch.setattr("tormagd.ctl.scene_check.answer_of", answer_of)
+    monkeypatch.setattr("tormagd.ctl.scene.answer_of", answer_of)
 
 
 @pytest.fixture

@@ -254,7 +254,7 @@ def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_writ
 ):
     out = fast.with_name("mine.toml")
     with monkeypatch.context() as slow:
-        slow.setattr("tormagd.ctl.scene_check.machine_us", lambda: 2e3)
+        slow.setattr("tormagd.ctl.scene.machine_us", lambda: 2e3)
         found = ctl("--json", "scene", "check", str(fast), *bound, "--out", str(out)).ended(0).result
     assert tuple(found["way"].values()) == WAYS[way]
     assert found["daemon_share"] == pytest.approx({"usual": 0.4, "cheap": 0.2, "dear": 0.6, "nearer": 0.56}[way])
@@ -265,7 +265,7 @@ def test_the_cheapest_way_within_an_error_and_the_most_exact_at_a_price_are_writ
 
 
 def test_of_ways_that_are_alike_the_cheaper_is_taken(fast, ctl, monkeypatch):
-    monkeypatch.setattr("tormagd.ctl.scene_check.machine_us", lambda: 1e3)
+    monkeypatch.setattr("tormagd.ctl.scene.machine_us", lambda: 1e3)
     found = ctl("--json", "scene", "check", str(fast), "--share", "0.25").ended(0).result
     assert tuple(found["way"].values()) == WAYS["cheap"]
     refused = ctl("--json", "scene", "check", str(fast), "--share", "0.05").ended(1).error

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from reference_pages import commands_page, configuration_page, keys, subparsers, tables, ticks_page
+from reference_pages import commands_page, configuration_page, keys, tables, ticks_page
 
 from firmware_protocol.conformance import __main__ as conformance
 from tormag_lab.pages import KEY, figures_of, stamp
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
 from tormagd.ctl.commands import COMMANDS
-from tormagd.ctl.scene_check import measured_as
+from tormagd.ctl.completion import subparsers
+from tormagd.ctl.scene import measured_as
 from tormagd.daemon import main as daemon
 from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
@@ -77,7 +78,7 @@ def parser_of(words):
 
 
 def known_options(parser):
-    return {*parser._option_string_actions}.union(*(known_options(each) for _, each in subparsers(parser)))
+    return {*parser._option_string_actions}.union(*(each._option_string_actions for _, each in subparsers(parser)))
 
 
 def require_there(words):
@@ -177,7 +178,7 @@ def is_there(program, word, tool):
         return importlib.util.find_spec(word.rstrip(".")) is not None
     if program == "tormag-lab":
         return LAB is None or word in LAB.COMMANDS
-    return word in COMMANDS or word in PROSE
+    return word in PROSE or any(word == name.partition(" ")[0] for name in COMMANDS)
 
 
 def test_every_command_that_a_message_names_is_in_a_wheel():

@@ -1,6 +1,6 @@
 """`tormagctl keys`: make key pairs, show fingerprints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from tormagd.ctl.outcome import Outcome, as_usage_error
@@ -9,11 +9,7 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
 
 
-def keys(action: str, path: Path, **clients: Sequence[str]) -> Outcome:
-    return show_keys(path) if action == "show" else generate_keys(path, clients)
-
-
-def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]]) -> Outcome:
+def generate_keys(folder: Path, **clients: Sequence[str]) -> Outcome:
     """Make the daemon's key pair if there is none, and one for each of `clients`."""
     made = []
     with as_usage_error(OSError, ConfigError, hint="tormagctl keys generate --help; the guide has the whole exchange"):

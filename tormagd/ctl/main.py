@@ -16,7 +16,7 @@ import msgspec
 
 from tormagd import __version__
 from tormagd.config import Config, load_config, load_endpoints
-from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL
+from tormagd.ctl.commands import COMMANDS, GROUPS, KEY, SERVER_KEY, SHARED, USUAL
 from tormagd.ctl.outcome import (
     Outcome,
     as_usage_error,
@@ -53,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser().parse_args(given)
     except UsageError as error:
         refused = usage_error(error.message, error.hint)
-        print_error(next((each for each in given if each in COMMANDS), ""), refused, "--json" in given)
+        known = {name.partition(" ")[0] for name in COMMANDS}
+        print_error(next((each for each in given if each in known), ""), refused, "--json" in given)
         return refused.exit_code
     try:
         outcome = _run(options)
@@ -69,7 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> Outcome:
     """Call the command's function with its options and what it needs."""
-    command = COMMANDS[options.command]
+    name = f"{options.command} {options.in_group}".rstrip()
+    command = COMMANDS[name]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
         file = SERVICE_CONFIG
@@ -90,8 +92,8 @@ def _run(options: argparse.Namespace) -> Outcome:
             from tormagd_client.blocking import Client
 
             known["client"] = stack.enter_context(Client(known["endpoints"], options.wait))
-        given = {name: value for name, value in vars(options).items() if name not in ("command", *USUAL)}
-        return _called(options.command, given | {need: known[need] for need in command.needs})
+        given = {key: value for key, value in vars(options).items() if key not in ("command", "in_group", *USUAL)}
+        return _called(name, given | {need: known[need] for need in command.needs})
 
 
 def _called(command: str, arguments: dict[str, Any]) -> Outcome:
@@ -144,10 +146,16 @@ def parser() -> argparse.ArgumentParser:
     made.options = tuple(name for names, _ in (*SHARED, *of_commands) for name in names)
     made.set_defaults(**USUAL)
     made.add_argument("--version", action="version", version=f"tormagctl {__version__}")
+    made.set_defaults(in_group="")
     # otherwise argparse would lay out a usage to find it
-    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=made.prog)
+    commands = {"": made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=made.prog)}
     for name, (text, _, _, options, _) in COMMANDS.items():
-        add(commands.add_parser(name, help=text, description=text, parents=[shared], epilog=EXIT_TEXT), options)
+        group, _, last = name.rpartition(" ")
+        if group not in commands:
+            about = GROUPS[group]
+            inner = commands[""].add_parser(group, help=about, description=about, parents=[shared], epilog=EXIT_TEXT)
+            commands[group] = inner.add_subparsers(dest="in_group", required=True, metavar="ACTION", prog=inner.prog)
+        add(commands[group].add_parser(last, help=text, description=text, parents=[shared], epilog=EXIT_TEXT), options)
     return made
 
 

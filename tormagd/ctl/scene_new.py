@@ -13,7 +13,7 @@ import msgspec
 
 from tormagd.config import MIN_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ctl.scene_check import NEW_FILE, as_toml, check_scene
+from tormagd.ctl.scene import NEW_FILE, as_toml, check_scene
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert as known_insert
 from tormagd.ground.files import new_file
@@ -36,26 +36,28 @@ Tables = dict[str, Any]
 class Recorded(NamedTuple):
     """A recorded quantity that becomes the scene's force, and what a person states of the scene."""
 
-    force: Path | None = None
+    force: Path | None
     "A file with times and one column of the quantity; without it, a person is asked."
-    column: str | None = None
-    time_column: str | None = None
-    scale: float | None = None
+    column: str | None
+    time_column: str | None
+    scale: float | None
     "Newtons for each unit of the column."
-    offset_N: float | None = None
-    insert: str | None = None
+    offset_N: float | None
+    insert: str | None
     "By default the softest that renders the scene."
-    tolerance_N: float | None = None
+    tolerance_N: float | None
 
 
-def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
+def new_scene(out: Path, config_file: Path | None, **stated: Any) -> Outcome:
+    """Make the scene file `out` of a `Recorded` quantity, or of answers."""
+    recorded = Recorded(**stated)
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: {NEW_FILE}", "name another file")
     with as_usage_error(DomainError, hint="tormagctl scene new --help"):
         known_insert(INSERTS[0] if recorded.insert is None else recorded.insert)
     with as_usage_error(OSError, hint=f"name another file: {NEW_FILE}"), contextlib.ExitStack() as files:
         force_file, told = _forces_of(out, recorded, files)
-        made = _proposed(out, force_file, recorded, config)
+        made = _proposed(out, force_file, recorded, config_file)
     if not told:
         return made
     text = f"{recorded.force}: {'; '.join(told)}\n{made.text}"
