@@ -18,9 +18,9 @@ import numpy as np
 
 from tormagd.commission.finding import Array
 from tormagd.commission.force_findings import RAMPS_S, STEP_S, STEP_SHARES, force_over_gap, steps
-from tormagd.commission.procedure import Columns, handle_moved
+from tormagd.commission.procedure import Columns, Known, handle_moved
 from tormagd.config import Config
-from tormagd.ctl.calibrate_run import SOURCE, Range, Run, armed, known_of, reach
+from tormagd.ctl.calibrate_run import SOURCE, Run, armed, known_of, reach
 from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.element.physics.errors import DomainError
@@ -55,27 +55,26 @@ def calibrate_insert(
         insert(insert_name)
     with Client(endpoints, wait_s, SOURCE) as client:
         known = known_of(config, client.status(), scene.force.most_N)
-        forces = Range(known.least_N, known.most_N)
-        with armed(endpoints, client, forces.least_N) as run:
-            sweeps = [_sweep(run, forces, number, rates_N_s) for number in range(len(rates_N_s))]
+        with armed(endpoints, client, known.least_N) as run:
+            sweeps = [_sweep(run, known, number, rates_N_s) for number in range(len(rates_N_s))]
     rows = write_sweeps(out, sweeps)
     fitting = f"tormag-lab calibrate {out} --insert {insert_name} --out MODEL.safetensors"
     text = f"{out}: {rows} rows of {len(sweeps)} sweeps. next: {fitting}"
     return Outcome({"file": str(out), "insert": insert_name, "rows": rows}, text)
 
 
-def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
+def _sweep(run: Run, known: Known, number: int, rates_N_s: Sequence[float]) -> Columns:
     """Ask for a moving handle, then play one sweep and return its ticks."""
-    waveform = up_and_down(forces, rates_N_s[number])
+    waveform = up_and_down(known.least_N, known.most_N, rates_N_s[number])
     sweep = f"sweep {number + 1} of {len(rates_N_s)}, {waveform.duration_s:.0f} s"
     write_line(f"{sweep}: turn the handle to and fro {PACES[number % len(PACES)]}", sys.stderr)
-    run.follow(handle_moved(forces.least_N))
+    run.follow(handle_moved(known.least_N))
     return run.play(waveform)
 
 
-def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
-    half_s = (forces.most_N - forces.least_N) / rate_N_s
-    return by_legs(forces.least_N, [(half_s, forces.most_N), (half_s, forces.least_N)])
+def up_and_down(least_N: float, most_N: float, rate_N_s: float) -> Waveform:
+    half_s = (most_N - least_N) / rate_N_s
+    return by_legs(least_N, [(half_s, most_N), (half_s, least_N)])
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> int:
@@ -238,12 +237,12 @@ MIN_HZ = 900.0
 LONGEST_HOLE_S = 0.02
 
 
-def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
+def excitation(least_N: float, most_N: float, rounds: int = ROUNDS) -> Waveform:
     """Return the waveform to ask for: ramps, then jumps, `rounds` times."""
-    low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
-    ramps = [(ramp_s, force_N) for ramp_s in MOTOR_RAMPS_S for force_N in (high_N, low_N)]
+    low_N = least_N + CLEAR_N
+    ramps = [(ramp_s, force_N) for ramp_s in MOTOR_RAMPS_S for force_N in (most_N, low_N)]
     # each takes a millisecond, and is held
-    jumps = [(lasts_s, low_N + share * (high_N - low_N)) for share in JUMP_SHARES for lasts_s in (1e-3, JUMP_S)]
+    jumps = [(lasts_s, low_N + share * (most_N - low_N)) for share in JUMP_SHARES for lasts_s in (1e-3, JUMP_S)]
     return by_legs(low_N, rounds * (ramps + jumps))
 
 
@@ -251,7 +250,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
     """Drive both carriages through `excitation`, and write the log of one as CSV."""
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
-        waveform = excitation(reach(status, scene_most_N))
+        waveform = excitation(*reach(status, scene_most_N))
         hz = status.rates["control"].hz
         if hz < MIN_HZ:
             raise CommandError(

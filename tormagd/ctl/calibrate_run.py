@@ -4,7 +4,6 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import zmq
 
@@ -55,13 +54,6 @@ def interrupted_run() -> CommandError:
         "interrupted: a device that was armed is disabled and opens its gap; what was under way is not saved",
         "run it again when you are ready",
     )
-
-
-class Range(NamedTuple):
-    """The forces that a calibration may ask for."""
-
-    least_N: float
-    most_N: float
 
 
 class Run(Device):
@@ -150,7 +142,8 @@ def _rows(data: bytes, endpoints: Endpoints) -> list[Row]:
     return [[row[place] for place in places] for row in batch.rows]
 
 
-def reach(status: Status, scene_most_N: float) -> Range:
+def reach(status: Status, scene_most_N: float) -> tuple[float, float]:
+    """Return the least and the greatest force that a calibration may ask for."""
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
     is_held = holder is not None and holder.state == "holds"  # an old setpoint may be valid for long
@@ -161,17 +154,17 @@ def reach(status: Status, scene_most_N: float) -> Range:
             f"somebody published a setpoint {age_ms:.0f} ms ago",
             "stop the publisher: a calibration must be the only one",
         )
-    return Range(status.least_N, min(status.most_N, scene_most_N))
+    return status.least_N, min(status.most_N, scene_most_N)
 
 
 def known_of(config: Config, status: Status, scene_most_N: float, weight_N: float | None = None) -> Known:
-    forces = reach(status, scene_most_N)
-    known = Known(config, 1.0 / status.rates["control"].hz, forces.least_N, forces.most_N, weight_N)
-    if not known.force_N(0.0) < forces.most_N:
+    least_N, most_N = reach(status, scene_most_N)
+    known = Known(config, 1.0 / status.rates["control"].hz, least_N, most_N, weight_N)
+    if not known.force_N(0.0) < most_N:
         raise CommandError(
             Exit.REFUSED,
             "no_range",
-            f"the daemon's scene ends at {forces.most_N:g} N, under the least force of {forces.least_N:g} N",
+            f"the daemon's scene ends at {most_N:g} N, under the least force of {least_N:g} N",
             "run the daemon with a scene that asks for more force",
         )
     return known
