@@ -20,7 +20,7 @@ from tormagd.commission import finding as commission
 from tormagd.commission.force_findings import sensor_at_rest
 from tormagd.config import Config
 from tormagd.ctl.calibrate_run import ticks_at_rest
-from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rate, measured, rates
+from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, Headroom, Rate, measured, rates
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd.ctl.status import RECOMMISSION, refused
@@ -197,7 +197,7 @@ def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
     held = {row.loop: row for row in rates(config, found) if row.configured}
     return (
         bare_timer(found),
-        others(found),
+        steal(found),
         core(found),
         *(configured_rate(held[loop]) for loop in ("control", "inference")),
     )
@@ -215,15 +215,12 @@ def bare_timer(found: Headroom) -> Finding:
     )
 
 
-def others(found: Headroom) -> Finding:
-    """Judge what a hypervisor and other programs took during the measurement."""
-    waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
-    is_stolen = found.steal > MAX_STOLEN
+def steal(found: Headroom) -> Finding:
     return _finding(
-        "others",
-        not is_stolen and (found.waited or 0.0) <= MAX_WAITED,
-        f"stolen {found.steal:.1%}; something waited for a processor: {waited}",
-        "ask whoever runs the host for processors that are not shared" if is_stolen else STOP_OTHERS,
+        "steal",
+        found.steal <= MAX_STOLEN,
+        f"a hypervisor took {found.steal:.1%} of the time",
+        "ask whoever runs the host for processors that are not shared",
     )
 
 
