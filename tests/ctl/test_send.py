@@ -36,7 +36,6 @@ def file(tmp_path):
 def test_every_setpoint_arrives_from_the_first_on(published):
     result, arrived = published("ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
     assert result["sent"] + result["skipped"] == 61
-    assert 0.0 <= result["worst_late_ms"] <= 1e3 * result["seconds"]
     assert (len(arrived), arrived[0].servo_cf, arrived[-1].servo_cf) == (result["sent"], 1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
     # the force belongs to the setpoint's own deadline
@@ -215,11 +214,10 @@ def test_what_is_taken_while_enabled_is_rendered_and_when_sending_is_over_the_ne
         ({}, {"operating_state": "FAULT", "faults": ["SKEW"]}, "fault", 4, "in FAULT: SKEW", "tormagctl arm"),
         (None, {}, "not_heard", 1, "nothing of 'me': too much", "status"),
         ({"state": "refused"}, {}, "other_source", 1, "'robot' holds the brake", "do this"),
-        ({"state": "refused"}, {"limit_details": []}, "other_source", 1, "'robot' holds", "tormagctl take me"),
         ({"state": "stale"}, {}, "stale", 1, "300 ms late", "do this"),
-        ({"state": "stale"}, {"limit_details": []}, "stale", 1, "come too late", "status"),
+        ({"state": "stale"}, {"limit_details": []}, "stale", 1, "STALE: it holds the force of 'me' back", "status"),
         ({}, {"limits": ["F_MAX"]}, "f_max", 1, "more force was asked", "do this"),
-        ({}, {"limits": ["RANGE"]}, "range", 1, "the limit RANGE", "status"),
+        ({}, {"limits": ["RANGE"]}, "range", 1, "RANGE: it holds", "status"),
     ],
 )
 def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes, code, exit_code, said, hint):

@@ -29,6 +29,9 @@ ARRIVAL_S = 0.5
 "By then the last setpoint has arrived, even if an answer overtook it."
 MIN_TAKEN = 0.9
 "The first setpoints may be refused while their clock is not known."
+OTHER_SOURCE = "OTHER_SOURCE"
+OF_STATE = {"refused": OTHER_SOURCE, "stale": "STALE"}
+"The limit that a source meets in these states."
 SPOILING = ("RANGE", "F_MAX")
 "These mean another force than asked. F_MIN is not among them: 0 N asks for the device's least force."
 
@@ -61,27 +64,17 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
             "tormagctl resume" if status.operating_state == "PAUSED" else "tormagctl arm",
         )
     report = status.setpoints.by_source.get(source)
-    why = {each.code: each for each in status.limit_details}
     if report is None:
         heard = f": {status.setpoints.last_refusal}" if status.setpoints.last_refusal else ""
         return CommandError(
             Exit.REFUSED, "not_heard", f"the daemon has taken nothing of {source!r}{heard}", "tormagctl status"
         )
-    if report.state == "refused":
-        other = why.get("OTHER_SOURCE") or Explained(
-            "OTHER_SOURCE",
-            f"{status.setpoints.newest_source!r} holds the brake, not {source!r}",
-            f"end the other one, or tormagctl take {source}",
-        )
-        return CommandError(Exit.REFUSED, "other_source", other.cause, other.remedy)
-    spoiling = {code: f"the force is held by the limit {code}" for code in SPOILING if code in status.limits}
-    if report.state == "stale":
-        spoiling = {"STALE": f"the setpoints of {source!r} come too late, or not at all"}
-    if is_over or not spoiling:
+    code = OF_STATE.get(report.state) or next((each for each in SPOILING if each in status.limits), None)
+    if code is None or (is_over and code != OTHER_SOURCE):
         return None
-    code, otherwise = next(iter(spoiling.items()))
-    message = f"{code}: {why[code].cause}" if code in why else otherwise
-    return CommandError(Exit.REFUSED, code.lower(), message, why[code].remedy if code in why else "tormagctl status")
+    unexplained = Explained(code, f"it holds the force of {source!r} back", "tormagctl status")
+    known = next((each for each in status.limit_details if each.code == code), unexplained)
+    return CommandError(Exit.REFUSED, code.lower(), f"{code}: {known.cause}", known.remedy)
 
 
 class StatusWatch:
@@ -247,7 +240,6 @@ def _publish(
     watch: StatusWatch | None,
 ) -> dict[str, Any]:
     sent = skipped = index = 0
-    worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()
     # the margin keeps the last one despite the rounding of a file's times
     last = int(duration_s * rate_hz + 1e-6)
@@ -257,7 +249,6 @@ def _publish(
         if wait_s > 0.0:
             time.sleep(wait_s)
         late_s = time.monotonic() - start_s - t_s
-        worst_late_s = max(worst_late_s, late_s)
         overdue = min(int(late_s * rate_hz), last - index)
         skipped += overdue
         index += overdue
@@ -284,6 +275,5 @@ def _publish(
         "skipped": skipped,
         "start_ns": start_ns,
         "seconds": round(time.monotonic() - start_s, 3),
-        "worst_late_ms": round(worst_late_s * 1e3, 3),
         "interrupted": bool(is_interrupted()),
     }
