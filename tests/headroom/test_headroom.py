@@ -4,7 +4,6 @@ import asyncio
 import json
 from functools import partial
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import uvloop
@@ -14,7 +13,7 @@ from tormagd.config import Config, RealTime
 from tormagd.control.assembly.build import Core
 from tormagd.ground import machine_loop
 from tormagd.headroom import __main__ as program
-from tormagd.headroom.bare_timer import beat, lateness
+from tormagd.headroom.bare_timer import lateness
 
 pytestmark = pytest.mark.usefixtures("usual_slices")
 
@@ -60,13 +59,6 @@ def test_each_call_is_made_once_in_its_own_beat() -> None:
     found = asyncio.run(program.core_cost(steps, plans, 1_000))
     assert made == ["plan", "step"] * 7
     assert [len(each) for each in found] == [7, 7]
-
-
-async def test_a_beat_ends_when_it_is_told_to() -> None:
-    ended = asyncio.Event()
-    on_beat = Mock(side_effect=lambda *_: ended.set())
-    await beat(1_000_000, on_beat, ended)
-    on_beat.assert_called()
 
 
 def test_the_program_prints_every_figure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
