@@ -90,23 +90,27 @@ def test_any_size_can_be_drawn_on_and_a_narrow_one_keeps_a_sparkline(
     assert width != 40 or not count or re.search(r"\nasked +\d\.\d{3} N +[▁▂▃▄▅▆▇█]{8}", "\n".join(lines))
 
 
-def test_what_comes_with_the_newest_snapshot_is_explained_and_a_daemon_that_is_gone_is_waited_for(seen: Seen) -> None:
+def test_the_status_is_asked_for_at_news_and_a_daemon_that_is_gone_is_waited_for(seen: Seen) -> None:
     known = msgspec.structs.replace(seen.status, limit_details=(RATE,))
-    client = Mock(**{"status.side_effect": [seen.status, known, UnreachableError("gone", "", "")]})
-    client.telemetry.side_effect = [seen.telemetry[-1:], seen.telemetry[:1], seen.telemetry[-1:]]
+    old, new, paused = seen.telemetry[0], seen.telemetry[-1], msgspec.structs.replace(seen.telemetry[0], seq=9)
+    paused = msgspec.structs.replace(paused, operating_state="PAUSED")
+    client = Mock(**{"status.side_effect": [seen.status, seen.status, known, UnreachableError("gone", "", "")]})
+    client.telemetry.side_effect = [[old], [old], [new], [new], [paused]]
     watcher = Watcher(client)
-    watcher._ask_s = math.inf
-    looks = [watcher.look() for _ in range(3)]
-    assert (len(looks[-1].telemetry), looks[-1].explained, client.status.call_count) == (3, {"RATE": RATE}, 2)
-    watcher._ask_s, client.telemetry.side_effect = 0.0, [seen.telemetry[:1]]
-    assert watcher.look().status == known
+    looks = [(watcher.look(), client.status.call_count) for _ in range(5)]
+    # at first, not twice a second, what is not explained, nothing new, another state
+    assert [count for _, count in looks] == [2, 2, 3, 3, 4]
+    last, _ = looks[-1]
+    assert (len(last.telemetry), last.explained, last.status) == (5, {"RATE": RATE}, known)
 
 
 def test_nothing_that_telemetry_says_is_obeyed_by_the_terminal(seen: Seen) -> None:
     last = msgspec.structs.replace(seen.telemetry[-1], limits=(f"C{EVIL}",))
     text = "".join(drawn(seen._replace(telemetry=[last]), 160, 50))
     assert text.isprintable()
-    assert r"C\u001b[2J" in text
+    assert r"\u202e 100% of the time" in text
+    rare = [seen.telemetry[0]] * 199 + [last]
+    assert r"\u202e under 1% of the time" in "".join(drawn(seen._replace(telemetry=rare), 160, 50))
 
 
 @given(
