@@ -21,7 +21,16 @@ from tormagd.commission.force_findings import RAMPS_S, STEP_S, STEP_SHARES, forc
 from tormagd.commission.procedure import Columns, Known, handle_moved
 from tormagd.config import Config
 from tormagd.ctl.calibrate_run import SOURCE, Run, armed, known_of, reach
-from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
+from tormagd.ctl.outcome import (
+    NEW_FILE,
+    WRITABLE,
+    CommandError,
+    Exit,
+    Outcome,
+    as_usage_error,
+    is_terminal,
+    usage_error,
+)
 from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
@@ -115,12 +124,8 @@ def calibrate(
             "--out is not for --device" if device else "--out is missing: the file of the sweeps or the log",
             "leave it out: the daemon keeps the profile" if device else "give --out FILE",
         )
-    if insert is not None and out is not None and out.suffix != ".csv":
-        raise usage_error(f"--out {out}: allowed is a name that ends with .csv", "tormag-lab calibrate fits the model")
-    if out is not None and out.exists():
-        raise usage_error(f"--out {out} exists", "give another name; nothing is overwritten")
-    if out is not None and not out.parent.is_dir():
-        raise usage_error(f"--out {out}: {out.parent} is not a directory", "give a file in one you may write to")
+    if out is not None and (out.exists() or not out.parent.is_dir()):
+        raise usage_error(f"--out {out}: {NEW_FILE}", "give another name; nothing is overwritten")
     with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
         scene = load_scene(config.scene)
     if not is_agreed:

@@ -32,7 +32,6 @@ from tormagd_client.messages import Status
 
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
 MEMORY_TO_LOCK_BYTES = 1_000_000_000
-GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
 FAST_LATENCY_MS = 1
 LATE_SHARE = 0.25
 "If a bare timer is later at p99, as a share of a control period, the daemon has too little left."
@@ -187,10 +186,10 @@ def of_daemon(known: Running, machine: Machine) -> tuple[Finding, ...]:
 
 
 def _in_force(known: Running) -> Config:
-    """Return a daemon's configuration without the wishes that the kernel refused."""
+    """Return a daemon's configuration without the priority that the kernel refused."""
     config, lacking = known.config, refused(known.status.not_granted)
-    kept = {key: value for key, value in (("lock_memory", False), ("fifo_priority", 0)) if f"realtime.{key}" in lacking}
-    return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, **kept))
+    priority = 0 if "realtime.fifo_priority" in lacking else config.realtime.fifo_priority
+    return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, fifo_priority=priority))
 
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
@@ -312,27 +311,6 @@ def load(config: Config, machine: Machine) -> Finding:
         return Finding("load", Severity.WARN, "not known", "mount /proc")
     average, count = float(fields[0]), machine.cores()
     return _finding("load", average <= 0.8 * count, f"{average:.2f} over one minute on {count} cores", STOP_OTHERS)
-
-
-def clock_source(config: Config, machine: Machine) -> Finding:
-    """Judge whether reading the time is fast and even."""
-    name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
-    return _finding(
-        "clock source",
-        name is None or name in GOOD_CLOCKS,
-        "the kernel does not say" if name is None else name,
-        "dmesg | grep -i clocksource tells why tsc was given up; update the firmware",
-    )
-
-
-def swap(config: Config, machine: Machine) -> Finding:
-    """Judge whether the daemon's memory can be paged out."""
-    lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
-    if not lines:
-        return Finding("swap", Severity.OK, "off")
-    is_locked = config.realtime.lock_memory
-    found = f"on ({lines[0].split()[0]}){', but realtime.lock_memory keeps the daemon in' if is_locked else ''}"
-    return _finding("swap", is_locked, found, "see memlock above, or sudo swapoff -a")
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
@@ -460,8 +438,6 @@ OF_MACHINE: tuple[Check, ...] = (
     governor,
     cores,
     load,
-    clock_source,
-    swap,
     huge_pages,
     autogroup,
     usb_latency,

@@ -21,6 +21,7 @@ from tormagd_client.printable import each_text, printable
 
 NARROWEST = 20
 LABEL = re.compile(r"\S{0,24} +")
+NEW_FILE = "allowed is a new file in a folder that exists"
 WRITABLE = "give another file's name, in a directory you may write to"
 ROOM = "make room on its disk"
 REMEDIES = {

@@ -11,7 +11,7 @@ import msgspec
 from msgspec import UNSET
 
 from tormagd.config import Config
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, answer_of, as_usage_error, folded, usage_error
+from tormagd.ctl.outcome import NEW_FILE, CommandError, Exit, Outcome, answer_of, as_usage_error, folded, usage_error
 from tormagd.ground.files import new_file
 from tormagd.ground.machine_loop import machine_us
 from tormagd.scenes.measured import MeasuredScene, OperatingPoint, Served, measured, own_way
@@ -21,7 +21,6 @@ from tormagd_client.endpoints import ConfigError
 if TYPE_CHECKING:  # listing scenes needs no sockets
     from tormagd_client.blocking import Client
 
-NEW_FILE = "allowed is a new file in a folder that exists"
 LONGEST_S = 30.0
 "The daemon's own check takes half a second."
 

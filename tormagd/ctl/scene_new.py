@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd.config import MIN_INFERENCE_HZ
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ctl.scene import NEW_FILE, as_toml, check_scene
+from tormagd.ctl.outcome import NEW_FILE, CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
+from tormagd.ctl.scene import as_toml, check_scene
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert as known_insert
 from tormagd.ground.files import new_file
