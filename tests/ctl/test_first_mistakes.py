@@ -114,7 +114,6 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl --endpoint tcp://192.0.2.1:5555 status", 2, "CURVE", {}),
     ("tormagctl --endpoint carrier-pigeon status", 2, "carrier-pigeon", {}),
     (f"tormagctl --endpoint ipc://{'x' * 200} status", 2, "107", {}),
-    ("tormagctl --key /nowhere/a.key_secret status", 2, "--server-key FILE", {}),
     ("tormagctl --config /nowhere/tormagd.toml status", 2, "/nowhere/tormagd.toml", {}),
     ("tormagctl scene burn", 2, "ACTION: 'burn': allowed are list, show", {}),
     ("tormagctl scene sohw", 2, "did you mean `show`?", {}),

@@ -320,9 +320,11 @@ def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, ctl):
 
 
 def test_a_key_that_may_only_publish_is_told_how(run_dir, tmp_path, ctl):
-    ctl("keys", "generate", str(tmp_path / "keys"), "--publish", "robot").ended(0)
-    keys = ("--key", str(tmp_path / "keys/robot.key_secret"), "--server-key", str(tmp_path / "keys/server.key"))
-    told = ctl("--endpoint", f"ipc://{run_dir}/control", *keys, "--wait", "0.05", "send", "step").ended(3).err
+    ctl("keys", "generate", str(tmp_path), "--publish", "robot").ended(0)
+    config = tmp_path / "client.toml"
+    curve = f'client_secret = "{tmp_path}/robot.key_secret"\nserver_public = "{tmp_path}/server.key"\n'
+    config.write_text(f'[endpoints]\ncontrol = "ipc://{run_dir}/control"\n[endpoints.curve]\n{curve}')
+    told = ctl("--config", str(config), "--wait", "0.05", "send", "step").ended(3).err
     assert "with a key that may only publish: --blind" in told
 
 

@@ -14,7 +14,6 @@ from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
 ORIGIN = re.compile(r"(https://[a-z0-9.-]+|http://(localhost|127\.0\.0\.1))(:[0-9]{1,5})?")
-KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 
 
 class Command(NamedTuple):
@@ -65,13 +64,11 @@ ABOVE_ZERO = Within(1e-3, 1e6)
 SHARED = (
     option("--config", type=Path, metavar="FILE", help="the daemon's configuration"),
     option("--endpoint", metavar="URL", help="the control endpoint; ipc://DIR/control means all four in DIR"),
-    option("--key", metavar="FILE", help=f"the .key_secret for tcp:// ({KEY})"),
-    option("--server-key", metavar="FILE", help=f"the daemon's .key ({SERVER_KEY})"),
     option("--json", action="store_true", help="one JSON object on stdout"),
     option("--wait", type=ABOVE_ZERO, metavar="S", help="wait this long for the daemon (1)"),
 )
 "Before or after any command."
-USUAL = {"config": None, "endpoint": None, "key": None, "server_key": None, "json": False, "wait": 1.0}
+USUAL = {"config": None, "endpoint": None, "json": False, "wait": 1.0}
 
 
 def _operate(help_text: str) -> Command:

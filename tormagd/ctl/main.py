@@ -16,7 +16,7 @@ import msgspec
 
 from tormagd import __version__
 from tormagd.config import Config, load_config, load_endpoints
-from tormagd.ctl.commands import COMMANDS, GROUPS, KEY, SERVER_KEY, SHARED, USUAL
+from tormagd.ctl.commands import COMMANDS, GROUPS, SHARED, USUAL
 from tormagd.ctl.outcome import (
     Outcome,
     as_usage_error,
@@ -27,7 +27,7 @@ from tormagd.ctl.outcome import (
 )
 from tormagd.ground.command_line import Parser, UsageError, add
 from tormagd.ground.terminal import write_in_any_encoding, write_line
-from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
+from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.errors import ClientError
 from tormagd_client.printable import in_short
 
@@ -85,7 +85,7 @@ def _run(options: argparse.Namespace) -> Outcome:
                 if "config" in command.needs:
                     known["config"] = load_config(file)
                 endpoints = load_endpoints(file)
-            known["endpoints"] = _endpoints(endpoints, options)
+            known["endpoints"] = endpoints if options.endpoint is None else _at(options.endpoint, endpoints)
         else:
             known["parser"] = parser()
         if "client" in command.needs:
@@ -112,27 +112,18 @@ def _called(command: str, arguments: dict[str, Any]) -> Outcome:
         raise usage_error(f"{in_short(error.object)}: allowed is UTF-8 text", "give another text or name") from error
 
 
-def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
-    """Return the configured endpoints and keys with the changes of options and environment."""
-    changed: dict[str, object] = {}
-    given = {
-        "client_secret": options.key or os.environ.get(KEY),
-        "server_public": options.server_key or os.environ.get(SERVER_KEY),
-    }
-    if named := {name: file for name, file in given.items() if file}:
-        changed["curve"] = msgspec.structs.replace(configured.curve or Curve(), **named)
-    address = options.endpoint
-    if address is not None:
-        changed["control"] = address
-        if address.startswith("ipc://") and address.endswith("/control"):
-            directory = address.removesuffix("control")
-            changed |= {name: directory + name for name in ENDPOINTS}
+def _at(address: str, configured: Endpoints) -> Endpoints:
+    """Return the endpoints of the daemon whose control endpoint is `address`, with the configured keys."""
+    changed = {"control": address}
+    if address.startswith("ipc://") and address.endswith("/control"):
+        directory = address.removesuffix("control")
+        changed |= {name: directory + name for name in ENDPOINTS}
     try:
         return Config(endpoints=msgspec.structs.replace(configured, **changed)).endpoints
     except ValueError as error:
         raise usage_error(
             f"--endpoint: {error}",
-            "give an address such as ipc:///run/tormag/control; for another machine's also --key and --server-key",
+            "give an address such as ipc:///run/tormag/control; tormagctl guide another-machine says what others need",
         ) from error
 
 
