@@ -103,14 +103,15 @@ async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever
 
 
 @pytest.mark.parametrize(
-    ("secret", "public", "named"),
+    ("files", "named"),
     [
-        ("/nowhere/a.key_secret", "server.key", "/nowhere/a.key_secret: No such file"),
-        ("/dev/zero", "server.key", "/dev/zero: allowed is a regular file"),
-        ("operate/console.key", "server.key", "holds no secret key"),
-        ("console.key_secret", "/dev/zero", "/dev/zero: allowed is a regular file"),
+        (("console.key_secret",), "the daemon's public key is not given"),
+        (("/nowhere/a.key_secret", "server.key"), "/nowhere/a.key_secret: No such file"),
+        (("/dev/zero", "server.key"), "/dev/zero: allowed is a regular file"),
+        (("operate/console.key", "server.key"), "holds no secret key"),
+        (("console.key_secret", "/dev/zero"), "/dev/zero: allowed is a regular file"),
     ],
 )
-def test_a_key_that_is_no_good_is_a_usage_error(shows: Shows, ctl, secret: str, public: str, named: str) -> None:
-    mine = shows("tcp://192.0.2.1:5555", client_secret=secret, server_public=public)
-    assert named in ctl(*mine, "status").ended(2).error["message"]
+def test_a_key_that_is_no_good_is_a_usage_error(shows: Shows, ctl, files: tuple[str, ...], named: str) -> None:
+    named_so = dict(zip(("client_secret", "server_public"), files, strict=False))
+    assert named in ctl(*shows("tcp://192.0.2.1:5555", **named_so), "status").ended(2).error["message"]
