@@ -58,7 +58,6 @@ def test_a_good_machine_has_nothing_to_remedy(good):
     assert (outcome.result["ok"], outcome.exit_code) == (len(checks.CHECKS), 0)
 
 
-PINNED = Config(realtime=RealTime(cpus=(1, 9)))
 DYNAMIC = "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC Debian"
 CAN = Config(device=Device(port="can0"))
 BY_TCP = Config(endpoints=Endpoints(control="tcp://127.0.0.1:5555"))
@@ -93,7 +92,6 @@ CASES = [
     (checks.memory_lock, Config(), limited("8388608", "0"), "warn", "8 MB"),
     (checks.cores, REALTIME, {"sys/devices/system/cpu/online": "0"}, "warn", "1 online"),
     (checks.cores, REALTIME, {"sys/devices/system/cpu/online": "0,2-5"}, "ok", "5 online"),
-    (checks.cores, PINNED, {}, "fail", "[9]"),
     (checks.load, REALTIME, {"proc/loadavg": "3.90 1 1 1/2 3"}, "warn", "3.90"),
     (
         checks.huge_pages,

@@ -53,25 +53,24 @@ class Seen(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A row with a sparkline. Curves with the same `scale` share one, at least `least` wide."""
+    """A row with a sparkline. Curves of one unit share a scale, at least `least` wide."""
 
     label: str
     unit: str
     digits: int
     style: str
-    scale: str
     least: float
     value: Callable[[Telemetry], float | None]
     of_column: Callable[[list[float]], float] = fmean
 
 
 CURVES = (
-    Curve("asked", "N", 3, "bright_white", "force", 0.05, lambda it: it.setpoint_cf),
-    Curve("governed", "N", 3, "dodger_blue1", "force", 0.05, lambda it: it.governed_cf),
-    Curve("measured", "N", 3, "orange1", "force", 0.05, lambda it: it.measured_cf),
-    Curve("gap", "mm", 2, "cyan", "gap", 0.5, lambda it: it.gap_mm),
-    Curve("field", "mT", 1, "green", "field", 1.0, lambda it: it.field_mT),
-    Curve("late", "us", 0, "magenta", "late", 100.0, lambda it: it.tick.lateness_us, max),
+    Curve("asked", "N", 3, "bright_white", 0.05, lambda it: it.setpoint_cf),
+    Curve("governed", "N", 3, "dodger_blue1", 0.05, lambda it: it.governed_cf),
+    Curve("measured", "N", 3, "orange1", 0.05, lambda it: it.measured_cf),
+    Curve("gap", "mm", 2, "cyan", 0.5, lambda it: it.gap_mm),
+    Curve("field", "mT", 1, "green", 1.0, lambda it: it.field_mT),
+    Curve("late", "us", 0, "magenta", 100.0, lambda it: it.tick.lateness_us, max),
 )
 
 
@@ -164,9 +163,9 @@ def _curves(telemetry: Sequence[Telemetry], width: int, rows: int) -> Table:
     ]
     scales: dict[str, list[float | None]] = {}
     for curve, course in zip(CURVES, courses, strict=True):
-        scales.setdefault(curve.scale, []).extend(course)
+        scales.setdefault(curve.unit, []).extend(course)
     for curve, course in zip(CURVES, courses, strict=True):
-        low, high = span(scales[curve.scale], curve.least)
+        low, high = span(scales[curve.unit], curve.least)
         newest = curve.value(telemetry[-1]) if telemetry else None
         shown = "-" if newest is None else f"{newest:.{curve.digits}f}"
         digits = min(curve.digits, 2)
