@@ -119,10 +119,15 @@ RATE: dict[str, Any] = {
 }
 
 
+def merged(known: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    inner = {name: it for name, it in changes.items() if isinstance(it, dict) and isinstance(known.get(name), dict)}
+    return known | changes | {name: merged(known[name], it) for name, it in inner.items()}
+
+
 def status(**changes: Any) -> dict[str, Any]:
-    known: dict[str, Any] = msgspec.to_builtins(telemetry(1, 1))
-    return (
-        known
+    """Return what a daemon answers, with changes, also within its tables."""
+    return merged(
+        msgspec.to_builtins(telemetry(1, 1))
         | {
             "version": "0",
             "build": "compiled",
@@ -156,8 +161,8 @@ def status(**changes: Any) -> dict[str, Any]:
             "limit_details": [],
             "newest_stall": None,
             "not_granted": [],
-        }
-        | changes
+        },
+        changes,
     )
 
 
@@ -202,7 +207,7 @@ class FakeDaemon(threading.Thread):
     def taken(self) -> dict[str, Any]:
         counts = Counter(setpoint.source for setpoint in self.setpoints)
         by_source = {name: SOURCE | {"accepted": count} for name, count in counts.items()}
-        return status()["setpoints"] | {"by_source": by_source if self.taken_by_source else {}}
+        return {"by_source": by_source if self.taken_by_source else {}}
 
     def arrived(self, count: int) -> list[Setpoint]:
         until_s = time.monotonic() + PATIENCE_S

@@ -80,10 +80,9 @@ class Played:
         return self._found
 
 
-def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, tmp_path, monkeypatch, ctl):
+def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monkeypatch, ctl):
     monkeypatch.setattr(ctl_calibrate, "armed", lambda *_: contextlib.nullcontext(Played(ticks(300))))
-    slow = {name: rate | {"hz": 500.0} for name, rate in status_with()["rates"].items()}
-    fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0, rates=slow)
+    fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0, rates={"control": {"hz": 500.0}})
     out = tmp_path / "right.csv"
     arguments = [*fake_daemon.at, "--json", "calibrate", "--yes", "--motors", "--side", "right"]
     assert ctl(*arguments, "--out", str(out)).ended(1).error["code"] == "slow_control"
@@ -107,10 +106,9 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, status_with, t
     ],
 )
 def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_moves(
-    fake_daemon, status_with, source_with, tmp_path, ctl, name, age_ms, state, told, asked, ended
+    fake_daemon, source_with, tmp_path, ctl, name, age_ms, state, told, asked, ended
 ):
-    setpoints = status_with()["setpoints"] | {"by_source": {"a": source_with(state=state)}}
-    fake_daemon.says(setpoint_age_ms=age_ms, setpoints=setpoints)
+    fake_daemon.says(setpoint_age_ms=age_ms, setpoints={"by_source": {"a": source_with(state=state)}})
     arguments = [*fake_daemon.at, "--json", "calibrate", "--yes", "--insert", name]
     assert told[1] in ctl(*arguments, "--out", str(tmp_path / "sweeps.csv")).ended(ended).error[told[0]]
     assert fake_daemon.commands == asked

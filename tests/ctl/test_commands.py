@@ -27,7 +27,7 @@ UNDONE: list[Row] = [
 ]
 NOT_UNDERSTOOD: list[Row] = [
     ({"version": "0.0.9", key: value}, {}, 3, ['"code":"unintelligible"', "tormagd 0.0.9", key])
-    for key, value in (("is_homed", None), ("link", 3), ("rates", {"control": {}}), ("limits", None))
+    for key, value in (("is_homed", None), ("link", 3), ("rates", {"control": 3}), ("limits", None))
 ]
 ARMED = {"given": ["home", "enable"], "is_over": True, "error": None}
 A_FAULT = {"code": "fault", "cause": "it came back", "remedy": "tormagctl status"}
@@ -426,9 +426,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
 @pytest.fixture
 def shown(status_with: Any) -> Any:
     def text(**changes: Any) -> str:
-        usual = status_with()
-        changed = {name: usual[name] | it if isinstance(usual.get(name), dict) else it for name, it in changes.items()}
-        return f"\n{status_text(msgspec.convert(usual | changed, Status), Colour(sys.stdout))}\n"
+        return f"\n{status_text(msgspec.convert(status_with(**changes), Status), Colour(sys.stdout))}\n"
 
     return text
 
@@ -502,8 +500,9 @@ def test_a_black_box_is_waited_for_until_it_is_written_or_cannot_be(fake_daemon,
 
 @pytest.fixture
 def text(status_with: Any) -> Any:
-    link = status_with()["link"]
-    return lambda **changes: firmware_text(msgspec.convert(link | changes, LinkReport), Colour(sys.stdout))
+    return lambda **changes: firmware_text(
+        msgspec.convert(status_with(link=changes)["link"], LinkReport), Colour(sys.stdout)
+    )
 
 
 EVERYTHING = (
@@ -539,9 +538,9 @@ def test_nothing_known_is_no_error(text: Any) -> None:
 
 
 def test_the_keys_of_json_are_the_links(fake_daemon: Any, status_with: Any, ctl: Any) -> None:
-    known = status_with()["link"] | {"of a newer daemon": 1}
-    fake_daemon.says(link=known)
-    assert ctl(*fake_daemon.at, "--json", "firmware").ended(0).result == known
+    newer = {"of a newer daemon": 1}
+    fake_daemon.says(link=newer)
+    assert ctl(*fake_daemon.at, "--json", "firmware").ended(0).result == status_with(link=newer)["link"]
     assert "RUNNING" in ctl(*fake_daemon.at, "firmware").ended(0).out
 
 

@@ -170,7 +170,7 @@ def test_a_daemon_that_runs_says_itself_what_it_was_granted(machine, told):
 
 def test_a_daemon_s_device_and_build_are_what_it_says(told, status_with, machine):
     machine.process(4242, "python", "/dev/ttyUSB0")  # so it is called where its interpreter's path has a space
-    link = status_with()["link"] | {"state": "BACK_OFF", "cause": "no such port", "remedy": "plug it in"}
+    link = {"state": "BACK_OFF", "cause": "no such port", "remedy": "plug it in"}
     found = told(
         link=link, build="interpreted: no C compiler", calibration={"refusal": "serial_number = 8"}, process_id=4242
     )

@@ -187,7 +187,7 @@ EXPLAINED = {
 def seen(status_with: Any, source_with: Any) -> Any:
     def made(source: dict[str, Any] | None = None, **changes: Any) -> Status:
         by_source = {} if source is None else {"me": source_with(**source)}
-        setpoints = status_with()["setpoints"] | {"by_source": by_source, "newest_source": "robot"}
+        setpoints = {"by_source": by_source, "newest_source": "robot"}
         details = [{"code": code, "cause": cause, "remedy": "do this"} for code, cause in EXPLAINED.items()]
         return msgspec.convert(status_with(**{"setpoints": setpoints, "limit_details": details} | changes), Status)
 

@@ -114,7 +114,7 @@ def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, ctl, status_with, so
             limits=["RATE"],
             faults=["SKEW"],
             fault_details=[{"code": "SKEW", "cause": "a", "remedy": "b"}],
-            setpoints=status_with()["setpoints"] | {"by_source": {"me": source_with()}, "last_refusal": "x"},
+            setpoints={"by_source": {"me": source_with()}, "last_refusal": "x"},
             late_ticks_by={"somebody": 3},
             peers={
                 "refused": 1,
