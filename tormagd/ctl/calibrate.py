@@ -8,7 +8,6 @@
 """
 
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -21,6 +20,7 @@ from tormagd.commission.force_findings import RAMPS_S, STEP_S, STEP_SHARES, forc
 from tormagd.commission.procedure import Columns, Known, handle_moved
 from tormagd.config import Config
 from tormagd.ctl.calibrate_run import SOURCE, Run, armed, known_of, reach
+from tormagd.ctl.operate import statuses
 from tormagd.ctl.outcome import (
     NEW_FILE,
     WRITABLE,
@@ -184,14 +184,12 @@ def require_believed(status: Status) -> None:
 
 
 def _kept(client: Client) -> ProfileReport:
-    began_s = time.monotonic()
-    while True:
-        profile = client.status().profile
-        if profile.age_s is not None and profile.age_s < time.monotonic() - began_s + 1.0 and not profile.refusal:
-            return profile
-        if profile.refusal or time.monotonic() - began_s > KEPT_WITHIN_S:
-            raise _not_kept(profile)
-        time.sleep(0.05)
+    for waited_s, status in statuses(client, KEPT_WITHIN_S):
+        if status.profile.refusal:
+            break
+        if status.profile.age_s is not None and status.profile.age_s < waited_s + 1.0:
+            return status.profile
+    raise _not_kept(status.profile)
 
 
 def _not_kept(profile: ProfileReport) -> CommandError:

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from tormagd.ctl.operate import require_no_fault
+from tormagd.ctl.operate import require_no_fault, statuses
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.ground.force_file import stated_columns
@@ -24,7 +24,6 @@ from tormagd_client.messages import MAX_PREVIEW_SAMPLES, Description, Explained,
 from tormagd_client.wire import Pending, understood
 
 LOOK_S = 0.1
-LAST_ANSWER_S = 1.0
 ARRIVAL_S = 0.5
 "By then the last setpoint has arrived, even if an answer overtook it."
 MIN_TAKEN = 0.9
@@ -122,11 +121,9 @@ class StatusWatch:
         """Wait until the daemon has taken all `sent` setpoints, and return how many it took, how often they were seen
         rendered, and what held them back.
         """
-        until_s = time.monotonic() + ARRIVAL_S
-        while True:
-            status = self._client.status(LAST_ANSWER_S)
+        for _, status in statuses(self._client, ARRIVAL_S):
             accepted = _accepted(status, self._source) - self._before
-            if accepted >= sent or time.monotonic() > until_s:
+            if accepted >= sent:
                 break
         held = held_back(status, self._source, is_over=True)
         why = held or self._spoilt or (self._held if self._looks and not self._rendered else None)
