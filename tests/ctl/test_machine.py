@@ -110,6 +110,7 @@ CASES = [
         "16 ms",
     ),
     (checks.port, Config(), {}, "ok", "/dev/tormag (/dev/ttyUSB0)"),
+    (checks.port, Config(device=Device(port="/dev/none")), {}, "fail", "/dev/none does not exist"),
     (checks.port, CAN, {}, "warn", "no network interface can0"),
     (checks.port, CAN, {"sys/class/net/can0/operstate": "up"}, "ok", "network interface can0"),
     (checks.run_directory, ELSEWHERE, {}, "fail", "/run/elsewhere does not exist"),
@@ -215,11 +216,6 @@ def test_a_run_directory_that_others_may_write_to_is_found(good):
     (good / "run/tormag").chmod(0o777)
     finding = checks.run_directory(Config(), Machine(good))
     assert (finding.verdict, "mode 0777" in finding.found, finding.remedy[:11]) == ("fail", True, "chmod go-w ")
-
-
-def test_a_port_that_is_not_there_is_missed(good):
-    (good / "dev/ttyUSB0").unlink()
-    assert "does not exist" in checks.port(Config(), Machine(good)).found
 
 
 @pytest.mark.parametrize(("daemon_id", "remedy"), [(1, "end it, or"), (None, "end it, unless it is the daemon, or")])
