@@ -125,7 +125,6 @@ def merged(known: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def status(**changes: Any) -> dict[str, Any]:
-    """Return what a daemon answers, with changes, also within its tables."""
     return merged(
         msgspec.to_builtins(telemetry(1, 1))
         | {

@@ -66,7 +66,6 @@ Shows = Callable[..., tuple[str, ...]]
 
 @pytest.fixture
 def shows(keys: Path, tmp_path: Path) -> Shows:
-    """The options of who shows these keys at an address."""
 
     def made(address: str, **files: str) -> tuple[str, ...]:
         named = "".join(f'{name} = "{keys / file}"\n' for name, file in files.items())

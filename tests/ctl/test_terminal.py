@@ -327,7 +327,6 @@ def test_the_status_is_asked_for_at_news_and_a_daemon_that_is_gone_is_waited_for
     client.telemetry.side_effect = [[old], [old], [new], [new], [paused]]
     watcher = Watcher(client)
     looks = [(watcher.look(), client.status.call_count) for _ in range(5)]
-    # at first, not twice a second, what is not explained, nothing new, another state
     assert [count for _, count in looks] == [2, 2, 3, 3, 4]
     last, _ = looks[-1]
     assert (len(last.telemetry), last.explained, last.status) == (5, {"RATE": RATE}, known)

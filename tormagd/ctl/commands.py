@@ -429,3 +429,4 @@ COMMANDS = {
         has_daemon=False,
     ),
 }
+FIRST_WORDS = {name.partition(" ")[0] for name in COMMANDS}

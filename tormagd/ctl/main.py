@@ -16,7 +16,7 @@ import msgspec
 
 from tormagd import __version__
 from tormagd.config import Config, load_config, load_endpoints
-from tormagd.ctl.commands import COMMANDS, GROUPS, SHARED, USUAL
+from tormagd.ctl.commands import COMMANDS, FIRST_WORDS, GROUPS, SHARED, USUAL
 from tormagd.ctl.outcome import (
     Outcome,
     as_usage_error,
@@ -53,8 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser().parse_args(given)
     except UsageError as error:
         refused = usage_error(error.message, error.hint)
-        known = {name.partition(" ")[0] for name in COMMANDS}
-        print_error(next((each for each in given if each in known), ""), refused, "--json" in given)
+        print_error(next((each for each in given if each in FIRST_WORDS), ""), refused, "--json" in given)
         return refused.exit_code
     try:
         outcome = _run(options)
