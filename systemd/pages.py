@@ -9,7 +9,7 @@ from argparse_manpage.manpage import Manpage
 
 from tormagd import __version__
 from tormagd.ctl.commands import SHELLS
-from tormagd.ctl.completion import script
+from tormagd.ctl.completion import script, subparsers
 from tormagd.ctl.main import parser as ctl
 from tormagd.daemon.main import parser as daemon
 
@@ -19,13 +19,12 @@ def page(parser: ArgumentParser) -> bytes:
     known = {"project_name": "tormagd", "version": __version__, "manual_title": "Haptic controller"}
     known["description"] = (parser.description or "").rstrip(".")
     parser._positionals.title = "commands"
-    for commands in (action.choices.values() for action in parser._actions if isinstance(action.choices, dict)):
-        for command in commands:
-            # its heading and the common options are the program's; its own usage line would repeat both
-            command.description, command.epilog, command.usage = None, None, SUPPRESS
-            for action in command._actions:
-                if not parser._option_string_actions.keys().isdisjoint(action.option_strings):
-                    action.help = SUPPRESS
+    for _, command in subparsers(parser):
+        # its heading and the common options are the program's; its own usage line would repeat both
+        command.description, command.epilog, command.usage = None, None, SUPPRESS
+        for action in command._actions:
+            if not parser._option_string_actions.keys().isdisjoint(action.option_strings):
+                action.help = SUPPRESS
     made = Manpage(parser, known, format="single-commands-section")
     made.date = ""  # the date of the build means nothing
     return gzip.compress(str(made).encode(), mtime=0)

@@ -17,6 +17,7 @@ import msgspec
 from firmware_protocol.conformance import __main__ as conformance
 from tormagd import config
 from tormagd.ctl import main as ctl
+from tormagd.ctl.completion import subparsers
 from tormagd.daemon import main as daemon
 from tormagd.hardware import can_backend, serial_backend
 from tormagd.record import telemetry
@@ -103,12 +104,6 @@ def ticks_page() -> str:
             *(("measurement", telemetry.OF_MEASUREMENT), ("link", telemetry.OF_LINK)),
         )
     )
-
-
-def subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            yield from action.choices.items()
 
 
 def _options(parser: argparse.ArgumentParser) -> list[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from tormag_lab.pages import stamp, subplots, table
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
-from tormagd.ctl.scene_check import measured_as
+from tormagd.ctl.scene import measured_as
 from tormagd.ctl.scene_measure import COMES_S, CONTACT_S, SLOWER_MM_S
 from tormagd.scenes.measured import AHEAD_MS, MeasuredScene, Served
 from tormagd.scenes.scene import load_scene, shipped_scenes

@@ -208,10 +208,6 @@ def test_a_refusal_is_short_whatever_was_sent(fields: dict[str, Any], kind: type
     assert len(refusal(changed(SETPOINT if kind is Setpoint else REQUEST, **fields), kind)) < LONGEST_SHOWN + 60
 
 
-def test_integers_are_forces_too() -> None:
-    assert decode(changed(SETPOINT, servo_cf=2), Setpoint).servo_cf == 2.0
-
-
 @pytest.mark.parametrize(
     ("fields", "name"),
     [

@@ -18,7 +18,6 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.measure import Measure
 from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.ctl.calibrate import SWEEP_COLUMNS, SWEPT_COLUMNS, up_and_down, write_sweeps
-from tormagd.ctl.calibrate_run import Range
 from tormagd.element.model.displacement import Turn
 from tormagd.element.model.model_file import ForceModel, load_model, model_path
 from tormagd.element.physics.inserts import insert
@@ -39,7 +38,7 @@ def sweeps():
     loop.arm()
     made = []
     for rate_N_s in (0.8, 1.0, 0.8):
-        waveform = up_and_down(Range(core.portrait.min_N, 2.0), rate_N_s)
+        waveform = up_and_down(core.portrait.min_N, 2.0, rate_N_s)
         start_s = loop.now_s
         ticks = [
             (sample.time_s, seen.left_mm, seen.right_mm, seen.handle_mm, seen.handle.rate_mm_s, seen.force_N)

@@ -23,7 +23,7 @@ from tormagd.config import Config, Rates, load_config
 from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.ctl.calibrate import MOTOR_COLUMNS, excitation, motor_log
-from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Range
+from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS
 from tormagd.record.telemetry import COLUMNS as OF_TICK, Moment
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import RecordingWriter
@@ -105,7 +105,7 @@ def calibrated() -> Columns:
     list(loop.run(1.0))
     # as a daemon's status says it: what the device gives with its gap open, as far as it has shown itself
     least_N = loop.planner.believe.device.force_N(loop.planner.believe.memory.open_N())
-    waveform = excitation(Range(least_N, min(core.portrait.max_N, core.scene.force.most_N)), 2)
+    waveform = excitation(least_N, min(core.portrait.max_N, core.scene.force.most_N), 2)
     start_s = loop.now_s
 
     def newest(now_s: float) -> TimedSetpoint:

@@ -21,6 +21,7 @@ import pytest
 import zmq
 
 from tormagd.ctl.main import main
+from tormagd.scenes.scene import load_scene
 from tormagd_client.messages import (
     MOTION_TOPIC,
     VERDICT_TOPIC,
@@ -118,10 +119,14 @@ RATE: dict[str, Any] = {
 }
 
 
+def merged(known: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    inner = {name: it for name, it in changes.items() if isinstance(it, dict) and isinstance(known.get(name), dict)}
+    return known | changes | {name: merged(known[name], it) for name, it in inner.items()}
+
+
 def status(**changes: Any) -> dict[str, Any]:
-    known: dict[str, Any] = msgspec.to_builtins(telemetry(1, 1))
-    return (
-        known
+    return merged(
+        msgspec.to_builtins(telemetry(1, 1))
         | {
             "version": "0",
             "build": "compiled",
@@ -155,8 +160,8 @@ def status(**changes: Any) -> dict[str, Any]:
             "limit_details": [],
             "newest_stall": None,
             "not_granted": [],
-        }
-        | changes
+        },
+        changes,
     )
 
 
@@ -164,7 +169,7 @@ DESCRIPTION: dict[str, Any] = {
     "version": "0",
     "build": "compiled",
     "configuration": {"rates": {"control_hz": 1_000}},
-    "scene": {"name": "pulse", "force": {"least_N": 0.0, "most_N": 5.0}},
+    "scene": msgspec.to_builtins(load_scene("pulse")),
     "model": 16 * "0123",
     "profile": {"is_used": False, "age_s": None, "refusal": ""},
     "firmware": "1.0",
@@ -201,7 +206,7 @@ class FakeDaemon(threading.Thread):
     def taken(self) -> dict[str, Any]:
         counts = Counter(setpoint.source for setpoint in self.setpoints)
         by_source = {name: SOURCE | {"accepted": count} for name, count in counts.items()}
-        return status()["setpoints"] | {"by_source": by_source if self.taken_by_source else {}}
+        return {"by_source": by_source if self.taken_by_source else {}}
 
     def arrived(self, count: int) -> list[Setpoint]:
         until_s = time.monotonic() + PATIENCE_S
@@ -335,7 +340,7 @@ def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
             raise ChildProcessError(told.getvalue().strip().splitlines()[-1])
         return said.getvalue()
 
-    monkeypatch.setattr("tormagd.ctl.scene_check.answer_of", answer_of)
+    monkeypatch.setattr("tormagd.ctl.scene.answer_of", answer_of)
 
 
 @pytest.fixture

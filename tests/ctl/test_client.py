@@ -180,7 +180,7 @@ def test_setpoints_are_numbered_stamped_and_checked(client, fake_daemon):
         ("me", 1, 1.6),
         ("me", 2, 1.7),
     ]
-    assert first.session == second.session == third.session is not None
+    assert first.session == second.session == third.session < Numbering("me").session
     assert (first.valid_for_ms, second.valid_for_ms, second.stamp_ns, second.rate_mm_s) == (100.0, 500.0, 7, 5.0)
     assert before_ns <= first.stamp_ns <= time.time_ns()
 

@@ -1,13 +1,12 @@
 import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from served import NAMES, Served, free_ports
 
 from tormagd.config import Config
-from tormagd.ctl.commands import KEY, SERVER_KEY
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.ground.access_keys import KeyRing
 from tormagd_client.aio import AsyncClient
@@ -36,23 +35,14 @@ def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, ctl) -> N
     before = (keys / "server.key_secret").read_bytes()
     printed = ctl("--json", "keys", "generate", str(keys), "--observe", "screen").ended(0)
     assert [made["name"] for made in printed.result["made"]] == ["screen"]
-    for arguments in ((), ("--observe", "screen"), ("--publish", "server"), ("--client", "robot")):
+    for arguments in ((), ("--observe", "screen"), ("--publish", "server")):
         assert "exists: keys are never overwritten" in ctl("keys", "generate", str(keys), *arguments).ended(2).err
     assert (keys / "server.key_secret").read_bytes() == before
 
 
-def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, ctl) -> None:
-    printed = ctl("--json", "keys", "generate", str(tmp_path / "mine"), "--client", "robot").ended(0)
-    assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == ["robot.key", "robot.key_secret"]
-    (made,) = printed.result["made"]
-    shown = {"name": "robot", "fingerprint": made["fingerprint"]}
-    assert ctl("--json", "keys", "show", made["public"]).result["keys"] == [shown]
-    ctl("keys", "generate", str(tmp_path), "--client", "a", "--publish", "b").ended(2)
-    assert not list(tmp_path.glob("*.key*"))
-
-
 def test_a_folder_of_keys_is_shown(keys: Path, ctl) -> None:
-    assert ctl("keys", "show", str(keys / "publish")).ended(0).out.endswith("  robot\n")
+    (shown,) = ctl("--json", "keys", "show", str(keys / "publish/robot.key")).ended(0).result["keys"]
+    assert ctl("keys", "show", str(keys / "publish")).ended(0).out == f"{shown['fingerprint']}  robot\n"
 
 
 @pytest.fixture
@@ -71,27 +61,32 @@ def guarded(keys: Path) -> Iterator[str]:
     served.close()
 
 
-def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
-    keys: Path, guarded: str, ctl, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+Shows = Callable[..., tuple[str, ...]]
+
+
+@pytest.fixture
+def shows(keys: Path, tmp_path: Path) -> Shows:
+
+    def made(address: str, **files: str) -> tuple[str, ...]:
+        named = "".join(f'{name} = "{keys / file}"\n' for name, file in files.items())
+        config = tmp_path / "client.toml"
+        config.write_text(f'[endpoints]\ncontrol = "{address}"\n{named and f"[endpoints.curve]{chr(10)}{named}"}')
+        return "--json", "--config", str(config)
+
+    return made
+
+
+def test_a_listed_key_is_answered(shows: Shows, guarded: str, ctl) -> None:
+    mine = shows(guarded, client_secret="console.key_secret", server_public="server.key")
+    assert ctl(*mine, "--wait", "20", "mark", "here").ended(0).result == {"operating_state": "DISABLED"}
+
+
+@pytest.mark.parametrize("files", [{}, {"client_secret": "robot.key_secret", "server_public": "server.key"}], ids=str)
+def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
+    shows: Shows, guarded: str, ctl, files: dict[str, str]
 ) -> None:
-    mine, server = str(keys / "console.key_secret"), str(keys / "server.key")
-    patient = ("--wait", "20")
-    shown = (*patient, "--endpoint", guarded, "--key", mine, "--server-key", server, "--json")
-    assert ctl(*shown, "disable", "--no-wait").ended(0).result == {"operating_state": "DISABLED"}
-    config = tmp_path / "client.toml"
-    config.write_text(
-        f'[endpoints]\ncontrol = "{guarded}"\n[endpoints.curve]\nclient_secret = "{mine}"\nserver_public = "{server}"\n'
-    )
-    ctl(*patient, "--config", str(config), "disable", "--no-wait").ended(0)
-    monkeypatch.setenv(KEY, mine)
-    monkeypatch.setenv(SERVER_KEY, server)
-    ctl(*patient, "--endpoint", guarded, "disable", "--no-wait").ended(0)
-
-
-def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(keys: Path, guarded: str, ctl) -> None:
-    for arguments in ((), ("--key", str(keys / "robot.key_secret"), "--server-key", str(keys / "server.key"))):
-        error = ctl("--endpoint", guarded, "--wait", "0.3", "--json", *arguments, "disable", "--no-wait").ended(3).error
-        assert (error["code"], "--key and --server-key" in error["hint"]) == ("unreachable", True)
+    error = ctl(*shows(guarded, **files), "--wait", "0.3", "mark", "here").ended(3).error
+    assert (error["code"], "client_secret and server_public" in error["hint"]) == ("unreachable", True)
 
 
 async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever(guarded: str) -> None:
@@ -107,17 +102,15 @@ async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever
 
 
 @pytest.mark.parametrize(
-    ("arguments", "named"),
+    ("files", "named"),
     [
-        (("--key", "KEYS/console.key_secret"), "--server-key"),
-        (("--key", "/nowhere/a.key_secret", "--server-key", "KEYS/server.key"), "/nowhere/a.key_secret: No such file"),
-        (("--key", "/dev/zero", "--server-key", "KEYS/server.key"), "/dev/zero: allowed is a regular file"),
-        (("--key", "KEYS/operate/console.key", "--server-key", "KEYS/server.key"), "holds no secret key"),
-        (("--key", "KEYS/console.key_secret", "--server-key", "/dev/zero"), "/dev/zero: allowed is a regular file"),
+        (("console.key_secret",), "the daemon's public key is not given"),
+        (("/nowhere/a.key_secret", "server.key"), "/nowhere/a.key_secret: No such file"),
+        (("/dev/zero", "server.key"), "/dev/zero: allowed is a regular file"),
+        (("operate/console.key", "server.key"), "holds no secret key"),
+        (("console.key_secret", "/dev/zero"), "/dev/zero: allowed is a regular file"),
     ],
-    ids=range(5),
 )
-def test_a_key_that_is_no_good_is_a_usage_error(keys: Path, ctl, arguments: tuple[str, ...], named: str) -> None:
-    placed = [each.replace("KEYS", str(keys)) for each in arguments]
-    error = ctl("--endpoint", "tcp://192.0.2.1:5555", "--json", *placed, "status").ended(2).error
-    assert named in error["message"] + error["hint"]
+def test_a_key_that_is_no_good_is_a_usage_error(shows: Shows, ctl, files: tuple[str, ...], named: str) -> None:
+    named_so = dict(zip(("client_secret", "server_public"), files, strict=False))
+    assert named in ctl(*shows("tcp://192.0.2.1:5555", **named_so), "status").ended(2).error["message"]

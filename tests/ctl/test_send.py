@@ -34,26 +34,30 @@ def file(tmp_path):
 
 
 def test_every_setpoint_arrives_from_the_first_on(published):
-    result, arrived = published("ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
+    result, arrived = published(
+        "ramp",
+        "--duration",
+        "0.3",
+        "--rate",
+        "200",
+        "--from-N",
+        "1",
+        "--to-N",
+        "2",
+        "--source",
+        "me",
+        "--valid-for-ms",
+        "70",
+    )
     assert result["sent"] + result["skipped"] == 61
-    assert 0.0 <= result["worst_late_ms"] <= 1e3 * result["seconds"]
     assert (len(arrived), arrived[0].servo_cf, arrived[-1].servo_cf) == (result["sent"], 1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
+    assert {(each.source, each.valid_for_ms) for each in arrived} == {("me", 70.0)}
     # the force belongs to the setpoint's own deadline
     due_N = [1.0 + after_s(setpoint, arrived[0]) / 0.3 for setpoint in arrived]
     assert [setpoint.servo_cf for setpoint in arrived] == pytest.approx(due_N, abs=1e-6)
     # the count has no holes: what was left out was never sent
     assert [setpoint.seq for setpoint in arrived] == list(range(result["sent"]))
-
-
-def test_a_second_run_of_the_same_source_is_newer(published):
-    options = ("step", "--duration", "0.02", "--source", "me", "--valid-for-ms", "70")
-    first, _ = published(*options)
-    _, arrived = published(*options)
-    numbers = [(setpoint.session, setpoint.seq) for setpoint in arrived]
-    assert numbers[0][1] == numbers[first["sent"]][1] == 0
-    assert numbers == sorted(set(numbers))
-    assert {(s.source, s.valid_for_ms) for s in arrived} == {("me", 70.0)}
 
 
 @pytest.mark.parametrize(("rate_hz", "preview_ms", "count"), [(100, 50, 5), (320, 800, MAX_PREVIEW_SAMPLES)])
@@ -183,7 +187,7 @@ EXPLAINED = {
 def seen(status_with: Any, source_with: Any) -> Any:
     def made(source: dict[str, Any] | None = None, **changes: Any) -> Status:
         by_source = {} if source is None else {"me": source_with(**source)}
-        setpoints = status_with()["setpoints"] | {"by_source": by_source, "newest_source": "robot"}
+        setpoints = {"by_source": by_source, "newest_source": "robot"}
         details = [{"code": code, "cause": cause, "remedy": "do this"} for code, cause in EXPLAINED.items()]
         return msgspec.convert(status_with(**{"setpoints": setpoints, "limit_details": details} | changes), Status)
 
@@ -215,11 +219,10 @@ def test_what_is_taken_while_enabled_is_rendered_and_when_sending_is_over_the_ne
         ({}, {"operating_state": "FAULT", "faults": ["SKEW"]}, "fault", 4, "in FAULT: SKEW", "tormagctl arm"),
         (None, {}, "not_heard", 1, "nothing of 'me': too much", "status"),
         ({"state": "refused"}, {}, "other_source", 1, "'robot' holds the brake", "do this"),
-        ({"state": "refused"}, {"limit_details": []}, "other_source", 1, "'robot' holds", "tormagctl take me"),
         ({"state": "stale"}, {}, "stale", 1, "300 ms late", "do this"),
-        ({"state": "stale"}, {"limit_details": []}, "stale", 1, "come too late", "status"),
+        ({"state": "stale"}, {"limit_details": []}, "stale", 1, "STALE: it holds the force of 'me' back", "status"),
         ({}, {"limits": ["F_MAX"]}, "f_max", 1, "more force was asked", "do this"),
-        ({}, {"limits": ["RANGE"]}, "range", 1, "the limit RANGE", "status"),
+        ({}, {"limits": ["RANGE"]}, "range", 1, "RANGE: it holds", "status"),
     ],
 )
 def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes, code, exit_code, said, hint):
@@ -306,7 +309,7 @@ def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, ctl, tmp_path, a
     file.write_text("t_s,force_N\n0,1\n1,7\n")
     told = [str(file) if each == "FILE" else each for each in arguments]
     error = ctl(*fake_daemon.at, "--json", "send", *told).ended(1).error
-    assert error["message"] == f"{asked} N is asked: allowed is 0..5 N in scene pulse; nothing was sent"
+    assert error["message"] == f"{asked} N is asked: allowed is 0.5..2 N in scene pulse; nothing was sent"
     assert (error["code"], fake_daemon.setpoints) == ("out_of_range", [])
 
 
@@ -317,9 +320,11 @@ def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, ctl):
 
 
 def test_a_key_that_may_only_publish_is_told_how(run_dir, tmp_path, ctl):
-    ctl("keys", "generate", str(tmp_path / "keys"), "--publish", "robot").ended(0)
-    keys = ("--key", str(tmp_path / "keys/robot.key_secret"), "--server-key", str(tmp_path / "keys/server.key"))
-    told = ctl("--endpoint", f"ipc://{run_dir}/control", *keys, "--wait", "0.05", "send", "step").ended(3).err
+    ctl("keys", "generate", str(tmp_path), "--publish", "robot").ended(0)
+    config = tmp_path / "client.toml"
+    curve = f'client_secret = "{tmp_path}/robot.key_secret"\nserver_public = "{tmp_path}/server.key"\n'
+    config.write_text(f'[endpoints]\ncontrol = "ipc://{run_dir}/control"\n[endpoints.curve]\n{curve}')
+    told = ctl("--config", str(config), "--wait", "0.05", "send", "step").ended(3).err
     assert "with a key that may only publish: --blind" in told
 
 

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from reference_pages import commands_page, configuration_page, keys, subparsers, tables, ticks_page
+from reference_pages import commands_page, configuration_page, keys, tables, ticks_page
 
 from firmware_protocol.conformance import __main__ as conformance
 from tormag_lab.pages import KEY, figures_of, stamp
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
-from tormagd.ctl.commands import COMMANDS
-from tormagd.ctl.scene_check import measured_as
+from tormagd.ctl.commands import FIRST_WORDS
+from tormagd.ctl.completion import subparsers
+from tormagd.ctl.scene import measured_as
 from tormagd.daemon import main as daemon
 from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
@@ -76,10 +77,6 @@ def parser_of(words):
     return None
 
 
-def known_options(parser):
-    return {*parser._option_string_actions}.union(*(known_options(each) for _, each in subparsers(parser)))
-
-
 def require_there(words):
     if words[0] == "make":
         targets = [word for word in words[1:] if "=" not in word]
@@ -120,7 +117,10 @@ def test_every_command_in_a_block_is_understood(page, capsys):
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_command_in_a_line_has_the_options_that_are_named(page):
     for words, parser, arguments in parsed(spans(page.read_text(encoding="utf-8"))):
-        assert {word for word in arguments if word.startswith("--")} <= known_options(parser), words
+        named = {word for word in arguments if word.startswith("--")}
+        assert named <= set().union(*(it._option_string_actions for _, it in (("", parser), *subparsers(parser)))), (
+            words
+        )
         if words[0] == "tormagctl" and arguments and not arguments[0].startswith("--"):
             assert arguments[0] in dict(subparsers(parser)), words
 
@@ -177,7 +177,7 @@ def is_there(program, word, tool):
         return importlib.util.find_spec(word.rstrip(".")) is not None
     if program == "tormag-lab":
         return LAB is None or word in LAB.COMMANDS
-    return word in COMMANDS or word in PROSE
+    return word in FIRST_WORDS or word in PROSE
 
 
 def test_every_command_that_a_message_names_is_in_a_wheel():

@@ -46,7 +46,7 @@ def test_a_force_recording_becomes_a_scene(here: Path) -> None:
     (here / "01.TXT").write_text("\n".join(["% a tool, 10 columns", *rows]))
     run("scene.md")
     scene = load_scene("tool.toml")
-    assert (scene.force.least_N, scene.insert.name) == (pytest.approx(0.92, abs=0.03), "MRE-10-20")
+    assert (scene.force.least_N, scene.insert.name) == (pytest.approx(0.92, abs=0.03), "MRE-10-10")
 
 
 def test_cycles_become_a_model_of_the_inserts_law_that_a_scene_takes(here: Path) -> None:

@@ -4,17 +4,16 @@ import asyncio
 import json
 from functools import partial
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import uvloop
 
-from firmware_protocol.build import Build
+from firmware_protocol.build import settle
 from tormagd.config import Config, RealTime
 from tormagd.control.assembly.build import Core
 from tormagd.ground import machine_loop
-from tormagd.headroom import __main__ as program, core_cost
-from tormagd.headroom.bare_timer import beat, lateness
+from tormagd.headroom import __main__ as program
+from tormagd.headroom.bare_timer import lateness
 
 pytestmark = pytest.mark.usefixtures("usual_slices")
 
@@ -40,7 +39,7 @@ def test_what_the_kernel_refuses_is_said() -> None:
 
 
 def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again(core: Core) -> None:
-    made: Any = core_cost.calls(Config(), core, 0.05)
+    made: Any = program.calls(Config(), core, 0.05)
     steps, plans = made
     assert (len(steps), len(plans)) == (50, 50)
     # each of these plans is the one that the step was given in the loop
@@ -48,7 +47,7 @@ def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again(core: Core
     assert planned == [step.args[2] for step in steps]
     numbers = [plan.number for plan in planned]
     assert numbers == list(range(numbers[0], numbers[0] + 50))
-    again, _ = core_cost.calls(Config(), core, 0.05)
+    again, _ = program.calls(Config(), core, 0.05)
     outputs = [step() for step in steps]
     assert outputs == [step() for step in again]
     assert any(output.left_duty != 0.0 for output in outputs)
@@ -57,16 +56,9 @@ def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again(core: Core
 def test_each_call_is_made_once_in_its_own_beat() -> None:
     made: list[str] = []
     steps, plans = ([partial(made.append, name)] * 7 for name in ("step", "plan"))
-    found = asyncio.run(core_cost.core_cost(steps, plans, 1_000))
+    found = asyncio.run(program.core_cost(steps, plans, 1_000))
     assert made == ["plan", "step"] * 7
     assert [len(each) for each in found] == [7, 7]
-
-
-async def test_a_beat_ends_when_it_is_told_to() -> None:
-    ended = asyncio.Event()
-    on_beat = Mock(side_effect=lambda *_: ended.set())
-    await beat(1_000_000, on_beat, ended)
-    on_beat.assert_called()
 
 
 def test_the_program_prints_every_figure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,7 +68,7 @@ def test_the_program_prints_every_figure(monkeypatch: pytest.MonkeyPatch, capsys
     found = json.loads(capsys.readouterr().out)
     assert set(found) == {"machine_us", "build", "step_us", "plan_us", "bare"}
     assert set(found["step_us"]) == set(found["bare"]["lateness_us"]) == {"mean", "p50", "p99", "p999", "max"}
-    assert found["bare"]["rate_hz"] == 1_000
+    assert (found["bare"]["rate_hz"], found["build"]) == (1_000, str(settle()))
 
 
 def test_a_configuration_that_does_not_fit_is_refused(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,9 +76,3 @@ def test_a_configuration_that_does_not_fit_is_refused(tmp_path, capsys: pytest.C
     path.write_text("[rates]\ncontrol_hz = 100\ninference_hz = 83\n")
     assert program.main(["--config", str(path)]) == 2
     assert "rates.control_hz = 100" in capsys.readouterr().err
-
-
-def test_the_build_is_what_the_package_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    for runs, name in ((Build(True, ""), "compiled"), (Build(False, "it was not compiled"), "interpreted")):
-        monkeypatch.setattr(program, "settle", lambda runs=runs: runs)
-        assert program.build() == name

@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core, choose_solver
-from tormagd.ctl.scene_check import measured_as
+from tormagd.ctl.scene import measured_as
 from tormagd.element.inverse import choice, ordered
 from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, mean_error_N, named
 from tormagd.element.inverse.nearest import NearestFieldSearch, field_grid

@@ -115,7 +115,7 @@ def contradicts(low: str, low_value: float, high: str, high_value: float) -> tup
         ({"solver__step_mT": "0.0"}, ("$.solver.step_mT", "0.0", "> 0.0")),
         ({"solver__neighbours": "1.5"}, ("$.solver.neighbours", "1.5", "`int`")),
         ({"bandwidth__inference_hz": "50"}, ("$.bandwidth.inference_hz", "50", ">= 83")),
-        ({"signal__file": '"a.csv"', "signal__hold_s": "1.0"}, ("signal.hold_s = 1.0", "without signal.file")),
+        ({"signal__file": '"a.csv"', "signal__hold_s": "1.0"}, ("signal.hold_s = 1.0", "none beside signal.file")),
         ({"signal__hold_s": "1.0"}, ("signal.bandwidth_hz is missing",)),
         ({"signal__bandwidth_hz": "0.0"}, ("$.signal.bandwidth_hz", "> 0.0")),
         ({"signal__bandwidth_hz": "101.0"}, ("$.signal.bandwidth_hz", "<= 100.0")),

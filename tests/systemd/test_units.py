@@ -1,4 +1,3 @@
-import argparse
 import gzip
 import os
 import re
@@ -12,6 +11,7 @@ import pytest
 
 from tormagd import __version__
 from tormagd.config import Config
+from tormagd.ctl.completion import subparsers
 from tormagd.ctl.main import parser
 from tormagd.daemon.service import notify
 
@@ -52,11 +52,6 @@ def runnable(unit: Path, folder: Path) -> Path:
     assert changed != unit.read_text()
     copy.write_text(changed)
     return copy
-
-
-def commands() -> dict[str, argparse.ArgumentParser]:
-    (chosen,) = (action for action in parser()._actions if isinstance(action.choices, dict))
-    return dict(chosen.choices)
 
 
 def analyze(*arguments: object) -> "subprocess.CompletedProcess[str]":
@@ -140,9 +135,10 @@ def test_man_pages_name_every_command_and_option(root):
     pages = {path.name: gzip.decompress(path.read_bytes()).decode() for path in (root / "usr/share/man/man1").iterdir()}
     assert sorted(pages) == ["tormagctl.1.gz", "tormagd.1.gz"]
     plain = pages["tormagctl.1.gz"].replace("\\-", "-").replace("\\fB", "").replace("\\fR", "")
-    actions = [action for command in commands().values() for action in command._actions]
+    commands = dict(subparsers(parser()))
+    actions = [action for command in commands.values() for action in command._actions]
     options = {option for action in actions for option in action.option_strings} - {"--help"}
-    assert [said for said in (*(f"tormagctl {name}" for name in commands()), *options) if said not in plain] == []
+    assert [said for said in (*(f"tormagctl {name}" for name in commands), *options) if said not in plain] == []
     assert plain.count("\n--endpoint ") == 1
     assert "SIGHUP" in pages["tormagd.1.gz"]
 

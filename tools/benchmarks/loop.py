@@ -38,7 +38,7 @@ from tormag_lab.arrays import Array
 from tormagd.config import Config, RealTime, load_config
 from tormagd.ctl.processes import begun, first_line, is_linked, processor_s
 from tormagd.ctl.record import listening
-from tormagd.ctl.scene_check import as_toml
+from tormagd.ctl.scene import as_toml
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.realtime import Heartbeat, prepare, priority_of_threads
 from tormagd.headroom.bare_timer import beat

@@ -86,7 +86,7 @@ def felt(watched: HostWatch) -> list[Touch]:
         print(f"a wall of {WALL_N_MM:g} N/mm over a round trip of {ROUND_TRIP_MS:g} ms, met twice:")
         pushed(rig, first + 1, patient)
         try:
-            open_gap(rig.client, "disable", 2.0 * HALF_S, is_waiting=True)
+            open_gap(rig.client, "disable")
             use_scene(rig.client, str(SCENE))
         except ClientError as error:
             raise ShowError(error.message, error.hint, is_of_time=True) from error

@@ -8,7 +8,6 @@
 """
 
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -18,14 +17,25 @@ import numpy as np
 
 from tormagd.commission.finding import Array
 from tormagd.commission.force_findings import RAMPS_S, STEP_S, STEP_SHARES, force_over_gap, steps
-from tormagd.commission.procedure import Columns, handle_moved
+from tormagd.commission.procedure import Columns, Known, handle_moved
 from tormagd.config import Config
-from tormagd.ctl.calibrate_run import SOURCE, Range, Run, armed, known_of, reach
-from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
+from tormagd.ctl.calibrate_run import SOURCE, Run, armed, known_of, reach
+from tormagd.ctl.operate import statuses
+from tormagd.ctl.outcome import (
+    NEW_FILE,
+    WRITABLE,
+    CommandError,
+    Exit,
+    Outcome,
+    as_usage_error,
+    is_terminal,
+    usage_error,
+)
 from tormagd.ctl.waveform import Waveform, by_legs
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert
 from tormagd.ground.files import new_file
+from tormagd.ground.terminal import write_line
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
@@ -54,28 +64,26 @@ def calibrate_insert(
         insert(insert_name)
     with Client(endpoints, wait_s, SOURCE) as client:
         known = known_of(config, client.status(), scene.force.most_N)
-        forces = Range(known.least_N, known.most_N)
-        with armed(endpoints, client, forces.least_N) as run:
-            sweeps = [_sweep(run, forces, number, rates_N_s) for number in range(len(rates_N_s))]
+        with armed(endpoints, client, known.least_N) as run:
+            sweeps = [_sweep(run, known, number, rates_N_s) for number in range(len(rates_N_s))]
     rows = write_sweeps(out, sweeps)
     fitting = f"tormag-lab calibrate {out} --insert {insert_name} --out MODEL.safetensors"
     text = f"{out}: {rows} rows of {len(sweeps)} sweeps. next: {fitting}"
     return Outcome({"file": str(out), "insert": insert_name, "rows": rows}, text)
 
 
-def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
+def _sweep(run: Run, known: Known, number: int, rates_N_s: Sequence[float]) -> Columns:
     """Ask for a moving handle, then play one sweep and return its ticks."""
-    waveform = up_and_down(forces, rates_N_s[number])
-    label = f"sweep {number + 1} of {len(rates_N_s)}"
-    print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
-    run.follow(handle_moved(forces.least_N))
-    run.progress.begin(label, waveform.duration_s)
+    waveform = up_and_down(known.least_N, known.most_N, rates_N_s[number])
+    sweep = f"sweep {number + 1} of {len(rates_N_s)}, {waveform.duration_s:.0f} s"
+    write_line(f"{sweep}: turn the handle to and fro {PACES[number % len(PACES)]}", sys.stderr)
+    run.follow(handle_moved(known.least_N))
     return run.play(waveform)
 
 
-def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
-    half_s = (forces.most_N - forces.least_N) / rate_N_s
-    return by_legs(forces.least_N, [(half_s, forces.most_N), (half_s, forces.least_N)])
+def up_and_down(least_N: float, most_N: float, rate_N_s: float) -> Waveform:
+    half_s = (most_N - least_N) / rate_N_s
+    return by_legs(least_N, [(half_s, most_N), (half_s, least_N)])
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> int:
@@ -116,12 +124,8 @@ def calibrate(
             "--out is not for --device" if device else "--out is missing: the file of the sweeps or the log",
             "leave it out: the daemon keeps the profile" if device else "give --out FILE",
         )
-    if insert is not None and out is not None and out.suffix != ".csv":
-        raise usage_error(f"--out {out}: allowed is a name that ends with .csv", "tormag-lab calibrate fits the model")
-    if out is not None and out.exists():
-        raise usage_error(f"--out {out} exists", "give another name; nothing is overwritten")
-    if out is not None and not out.parent.is_dir():
-        raise usage_error(f"--out {out}: {out.parent} is not a directory", "give a file in one you may write to")
+    if out is not None and (out.exists() or not out.parent.is_dir()):
+        raise usage_error(f"--out {out}: {NEW_FILE}", "give another name; nothing is overwritten")
     with as_usage_error(ConfigError, hint="correct the scene, or give the daemon's own --config"):
         scene = load_scene(config.scene)
     if not is_agreed:
@@ -154,8 +158,8 @@ def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, 
             raise _not_kept(status.profile)
         known = known_of(config, status, scene_most_N)
         with armed(endpoints, client, known.force_N(0.0)) as run:
-            print("turn the handle to and fro, about 20 turns a minute, until the gap opens", file=sys.stderr)
-            run.progress.begin("device", 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES))
+            lasts_s = 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES)
+            write_line(f"{lasts_s:.0f} s: turn the handle to and fro, about 20 turns a minute", sys.stderr)
             run.follow(force_over_gap(known))
             mean, worst, *_ = run.follow(steps(known))
             status = client.status()
@@ -180,14 +184,12 @@ def require_believed(status: Status) -> None:
 
 
 def _kept(client: Client) -> ProfileReport:
-    began_s = time.monotonic()
-    while True:
-        profile = client.status().profile
-        if profile.age_s is not None and profile.age_s < time.monotonic() - began_s + 1.0 and not profile.refusal:
-            return profile
-        if profile.refusal or time.monotonic() - began_s > KEPT_WITHIN_S:
-            raise _not_kept(profile)
-        time.sleep(0.05)
+    for waited_s, status in statuses(client, KEPT_WITHIN_S):
+        if status.profile.refusal:
+            break
+        if status.profile.age_s is not None and status.profile.age_s < waited_s + 1.0:
+            return status.profile
+    raise _not_kept(status.profile)
 
 
 def _not_kept(profile: ProfileReport) -> CommandError:
@@ -238,12 +240,12 @@ MIN_HZ = 900.0
 LONGEST_HOLE_S = 0.02
 
 
-def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
+def excitation(least_N: float, most_N: float, rounds: int = ROUNDS) -> Waveform:
     """Return the waveform to ask for: ramps, then jumps, `rounds` times."""
-    low_N, high_N = forces.least_N + CLEAR_N, forces.most_N
-    ramps = [(ramp_s, force_N) for ramp_s in MOTOR_RAMPS_S for force_N in (high_N, low_N)]
+    low_N = least_N + CLEAR_N
+    ramps = [(ramp_s, force_N) for ramp_s in MOTOR_RAMPS_S for force_N in (most_N, low_N)]
     # each takes a millisecond, and is held
-    jumps = [(lasts_s, low_N + share * (high_N - low_N)) for share in JUMP_SHARES for lasts_s in (1e-3, JUMP_S)]
+    jumps = [(lasts_s, low_N + share * (most_N - low_N)) for share in JUMP_SHARES for lasts_s in (1e-3, JUMP_S)]
     return by_legs(low_N, rounds * (ramps + jumps))
 
 
@@ -251,7 +253,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
     """Drive both carriages through `excitation`, and write the log of one as CSV."""
     with Client(endpoints, wait_s, SOURCE) as client:
         status = client.status()
-        waveform = excitation(reach(status, scene_most_N))
+        waveform = excitation(*reach(status, scene_most_N))
         hz = status.rates["control"].hz
         if hz < MIN_HZ:
             raise CommandError(
@@ -262,7 +264,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
                 "there, tormagctl doctor",
             )
         with armed(endpoints, client, waveform.least_N) as run:
-            run.progress.begin("motors", waveform.duration_s)
+            write_line(f"motors: {waveform.duration_s:.0f} s", sys.stderr)
             columns = run.play(waveform)
     log = motor_log(columns, side)
     rows = _saved(path, np.column_stack([log[name] for name in LOG_COLUMNS]), "%.6f", LOG_COLUMNS)

@@ -1,11 +1,9 @@
 """A calibration run through the daemon: arm, publish forces, collect control ticks, open the gap whatever happens."""
 
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import zmq
 
@@ -29,7 +27,7 @@ from tormagd.commission.procedure import (
 from tormagd.config import Config
 from tormagd.control.safety.codes import FAULTS
 from tormagd.ctl.operate import home
-from tormagd.ctl.outcome import CommandError, Exit, is_terminal
+from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.ctl.record import listening
 from tormagd.ctl.waveform import Waveform
 from tormagd.ground.terminal import interrupted_by
@@ -47,7 +45,6 @@ VALID_FOR_MS = 250.0
 SILENT_S = 1.0
 "Ticks come every 20 ms: after this silence the daemon has gone."
 RECENT_SETPOINT_MS = 1_000.0
-HOMING_S = 30.0
 
 
 def interrupted_run() -> CommandError:
@@ -57,34 +54,6 @@ def interrupted_run() -> CommandError:
         "interrupted: a device that was armed is disabled and opens its gap; what was under way is not saved",
         "run it again when you are ready",
     )
-
-
-class Range(NamedTuple):
-    """The forces that a calibration may ask for."""
-
-    least_N: float
-    most_N: float
-
-
-class Progress:
-    def __init__(self) -> None:
-        self._label, self._lasts_s, self._begun_s, self._is_shown = "", 0.0, 0.0, is_terminal(sys.stderr)
-
-    def begin(self, label: str, lasts_s: float) -> None:
-        self.end()
-        self._label, self._lasts_s, self._begun_s = label, lasts_s, time.monotonic()
-
-    def show(self) -> None:
-        if self._is_shown and self._label:
-            since_s = time.monotonic() - self._begun_s
-            print(
-                f"\r{self._label}: {since_s:.0f} of about {self._lasts_s:.0f} s ", end="", file=sys.stderr, flush=True
-            )
-
-    def end(self) -> None:
-        if self._is_shown and self._label:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-        self._label = ""
 
 
 class Run(Device):
@@ -100,7 +69,6 @@ class Run(Device):
         self._endpoints, self._client = endpoints, client
         self._ticks, self._is_interrupted = ticks, is_interrupted
         self._heard_s = time.monotonic()
-        self.progress = Progress()
 
     def follow(self, course: Course[Found]) -> Found:
         try:
@@ -108,8 +76,6 @@ class Run(Device):
         except StoppedError as error:
             kind = Exit.FAULT if error.code in FAULTS else Exit.REFUSED
             raise CommandError(kind, error.code, error.cause, error.remedy) from error
-        finally:
-            self.progress.end()
 
     def play(self, waveform: Waveform) -> Columns:
         """Publish `waveform` in real time, and return its ticks by column."""
@@ -138,7 +104,6 @@ class Run(Device):
             ahead_N = asked.preview_N or None
             step_ms = 1e3 * PREVIEW_STEP_S if ahead_N else None
             self._client.publish(asked.force_N, VALID_FOR_MS, preview_N=ahead_N, preview_dt_ms=step_ms)
-        self.progress.show()
         rows: list[Row] = []
         # whatever waits is read even if this program is late
         while self._ticks.poll(max(0, round((due_s - time.monotonic()) * 1e3))):
@@ -177,7 +142,8 @@ def _rows(data: bytes, endpoints: Endpoints) -> list[Row]:
     return [[row[place] for place in places] for row in batch.rows]
 
 
-def reach(status: Status, scene_most_N: float) -> Range:
+def reach(status: Status, scene_most_N: float) -> tuple[float, float]:
+    """Return the least and the greatest force that a calibration may ask for."""
     age_ms, setpoints = status.setpoint_age_ms, status.setpoints
     holder = setpoints.by_source.get(setpoints.newest_source)
     is_held = holder is not None and holder.state == "holds"  # an old setpoint may be valid for long
@@ -188,17 +154,17 @@ def reach(status: Status, scene_most_N: float) -> Range:
             f"somebody published a setpoint {age_ms:.0f} ms ago",
             "stop the publisher: a calibration must be the only one",
         )
-    return Range(status.least_N, min(status.most_N, scene_most_N))
+    return status.least_N, min(status.most_N, scene_most_N)
 
 
 def known_of(config: Config, status: Status, scene_most_N: float, weight_N: float | None = None) -> Known:
-    forces = reach(status, scene_most_N)
-    known = Known(config, 1.0 / status.rates["control"].hz, forces.least_N, forces.most_N, weight_N)
-    if not known.force_N(0.0) < forces.most_N:
+    least_N, most_N = reach(status, scene_most_N)
+    known = Known(config, 1.0 / status.rates["control"].hz, least_N, most_N, weight_N)
+    if not known.force_N(0.0) < most_N:
         raise CommandError(
             Exit.REFUSED,
             "no_range",
-            f"the daemon's scene ends at {forces.most_N:g} N, under the least force of {forces.least_N:g} N",
+            f"the daemon's scene ends at {most_N:g} N, under the least force of {least_N:g} N",
             "run the daemon with a scene that asks for more force",
         )
     return known
@@ -226,6 +192,6 @@ def armed(endpoints: Endpoints, client: Client, force_N: float) -> Iterator[Run]
     """Home if needed, enable with the setpoint `force_N`, and yield a `Run`."""
     with connected(endpoints, client) as run:
         if not client.status().is_homed:
-            home(client, HOMING_S, is_waiting=True)
+            home(client)
         run.follow(enabled(force_N))
         yield run

@@ -1,4 +1,7 @@
-"""The commands of `tormagctl`, in one table: each with its options and the function that carries it out."""
+"""The commands of `tormagctl`, in one table: each with its options and the function that carries it out.
+
+`scene list` is the command `list` of the group `scene`.
+"""
 
 import argparse
 import math
@@ -11,7 +14,6 @@ from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
 ORIGIN = re.compile(r"(https://[a-z0-9.-]+|http://(localhost|127\.0\.0\.1))(:[0-9]{1,5})?")
-KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 
 
 class Command(NamedTuple):
@@ -62,38 +64,26 @@ ABOVE_ZERO = Within(1e-3, 1e6)
 SHARED = (
     option("--config", type=Path, metavar="FILE", help="the daemon's configuration"),
     option("--endpoint", metavar="URL", help="the control endpoint; ipc://DIR/control means all four in DIR"),
-    option("--key", metavar="FILE", help=f"the .key_secret for tcp:// ({KEY})"),
-    option("--server-key", metavar="FILE", help=f"the daemon's .key ({SERVER_KEY})"),
     option("--json", action="store_true", help="one JSON object on stdout"),
     option("--wait", type=ABOVE_ZERO, metavar="S", help="wait this long for the daemon (1)"),
 )
 "Before or after any command."
-USUAL = {"config": None, "endpoint": None, "key": None, "server_key": None, "json": False, "wait": 1.0}
+USUAL = {"config": None, "endpoint": None, "json": False, "wait": 1.0}
 
 
 def _operate(help_text: str) -> Command:
     return Command(help_text, "operate.operate", ("client", "command"))
 
 
-def _waiting(usual_s: float) -> tuple[Option, ...]:
-    return (
-        option(
-            "--timeout",
-            dest="timeout_s",
-            type=ABOVE_ZERO,
-            default=usual_s,
-            metavar="S",
-            help=f"wait this long ({usual_s:g})",
-        ),
-        option("--no-wait", dest="is_waiting", action="store_false", help="do not wait"),
-    )
-
-
 def _open_gap(help_text: str) -> Command:
-    # homing takes six seconds at most
-    return Command(help_text, "operate.open_gap", ("client", "command"), _waiting(10.0))
+    return Command(help_text, "operate.open_gap", ("client", "command"))
 
 
+GROUPS = {
+    "scene": "list and show scenes; check, explain, measure, make or use one",
+    "keys": "make key pairs for the daemon and its clients, or show a key's fingerprint",
+}
+SCENE = option("name", nargs="?", metavar="NAME|FILE", help="default: the configuration's")
 COMMANDS = {
     "status": Command("what the daemon is doing", "status.status", ("client",)),
     "top": Command(
@@ -107,7 +97,6 @@ COMMANDS = {
         "clear faults, home and enable as needed; the force ramps up",
         "operate.arm",
         ("client",),
-        _waiting(30.0)[:1],
     ),
     "enable": _operate("start rendering force along a ramp"),
     "disable": _open_gap("open the gap and turn the drives off"),
@@ -131,7 +120,6 @@ COMMANDS = {
         "find the home switches of both carriages",
         "operate.home",
         ("client",),
-        _waiting(30.0),
     ),
     "send": Command(
         "publish setpoints: a synthetic shape, or times and forces of a file",
@@ -221,7 +209,6 @@ COMMANDS = {
         "have the daemon write the last half minute, as on a fault",
         "operate.black_box",
         ("client",),
-        (option("copy", type=Path, nargs="?", metavar="FILE.mcap", help="copy it to this file"),),
     ),
     "replay": Command(
         "run a black box again bit for bit, or with --set or --fault on the simulator",
@@ -346,50 +333,61 @@ COMMANDS = {
         ("endpoints", "wait_s"),
         (option("--port", type=port, metavar="N", help="of 127.0.0.1"),),
     ),
-    "scene": Command(
-        "list scenes; show, check, explain, measure, make or use one (default: the configuration's)",
-        "scene.scene",
-        ("config", "config_file", "endpoints", "wait_s"),
+    "scene list": Command("the shipped scenes", "scene.list_scenes"),
+    "scene show": Command("a scene as TOML, with its defaults", "scene.show_scene", ("config",), (SCENE,)),
+    "scene check": Command(
+        "whether daemon and device can serve it; with --share or --tolerance, in which measured way",
+        "scene.check",
+        ("config", "config_file"),
         (
-            option(
-                "action",
-                choices=("list", "show", "check", "explain", "measure", "new", "use"),
-                help="check: whether daemon and device can serve it. explain: ways to serve it, with error and cost. "
-                "measure: those ways, live beside a simulated device. "
-                "new: ask for the task and write one. use: change to it while disabled",
-            ),
-            option("name", nargs="?", metavar="NAME|FILE"),
-            option("--force", type=Path, metavar="FORCE.csv", help="new: from this recorded force"),
-            option("--column", metavar="NAME[:UNIT]", help="new: its column (force_N)"),
-            option("--time-column", metavar="NAME[:UNIT]", help="new: its times (t_s)"),
-            option("--scale", type=Within(-1e6, 1e6), metavar="K", help="new: newtons per unit (1)"),
-            option("--offset", type=Within(-1e6, 1e6), dest="offset_N", metavar="N", help="new: newtons at 0 (0)"),
-            option("--insert", metavar="NAME", help="new: insert (the softest that renders it all)"),
-            option(
-                "--share",
-                type=ABOVE_ZERO,
-                metavar="S",
-                help="check: most exact way within this share of a processor",
-            ),
+            SCENE,
+            option("--share", type=ABOVE_ZERO, metavar="S", help="the most exact way within this share of a processor"),
             option(
                 "--tolerance",
                 type=ABOVE_ZERO,
                 dest="tolerance_N",
                 metavar="N",
-                help="check: cheapest way within this RMS error. new: RMS error to state",
+                help="the cheapest way within this RMS error",
             ),
-            option(
-                "--out", "-o", type=Path, metavar="FILE.toml", help="check: write the scene served so to a new file"
-            ),
+            option("--out", "-o", type=Path, metavar="FILE.toml", help="write the scene served so to a new file"),
         ),
     ),
-    "keys": Command(
-        "make key pairs for the daemon and its clients, or show a key's fingerprint",
-        "keys.keys",
+    "scene explain": Command(
+        "ways to serve a scene, with error and cost", "scene.explain_scene", ("config", "config_file"), (SCENE,)
+    ),
+    "scene measure": Command(
+        "serve a scene live in each way, beside a simulated device",
+        "scene_measure.measure_scene",
+        (),
+        (option("name", metavar="NAME|FILE"),),
+    ),
+    "scene new": Command(
+        "make a scene from a recorded force, or ask for the task",
+        "scene_new.new_scene",
+        ("config_file",),
+        (
+            option("out", type=Path, metavar="FILE.toml", help="the file to write"),
+            option("--force", type=Path, metavar="FORCE.csv", help="the recorded force"),
+            option("--column", metavar="NAME[:UNIT]", help="its column (force_N)"),
+            option("--time-column", metavar="NAME[:UNIT]", help="its times (t_s)"),
+            option("--scale", type=Within(-1e6, 1e6), metavar="K", help="newtons per unit (1)"),
+            option("--offset", type=Within(-1e6, 1e6), dest="offset_N", metavar="N", help="newtons at 0 (0)"),
+            option("--insert", metavar="NAME", help="insert (the softest that renders it all)"),
+            option("--tolerance", type=ABOVE_ZERO, dest="tolerance_N", metavar="N", help="RMS error to state"),
+        ),
+    ),
+    "scene use": Command(
+        "change to a scene while disabled",
+        "scene.use_scene",
+        ("client",),
+        (option("name", metavar="NAME|FILE"),),
+    ),
+    "keys generate": Command(
+        "make the daemon's key pair if there is none, and those of its clients",
+        "keys.generate_keys",
         (),
         (
-            option("action", choices=("generate", "show")),
-            option("path", type=Path, metavar="DIR|FILE", help="generate: folder; show: file"),
+            option("folder", type=Path, metavar="DIR"),
             *(
                 option(
                     f"--{role}",
@@ -400,12 +398,14 @@ COMMANDS = {
                 )
                 for role in ROLES
             ),
-            option(
-                "--client",
-                metavar="NAME",
-                help="make only a client's pair, on its machine; send NAME.key to the daemon's",
-            ),
         ),
+        has_daemon=False,
+    ),
+    "keys show": Command(
+        "a key's fingerprint, or those of all keys in a folder",
+        "keys.show_keys",
+        (),
+        (option("path", type=Path, metavar="FILE|DIR"),),
         has_daemon=False,
     ),
     "doctor": Command(
@@ -429,3 +429,4 @@ COMMANDS = {
         has_daemon=False,
     ),
 }
+FIRST_WORDS = {name.partition(" ")[0] for name in COMMANDS}

@@ -16,6 +16,7 @@ from tormagd.ctl.calibrate_run import Run, connected, known_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ground.files import in_place_of, read_bounded
 from tormagd.ground.terminal import write_line
+from tormagd.scenes.scene import Scene
 from tormagd.view.commission_page import page_of
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
@@ -29,16 +30,6 @@ class _Conformance(msgspec.Struct):
     """The fields used of the conformance kit's report."""
 
     checks: list["_Check"]
-
-
-class _Scene(msgspec.Struct):
-    """The fields used of the daemon's scene."""
-
-    force: "_Force"
-
-
-class _Force(msgspec.Struct):
-    most_N: float
 
 
 class _Check(msgspec.Struct):
@@ -62,7 +53,7 @@ def commission(
     with Client(endpoints, wait_s, SOURCE) as client:
         status, running = client.status(), client.describe()
         with as_usage_error(ConfigError, hint="check that tormagd and tormagctl are of the same version"):
-            config, scene = checked(running.configuration, Config), checked(running.scene, _Scene)
+            config, scene = checked(running.configuration, Config), checked(running.scene, Scene)
         known = known_of(config, status, scene.force.most_N, weight_N)
         serial_number = status.link.serial_number
         if serial_number is None:
@@ -109,11 +100,10 @@ class Kept:
 
         def begins(step: Step) -> None:
             self._step = step.name
-            write_line(f"step {steps.index(step) + 1} of {len(steps)}, {step.name}: {step.says}", sys.stderr)
-            run.progress.begin(step.name, step.lasts_s)
+            number = f"step {steps.index(step) + 1} of {len(steps)}"
+            write_line(f"{number}, {step.name}, about {step.lasts_s:.0f} s: {step.says}", sys.stderr)
 
         def ends(step: Step, found: Findings) -> None:
-            run.progress.end()
             self._note(findings=self.report.findings | {step.name: list(found)})
 
         try:

@@ -1,7 +1,7 @@
 """`tormagctl completion`: what a shell needs to complete commands, options, names and files."""
 
-from argparse import ArgumentParser
-from collections.abc import Iterable
+from argparse import ArgumentParser, _SubParsersAction
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import shtab
@@ -24,20 +24,24 @@ def script(parser: ArgumentParser, shell: str) -> str:
         "scene": ("name", shipped_scenes()),
         "guide": ("name", guide(None).result["guides"]),
     }
-    _complete(parser, {name: (dest, _names(name, each)) for name, (dest, each) in words.items()})
+    named = {name: (dest, _names(name, each)) for name, (dest, each) in words.items()}
+    for command, each in (("", parser), *subparsers(parser)):
+        dest, known = named.get(command.partition(" ")[0], ("", None))
+        for action in each._actions:
+            if action.dest == dest:
+                action.complete = known  # type: ignore[attr-defined]  # shtab looks for it here
+            elif action.type is Path or action.metavar == "FILE":
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
     return str(shtab.complete(parser, shell=shell))
 
 
-def _complete(parser: ArgumentParser, names: dict[str, tuple[str, object]]) -> None:
-    """Mark arguments that are files, or names of a command, so that shtab completes them."""
-    dest, words = names.get(parser.prog.rpartition(" ")[2], ("", None))
+def subparsers(parser: ArgumentParser) -> Iterator[tuple[str, ArgumentParser]]:
+    """Yield each command with its name, and those of a group behind it."""
     for action in parser._actions:
-        if action.dest == dest:
-            action.complete = words  # type: ignore[attr-defined]  # shtab looks for it here
-        elif action.type is Path or action.metavar == "FILE":
-            action.complete = shtab.FILE  # type: ignore[attr-defined]
-        for inner in action.choices.values() if isinstance(action.choices, dict) else ():
-            _complete(inner, names)
+        if isinstance(action, _SubParsersAction):
+            for name, command in action.choices.items():
+                yield name, command
+                yield from ((f"{name} {inner}", each) for inner, each in subparsers(command))
 
 
 def _names(command: str, words: Iterable[str]) -> object:

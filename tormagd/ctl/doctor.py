@@ -20,7 +20,7 @@ from tormagd.commission import finding as commission
 from tormagd.commission.force_findings import sensor_at_rest
 from tormagd.config import Config
 from tormagd.ctl.calibrate_run import ticks_at_rest
-from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, MAX_WAITED, Headroom, Rate, measured, rates
+from tormagd.ctl.headroom import MAX_STOLEN, MAX_USED, Headroom, Rate, measured, rates
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome, folded
 from tormagd.ctl.status import RECOMMISSION, refused
@@ -32,7 +32,6 @@ from tormagd_client.messages import Status
 
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
 MEMORY_TO_LOCK_BYTES = 1_000_000_000
-GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
 FAST_LATENCY_MS = 1
 LATE_SHARE = 0.25
 "If a bare timer is later at p99, as a share of a control period, the daemon has too little left."
@@ -187,17 +186,17 @@ def of_daemon(known: Running, machine: Machine) -> tuple[Finding, ...]:
 
 
 def _in_force(known: Running) -> Config:
-    """Return a daemon's configuration without the wishes that the kernel refused."""
+    """Return a daemon's configuration without the priority that the kernel refused."""
     config, lacking = known.config, refused(known.status.not_granted)
-    kept = {key: value for key, value in (("lock_memory", False), ("fifo_priority", 0)) if f"realtime.{key}" in lacking}
-    return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, **kept))
+    priority = 0 if "realtime.fifo_priority" in lacking else config.realtime.fifo_priority
+    return msgspec.structs.replace(config, realtime=msgspec.structs.replace(config.realtime, fifo_priority=priority))
 
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
     held = {row.loop: row for row in rates(config, found) if row.configured}
     return (
         bare_timer(found),
-        others(found),
+        steal(found),
         core(found),
         *(configured_rate(held[loop]) for loop in ("control", "inference")),
     )
@@ -215,15 +214,12 @@ def bare_timer(found: Headroom) -> Finding:
     )
 
 
-def others(found: Headroom) -> Finding:
-    """Judge what a hypervisor and other programs took during the measurement."""
-    waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
-    is_stolen = found.steal > MAX_STOLEN
+def steal(found: Headroom) -> Finding:
     return _finding(
-        "others",
-        not is_stolen and (found.waited or 0.0) <= MAX_WAITED,
-        f"stolen {found.steal:.1%}; something waited for a processor: {waited}",
-        "ask whoever runs the host for processors that are not shared" if is_stolen else STOP_OTHERS,
+        "steal",
+        found.steal <= MAX_STOLEN,
+        f"a hypervisor took {found.steal:.1%} of the time",
+        "ask whoever runs the host for processors that are not shared",
     )
 
 
@@ -248,21 +244,11 @@ def preemption(config: Config, machine: Machine) -> Finding:
     """Judge how soon the kernel lets go of a processor: OK for PREEMPT_RT."""
     version = machine.text("/proc/version") or ""
     is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
-    # the model in force is in brackets or parentheses; only root can read it
-    active = re.search(r"[\[(](\w+)[\])]", machine.text("/sys/kernel/debug/sched/preempt") or "")
-    asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")
-    if is_real_time:
-        found = "PREEMPT_RT"
-    elif active:
-        found = f"dynamic, {active[1]} in force"
-    elif "PREEMPT_DYNAMIC" in version:
-        found = f"dynamic, {asked[1] if asked else 'default'} model"
-    else:
-        found = "full, but not PREEMPT_RT" if re.search(r"\bPREEMPT\b", version) else "none or voluntary"
+    model = re.search(r"\bPREEMPT\w*", version)
     return _finding(
         "preemption",
         is_real_time,
-        found,
+        "PREEMPT_RT" if is_real_time else model[0] if model else "none or voluntary",
         "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or boot with preempt=full",
     )
 
@@ -306,16 +292,7 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
-    """Judge whether the processors of `realtime.cpus`, and at least two, are online."""
     count = machine.cores()
-    impossible = [number for number in config.realtime.cpus if number >= count]
-    if impossible:
-        return Finding(
-            "cores",
-            Severity.FAIL,
-            f"{count} online, realtime.cpus asks for {impossible}",
-            f"name cores 0..{count - 1}",
-        )
     return _finding("cores", count >= 2, f"{count} online", "use a machine with at least 2 cores")
 
 
@@ -325,27 +302,6 @@ def load(config: Config, machine: Machine) -> Finding:
         return Finding("load", Severity.WARN, "not known", "mount /proc")
     average, count = float(fields[0]), machine.cores()
     return _finding("load", average <= 0.8 * count, f"{average:.2f} over one minute on {count} cores", STOP_OTHERS)
-
-
-def clock_source(config: Config, machine: Machine) -> Finding:
-    """Judge whether reading the time is fast and even."""
-    name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
-    return _finding(
-        "clock source",
-        name is None or name in GOOD_CLOCKS,
-        "the kernel does not say" if name is None else name,
-        "dmesg | grep -i clocksource tells why tsc was given up; update the firmware",
-    )
-
-
-def swap(config: Config, machine: Machine) -> Finding:
-    """Judge whether the daemon's memory can be paged out."""
-    lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
-    if not lines:
-        return Finding("swap", Severity.OK, "off")
-    is_locked = config.realtime.lock_memory
-    found = f"on ({lines[0].split()[0]}){', but realtime.lock_memory keeps the daemon in' if is_locked else ''}"
-    return _finding("swap", is_locked, found, "see memlock above, or sudo swapoff -a")
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
@@ -473,8 +429,6 @@ OF_MACHINE: tuple[Check, ...] = (
     governor,
     cores,
     load,
-    clock_source,
-    swap,
     huge_pages,
     autogroup,
     usb_latency,

@@ -1,10 +1,9 @@
 """`tormagctl doctor --measure`: which control and inference rates this machine holds with margin.
 
 `python -m tormagd.headroom` measures, in a process that needs neither daemon nor device. Here its figures are judged,
-beside what the kernel counts meanwhile of steal and of processes that waited.
+beside what a hypervisor took meanwhile.
 """
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import msgspec
 
 from firmware_protocol.build import REMEDY
 from tormagd.config import MIN_INFERENCE_HZ, Config
-from tormagd.ctl.machine import Machine, Taken
+from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import CommandError, Exit, answer_of
 from tormagd_client.messages import ExecReport
 
@@ -25,8 +24,8 @@ PERIOD_OVER_STEP = 3.5
 ZeroMQ."""
 MAX_USED = 0.7
 "The rest is for clients that ask, and for times when the machine gives less."
-MAX_STOLEN, MAX_WAITED = 0.01, 0.1
-"Others may take these shares of the time without a warning."
+MAX_STOLEN = 0.01
+"A hypervisor may take this share of the time without a warning."
 
 
 class Quantiles(ExecReport, frozen=True, kw_only=True):
@@ -43,7 +42,7 @@ class Bare(msgspec.Struct, frozen=True):
 
 
 class Headroom(msgspec.Struct, frozen=True):
-    """What `python -m tormagd.headroom` prints, and the shares of its time that others took."""
+    """What `python -m tormagd.headroom` prints, and the share of its time that a hypervisor took."""
 
     machine_us: float
     build: str
@@ -51,7 +50,6 @@ class Headroom(msgspec.Struct, frozen=True):
     plan_us: Quantiles
     bare: Bare
     steal: float = 0.0
-    waited: float | None = None
 
 
 class Rate(msgspec.Struct, frozen=True):
@@ -66,7 +64,7 @@ class Rate(msgspec.Struct, frozen=True):
 
 
 def measured(path: Path | None, machine: Machine) -> Headroom:
-    before, started_s = machine.taken(), time.monotonic()
+    before = machine.stolen()
     try:
         printed = answer_of("tormagd.headroom", [f"--config={path}"] if path else [], LONGEST_S)
     except (TimeoutError, ChildProcessError) as error:
@@ -74,16 +72,12 @@ def measured(path: Path | None, machine: Machine) -> Headroom:
             Exit.REFUSED, "not_measured", f"this machine could not be measured: {error}", "try it again"
         ) from error
     found = msgspec.json.decode(printed, type=Headroom)
-    steal, waited = shares(before, machine.taken(), time.monotonic() - started_s)
-    return msgspec.structs.replace(found, steal=steal, waited=waited)
+    return msgspec.structs.replace(found, steal=share(before, machine.stolen()))
 
 
-def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | None]:
-    """Return the shares of time that were stolen, and in which something waited for a processor."""
-    steal = (after.stolen - before.stolen) / max(after.ticks - before.ticks, 1)
-    if before.waited_us is None or after.waited_us is None:
-        return steal, None
-    return steal, min((after.waited_us - before.waited_us) * 1e-6 / took_s, 1.0)
+def share(before: tuple[int, int], after: tuple[int, int]) -> float:
+    """Return the share of the ticks between two looks that were stolen."""
+    return (after[0] - before[0]) / max(after[1] - before[1], 1)
 
 
 def rates(config: Config, found: Headroom) -> Iterator[Rate]:
@@ -108,7 +102,7 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         change = ""
     elif loop == "control" and late_us.p99 > TICK_OVER_STEP * step.p99 and in_time > busy:
         change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
-    elif found.build == "interpreted":
+    elif found.build != "compiled":
         change = f"compile the core: {REMEDY}"
     else:
         change = f"a faster processor, or less than {hz} Hz"

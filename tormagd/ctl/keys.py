@@ -1,35 +1,28 @@
 """`tormagctl keys`: make key pairs, show fingerprints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
+from tormagd.ctl.outcome import Outcome, as_usage_error
 from tormagd.ground.access_keys import load_folder
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
 
-HINT = "tormagctl keys generate --help; the guide has the whole exchange"
 
-
-def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) -> Outcome:
-    return show_keys(path) if action == "show" else generate_keys(path, clients, client)
-
-
-def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
-    """Make the daemon's key pair if there is none, and one for each of `clients`, or for `client`."""
-    names = [name for listed in clients.values() for name in listed]
-    if client is not None and names:
-        raise usage_error("--client stands alone: it makes a pair that no list of this machine has", HINT)
+def generate_keys(folder: Path, **clients: Sequence[str]) -> Outcome:
+    """Make the daemon's key pair if there is none, and one for each of `clients`."""
     made = []
-    with as_usage_error(OSError, ConfigError, hint=HINT):
-        if client is not None:
-            return _outcome([_made(client, "client", folder, folder)])
-        if not (folder / f"{SERVER}{PUBLIC}").exists() or not names:
+    with as_usage_error(OSError, ConfigError, hint="tormagctl keys generate --help; the guide has the whole exchange"):
+        if not (folder / f"{SERVER}{PUBLIC}").exists() or not any(clients.values()):
             made.append(_made(SERVER, SERVER, folder, folder))
         for role, listed in clients.items():
             (folder / role).mkdir(mode=0o700, exist_ok=True)
             made += [_made(name, role, folder, folder / role) for name in listed]
-    return _outcome(made)
+    lines = [
+        f"{key['name']} ({key['role']}) {key['fingerprint']}\n  secret {key['secret']}\n  public {key['public']}"
+        for key in made
+    ]
+    return Outcome({"made": made}, "\n".join(lines))
 
 
 def show_keys(path: Path) -> Outcome:
@@ -49,11 +42,3 @@ def _made(name: str, role: str, secret_in: Path, public_in: Path) -> dict[str, s
         "public": str(public),
         "fingerprint": fingerprint(load_public(public)),
     }
-
-
-def _outcome(made: list[dict[str, str]]) -> Outcome:
-    lines = [
-        f"{key['name']} ({key['role']}) {key['fingerprint']}\n  secret {key['secret']}\n  public {key['public']}"
-        for key in made
-    ]
-    return Outcome({"made": made}, "\n".join(lines))

@@ -4,17 +4,8 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from tormagd_client.printable import printable
-
-
-class Taken(NamedTuple):
-    """Counters of what others took from this machine."""
-
-    stolen: int
-    ticks: int
-    waited_us: int | None
 
 
 class Machine:
@@ -51,12 +42,11 @@ class Machine:
         ranges = re.findall(r"(\d+)(?:-(\d+))?", self.text("/sys/devices/system/cpu/online") or "0")
         return sum(int(last or first) - int(first) + 1 for first, last in ranges) or 1
 
-    def taken(self) -> Taken:
-        """Read the counters of what others took (proc_stat(5), Documentation/accounting/psi)."""
+    def stolen(self) -> tuple[int, int]:
+        """Return the ticks that a hypervisor took from all processors since the start, and all ticks (proc_stat(5))."""
         first = (self.text("/proc/stat") or "").split("\n", 1)[0]
         fields = [int(field) for field in first.split()[1:9]]  # without guests, which count as users already
-        some = re.search(r"^some .*total=(\d+)$", self.text("/proc/pressure/cpu") or "", re.MULTILINE)
-        return Taken(fields[7] if len(fields) == 8 else 0, sum(fields), int(some[1]) if some else None)
+        return fields[7] if len(fields) == 8 else 0, sum(fields)
 
     def resolved(self, absolute: str) -> str:
         there, root = os.path.realpath(self.path(absolute)), os.path.realpath(self.root)

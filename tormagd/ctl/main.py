@@ -16,7 +16,7 @@ import msgspec
 
 from tormagd import __version__
 from tormagd.config import Config, load_config, load_endpoints
-from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL
+from tormagd.ctl.commands import COMMANDS, FIRST_WORDS, GROUPS, SHARED, USUAL
 from tormagd.ctl.outcome import (
     Outcome,
     as_usage_error,
@@ -27,7 +27,7 @@ from tormagd.ctl.outcome import (
 )
 from tormagd.ground.command_line import Parser, UsageError, add
 from tormagd.ground.terminal import write_in_any_encoding, write_line
-from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
+from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.errors import ClientError
 from tormagd_client.printable import in_short
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parser().parse_args(given)
     except UsageError as error:
         refused = usage_error(error.message, error.hint)
-        print_error(next((each for each in given if each in COMMANDS), ""), refused, "--json" in given)
+        print_error(next((each for each in given if each in FIRST_WORDS), ""), refused, "--json" in given)
         return refused.exit_code
     try:
         outcome = _run(options)
@@ -69,7 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> Outcome:
     """Call the command's function with its options and what it needs."""
-    command = COMMANDS[options.command]
+    name = f"{options.command} {options.in_group}".rstrip()
+    command = COMMANDS[name]
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
         file = SERVICE_CONFIG
@@ -83,15 +84,15 @@ def _run(options: argparse.Namespace) -> Outcome:
                 if "config" in command.needs:
                     known["config"] = load_config(file)
                 endpoints = load_endpoints(file)
-            known["endpoints"] = _endpoints(endpoints, options)
+            known["endpoints"] = endpoints if options.endpoint is None else _at(options.endpoint, endpoints)
         else:
             known["parser"] = parser()
         if "client" in command.needs:
             from tormagd_client.blocking import Client
 
             known["client"] = stack.enter_context(Client(known["endpoints"], options.wait))
-        given = {name: value for name, value in vars(options).items() if name not in ("command", *USUAL)}
-        return _called(options.command, given | {need: known[need] for need in command.needs})
+        given = {key: value for key, value in vars(options).items() if key not in ("command", "in_group", *USUAL)}
+        return _called(name, given | {need: known[need] for need in command.needs})
 
 
 def _called(command: str, arguments: dict[str, Any]) -> Outcome:
@@ -110,27 +111,18 @@ def _called(command: str, arguments: dict[str, Any]) -> Outcome:
         raise usage_error(f"{in_short(error.object)}: allowed is UTF-8 text", "give another text or name") from error
 
 
-def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
-    """Return the configured endpoints and keys with the changes of options and environment."""
-    changed: dict[str, object] = {}
-    given = {
-        "client_secret": options.key or os.environ.get(KEY),
-        "server_public": options.server_key or os.environ.get(SERVER_KEY),
-    }
-    if named := {name: file for name, file in given.items() if file}:
-        changed["curve"] = msgspec.structs.replace(configured.curve or Curve(), **named)
-    address = options.endpoint
-    if address is not None:
-        changed["control"] = address
-        if address.startswith("ipc://") and address.endswith("/control"):
-            directory = address.removesuffix("control")
-            changed |= {name: directory + name for name in ENDPOINTS}
+def _at(address: str, configured: Endpoints) -> Endpoints:
+    """Return the endpoints of the daemon whose control endpoint is `address`, with the configured keys."""
+    changed = {"control": address}
+    if address.startswith("ipc://") and address.endswith("/control"):
+        directory = address.removesuffix("control")
+        changed |= {name: directory + name for name in ENDPOINTS}
     try:
         return Config(endpoints=msgspec.structs.replace(configured, **changed)).endpoints
     except ValueError as error:
         raise usage_error(
             f"--endpoint: {error}",
-            "give an address such as ipc:///run/tormag/control; for another machine's also --key and --server-key",
+            "give an address such as ipc:///run/tormag/control; tormagctl guide another-machine says what others need",
         ) from error
 
 
@@ -144,10 +136,16 @@ def parser() -> argparse.ArgumentParser:
     made.options = tuple(name for names, _ in (*SHARED, *of_commands) for name in names)
     made.set_defaults(**USUAL)
     made.add_argument("--version", action="version", version=f"tormagctl {__version__}")
+    made.set_defaults(in_group="")
     # otherwise argparse would lay out a usage to find it
-    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=made.prog)
+    commands = {"": made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=made.prog)}
     for name, (text, _, _, options, _) in COMMANDS.items():
-        add(commands.add_parser(name, help=text, description=text, parents=[shared], epilog=EXIT_TEXT), options)
+        group, _, last = name.rpartition(" ")
+        if group not in commands:
+            about = GROUPS[group]
+            inner = commands[""].add_parser(group, help=about, description=about, parents=[shared], epilog=EXIT_TEXT)
+            commands[group] = inner.add_subparsers(dest="in_group", required=True, metavar="ACTION", prog=inner.prog)
+        add(commands[group].add_parser(last, help=text, description=text, parents=[shared], epilog=EXIT_TEXT), options)
     return made
 
 

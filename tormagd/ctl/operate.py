@@ -1,14 +1,12 @@
 """The commands that change what the device does."""
 
-import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ground.files import new_file
+from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ground.terminal import write_line
 from tormagd_client.blocking import Client
 from tormagd_client.messages import Explained, Status
@@ -16,6 +14,8 @@ from tormagd_client.messages import Explained, Status
 POLL_S = 0.05
 BEGIN_S = 2.0
 "By then a device that took the command is busy, even over the slowest link."
+ARMS_S, HOMES_S, OPENS_S = 30.0, 30.0, 10.0
+"Homing takes six seconds at most."
 
 DONE: dict[str, tuple[str, tuple[str, ...]]] = {
     "enable": ("enabled", ("ENABLED",)),
@@ -42,10 +42,10 @@ LONGEST_WRITE_S = 30.0
 "Longest wait for a black box; writing takes a second or two, at low priority."
 
 
-def arm(client: Client, timeout_s: float) -> Outcome:
+def arm(client: Client) -> Outcome:
     """Have the daemon clear faults, home and enable as needed, and report each step on stderr."""
     begun_s = time.monotonic()
-    given = client.arm(timeout_s, report_step)
+    given = client.arm(ARMS_S, report_step)
     return armed(given, client.status(), time.monotonic() - begun_s)
 
 
@@ -85,13 +85,13 @@ def done(command: str, result: dict[str, Any]) -> Outcome:
     return Outcome(result, text)
 
 
-def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
-    """Give `disable` or `stop`, and with `is_waiting` wait until the gap is open."""
+def open_gap(client: Client, command: str) -> Outcome:
+    """Give `disable` or `stop`, and wait until the gap is open."""
     begun = operate(client, command)
-    if begun.exit_code is not Exit.DONE or not is_waiting:
+    if begun.exit_code is not Exit.DONE:
         return begun
     gap_mm = None
-    for elapsed_s, state in statuses(client, timeout_s, "opening"):
+    for elapsed_s, state in statuses(client, OPENS_S):
         gap_mm = state.gap_mm
         if state.is_open and not state.is_busy:
             return Outcome({**begun.result, "seconds": round(elapsed_s, 2)}, IS_OPEN[command])
@@ -101,7 +101,7 @@ def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -
     raise CommandError(
         Exit.REFUSED,
         "not_open",
-        f"after {timeout_s:g} s the gap is not " + ("known to be open" if gap_mm is None else f"open: {gap_mm:.1f} mm"),
+        f"after {OPENS_S:g} s the gap is not " + ("known to be open" if gap_mm is None else f"open: {gap_mm:.1f} mm"),
         "it goes on by itself; tormagctl status shows how far",
     )
 
@@ -128,13 +128,11 @@ def _not_done(what: str) -> CommandError:
     return CommandError(Exit.REFUSED, "not_done", what, "tormagctl status")
 
 
-def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
+def home(client: Client) -> Outcome:
     was_homed = client.status().is_homed
     result = client.request("home")
-    if not is_waiting:
-        return Outcome(result, "homing; tormagctl status shows when it is done")
     has_begun = False
-    for elapsed_s, state in statuses(client, timeout_s, "homing"):
+    for elapsed_s, state in statuses(client, HOMES_S):
         require_no_fault(state, "fault while homing")
         # a homing too short to be seen has changed the device to homed
         has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
@@ -151,15 +149,13 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     raise CommandError(
         Exit.REFUSED,
         "timeout",
-        f"still homing after {timeout_s:g} s",
+        f"still homing after {HOMES_S:g} s",
         "it goes on by itself; tormagctl status shows how far, tormagctl stop ends it",
     )
 
 
-def black_box(client: Client, copy: Path | None) -> Outcome:
-    """Have the daemon write its black box, wait until the file is on the disk, and copy it to the new file `copy`."""
-    if copy is not None and copy.exists():
-        raise usage_error(f"{copy} exists", "give another name; nothing is overwritten")
+def black_box(client: Client) -> Outcome:
+    """Have the daemon write its black box, and wait until the file is on the disk."""
     written = Path(client.request("blackbox")["file"])
     boxes = (state.black_box for _, state in statuses(client, LONGEST_WRITE_S))
     box = next((each for each in boxes if each.newest == written.name or each.refusal), None)
@@ -170,29 +166,15 @@ def black_box(client: Client, copy: Path | None) -> Outcome:
             f"{written} was not written within {LONGEST_WRITE_S:g} s" if box is None else box.refusal,
             "make room in [black_box] folder, or name another; the daemon's log says more",
         )
-    if copy is None:
-        return Outcome({"file": str(written)}, f"{written}\ntormagctl replay runs it again, tormagctl plot draws it")
-    hint = f"it is {written} on the daemon's machine: fetch it from there"
-    with as_usage_error(OSError, hint=hint), new_file(copy):
-        shutil.copyfile(written, copy)
-    return Outcome({"file": str(copy), "original": str(written)}, f"{copy} (also {written})")
+    return Outcome({"file": str(written)}, f"{written}\ntormagctl replay runs it again, tormagctl plot draws it")
 
 
-def statuses(client: Client, timeout_s: float, doing: str = "") -> Iterator[tuple[float, Status]]:
-    """Yield seconds since the start and status, every POLL_S, until `timeout_s`."""
+def statuses(client: Client, longest_s: float) -> Iterator[tuple[float, Status]]:
+    """Yield seconds since the start and status, every POLL_S, until `longest_s`."""
     started_s = time.monotonic()
-    shows_progress = bool(doing) and is_terminal(sys.stderr)
-    try:
-        while (elapsed_s := time.monotonic() - started_s) < timeout_s:
-            state = client.status()
-            yield elapsed_s, state
-            if shows_progress:
-                gap = "not known" if state.gap_mm is None else f"{state.gap_mm:.1f} mm"
-                print(f"\r{doing} {elapsed_s:5.1f} s, gap {gap}   ", end="", file=sys.stderr, flush=True)
-            time.sleep(POLL_S)
-    finally:
-        if shows_progress:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    while (elapsed_s := time.monotonic() - started_s) < longest_s:
+        yield elapsed_s, client.status()
+        time.sleep(POLL_S)
 
 
 def require_no_fault(state: Status, what: str, then: str = "tormagctl clear-fault") -> None:

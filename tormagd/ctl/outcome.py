@@ -21,6 +21,7 @@ from tormagd_client.printable import each_text, printable
 
 NARROWEST = 20
 LABEL = re.compile(r"\S{0,24} +")
+NEW_FILE = "allowed is a new file in a folder that exists"
 WRITABLE = "give another file's name, in a directory you may write to"
 ROOM = "make room on its disk"
 REMEDIES = {
@@ -113,16 +114,19 @@ def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[s
 
 
 def folded(text: str) -> str:
-    """Wrap `text` to the terminal's width, with a line's rest indented under its words."""
-    if not is_terminal(sys.stdout):
-        return text
-    width = max(shutil.get_terminal_size().columns, NARROWEST)
+    """Wrap `text` to the terminal's width, if stdout is one."""
+    return "\n".join(wrapped(text, shutil.get_terminal_size().columns)) if is_terminal(sys.stdout) else text
+
+
+def wrapped(text: str, width: int) -> list[str]:
+    """Return lines of at most `width`, with a line's rest indented under its words."""
+    width = max(width, NARROWEST)
     lines: list[str] = []
     for line in text.splitlines():
         label = LABEL.match(line)
         under = " " * min(0 if label is None else label.end(), width // 3)
         lines += textwrap.wrap(line, width, subsequent_indent=under) if len(line) > width else [line]
-    return "\n".join(lines)
+    return lines
 
 
 def is_terminal(stream: TextIO | None) -> bool:

@@ -11,8 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from tormagd.config import Config
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Outcome, folded
@@ -24,40 +22,6 @@ NOT_ASKED = ("serial", "socketcand", "virtual")
 "They repeat serial ports, listen for seconds for network beacons, or reach no other process."
 
 
-class Holder(msgspec.Struct, frozen=True):
-    process_id: int
-    name: str
-    is_locking: bool
-
-
-class ListedPort(msgspec.Struct, frozen=True):
-    """A serial port. `latency_ms` is that of a USB chip's driver, if it has such a timer."""
-
-    port: str
-    description: str
-    usb_id: str | None
-    serial_number: str | None
-    is_configured: bool
-    is_accessible: bool
-    latency_ms: int | None
-    holders: tuple[Holder, ...]
-
-
-class CanChannel(msgspec.Struct, frozen=True):
-    interface: str
-    channel: str
-    is_configured: bool
-    is_up: bool | None
-
-
-class Ports(msgspec.Struct, frozen=True):
-    """What `tormagctl ports` found. `hidden_processes` counts those whose open files we may not see."""
-
-    serial: tuple[ListedPort, ...]
-    can: tuple[CanChannel, ...]
-    hidden_processes: int
-
-
 def ports(config: Config, root: Path = Path("/")) -> Outcome:
     # it reports at every start which makers' libraries are not installed
     logging.getLogger("can").setLevel(logging.CRITICAL)
@@ -67,11 +31,16 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
     asked = sorted(set(can.VALID_INTERFACES) - set(NOT_ASKED))
     channels = can.detect_available_configs(asked, timeout=DETECTION_S)
     found = survey(config, Machine(root), comports(), channels)
-    return Outcome(msgspec.to_builtins(found), folded(_text(found, config, Colour(sys.stdout))))
+    return Outcome(found, folded(_text(found, config, Colour(sys.stdout))))
 
 
-def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:
-    """Describe serial ports, sorted by path, CAN channels, and the processes that hold them."""
+def survey(
+    config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Describe serial ports, sorted by path, CAN channels, and the processes that hold them.
+
+    `hidden_processes` counts those whose open files we may not see.
+    """
     known = {machine.resolved(info.device): info for info in listed}
     configured = machine.resolved(config.device.port) if _is_line(config) else ""
     if configured and machine.path(configured).exists():
@@ -81,30 +50,36 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
     own = (str(config.device.options.get("interface")), config.device.port) if config.device.backend == "can" else None
     if own is not None and own not in channels:
         channels.append(own)
-    return Ports(
-        tuple(_serial_port(machine, path, known[path], path == configured, holding[path]) for path in sorted(known)),
-        tuple(CanChannel(*entry, entry == own, _is_up(machine, entry[1])) for entry in channels),
-        hidden,
-    )
+    return {
+        "serial": [
+            _serial_port(machine, path, known[path], holding[path]) | {"is_configured": path == configured}
+            for path in sorted(known)
+        ],
+        "can": [
+            {"interface": name, "channel": channel, "is_up": _is_up(machine, channel)}
+            | {"is_configured": (name, channel) == own}
+            for name, channel in channels
+        ],
+        "hidden_processes": hidden,
+    }
 
 
-def _serial_port(
-    machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
-) -> ListedPort:
+def _serial_port(machine: Machine, path: str, info: Any, opened: Sequence[tuple[int, str]]) -> dict[str, Any]:
     """Describe the serial port at `path`, without symbolic links; `info` is pyserial's."""
     locking = machine.lock_owners(path)
     names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
     has_usb_id = info is not None and info.vid is not None
-    return ListedPort(
-        port=path,
-        description="pseudo-terminal" if info is None else printable(str(info.description)),
-        usb_id=f"{info.vid:04x}:{info.pid:04x}" if has_usb_id else None,
-        serial_number=None if info is None or info.serial_number is None else printable(str(info.serial_number)),
-        is_configured=is_configured,
-        is_accessible=os.access(machine.path(path), os.R_OK | os.W_OK),
-        latency_ms=machine.number(f"/sys/bus/usb-serial/devices/{Path(path).name}/latency_timer"),
-        holders=tuple(Holder(owner, name, owner in locking) for owner, name in sorted(names.items())),
-    )
+    return {
+        "port": path,
+        "description": "pseudo-terminal" if info is None else printable(str(info.description)),
+        "usb_id": f"{info.vid:04x}:{info.pid:04x}" if has_usb_id else None,
+        "serial_number": None if info is None or info.serial_number is None else printable(str(info.serial_number)),
+        "is_accessible": os.access(machine.path(path), os.R_OK | os.W_OK),
+        "latency_ms": machine.number(f"/sys/bus/usb-serial/devices/{Path(path).name}/latency_timer"),
+        "holders": [
+            {"process_id": owner, "name": name, "is_locking": owner in locking} for owner, name in sorted(names.items())
+        ],
+    }
 
 
 def _is_line(config: Config) -> bool:
@@ -120,28 +95,28 @@ def _is_up(machine: Machine, channel: str) -> bool | None:
     return None if state is None else state in ("up", "unknown")
 
 
-def _text(found: Ports, config: Config, colour: Colour) -> str:
+def _text(found: dict[str, Any], config: Config, colour: Colour) -> str:
     lines = []
-    for entry in found.serial:
-        marks = [
-            *([colour.bold("configured")] if entry.is_configured else []),
-            *([] if entry.is_accessible else [colour.red("not readable and writable for you")]),
-            *([f"USB {entry.usb_id}"] if entry.usb_id else []),
-            *([f"serial number {entry.serial_number}"] if entry.serial_number else []),
-            *([f"latency {entry.latency_ms} ms"] if entry.latency_ms is not None else []),
-        ]
-        lines.append(f"serial  {', '.join((entry.port, entry.description, *marks))}")
-        for holder in entry.holders:
-            how = ", exclusively" if holder.is_locking else ""
-            lines.append(f"          held by {holder.name} (process {holder.process_id}{how})")
-    if not any(entry.is_configured for entry in found.serial) and _is_line(config):
+    for entry in found["serial"]:
+        usb_id, serial_number, latency_ms = entry["usb_id"], entry["serial_number"], entry["latency_ms"]
+        marks = {
+            colour.bold("configured"): entry["is_configured"],
+            colour.red("not readable and writable for you"): not entry["is_accessible"],
+            f"USB {usb_id}": usb_id,
+            f"serial number {serial_number}": serial_number,
+            f"latency {latency_ms} ms": latency_ms is not None,
+        }
+        told = (entry["port"], entry["description"], *(mark for mark, holds in marks.items() if holds))
+        lines.append(f"serial  {', '.join(told)}")
+        for holder in entry["holders"]:
+            how = ", exclusively" if holder["is_locking"] else ""
+            lines.append(f"          held by {holder['name']} (process {holder['process_id']}{how})")
+    if not any(entry["is_configured"] for entry in found["serial"]) and _is_line(config):
         lines.append(f"serial  {config.device.port}, {colour.yellow('configured, but not there')}")
-    for channel in found.can:
-        state = {None: "", True: ", up", False: f", {colour.yellow('down')}"}[channel.is_up]
-        mark = f", {colour.bold('configured')}" if channel.is_configured else ""
-        lines.append(f"can     {channel.interface} {channel.channel}{mark}{state}")
-    if found.hidden_processes:
-        lines.append(
-            f"{found.hidden_processes} processes of other users may hold a port too without locking it: sudo shows them"
-        )
+    for channel in found["can"]:
+        state = {None: "", True: ", up", False: f", {colour.yellow('down')}"}[channel["is_up"]]
+        mark = f", {colour.bold('configured')}" if channel["is_configured"] else ""
+        lines.append(f"can     {channel['interface']} {channel['channel']}{mark}{state}")
+    if hidden := found["hidden_processes"]:
+        lines.append(f"{hidden} processes of other users may hold a port too without locking it: sudo shows them")
     return "\n".join(lines) or "no serial port and no CAN channel"

@@ -23,7 +23,7 @@ from msgspec import UNSET
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.processes import begun, first_line, is_linked, processor_s
-from tormagd.ctl.scene_check import as_toml, derived_of, loaded, write_scene
+from tormagd.ctl.scene import as_toml, derived_of, loaded, write_scene
 from tormagd.element.physics.force import TORMAG
 from tormagd.ground.files import in_place_of
 from tormagd.ground.machine_loop import machine_us

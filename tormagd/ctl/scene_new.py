@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd.config import MIN_INFERENCE_HZ
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
-from tormagd.ctl.scene_check import NEW_FILE, as_toml, check_scene
+from tormagd.ctl.outcome import NEW_FILE, CommandError, Exit, Outcome, as_usage_error, is_terminal, usage_error
+from tormagd.ctl.scene import as_toml, check_scene
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.inserts import insert as known_insert
 from tormagd.ground.files import new_file
@@ -27,12 +27,8 @@ INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
 "From the softest, whose least force is the lowest."
 TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
 "The proposed tolerance is this share of the range, but at least this share of the greatest force."
-RESERVED = 0.7
-OVER_MISSED = 4.0
-"A tolerance under this multiple of what the gap's speed alone misses may be missed: carriages have mass and delay."
-
-UNMET, UNMET_IF_WEAK = "# NOT MET: ", "# NOT MET BY A WEAK DEVICE: "
-"They begin a line of a scene file that says what the device does not give."
+UNMET = "# NOT MET: "
+"Begins a line of a scene file that says what the device does not give."
 
 Tables = dict[str, Any]
 
@@ -40,26 +36,28 @@ Tables = dict[str, Any]
 class Recorded(NamedTuple):
     """A recorded quantity that becomes the scene's force, and what a person states of the scene."""
 
-    force: Path | None = None
+    force: Path | None
     "A file with times and one column of the quantity; without it, a person is asked."
-    column: str | None = None
-    time_column: str | None = None
-    scale: float | None = None
+    column: str | None
+    time_column: str | None
+    scale: float | None
     "Newtons for each unit of the column."
-    offset_N: float | None = None
-    insert: str | None = None
+    offset_N: float | None
+    insert: str | None
     "By default the softest that renders the scene."
-    tolerance_N: float | None = None
+    tolerance_N: float | None
 
 
-def new_scene(out: Path, recorded: Recorded, config: Path | None) -> Outcome:
+def new_scene(out: Path, config_file: Path | None, **stated: Any) -> Outcome:
+    """Make the scene file `out` of a `Recorded` quantity, or of answers."""
+    recorded = Recorded(**stated)
     if out.exists() or not out.parent.is_dir():
         raise usage_error(f"{out}: {NEW_FILE}", "name another file")
     with as_usage_error(DomainError, hint="tormagctl scene new --help"):
         known_insert(INSERTS[0] if recorded.insert is None else recorded.insert)
     with as_usage_error(OSError, hint=f"name another file: {NEW_FILE}"), contextlib.ExitStack() as files:
         force_file, told = _forces_of(out, recorded, files)
-        made = _proposed(out, force_file, recorded, config)
+        made = _proposed(out, force_file, recorded, config_file)
     if not told:
         return made
     text = f"{recorded.force}: {'; '.join(told)}\n{made.text}"
@@ -83,28 +81,29 @@ def _proposed(out: Path, force_file: Path | None, recorded: Recorded, config: Pa
 
 
 def _chosen(out: Path, tables: Tables, inserts: Sequence[str], config: Path | None) -> Outcome:
-    insert, checked, unmet = _softest(out, tables, inserts, config)
-    found = {"file": str(out), "insert": insert, "unmet": unmet, "unmet_if_weak": []}
-    if checked is None:
-        said = f"{out} is written, with insert {insert}, and is NOT MET:\n" + "\n".join(unmet)
-        hint = "state what is allowed, or another --insert, --tolerance, --scale or --offset"
-        return Outcome(found, f"{said}\n{hint}", Exit.REFUSED)
-    text = f"{checked.text}\n\n{out} is written, with insert {insert}: its tolerance, handle and rates are proposals"
-    if weak := _unmet_if_weak(tables, checked):
-        _write(out, tables, insert, weak, UNMET_IF_WEAK)
-        text += "\nnot met by a weak device: " + "; ".join(weak)
-    return Outcome(checked.result | found | {"unmet_if_weak": weak}, text)
-
-
-def _unmet_if_weak(tables: Tables, checked: Outcome) -> list[str]:
-    """Return what a weak device does not give of the scene, with what it does give."""
-    force, missed_N = tables["force"], checked.result["missed_rms_N"] or 0.0
-    weak = []
-    if not _has_reserve(tables, checked):
-        weak.append(f"force.most_N = {force['most_N']:g}: it gives {RESERVED * checked.result['most_N']:.2f}")
-    if force["tolerance_rms_N"] < OVER_MISSED * missed_N:
-        weak.append(f"force.tolerance_rms_N = {force['tolerance_rms_N']:g}: it keeps {OVER_MISSED * missed_N:.2g}")
-    return weak
+    """Write the scene with the softest of `inserts` that renders it, else marked with what is not met."""
+    lacks: dict[str, list[str]] = {}
+    for insert in inserts:
+        _write(out, tables, insert)
+        try:
+            checked = check_scene(str(out), config)
+        except CommandError as error:
+            reason = error.message.removeprefix(f"scene {tables['name']}: ")
+            # a machine too busy to say, or an unknown insert or model
+            if error.code not in ("refused", "budget") or reason.startswith("insert."):
+                raise
+            lacks[insert] = reason.split(AND_UNMET)
+        else:
+            said = f"{out} is written, with insert {insert}: its tolerance, handle and rates are proposals"
+            found = {"file": str(out), "insert": insert, "unmet": []}
+            return Outcome(checked.result | found, f"{checked.text}\n\n{said}")
+    # the softest of those that are strong enough follows fastest; else the stiffest
+    strong = [name for name in inserts if not any(reason.startswith("force.most_N") for reason in lacks[name])]
+    insert = min(strong, key=lambda name: len(lacks[name])) if strong else inserts[-1]
+    _write(out, tables, insert, lacks[insert])
+    said = f"{out} is written, with insert {insert}, and is NOT MET:\n" + "\n".join(lacks[insert])
+    hint = "state what is allowed, or another --insert, --tolerance, --scale or --offset"
+    return Outcome({"file": str(out), "insert": insert, "unmet": lacks[insert]}, f"{said}\n{hint}", Exit.REFUSED)
 
 
 def _forces_of(out: Path, recorded: Recorded, files: contextlib.ExitStack) -> tuple[Path | None, list[str]]:
@@ -133,47 +132,13 @@ def _forces_of(out: Path, recorded: Recorded, files: contextlib.ExitStack) -> tu
     return converted, table.told
 
 
-def _softest(
-    out: Path, tables: Tables, inserts: Sequence[str], config: Path | None
-) -> tuple[str, Outcome | None, list[str]]:
-    """Write the scene with the softest of `inserts` that gives it with RESERVED to spare, else the softest at all."""
-    taken: dict[str, Outcome] = {}
-    lacks: dict[str, list[str]] = {}
-    for insert in inserts:
-        _write(out, tables, insert)
-        try:
-            taken[insert] = check_scene(str(out), config)
-        except CommandError as error:
-            reason = error.message.removeprefix(f"scene {tables['name']}: ")
-            # a machine too busy to say, or an unknown insert or model
-            if error.code not in ("refused", "budget") or reason.startswith("insert."):
-                raise
-            lacks[insert] = reason.split(AND_UNMET)
-            continue
-        if _has_reserve(tables, taken[insert]):
-            return insert, taken[insert], []
-    if taken:
-        insert = next(iter(taken))
-        _write(out, tables, insert)
-        return insert, taken[insert], []
-    # the softest of those that are strong enough follows fastest; else the stiffest
-    strong = [name for name in inserts if not any(reason.startswith("force.most_N") for reason in lacks[name])]
-    insert = min(strong, key=lambda name: len(lacks[name])) if strong else inserts[-1]
-    _write(out, tables, insert, lacks[insert])
-    return insert, None, lacks[insert]
-
-
 def _with(tables: Tables, insert: str) -> Tables:
     return tables | {"insert": {"name": insert, "model": AUTO}}
 
 
-def _write(out: Path, tables: Tables, insert: str, unmet: Sequence[str] = (), begin: str = UNMET) -> None:
-    lines = [line for reason in unmet for line in textwrap.wrap(f"{begin}{reason}", 100, subsequent_indent="#   ")]
+def _write(out: Path, tables: Tables, insert: str, unmet: Sequence[str] = ()) -> None:
+    lines = [line for reason in unmet for line in textwrap.wrap(f"{UNMET}{reason}", 100, subsequent_indent="#   ")]
     out.write_text("\n".join([*lines, as_toml(_with(tables, insert))]) + "\n", encoding="utf-8")
-
-
-def _has_reserve(tables: Tables, checked: Outcome) -> bool:
-    return bool(tables["force"]["most_N"] <= RESERVED * checked.result["most_N"])
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:

@@ -10,54 +10,44 @@ from typing import Any
 
 import msgspec
 
-from tormagd.ctl.operate import require_no_fault
+from tormagd.ctl.operate import require_no_fault, statuses
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, as_usage_error, usage_error
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.ground.force_file import stated_columns
 from tormagd.ground.table import TableError
 from tormagd.ground.terminal import interrupted_by, write_line
+from tormagd.scenes.scene import Scene
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
-from tormagd_client.errors import UnreachableError
+from tormagd_client.errors import UnreachableError, not_understood
 from tormagd_client.messages import MAX_PREVIEW_SAMPLES, Description, Explained, Status
 from tormagd_client.wire import Pending, understood
 
 LOOK_S = 0.1
-LAST_ANSWER_S = 1.0
 ARRIVAL_S = 0.5
 "By then the last setpoint has arrived, even if an answer overtook it."
 MIN_TAKEN = 0.9
 "The first setpoints may be refused while their clock is not known."
+OTHER_SOURCE = "OTHER_SOURCE"
+OF_STATE = {"refused": OTHER_SOURCE, "stale": "STALE"}
+"The limit that a source meets in these states."
 SPOILING = ("RANGE", "F_MAX")
 "These mean another force than asked. F_MIN is not among them: 0 N asks for the device's least force."
-
-
-class Fate(msgspec.Struct, frozen=True):
-    """How many setpoints were taken, how often they were seen rendered, and what held them back."""
-
-    accepted: int
-    rendered_share: float | None
-    limits: tuple[str, ...]
 
 
 def require_range(known: Description, least_N: float, most_N: float) -> None:
     """Raise CommandError unless the daemon's scene allows forces from `least_N` to `most_N`."""
     try:
-        force = msgspec.convert(known.scene["force"], dict[str, Any])
-        allowed = msgspec.convert((force["least_N"], force["most_N"]), tuple[float, float])
-    except (KeyError, msgspec.ValidationError) as error:
-        raise CommandError(
-            Exit.UNREACHABLE,
-            "unintelligible",
-            f"the scene of tormagd {known.version} is not understood: {error}",
-            "install tormagd and tormagctl of the same version, and start the daemon again",
-        ) from error
-    if not allowed[0] <= least_N <= most_N <= allowed[1]:
+        scene = msgspec.convert(known.scene, Scene)
+    except ValueError as error:
+        raise not_understood("scene", error) from error
+    force = scene.force
+    if not force.least_N <= least_N <= most_N <= force.most_N:
         raise CommandError(
             Exit.REFUSED,
             "out_of_range",
-            f"{least_N:.12g}..{most_N:.12g} N is asked: allowed is {allowed[0]:.12g}..{allowed[1]:.12g} N "
-            f"in scene {known.scene.get('name', '-')}; nothing was sent",
+            f"{least_N:.12g}..{most_N:.12g} N is asked: allowed is {force.least_N:.12g}..{force.most_N:.12g} N "
+            f"in scene {scene.name}; nothing was sent",
             "ask within the range, or let the daemon run another scene",
         )
 
@@ -73,27 +63,17 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
             "tormagctl resume" if status.operating_state == "PAUSED" else "tormagctl arm",
         )
     report = status.setpoints.by_source.get(source)
-    why = {each.code: each for each in status.limit_details}
     if report is None:
         heard = f": {status.setpoints.last_refusal}" if status.setpoints.last_refusal else ""
         return CommandError(
             Exit.REFUSED, "not_heard", f"the daemon has taken nothing of {source!r}{heard}", "tormagctl status"
         )
-    if report.state == "refused":
-        other = why.get("OTHER_SOURCE") or Explained(
-            "OTHER_SOURCE",
-            f"{status.setpoints.newest_source!r} holds the brake, not {source!r}",
-            f"end the other one, or tormagctl take {source}",
-        )
-        return CommandError(Exit.REFUSED, "other_source", other.cause, other.remedy)
-    spoiling = {code: f"the force is held by the limit {code}" for code in SPOILING if code in status.limits}
-    if report.state == "stale":
-        spoiling = {"STALE": f"the setpoints of {source!r} come too late, or not at all"}
-    if is_over or not spoiling:
+    code = OF_STATE.get(report.state) or next((each for each in SPOILING if each in status.limits), None)
+    if code is None or (is_over and code != OTHER_SOURCE):
         return None
-    code, otherwise = next(iter(spoiling.items()))
-    message = f"{code}: {why[code].cause}" if code in why else otherwise
-    return CommandError(Exit.REFUSED, code.lower(), message, why[code].remedy if code in why else "tormagctl status")
+    unexplained = Explained(code, f"it holds the force of {source!r} back", "tormagctl status")
+    known = next((each for each in status.limit_details if each.code == code), unexplained)
+    return CommandError(Exit.REFUSED, code.lower(), f"{code}: {known.cause}", known.remedy)
 
 
 class StatusWatch:
@@ -137,13 +117,13 @@ class StatusWatch:
             self._spoilt = held
         self._held = held
 
-    def finish(self, sent: int) -> Fate:
-        """Wait until the daemon has taken all `sent` setpoints, and return what became of them."""
-        until_s = time.monotonic() + ARRIVAL_S
-        while True:
-            status = self._client.status(LAST_ANSWER_S)
+    def finish(self, sent: int) -> dict[str, Any]:
+        """Wait until the daemon has taken all `sent` setpoints, and return how many it took, how often they were seen
+        rendered, and what held them back.
+        """
+        for _, status in statuses(self._client, ARRIVAL_S):
             accepted = _accepted(status, self._source) - self._before
-            if accepted >= sent or time.monotonic() > until_s:
+            if accepted >= sent:
                 break
         held = held_back(status, self._source, is_over=True)
         why = held or self._spoilt or (self._held if self._looks and not self._rendered else None)
@@ -160,7 +140,7 @@ class StatusWatch:
                 "look at the source in tormagctl status: another publisher of its name, or a loss on the way",
             )
         share_rendered = round(self._rendered / self._looks, 3) if self._looks else None
-        return Fate(accepted, share_rendered, tuple(self._limits))
+        return {"accepted": accepted, "rendered_share": share_rendered, "limits": list(self._limits)}
 
 
 def _accepted(status: Status, source: str) -> int:
@@ -222,15 +202,15 @@ def send(
                 is_interrupted,
                 watch,
             )
-            became = None if watch is None else watch.finish(done["sent"])
+            became = {} if watch is None else watch.finish(done["sent"])
     left_out = f", {done['skipped']} left out because this machine was late" if done["skipped"] else ""
     read = f"{what}: {'; '.join(waveform.told)}\n" if waveform.told else ""
     text = f"{read}sent {done['sent']} setpoints as {source!r} in {done['seconds']:.1f} s{left_out}; "
-    if became is None:
-        return Outcome({"source": source, "read": waveform.told, **done}, f"{text}whether they were taken is not known")
-    held = f", held by {', '.join(became.limits)} at times" if became.limits else ""
-    result = {"source": source, "read": waveform.told, **done, **msgspec.structs.asdict(became)}
-    return Outcome(result, f"{text}{became.accepted} taken and rendered{held}")
+    result = {"source": source, "read": waveform.told, **done, **became}
+    if watch is None:
+        return Outcome(result, f"{text}whether they were taken is not known")
+    held = f", held by {', '.join(became['limits'])} at times" if became["limits"] else ""
+    return Outcome(result, f"{text}{became['accepted']} taken and rendered{held}")
 
 
 def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> StatusWatch:
@@ -257,7 +237,6 @@ def _publish(
     watch: StatusWatch | None,
 ) -> dict[str, Any]:
     sent = skipped = index = 0
-    worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()
     # the margin keeps the last one despite the rounding of a file's times
     last = int(duration_s * rate_hz + 1e-6)
@@ -267,7 +246,6 @@ def _publish(
         if wait_s > 0.0:
             time.sleep(wait_s)
         late_s = time.monotonic() - start_s - t_s
-        worst_late_s = max(worst_late_s, late_s)
         overdue = min(int(late_s * rate_hz), last - index)
         skipped += overdue
         index += overdue
@@ -294,6 +272,5 @@ def _publish(
         "skipped": skipped,
         "start_ns": start_ns,
         "seconds": round(time.monotonic() - start_s, 3),
-        "worst_late_ms": round(worst_late_s * 1e3, 3),
         "interrupted": bool(is_interrupted()),
     }

@@ -11,13 +11,11 @@ from tormagd.view.believed import as_said
 from tormagd_client.blocking import Client
 from tormagd_client.messages import (
     BeliefReport,
-    ClockReport,
     Explained,
     LinkReport,
     PeersReport,
     PlayoutReport,
     RateReport,
-    RoundTripReport,
     SetpointReport,
     SourceReport,
     Status,
@@ -25,7 +23,7 @@ from tormagd_client.messages import (
 )
 from tormagd_client.wire import understood
 
-UNKNOWN = "-"
+UNKNOWN, NOT_YET = "-", "not known yet"
 RECOMMISSION = "tormagctl commission FOLDER writes a new one; then systemctl reload tormagd"
 OLD_MS = 1_000.0
 "An older setpoint may still be valid; its age is shown."
@@ -258,9 +256,7 @@ def firmware_text(link: LinkReport, colour: Colour) -> str:
         f"losses      {link.losses} since the daemon started{last}",
         f"received    {', '.join(f'{_shown(getattr(link, name))} {name}' for name in LINK_COUNTERS)}",
         f"refused     {', '.join(f'{name}: {why}' for name, why in sorted(link.refused.items())) or 'nothing'}",
-        f"round trip  {_round_trip(link.round_trip_us)}",
-        f"quality     {_quality(link)}",
-        f"clock       {_clock(link.clock)}",
+        *_wire(link),
     ]
     return "\n".join(lines)
 
@@ -269,26 +265,20 @@ def _shown(value: str | int | None) -> str:
     return UNKNOWN if value is None else str(value)
 
 
-def _round_trip(known: RoundTripReport | None) -> str:
-    if known is None:
-        return "not known yet"
-    return f"{known.p50:.0f} us (p50), {known.p99:.0f} us (p99), {known.least:.0f} us at least"
-
-
-def _quality(link: LinkReport) -> str:
-    """Say how many Drives were unanswered, frames damaged and messages held up in the last second."""
-    if link.unanswered_share is None or link.damaged_share is None:
-        return "not known yet"
-    return (
-        f"{link.unanswered_share:.1%} of the Drives unanswered, {link.damaged_share:.1%} of the frames damaged in the "
-        f"last second; {_shown(link.unsent)} messages found the wire full"
-    )
-
-
-def _clock(known: ClockReport | None) -> str:
-    if known is None:
-        return "not known yet: a fit takes some seconds"
-    return (
-        f"{known.drift_ppm:+.1f} ppm, host - device {known.offset_s:.6f} s, {known.residual_us:.1f} us around "
-        f"the line ({known.windows} windows, {known.outliers} outliers)"
-    )
+def _wire(link: LinkReport) -> list[str]:
+    """Return lines on how well the wire carries: round trip, the last second's losses, the device's clock."""
+    trip, clock = link.round_trip_us, link.clock
+    time_us, lost, drift = NOT_YET, NOT_YET, f"{NOT_YET}: a fit takes some seconds"
+    if trip is not None:
+        time_us = f"{trip.p50:.0f} us (p50), {trip.p99:.0f} us (p99), {trip.least:.0f} us at least"
+    if link.unanswered_share is not None and link.damaged_share is not None:
+        lost = (
+            f"{link.unanswered_share:.1%} of the Drives unanswered, {link.damaged_share:.1%} of the frames damaged in "
+            f"the last second; {_shown(link.unsent)} messages found the wire full"
+        )
+    if clock is not None:
+        drift = (
+            f"{clock.drift_ppm:+.1f} ppm, host - device {clock.offset_s:.6f} s, {clock.residual_us:.1f} us around "
+            f"the line ({clock.windows} windows, {clock.outliers} outliers)"
+        )
+    return [f"round trip  {time_us}", f"quality     {lost}", f"clock       {drift}"]

@@ -28,6 +28,7 @@ LONGEST_RELEASE_S = 30.0
 AND_UNMET = "; and "
 "Between what a device does not give of a scene."
 ENDING = ".toml"
+OF_BRAKE = "none where element is tactile"
 _SHIPPED = resources.files(__package__)
 
 
@@ -79,9 +80,8 @@ class Signal(Strict, frozen=True):
     def __post_init__(self) -> None:
         shaped = {key: getattr(self, key) for key in ("bandwidth_hz", "step_N", "hold_s")}
         stated = {key: value for key, value in shaped.items() if value is not UNSET}
-        if self.file and stated:
-            key, value = next(iter(stated.items()))
-            raise ValueError(f"signal.{key} = {value}: allowed only without signal.file")
+        for key, value in stated.items():
+            require(not self.file, f"signal.{key}", value, "none beside signal.file")
         if not self.file and self.bandwidth_hz is UNSET:
             raise ValueError("signal.bandwidth_hz is missing: allowed is that or signal.file")
 
@@ -167,8 +167,8 @@ class Solver(Strict, frozen=True):
     def __post_init__(self) -> None:
         for key in ("step_mT", "neighbours"):
             value = getattr(self, key)
-            if self.name == AUTO and value is not UNSET:
-                raise ValueError(f"solver.{key} = {value}: allowed only beside a solver.name other than {AUTO}")
+            is_none = self.name != AUTO or value is UNSET
+            require(is_none, f"solver.{key}", value, f"none where solver.name is {AUTO}")
 
 
 def is_plain(text: str, besides: str) -> bool:
@@ -217,29 +217,23 @@ class Scene(Strict, frozen=True):
             f"at least force.most_N / {LONGEST_RELEASE_S:g} s, {least_N_s:.2g}",
         )
         for low_name, low, high_name, high in pairs:
-            if not low < high:
-                raise ValueError(f"{low_name} = {low:g}: allowed is under {high_name} = {high:g}")
-        if (self.finger is UNSET) != (self.element == "torque"):
-            raise ValueError(
-                f"element = {self.element}: allowed is a table [finger] where it is tactile, and only there"
-            )
-        if self.element == "tactile":
+            require(low < high, low_name, low, f"under {high_name} = {high:g}")
+        is_brake = self.element == "torque"
+        require(is_brake == (self.finger is UNSET), "element", self.element, "[finger] where it is tactile, only there")
+        if not is_brake:
             self._require_no_brake()
         slowest, fastest = self.handle.least_mm_s, self.handle.most_mm_s
-        if slowest > fastest:
-            raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
+        require(slowest <= fastest, "handle.least_mm_s", slowest, f"at most handle.most_mm_s = {fastest:g}")
 
     def _require_no_brake(self) -> None:
         usual = Insert(self.insert.name, self.insert.model)
         for key in ("inner_radius_mm", "outer_radius_mm", "thickness_mm", "roller_radius_mm"):
             value = getattr(self.insert, key)
-            if value != getattr(usual, key):
-                raise ValueError(f"insert.{key} = {value:g}: allowed only where element is torque")
+            require(value == getattr(usual, key), f"insert.{key}", value, OF_BRAKE)
         for key in ("standby_N", "breakthrough"):
-            if (stated := getattr(self.force, key)) is not UNSET:
-                raise ValueError(f"force.{key} = {stated}: allowed only where element is torque")
-        if self.handle != Handle():
-            raise ValueError("handle: allowed only where element is torque, [finger] tells how a pad is pressed")
+            stated = getattr(self.force, key)
+            require(stated is UNSET, f"force.{key}", stated, OF_BRAKE)
+        require(self.handle == Handle(), "handle", self.handle, f"{OF_BRAKE}; [finger] tells how a pad is pressed")
 
     @property
     def roller_radius_mm(self) -> float | None:

@@ -63,7 +63,8 @@ class Endpoints(Strict, frozen=True):
     def is_guarded(self, name: str) -> bool:
         """Whether the endpoint `name` accepts only clients whose key is listed."""
         matched = _TCP.fullmatch(getattr(self, name))
-        is_local = matched is None or _is_loopback(matched[1])
+        address = None if matched is None else _ipv4(matched[1])
+        is_local = matched is None or (address is not None and address.is_loopback)
         return not is_local or (self.curve is not None and self.curve.also_local)
 
 
@@ -120,24 +121,20 @@ def _tcp_place(name: str, address: str, has_keys: bool) -> str:
     """Return host and port of a `tcp://` address; without keys only loopback is allowed."""
     matched = _TCP.fullmatch(address)
     host, port = matched.groups() if matched else ("", "0")
+    found = _ipv4(host)
     require(
-        (_is_loopback(host) or (has_keys and _is_ipv4(host))) and 0 < int(port) < 65_536,
+        found is not None and (has_keys or found.is_loopback) and 0 < int(port) < 65_536,
         f"endpoints.{name}",
         address,
         "ipc:// or tcp:// with an IPv4 address and a port of 1..65535"
         if has_keys
         else "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys in [endpoints.curve]",
     )
-    return f"{'127.0.0.1' if host == 'localhost' else host}:{int(port)}"
+    return f"{found}:{int(port)}"
 
 
-def _is_loopback(host: str) -> bool:
-    return host == "localhost" or (_is_ipv4(host) and ipaddress.IPv4Address(host).is_loopback)
-
-
-def _is_ipv4(host: str) -> bool:
+def _ipv4(host: str) -> ipaddress.IPv4Address | None:
     try:
-        ipaddress.IPv4Address(host)
+        return ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)
     except ValueError:
-        return False
-    return True
+        return None

@@ -49,8 +49,8 @@ def unreachable(address: str, what: str) -> UnreachableError:
     message, hint = f"daemon not reachable at {address}: {what}", "is it running? systemctl status tormagd"
     if address.startswith("tcp://"):
         hint += (
-            "; is this the address in its [endpoints]? --key and --server-key have to be the pair that is listed there "
-            "and that daemon's own: its tormagctl status and log name those that it refused"
+            "; is this the address in its [endpoints]? client_secret and server_public have to be of the pair that is "
+            "listed there and that daemon's own: its tormagctl status and log name those that it refused"
         )
     if address.startswith("ipc:///"):
         path = Path(address.removeprefix("ipc://"))

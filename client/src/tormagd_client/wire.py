@@ -72,13 +72,13 @@ def keys_of(curve: Curve | None) -> Keys | None:
         raise SettingError(
             "usage",
             "the daemon's public key is not given",
-            f"--server-key FILE: the server{PUBLIC} of the daemon's machine",
+            f"endpoints.curve.server_public = FILE: the server{PUBLIC} of the daemon's machine",
         )
     try:
         pair = load_pair(Path(curve.client_secret))
         return Keys(pair.public, pair.secret, load_public(Path(server_public)), curve.also_local)
     except ConfigError as error:
-        raise SettingError("usage", str(error), "correct the file, or what --key and --server-key name") from error
+        raise SettingError("usage", str(error), "correct the file, or what [endpoints.curve] names") from error
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
