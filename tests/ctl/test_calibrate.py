@@ -16,7 +16,7 @@ from tormagd.commission.sequence import STEPS, Stopped, begun
 from tormagd.config import Config
 from tormagd.ctl import calibrate as ctl_calibrate, commission as ctl_commission
 from tormagd.ctl.calibrate import MOTOR_COLUMNS, SWEEP_COLUMNS, SWEPT_COLUMNS, agree, motor_log, write_sweeps
-from tormagd.ctl.calibrate_run import armed
+from tormagd.ctl.calibrate_run import Progress, armed
 from tormagd.ctl.outcome import CommandError
 from tormagd.element.model.displacement import MOVING_MM_S
 from tormagd_client import Client, ClientError
@@ -70,6 +70,7 @@ def test_a_motor_log_with_a_hole_is_refused():
 class Played:
     def __init__(self, found) -> None:
         self._found = found
+        self.progress = Progress()
 
     def follow(self, course):
         course.close()
@@ -212,7 +213,7 @@ def test_the_steps_that_are_run_are_numbered_one_by_one(monkeypatch, tmp_path, c
         return []
 
     monkeypatch.setattr(ctl_commission, "STEPS", [step._replace(course=finds_nothing) for step in STEPS])
-    run = SimpleNamespace(follow=lambda course: next(course, None))
+    run = SimpleNamespace(progress=Progress(), follow=lambda course: next(course, None))
     kept = ctl_commission.Kept(tmp_path / "7.json", begun(None, 7, 0, None, Config().motor))
     kept.follow(run, course.Known(Config(), 1e-3, 0.6, 2.0, None))
     numbers = re.findall(r"step (\d) of (\d)", capsys.readouterr().err)

@@ -33,6 +33,7 @@ GOOD = {
     "proc/self/status": "CapEff:\t0000000000000000\n",
     "proc/loadavg": "0.10 0.10 0.10 1/99 1234\n",
     "sys/devices/system/cpu/online": "0-3\n",
+    "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc\n",
     "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance\n",
     "sys/kernel/mm/transparent_hugepage/enabled": "always [madvise] never\n",
     "sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "1\n",
@@ -50,6 +51,8 @@ def good(machine, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 REALTIME = Config(realtime=RealTime(fifo_priority=50, lock_memory=True))
+PINNED = Config(realtime=RealTime(cpus=(1, 9)))
+CLOCK = "sys/devices/system/clocksource/clocksource0/current_clocksource"
 
 
 def test_a_good_machine_has_nothing_to_remedy(good):
@@ -92,6 +95,8 @@ CASES = [
     (checks.memory_lock, Config(), limited("8388608", "0"), "warn", "8 MB"),
     (checks.cores, REALTIME, {"sys/devices/system/cpu/online": "0"}, "warn", "1 online"),
     (checks.cores, REALTIME, {"sys/devices/system/cpu/online": "0,2-5"}, "ok", "5 online"),
+    (checks.cores, PINNED, {}, "fail", "[9]"),
+    (checks.clock_source, REALTIME, {CLOCK: "hpet"}, "warn", "hpet"),
     (checks.load, REALTIME, {"proc/loadavg": "3.90 1 1 1/2 3"}, "warn", "3.90"),
     (
         checks.huge_pages,

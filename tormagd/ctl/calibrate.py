@@ -75,9 +75,10 @@ def calibrate_insert(
 def _sweep(run: Run, known: Known, number: int, rates_N_s: Sequence[float]) -> Columns:
     """Ask for a moving handle, then play one sweep and return its ticks."""
     waveform = up_and_down(known.least_N, known.most_N, rates_N_s[number])
-    sweep = f"sweep {number + 1} of {len(rates_N_s)}, {waveform.duration_s:.0f} s"
+    sweep = f"sweep {number + 1} of {len(rates_N_s)}"
     write_line(f"{sweep}: turn the handle to and fro {PACES[number % len(PACES)]}", sys.stderr)
     run.follow(handle_moved(known.least_N))
+    run.progress.begin(sweep, waveform.duration_s)
     return run.play(waveform)
 
 
@@ -158,8 +159,8 @@ def calibrate_device(config: Config, endpoints: Endpoints, scene_most_N: float, 
             raise _not_kept(status.profile)
         known = known_of(config, status, scene_most_N)
         with armed(endpoints, client, known.force_N(0.0)) as run:
-            lasts_s = 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES)
-            write_line(f"{lasts_s:.0f} s: turn the handle to and fro, about 20 turns a minute", sys.stderr)
+            write_line("turn the handle to and fro, about 20 turns a minute, until the gap opens", sys.stderr)
+            run.progress.begin("device", 2.0 * sum(RAMPS_S) + STEP_S * len(STEP_SHARES))
             run.follow(force_over_gap(known))
             mean, worst, *_ = run.follow(steps(known))
             status = client.status()
@@ -264,7 +265,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
                 "there, tormagctl doctor",
             )
         with armed(endpoints, client, waveform.least_N) as run:
-            write_line(f"motors: {waveform.duration_s:.0f} s", sys.stderr)
+            run.progress.begin("motors", waveform.duration_s)
             columns = run.play(waveform)
     log = motor_log(columns, side)
     rows = _saved(path, np.column_stack([log[name] for name in LOG_COLUMNS]), "%.6f", LOG_COLUMNS)

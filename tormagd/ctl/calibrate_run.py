@@ -1,6 +1,7 @@
 """A calibration run through the daemon: arm, publish forces, collect control ticks, open the gap whatever happens."""
 
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +28,7 @@ from tormagd.commission.procedure import (
 from tormagd.config import Config
 from tormagd.control.safety.codes import FAULTS
 from tormagd.ctl.operate import home
-from tormagd.ctl.outcome import CommandError, Exit
+from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.record import listening
 from tormagd.ctl.waveform import Waveform
 from tormagd.ground.terminal import interrupted_by
@@ -56,6 +57,29 @@ def interrupted_run() -> CommandError:
     )
 
 
+class Progress:
+    """Shows on a terminal how far a part of known length is."""
+
+    def __init__(self) -> None:
+        self._label, self._lasts_s, self._begun_s, self._is_shown = "", 0.0, 0.0, is_terminal(sys.stderr)
+
+    def begin(self, label: str, lasts_s: float) -> None:
+        self.end()
+        self._label, self._lasts_s, self._begun_s = label, lasts_s, time.monotonic()
+
+    def show(self) -> None:
+        if self._is_shown and self._label:
+            passed_s = time.monotonic() - self._begun_s
+            print(
+                f"\r{self._label}: {passed_s:.0f} of about {self._lasts_s:.0f} s ", end="", file=sys.stderr, flush=True
+            )
+
+    def end(self) -> None:
+        if self._is_shown and self._label:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        self._label = ""
+
+
 class Run(Device):
     """The daemon's device for courses: commands and forces go out, control ticks come in."""
 
@@ -69,6 +93,7 @@ class Run(Device):
         self._endpoints, self._client = endpoints, client
         self._ticks, self._is_interrupted = ticks, is_interrupted
         self._heard_s = time.monotonic()
+        self.progress = Progress()
 
     def follow(self, course: Course[Found]) -> Found:
         try:
@@ -76,6 +101,8 @@ class Run(Device):
         except StoppedError as error:
             kind = Exit.FAULT if error.code in FAULTS else Exit.REFUSED
             raise CommandError(kind, error.code, error.cause, error.remedy) from error
+        finally:
+            self.progress.end()
 
     def play(self, waveform: Waveform) -> Columns:
         """Publish `waveform` in real time, and return its ticks by column."""
@@ -104,6 +131,7 @@ class Run(Device):
             ahead_N = asked.preview_N or None
             step_ms = 1e3 * PREVIEW_STEP_S if ahead_N else None
             self._client.publish(asked.force_N, VALID_FOR_MS, preview_N=ahead_N, preview_dt_ms=step_ms)
+        self.progress.show()
         rows: list[Row] = []
         # whatever waits is read even if this program is late
         while self._ticks.poll(max(0, round((due_s - time.monotonic()) * 1e3))):

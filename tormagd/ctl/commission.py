@@ -100,10 +100,11 @@ class Kept:
 
         def begins(step: Step) -> None:
             self._step = step.name
-            number = f"step {steps.index(step) + 1} of {len(steps)}"
-            write_line(f"{number}, {step.name}, about {step.lasts_s:.0f} s: {step.says}", sys.stderr)
+            write_line(f"step {steps.index(step) + 1} of {len(steps)}, {step.name}: {step.says}", sys.stderr)
+            run.progress.begin(step.name, step.lasts_s)
 
         def ends(step: Step, found: Findings) -> None:
+            run.progress.end()
             self._note(findings=self.report.findings | {step.name: list(found)})
 
         try:

@@ -33,6 +33,7 @@ from tormagd_client.messages import Status
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
 MEMORY_TO_LOCK_BYTES = 1_000_000_000
 FAST_LATENCY_MS = 1
+GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
 LATE_SHARE = 0.25
 "If a bare timer is later at p99, as a share of a control period, the daemon has too little left."
 MISSED_SHARE = 0.001
@@ -292,7 +293,12 @@ def memory_lock(config: Config, machine: Machine) -> Finding:
 
 
 def cores(config: Config, machine: Machine) -> Finding:
+    """Judge whether the processors of `realtime.cpus`, and at least two, are online."""
     count = machine.cores()
+    impossible = [number for number in config.realtime.cpus if number >= count]
+    if impossible:
+        found = f"{count} online, realtime.cpus asks for {impossible}"
+        return Finding("cores", Severity.FAIL, found, f"name cores 0..{count - 1}")
     return _finding("cores", count >= 2, f"{count} online", "use a machine with at least 2 cores")
 
 
@@ -302,6 +308,17 @@ def load(config: Config, machine: Machine) -> Finding:
         return Finding("load", Severity.WARN, "not known", "mount /proc")
     average, count = float(fields[0]), machine.cores()
     return _finding("load", average <= 0.8 * count, f"{average:.2f} over one minute on {count} cores", STOP_OTHERS)
+
+
+def clock_source(config: Config, machine: Machine) -> Finding:
+    """Judge whether reading the time is fast and even."""
+    name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    return _finding(
+        "clock source",
+        name is None or name in GOOD_CLOCKS,
+        name or "the kernel does not say",
+        "dmesg | grep -i clocksource tells why tsc was given up; update the firmware",
+    )
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
@@ -429,6 +446,7 @@ OF_MACHINE: tuple[Check, ...] = (
     governor,
     cores,
     load,
+    clock_source,
     huge_pages,
     autogroup,
     usb_latency,
