@@ -32,9 +32,7 @@ STRAYS_S = 1.0
 FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
 "ns in each unit that publishers send by mistake."
 FAR_S = 86_400.0
-"Stamps in a wrong unit are years away from our clock. No setpoint is older than this."
-LOOKED_AT, MIN_S = 8, 0.005
-SLOW = 0.03
+"A stamp that is no further from our clock if it counts another unit does so. No setpoint is older than this."
 
 MAX_WAY_S = 0.2
 "A least lateness up to this is the way's: half of the delay allowed from sensor to force."
@@ -272,7 +270,6 @@ class Source:
         self._is_named = False
         self._begun = Order.NEWER
         self._unit = ""
-        self._far, self._far_s, self._far_ns = 0, 0.0, 0
         self._began_s: float | None = None
         self._sent_s = 0.0
         self._window: list[tuple[int, float, float]] = []
@@ -288,7 +285,7 @@ class Source:
             if order is not Order.NEWER:
                 self._begun = order
         self.heard_s = now_s
-        self._require_ns(setpoint, now_s, realtime_ns)
+        self._require_ns(setpoint, realtime_ns)
         lateness_s = (realtime_ns - setpoint.stamp_ns) * 1e-9
         delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is not Order.REPLACED)
         if not -AHEAD_S <= delay_s <= FAR_S:
@@ -313,7 +310,7 @@ class Source:
         self.delays.refresh()
         self._fit = self.clock.line.fit()
         self.cause = self.remedy = ""
-        if self._unit in FACTORS:
+        if self._unit:
             self.cause, self.remedy = f"its stamps count {self._unit}, and are refused", _in_ns(self._unit)
         elif not self.clock.is_settled:
             self.cause = "its stamps are far from this machine's clock: it is watched which of the two it is"
@@ -344,30 +341,15 @@ class Source:
             raised=self.raised,
         )
 
-    def _require_ns(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
-        """Raise MessageError if the stamps do not count ns, or if that is not known yet."""
+    def _require_ns(self, setpoint: Setpoint, realtime_ns: int) -> None:
+        """Raise MessageError if the stamp counts another unit."""
         stamp_ns = setpoint.stamp_ns
-        if abs(realtime_ns - stamp_ns) < FAR_S * 1e9:
-            self._unit, self._far = "ns", 0
-        else:
-            if self._far == 0:
-                self._far_s, self._far_ns = now_s, stamp_ns
-            self._far += 1
-            past_s = now_s - self._far_s
-            if self._far >= LOOKED_AT and past_s >= MIN_S:
-                is_slow = (stamp_ns - self._far_ns) * 1e-9 < SLOW * past_s
-                nearest = min(FACTORS, key=lambda unit: abs(stamp_ns * FACTORS[unit] - realtime_ns))
-                self._unit, self._far = nearest if is_slow else "ns", 0
-        if self._unit == "ns":
-            return
+        near = (unit for unit, factor in FACTORS.items() if abs(realtime_ns - stamp_ns * factor) < FAR_S * 1e9)
+        self._unit = next(near, "")
         if self._unit:
             raise MessageError(
                 f"stamp_ns = {stamp_ns} of {setpoint.source!r} counts {self._unit}: {_in_ns(self._unit)}"
             )
-        raise MessageError(
-            f"stamp_ns = {stamp_ns} of {setpoint.source!r} is days from this clock: allowed is less until "
-            f"{LOOKED_AT} messages show whether it counts ns"
-        )
 
     def _note_manner(self, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
         sent_s, missing = now_s - delay_s, self.sequence.missing
