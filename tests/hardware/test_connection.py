@@ -2,7 +2,6 @@
 
 import itertools
 from collections import deque
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -31,7 +30,7 @@ from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import LinkState
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.journal import Journal
+from tormagd.hardware.streams import FrameStream
 from tormagd_client.messages import LinkReport
 
 TICK_S = 1e-3
@@ -72,9 +71,7 @@ class Port:
     def __init__(self, bench: "Bench") -> None:
         self.bench = bench
         self.waiting: deque[Message] = deque()
-        self.statistics = SimpleNamespace(
-            frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0, unsent=0, refused={}
-        )
+        self.stream = FrameStream()
         self.is_dead = self.is_closed = False
 
     def receive(self) -> list[Message]:
@@ -82,7 +79,7 @@ class Port:
         if self.is_dead:
             raise BackendError("/dev/tormag: the device was unplugged")
         messages, self.waiting = list(self.waiting), deque()
-        self.statistics.frames += len(messages)
+        self.stream.statistics.frames += len(messages)
         return messages
 
     def send(self, message: Message) -> None:
@@ -158,7 +155,7 @@ class Bench:
             self.firmware.boot_ms += 1
             if (port := self.port) is not None and self.is_there:
                 if self.is_babbling:
-                    port.statistics.corrupt += 1
+                    port.stream.statistics.corrupt += 1
                 elif self.ms % 20 == 0 and self.has_status and not self.is_mute:
                     port.waiting.append(self.firmware.status())
             if not is_stalled:
@@ -310,14 +307,6 @@ def test_a_command_is_for_the_device_that_runs_when_it_is_given(
     heal(bench)
     bench.pass_ms(1_200)
     assert (bench.connection.state, bench.firmware.accepted) == (LinkState.RUNNING, [kind])
-
-
-def test_a_backend_that_shows_no_stream_has_no_frames_in_a_black_box(bench: Bench) -> None:
-    journal = bench.connection.traffic = Journal()
-    bench.running()
-    bench.connection.close()
-    assert journal.take() == [("connected", None), ("connected", None)]
-    assert bench.connection.memory() is None
 
 
 def test_a_closed_connection_stays_closed(bench: Bench) -> None:

@@ -21,7 +21,7 @@ from msgspec import Meta
 from firmware_protocol.codec import Message
 from tormagd.config import Device, Rates
 from tormagd.ground.files import did_you_mean
-from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver, LinkStatistics
+from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver
 from tormagd.hardware.streams import CanStream, SecondHostError
 from tormagd_client.endpoints import ConfigError, Strict
 
@@ -65,10 +65,6 @@ class CanBackend:
         self._readable.register(self._fd, select.POLLIN)
         self._writable.register(self._fd, select.POLLOUT)
         self._unsent = 0
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        return self.stream.statistics
 
     def receive(self) -> list[Message]:
         """Return the node's messages among the frames that have arrived, in order."""
