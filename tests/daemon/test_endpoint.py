@@ -221,14 +221,6 @@ def test_garbage_is_answered_with_bad_request(rig: Rig, data: bytes, number: int
     assert rig.is_answered()
 
 
-def test_a_client_that_has_gone_is_no_trouble(rig: Rig) -> None:
-    gone = rig.connect(zmq.DEALER, "control")
-    for number in range(10):
-        gone.send(command("status", number))
-    gone.close(linger=200)
-    assert rig.is_answered()
-
-
 def test_commands_are_answered_in_bounded_portions_and_in_their_order(rig: Rig) -> None:
     client, count = rig.connect(zmq.DEALER, "control"), 4 * MOST + 1
     for number in range(count):

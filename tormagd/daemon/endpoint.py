@@ -327,9 +327,7 @@ class Endpoint:
     def _reply(self, waiting: Waiting, reply: Reply) -> None:
         """Send the reply to the client that asked; drop it where the client has gone."""
         self.arrivals.touch(self._control)
-        # the client may have gone meanwhile
-        with contextlib.suppress(zmq.ZMQError):
-            self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
+        self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
 
 
 def _is_made(routing_id: bytes) -> bool:
