@@ -60,12 +60,6 @@ def test_a_device_waits_where_the_scene_runs_by_the_last_ones_calibration_alone(
     assert "force.most_N = 9" in rig.calibrations.report().refusal
 
 
-def test_a_refusal_of_the_core_names_the_calibration(rig: Rig, tmp_path: Path) -> None:
-    rig.is_refused = True
-    asyncio.run(rig.look(7))
-    assert rig.calibrations.report().refusal == f"{tmp_path / '00000007.toml'}: force.most_N = 9: allowed is less"
-
-
 async def test_a_scene_that_changed_while_the_device_was_away_stays(rig: Rig) -> None:
     rig.calibrations.look(7, rig.running, is_idle=True)
     rig.running = rig.calibrations.configured = msgspec.structs.replace(Config(), scene="pulse")

@@ -645,7 +645,7 @@ def test_a_device_runs_by_its_calibration_and_is_busy_until_then(
     for refused, says in (
         (calibrated.replace("= 1", "= 2"), "serial_number = 2: allowed is 1, the device's (line 1)"),
         (calibrated.replace("2.5", "0.0"), "$.motor.resistance_ohm` (it is 0.0) (line 3)"),
-        ("serial_number = 1\n[position]\nproportional_per_mm = 900.0\n", "gain margin"),
+        ("serial_number = 1\n[position]\nproportional_per_mm = 900.0\n", f"{file}: position: these gains leave"),
     ):
         signal.raise_signal(signal.SIGHUP)
         resistance_ohm, known = in_force(refused)
