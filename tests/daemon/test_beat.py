@@ -150,9 +150,7 @@ def test_one_log_line_in_a_while_with_the_worst_of_all(rig: Rig, caplog: pytest.
 def test_the_times_of_the_parts_are_reported(rig: Rig) -> None:
     for due_ms in range(10 * COUNTED):
         rig.beat(10 * due_ms, read=2)
-    for spent in rig.phases.spent.values():
-        spent.refresh()
-    assert {name: spent.report.max for name, spent in rig.phases.spent.items()} == {
+    assert {name: spent.report().max for name, spent in rig.phases.spent.items()} == {
         "read": 2_000.0,
         "drive": 0.0,
         "first": 0.0,

@@ -6,7 +6,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import msgspec
 
@@ -24,7 +24,7 @@ from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, gains_of, state_folder
-from tormagd.daemon.rate_group import ERROR_PERIODS, Histogram
+from tormagd.daemon.rate_group import ERROR_PERIODS
 from tormagd.daemon.realtime import Heartbeat, freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
 from tormagd.daemon.scene_change import SceneChange
@@ -43,7 +43,6 @@ SWITCH_S = 1e-4
 LONGEST_RETRACT_S = 10.0
 "The firmware needs 3 s for a full stroke; if it cannot retract, it reports that itself."
 TELL_S = 0.1
-REFRESHED = 2
 NAMED_S = 0.5
 "By then a gap that does not open is a fault, and in the log."
 
@@ -113,7 +112,7 @@ class Daemon:
             refused,
             config_file,
         )
-        self._service, self._told_s, self._histograms = Service(), 0.0, self._in_turn()
+        self._service, self._told_s = Service(), 0.0
         self._box.begin(self._control.stepper, self._inference.planner, self._connection)
         telemetry = self._telemetry
         self._phases.begin(
@@ -221,8 +220,6 @@ class Daemon:
         if now_s - self._told_s < TELL_S:
             return False
         self._told_s = now_s
-        for _ in range(REFRESHED):
-            next(self._histograms).refresh()
         self._endpoint.inbox.refresh(now_s)
         self._endpoint.inbox.tell(now_s)
         self._box.look()
@@ -232,10 +229,6 @@ class Daemon:
         self._endpoint.tell(now_s)
         self._phases.tell()
         return True
-
-    def _in_turn(self) -> Iterator[Histogram]:
-        while True:
-            yield from (*self._telemetry.histograms(), *self._phases.spent.values())
 
     async def _build(self, scene: str) -> Core:
         """Build the core of another scene at the running rates."""

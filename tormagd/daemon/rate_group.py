@@ -29,9 +29,6 @@ class Histogram:
         self._before = [0] * _BINS
         self._max_now = self._max_before = 0.0
         self._turned_s = -math.inf
-        self.report: ExecReport
-        "Percentiles are upper edges of their bins."
-        self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
         """Count one duration that ended at `now_s`; negative ones, a clock's grain, and NaN count as 0."""
@@ -43,7 +40,8 @@ class Histogram:
         if value_us > self._max_now:
             self._max_now = value_us
 
-    def refresh(self) -> None:
+    def report(self) -> ExecReport:
+        """Return percentiles, each the upper edge of its bin."""
         most = round(max(self._max_now, self._max_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []
@@ -52,7 +50,7 @@ class Histogram:
                 seen += self._now[used] + self._before[used]
                 used += 1
             edges.append(min(float(_upper_edge(used - 1)), most))
-        self.report = ExecReport(p50=edges[0], p99=edges[1], p999=edges[2], max=most)
+        return ExecReport(p50=edges[0], p99=edges[1], p999=edges[2], max=most)
 
 
 def _bin(value_us: float) -> int:
@@ -129,6 +127,6 @@ class RateGroup:
             merged=self.merged,
             overruns=self.overruns,
             stalls=self.stalls,
-            lateness_us=LatenessReport(**asdict(self.lateness.report), worst=round(self._worst_us, 1)),
-            exec_us=self.exec.report,
+            lateness_us=LatenessReport(**asdict(self.lateness.report()), worst=round(self._worst_us, 1)),
+            exec_us=self.exec.report(),
         )

@@ -307,7 +307,6 @@ class Source:
 
     def refresh(self, now_s: float) -> bool:
         """Update the report; return True if something is newly wrong."""
-        self.delays.refresh()
         self._fit = self.clock.line.fit()
         self.cause = self.remedy = ""
         if self._unit:
@@ -331,7 +330,7 @@ class Source:
             refused=self.refused,
             lost=sequence.lost,
             restarts=sequence.restarts,
-            delay_us=self.delays.report,
+            delay_us=self.delays.report(),
             jitter_us=round(clock.jitter_s * 1e6, 1),
             clock_behind_ms=round(clock.offset_s * 1e3, 3) if is_known else None,
             clock_steps=clock.steps,
