@@ -21,7 +21,7 @@ from tormagd.daemon.rate_group import Histogram
 from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S as LINE_S, DeviceClock
 from tormagd.scenes.scene import Scene
-from tormagd_client.messages import ClockReport, MessageError, Setpoint, SourceReport
+from tormagd_client.messages import MessageError, Setpoint, SourceReport
 
 LONGEST_JUMP = 1_000
 "A jump of `seq` by more steps is no loss: it is another run or a wrong number."
@@ -168,7 +168,7 @@ class SourceClock:
             self._settle()
         return max(lateness_s - self.offset_s, 0.0)
 
-    def wrong(self, now_s: float, stamp_ns: int, fit: ClockReport | None) -> str:
+    def wrong(self, now_s: float, stamp_ns: int) -> str:
         causes = []
         if self.is_wrong and stamp_ns < NEVER_SET_NS:
             causes.append(f"it was never set (it says {time.gmtime(stamp_ns * 1e-9).tm_year}), and is corrected")
@@ -179,6 +179,7 @@ class SourceClock:
         if now_s - self.stepped_at_s < STEP_NAMED_S:
             way, often = "forward" if self.stepped_s > 0.0 else "back", f", the last of {self.steps} times"
             causes.append(f"it was set {way} by {abs(self.stepped_s):.3f} s{often if self.steps > 1 else ''}")
+        fit = self.line.fit()
         if fit is not None and fit.windows >= SURE_WINDOWS:
             # standard deviation of the slope, ppm, of a line through evenly spaced points
             sd_ppm = fit.residual_us * math.sqrt(12.0 / fit.windows) / (fit.windows * LINE_S)
@@ -266,7 +267,6 @@ class Source:
         self.accepted = self.refused = self.raised = 0
         self.found: dict[Limit, Explanation] = {}
         self.cause = self.remedy = ""
-        self._fit: ClockReport | None = None
         self._is_named = False
         self._begun = Order.NEWER
         self._unit = ""
@@ -307,14 +307,13 @@ class Source:
 
     def refresh(self, now_s: float) -> bool:
         """Update the report; return True if something is newly wrong."""
-        self._fit = self.clock.line.fit()
         self.cause = self.remedy = ""
         if self._unit:
             self.cause, self.remedy = f"its stamps count {self._unit}, and are refused", _in_ns(self._unit)
         elif not self.clock.is_settled:
             self.cause = "its stamps are far from this machine's clock: it is watched which of the two it is"
             self.remedy = "wait a moment"
-        elif wrong := self.clock.wrong(now_s, self.setpoint.stamp_ns, self._fit):
+        elif wrong := self.clock.wrong(now_s, self.setpoint.stamp_ns):
             self.cause, self.remedy = f"its clock: {wrong}", "keep the clocks of both machines by chrony or ptp4l"
         was_named, self._is_named = self._is_named, self.clock.is_settled and bool(self.cause)
         return self._is_named and not was_named
@@ -334,7 +333,7 @@ class Source:
             jitter_us=round(clock.jitter_s * 1e6, 1),
             clock_behind_ms=round(clock.offset_s * 1e3, 3) if is_known else None,
             clock_steps=clock.steps,
-            clock=clock_report(self._fit),
+            clock=clock_report(clock.line.fit()),
             cause=self.cause,
             remedy=self.remedy,
             raised=self.raised,

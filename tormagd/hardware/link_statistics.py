@@ -220,8 +220,6 @@ class DeviceClock:
         self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)
         self._least: tuple[float, float] = (math.inf, 0.0)
         self._ends_s = -math.inf
-        self._fit: ClockReport | None = None
-        self._is_fitted = True
         self._newest_s = -math.inf
         self._standing = 0
         self.drift = 0.0
@@ -243,16 +241,12 @@ class DeviceClock:
 
     def fit(self) -> ClockReport | None:
         """Return the line of the host's time less the device's."""
-        if not self._is_fitted:
-            self._fit = _newest_line(list(self._windows))
-            self._is_fitted = True
-        return self._fit
+        return _newest_line(list(self._windows))
 
     def _turn(self, host_s: float) -> None:
         """Begin the next window, and renew `drift`."""
         if self._least[0] < math.inf:
             self._windows.append(self._least)
-            self._is_fitted = False
             newest = _newest_line(list(self._windows)[-DRIFT_WINDOWS:])
             if self._standing <= STANDING:
                 self.drift = 0.0 if newest is None else newest.drift_ppm * 1e-6
