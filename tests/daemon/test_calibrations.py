@@ -5,7 +5,7 @@ import msgspec
 import pytest
 
 from tormagd.config import Config
-from tormagd.daemon.calibrations import Calibrations
+from tormagd.daemon.configuration import Calibrations
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import CalibrationReport
 
@@ -35,7 +35,7 @@ class Rig:
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
     made = Rig(tmp_path)
-    monkeypatch.setattr("tormagd.daemon.calibrations.build_core", made.build)
+    monkeypatch.setattr("tormagd.daemon.configuration.build_core", made.build)
     return made
 
 

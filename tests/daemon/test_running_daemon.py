@@ -621,7 +621,7 @@ def test_a_device_runs_by_its_calibration_and_is_busy_until_then(
         gate.wait()
         return load_calibration(path, config, serial_number)
 
-    monkeypatch.setattr("tormagd.daemon.calibrations.load_calibration", once_open)
+    monkeypatch.setattr("tormagd.daemon.configuration.load_calibration", once_open)
 
     def in_force(text: str) -> tuple[float, dict[str, str]]:
         file.write_text(text)

@@ -17,17 +17,15 @@ from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.daemon.answers import Answers
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox, header
-from tormagd.daemon.calibrations import Calibrations
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.commands import Commands
+from tormagd.daemon.configuration import Calibrations, SceneChange, reread
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, gains_of, state_folder
 from tormagd.daemon.rate_group import ERROR_PERIODS
 from tormagd.daemon.realtime import Heartbeat, freeze_garbage, priority_of_threads
-from tormagd.daemon.reload import reread
-from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.daemon.service import Service, notify
 from tormagd.daemon.telemetry_loop import TelemetryLoop
