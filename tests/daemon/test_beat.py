@@ -1,7 +1,8 @@
 import contextlib
 import select
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
@@ -15,46 +16,38 @@ class Rig:
     """Each phase and slice takes as many ms as the test says, and drives judge the delay."""
 
     def __init__(self) -> None:
-        self.now_ns = 0
-        self.stopped_ns = 0
-        self.took = {"read": 0, "drive": 0}
+        self.now_ns = self.stopped_ns = 0
+        self.took: dict[str, int] = {}
         self.waiting: dict[str, int] = {"first": 0, "second": 0}
         self.ran: list[str] = []
         self.delays: list[Delay] = []
         self.errors: dict[str, Exception] = {}
         self.phases = Phases(6 * MS, lambda: self.now_ns, lambda: self.now_ns - self.stopped_ns)
         self.phases.begin(
-            [(name, self.phase(name)) for name in self.took], [(name, self.slice(name)) for name in self.waiting]
+            [(name, partial(self.phase, name)) for name in ("read", "drive")],
+            [(name, partial(self.slice, name)) for name in self.waiting],
         )
 
-    def phase(self, name: str) -> Callable[[Beat], None]:
-        def run(beat: Beat) -> None:
-            self.ran.append(name)
-            self.now_ns += self.took[name] * MS
-            if name in self.errors:
-                raise self.errors[name]
-            if name == "drive":
-                if self.now_ns - beat.due_ns > MS:
-                    self.delays.append(self.phases.blame(beat.due_ns))
-                else:
-                    self.phases.on_time()
+    def phase(self, name: str, beat: Beat) -> None:
+        self.ran.append(name)
+        self.now_ns += self.took.get(name, 0) * MS
+        if name in self.errors:
+            raise self.errors[name]
+        if name == "drive" and self.now_ns - beat.due_ns > MS:
+            self.delays.append(self.phases.blame(beat.due_ns))
+        elif name == "drive":
+            self.phases.on_time()
 
-        return run
-
-    def slice(self, name: str) -> Callable[[Beat], bool]:
-        def run(_beat: Beat) -> bool:
-            if not self.waiting[name]:
-                return False
+    def slice(self, name: str, beat: Beat) -> bool:
+        is_waiting = self.waiting[name] > 0
+        if is_waiting:
             self.waiting[name] -= 1
-            self.ran.append(name)
-            self.now_ns += self.took.get(name, 0) * MS
-            return True
-
-        return run
+            self.phase(name, beat)
+        return is_waiting
 
     def beat(self, due_ms: int, **took: int) -> list[str]:
         self.ran.clear()
-        self.took |= {"read": 0, "drive": 0, **took}
+        self.took = took
         self.now_ns = max(self.now_ns, due_ms * MS)
         self.phases.run(due_ms * MS, 0)
         return self.ran

@@ -633,11 +633,3 @@ def test_nothing_that_waits_outlives_a_scene_or_another_holder(core: Core) -> No
     assert listening.take(0.11, 1, 0.11, "b"), "a playout that was taken away holds nothing that comes"
     assert inbox.in_force.source == "b"
     assert not inbox.hand_on(0.2)
-
-
-def test_a_flood_is_held_in_bounds() -> None:
-    listening = Listening(200.0)
-    for seq in range(5_000):
-        listening.take(seq * 1e-5, seq, seq * 1e-5)
-    assert listening.inbox.hand_on(0.3)
-    assert listening.inbox.in_force.seq == 4_999

@@ -126,7 +126,7 @@ def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
 @pytest.mark.parametrize(
     ("module", "name", "error"),
     [
-        (termios, "tcgetattr", termios.error(errno.EIO, "unplugged meanwhile")),
+        (termios, "tcflush", termios.error(errno.EIO, "unplugged meanwhile")),
         (serial, "Serial", ValueError("Failed to set custom baud rate")),
     ],
 )
