@@ -56,14 +56,8 @@ class LinkQuality(Value):
 UNKNOWN_QUALITY: Final = LinkQuality()
 
 
-@final
-class Counts(Value):
-    def __init__(self, drives: int = 0, states: int = 0, frames: int = 0, damaged: int = 0, unsent: int = 0) -> None:
-        self.drives: Final = drives
-        self.states: Final = states
-        self.frames: Final = frames
-        self.damaged: Final = damaged
-        self.unsent: Final = unsent
+Counts: TypeAlias = tuple[int, int, int, int, int]
+"Drives, States, frames and damaged frames, and messages that the wire did not take, since the conversation began."
 
 
 @final
@@ -82,16 +76,13 @@ class LinkWatch:
         """Return the quality over the last LOOKS looks, and set when the next is due."""
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)
-        before = self._counts[0]
+        drives, states, frames, damaged, unsent = [new - old for new, old in zip(counts, self._counts[0], strict=True)]
         # at 4 kHz one pause fills the window of the usual round trip; by the next look it has left
         least_s, self._round_trip_s = min(self._round_trip_s, round_trip_s), round_trip_s
         return LinkQuality(
-            1.0 - _share(counts.states - before.states, counts.drives - before.drives, of_none=1.0),
-            _share(
-                counts.damaged - before.damaged,
-                counts.frames + counts.damaged - before.frames - before.damaged,
-            ),
-            _share(counts.unsent - before.unsent, counts.drives - before.drives),
+            1.0 - _share(states, drives, of_none=1.0),
+            _share(damaged, frames + damaged),
+            _share(unsent, drives),
             least_s,
             clock_drift,
         )

@@ -14,13 +14,13 @@ from tormagd.ground.plain_values import first_difference, kinds, packed, plain
 from tormagd.hardware.backend import BackendError, Sent, Stream
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
-from tormagd.hardware.link_statistics import Counts, LinkQuality
+from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.hardware.streams import CanStream, FrameStream, SecondHostError
 
 KNOWN = kinds(
     *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
-    *(LinkQuality, Counts, Frame, FramingStatistics),
+    *(LinkQuality, Frame, FramingStatistics),
 )
 
 
