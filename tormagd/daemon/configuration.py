@@ -8,7 +8,7 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -30,16 +30,8 @@ NEXT = (
 log = logging.getLogger(__name__)
 
 
-class Reread(NamedTuple):
-    """The configuration after a reload, the keys taken over, and the keys that wait for a restart."""
-
-    config: Config
-    taken: tuple[str, ...]
-    waiting: tuple[str, ...]
-
-
-def reread(running: Config, read: Config) -> Reread:
-    """Return `running` with the keys in LIVE taken from `read`."""
+def reread(running: Config, read: Config) -> tuple[Config, list[str], list[str]]:
+    """Return `running` with the keys in LIVE taken from `read`, those that changed, and those that await a restart."""
     timeout_ms, watchdog_ms = running.device.command_timeout_ms, read.realtime.watchdog_ms
     require(
         watchdog_ms > timeout_ms,
@@ -47,14 +39,14 @@ def reread(running: Config, read: Config) -> Reread:
         watchdog_ms,
         f"over device.command_timeout_ms = {timeout_ms:g}, which stays until a restart",
     )
-    differing = tuple(_differing(msgspec.to_builtins(running), msgspec.to_builtins(read), ""))
+    differing = [*_differing(msgspec.to_builtins(running), msgspec.to_builtins(read), "")]
     config = msgspec.structs.replace(
         running,
         sources=read.sources,
         realtime=msgspec.structs.replace(running.realtime, watchdog_ms=watchdog_ms),
     )
-    taken = tuple(key for key in differing if key.startswith(LIVE))
-    return Reread(config, taken, tuple(key for key in differing if not key.startswith(LIVE)))
+    taken = [key for key in differing if key.startswith(LIVE)]
+    return config, taken, [key for key in differing if key not in taken]
 
 
 def _differing(before: dict[str, Any], after: dict[str, Any], path: str) -> Iterator[str]:

@@ -279,19 +279,18 @@ class Daemon:
             log.error("the lists of keys stay as they were: %s; next: mend that and reload again", error)
         try:
             read = await asyncio.to_thread(self._read_again)
-            again, config = reread(self._calibrations.configured, read), reread(self._config, read).config
+            configured, taken, waiting = reread(self._calibrations.configured, read)
+            config, _, _ = reread(self._config, read)
         except ValueError as error:
             log.error("the configuration stays as it was: %s; next: mend that and reload again", error)
             return
-        self._calibrations.configured, self._config = again.config, config
+        self._calibrations.configured, self._config = configured, config
         self._calibrations.read_again()
         self._commands.config = self._config
-        self._endpoint.inbox.sources = again.config.sources
-        log.info(
-            "configuration read again: %s", f"now in force: {', '.join(again.taken)}" if again.taken else "no news"
-        )
-        if again.waiting:
-            log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
+        self._endpoint.inbox.sources = configured.sources
+        log.info("configuration read again: %s", f"now in force: {', '.join(taken)}" if taken else "no news")
+        if waiting:
+            log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(waiting))
 
     async def _open_gap(self) -> None:
         """Open the gap, and wait for it up to LONGEST_RETRACT_S while the beat goes on."""

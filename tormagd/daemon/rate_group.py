@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from typing import Final, NamedTuple, final
+from typing import Final, TypeAlias, final
 
 from msgspec.structs import asdict
 
@@ -68,11 +68,8 @@ def _upper_edge(index: int) -> int:
     return (part + 33) << (shift + 1)
 
 
-class _Mark(NamedTuple):
-    time_ns: int
-    runs: int
-    overruns: int
-    stalls: int
+_Mark: TypeAlias = tuple[int, int, int, int]
+"Time, ns, and runs, overruns and stalls until then."
 
 
 @final
@@ -96,8 +93,8 @@ class RateGroup:
         self._newest_ns = 0
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
-        if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
-            self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
+        if not self._marks or start_ns - self._marks[-1][0] > HORIZON_NS:
+            self._marks.append((start_ns, self.runs, self.overruns, self.stalls))
         self.lateness_us = (start_ns - due_ns) * 1e-3
         self.exec_us = (end_ns - start_ns) * 1e-3
         self.lateness.add(start_ns * 1e-9, self.lateness_us)
@@ -114,12 +111,12 @@ class RateGroup:
 
     def report(self) -> RateReport:
         """Return counts and worst lateness since the start; rate, grade and percentiles over one to two horizons."""
-        since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
+        since_ns, runs, overruns, stalls = self._marks[0] if self._marks else (0, 0, 0, 0)
         hz, grade = 0.0, "good"
-        if self._newest_ns > since.time_ns:
-            hz = (self.runs - 1 - since.runs) / ((self._newest_ns - since.time_ns) * 1e-9)
-        if self.overruns > since.overruns:
-            grade = "error" if self.stalls > since.stalls else "warning"
+        if self._newest_ns > since_ns:
+            hz = (self.runs - 1 - runs) / ((self._newest_ns - since_ns) * 1e-9)
+        if self.overruns > overruns:
+            grade = "error" if self.stalls > stalls else "warning"
         return RateReport(
             grade=grade,
             hz=round(hz, 2),
