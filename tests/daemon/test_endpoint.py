@@ -22,7 +22,6 @@ from served import MOST, NAMES, Served, command, setpoint
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
 from tormagd.daemon.peers import (
-    FIRST,
     LISTENERS,
     PEERS,
     TOPICS,
@@ -33,7 +32,6 @@ from tormagd.daemon.peers import (
     Peer,
     Requests,
     Waiting,
-    may_go_first,
 )
 from tormagd.record.ticks import encode_ticks
 from tormagd_client.endpoints import Endpoints
@@ -534,17 +532,6 @@ def test_every_client_has_its_turn_and_its_places(asked: list[str], kept: int, f
     assert [requests.put(waiting(each)) for each in asked].count(True) == kept
     assert [requests.next().data.decode() for _ in first] == first
     assert requests.put(waiting("a"))
-
-
-@pytest.mark.parametrize("command", FIRST)
-def test_no_packing_of_a_first_command_is_overlooked(command: str) -> None:
-    for header in (bytes([0xA0 | len(command)]), b"\xd9", b"\xda", b"\xdb"):
-        size = {0xD9: 1, 0xDA: 2, 0xDB: 4}.get(header[0])
-        text = header + (b"" if size is None else len(command).to_bytes(size, "big")) + command.encode()
-        data = b"\x83" + msgpack.packb("v") + b"\x01" + msgpack.packb("id") + b"\x01" + msgpack.packb("command") + text
-        assert msgpack.unpackb(data)["command"] == command
-        assert may_go_first(data)
-    assert not may_go_first(msgpack.packb({"v": 1, "id": 1, "command": "status"}))
 
 
 @pytest.mark.parametrize(
