@@ -24,7 +24,7 @@ from tormagd.daemon.source import (
 # -- numbers -----------------------------------------------------------------------------------------------------------
 
 
-NEWER, RESTARTED, REPLACED, STRAY = Order.NEWER, Order.RESTARTED, Order.REPLACED, Order.STRAY
+NEWER, NEW_RUN, STRAY = Order.NEWER, Order.NEW_RUN, Order.STRAY
 
 
 class Part(NamedTuple):
@@ -58,7 +58,7 @@ STREAMS: dict[str, tuple[Start, list[Part], dict[str, int]]] = {
     "a higher session starts anew at once": (
         (7, 1_000),
         [
-            Part([0, 1, 2], [RESTARTED, NEWER, NEWER], 8),
+            Part([0, 1, 2], [NEW_RUN, NEWER, NEWER], 8),
             Part([1_001, 1_002], [STRAY, STRAY], 7),
             Part([3], [NEWER], 8),
         ],
@@ -66,12 +66,12 @@ STREAMS: dict[str, tuple[Start, list[Part], dict[str, int]]] = {
     ),
     "a publisher without session that starts at 0 is heard after some messages": (
         (None, 1_000),
-        [Part([0, 1, 2, 3], [STRAY, STRAY, REPLACED, NEWER])],
+        [Part([0, 1, 2, 3], [STRAY, STRAY, NEW_RUN, NEWER])],
         {"restarts": 1},
     ),
     "and at once where what came before is not valid any more": (
         (None, 1_000),
-        [Part([0, 0], [REPLACED, STRAY], is_over=True)],
+        [Part([0, 0], [NEW_RUN, STRAY], is_over=True)],
         {},
     ),
     **{
@@ -86,7 +86,7 @@ STREAMS: dict[str, tuple[Start, list[Part], dict[str, int]]] = {
     **{
         f"nor as the second message, where it cannot be told from a publisher that counts so, as {wrong}": (
             (None, 0),
-            [Part([wrong, 1, 2, 3, 4], [NEWER, STRAY, STRAY, REPLACED, NEWER])],
+            [Part([wrong, 1, 2, 3, 4], [NEWER, STRAY, STRAY, NEW_RUN, NEWER])],
             {},
         )
         for wrong in (LAST, 10_000_000)
@@ -94,21 +94,21 @@ STREAMS: dict[str, tuple[Start, list[Part], dict[str, int]]] = {
     **{
         f"nor as the first, as {wrong}": (
             (None, wrong),
-            [Part([1, 2, 3, 4], [STRAY, STRAY, REPLACED, NEWER])],
+            [Part([1, 2, 3, 4], [STRAY, STRAY, NEW_RUN, NEWER])],
             {},
         )
         for wrong in (LAST, 10_000_000)
     },
     "no session locks a source out": (
         (1, 10),
-        [Part([0], [RESTARTED], LAST), Part([11, 12, 13, 14], [STRAY, STRAY, REPLACED, NEWER], 1)],
+        [Part([0], [NEW_RUN], LAST), Part([11, 12, 13, 14], [STRAY, STRAY, NEW_RUN, NEWER], 1)],
         {},
     ),
     "more missing than a loss can be is another run": (
         (None, 0),
         [
             Part([1, 1 + LONGEST_JUMP], [NEWER, NEWER]),
-            Part([FAR, FAR + 1, FAR + 2], [STRAY, STRAY, REPLACED]),
+            Part([FAR, FAR + 1, FAR + 2], [STRAY, STRAY, NEW_RUN]),
             Part([2 * FAR], [NEWER], is_over=True),
         ],
         {},

@@ -66,10 +66,8 @@ PLAYOUT_STEP_MS = 10
 
 class Order(Enum):
     NEWER = "newer"
-    RESTARTED = "restarted"
-    "The first of a new run, announced by a `session` above every earlier one."
-    REPLACED = "replaced"
-    "The first of a new run that was not announced."
+    NEW_RUN = "new run"
+    "The first of a publisher that has restarted, or was replaced by another."
     STRAY = "stray"
     "Old, repeated, or from another run."
 
@@ -101,13 +99,13 @@ class Sequence:
                 return Order.NEWER
         if session is not None and (self._latest_session is None or session > self._latest_session):
             self._latest_session = session
-            return self._begin(session, seq, Order.RESTARTED)
+            return self._begin(session, seq)
         is_in_row = self._in_row > 0 and session == self._stray_session and seq > self._stray_seq
         self._in_row = self._in_row + 1 if is_in_row else 1
         self._stray_session, self._stray_seq = session, seq
         is_repeated = session == self.session and seq == self.seq
         if self._in_row >= RUN or (is_over and not is_repeated):
-            return self._begin(session, seq, Order.REPLACED)
+            return self._begin(session, seq)
         if now_s - self._strays_since_s > STRAYS_S:
             self._strays, self._strays_since_s = 0, now_s
         self._strays += 1
@@ -116,11 +114,11 @@ class Sequence:
     def is_doubled(self, now_s: float) -> bool:
         return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
 
-    def _begin(self, session: int | None, seq: int, order: Order) -> Order:
+    def _begin(self, session: int | None, seq: int) -> Order:
         self.session, self.seq, self._step = session, seq, 0
         self._in_row = self._strays = self.missing = 0
         self.restarts += 1
-        return order
+        return Order.NEW_RUN
 
 
 @final
@@ -287,7 +285,7 @@ class Source:
         self.heard_s = now_s
         self._require_ns(setpoint, realtime_ns)
         lateness_s = (realtime_ns - setpoint.stamp_ns) * 1e-9
-        delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is not Order.REPLACED)
+        delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is Order.NEWER)
         if not -AHEAD_S <= delay_s <= FAR_S:
             raise MessageError(
                 f"stamp_ns is {abs(delay_s):.3f} s {'ahead of' if delay_s < 0.0 else 'behind'} this clock: allowed are "
