@@ -94,11 +94,7 @@ class Port:
         if not self.is_plugged_in:
             raise BackendError("no such port", "plug it in")
         self.line.open()
-        self._fd = os.eventfd(0)
         return self
-
-    def fileno(self) -> int:
-        return self._fd
 
     def receive(self) -> Any:
         if not self.is_plugged_in:
@@ -109,9 +105,6 @@ class Port:
         if self.is_mute:
             raise BackendError("the port takes nothing", "plug it in")
         self.line.send(message)
-
-    def close(self) -> None:
-        os.close(self._fd)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.line, name)
