@@ -22,6 +22,7 @@ from tormagd.hardware.link_statistics import (
     LinkWatch,
     RoundTrip,
 )
+from tormagd_client.messages import RoundTripReport
 
 PERIOD_S = 1e-3
 
@@ -74,7 +75,7 @@ def test_a_round_trip_of_any_length_is_known_after_one_hello_or_a_status_that_co
 ) -> None:
     assert trip.report() is None
     exchange(trip, range(1, ticks), way_ticks, frozenset(lost))
-    assert set(trip.report().values()) == {way_ticks * 1e3}
+    assert trip.report() == RoundTripReport(*[way_ticks * 1e3] * 3)
     assert (trip.least_s, trip.usual_s) == pytest.approx((way_ticks * PERIOD_S, way_ticks * PERIOD_S))
 
 
@@ -84,7 +85,7 @@ def test_percentiles_are_of_all_round_trips(trip: RoundTrip) -> None:
     for counter in range(1, 102):
         trip.state(counter, counter * PERIOD_S)
         trip.status(counter)
-    assert (trip.report(), trip.usual_s) == ({"least": 1e3, "p50": 51e3, "p99": 100e3}, pytest.approx(0.051))
+    assert (trip.report(), trip.usual_s) == (RoundTripReport(1e3, 51e3, 100e3), pytest.approx(0.051))
 
 
 def test_an_answer_to_what_has_not_been_sent_ends_the_count(trip: RoundTrip) -> None:
@@ -103,7 +104,7 @@ def test_a_state_that_overtakes_the_status_of_the_drive_before_contradicts_nothi
     trip.drive(0, 0.256)
     trip.state(0, 0.257)
     trip.status(255)
-    assert trip.report() == known == {"least": 1e3, "p50": 1e3, "p99": 1e3}
+    assert trip.report() == known == RoundTripReport(1e3, 1e3, 1e3)
 
 
 def test_a_status_tells_no_round_trip_of_a_drive_that_was_not_sent_or_is_not_answered_yet(trip: RoundTrip) -> None:
@@ -209,8 +210,8 @@ def test_drives_that_are_not_answered_make_no_round_trip_long(
     way_ticks: int, ticks: int, lost: frozenset[int], least_us: float, most_us: float, within_s: float, trip: RoundTrip
 ) -> None:
     exchange(trip, range(1, ticks), way_ticks, lost=lost)
-    report = trip.report() or {}
-    assert least_us <= report["least"] <= report["p99"] <= most_us
+    report = trip.report()
+    assert least_us <= report.least <= report.p99 <= most_us
     assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=within_s)
 
 

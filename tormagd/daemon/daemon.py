@@ -82,7 +82,6 @@ class Daemon:
             on_failure=self._fail_plan,
             beside=beside,
         )
-        self._profiles = self._profiles_of(core)
         self._calibrations = Calibrations(
             state_folder(config.device.calibrations, "calibrations"), config, self._run_core
         )
@@ -94,7 +93,7 @@ class Daemon:
             self._connection,
             endpoint.inbox,
             self._box,
-            self._profiles,
+            self._profiles_of(core),
             self._calibrations,
             SceneChange(self._build, self._require_disabled, self._run_scene),
         )
@@ -161,8 +160,8 @@ class Daemon:
         await self._ended.wait()
         notify("STOPPING=1")
         await self._open_gap()
-        self._profiles.look(None, is_driven=False)
-        await self._profiles.finished()
+        self._commands.profiles.look(None, is_driven=False)
+        await self._commands.profiles.finished()
         self._loop.remove_reader(heartbeat.fileno())
         self._connection.close()
         heartbeat.close()
@@ -234,7 +233,7 @@ class Daemon:
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
         if core.element.is_beside or self._inference.beside is not None:
             raise ConfigError(f"scene {core.scene.name}: a search beside the plans begins with the daemon: restart it")
-        await self._profiles.finished()
+        await self._commands.profiles.finished()
         return core
 
     def _require_disabled(self) -> None:
@@ -256,9 +255,8 @@ class Daemon:
         self._config, self._core = config, core
         control.stepper, inference.planner = stepper, planner
         self._endpoint.inbox.begin_scene(core.scene)
-        self._profiles.close()
-        self._profiles = self._profiles_of(core)
-        self._commands.config, self._commands.profiles = config, self._profiles
+        self._commands.profiles.close()
+        self._commands.config, self._commands.profiles = config, self._profiles_of(core)
         self._telemetry.run_scene(core)
         self._answers.reset()
         self._box.begin_scene(header(self._config, core), stepper, planner)

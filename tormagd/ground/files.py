@@ -16,9 +16,6 @@ from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import in_short
 from tormagd_client.regular_file import require_regular
 
-_CREDENTIALS = struct.Struct("3i")
-"Process, user and group of a connection's other end: `struct ucred` of unix(7)."
-
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
     """Return all bytes of a regular file of at most `most_bytes`, following links."""
@@ -61,10 +58,8 @@ def holder_of(path: Path) -> int | None:
         # whatever the type of a left socket was, the kernel refuses a connection
         if probe.connect_ex(str(path)) in (errno.ECONNREFUSED, errno.ENOENT):
             return None
-        process, _user, _group = _CREDENTIALS.unpack(
-            probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-        )
-        return int(process)
+        process: int = struct.unpack("3i", probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0]
+        return process
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from tormagd.ground.plain_values import Kinds, plain, restore
 from tormagd.hardware.backend import Backend, BackendError, Received, Sent
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import DeviceRequest, Measurement
-from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
+from tormagd_client.messages import ClockReport, LinkReport
 
 FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 1.0
@@ -199,7 +199,6 @@ class Connection:
     def report(self) -> LinkReport:
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
-        round_trip = None if link is None else link.round_trip.report()
         statistics = None if backend is None else backend.stream.statistics
         counted = {name: getattr(statistics, name, None) for name in COUNTERS}
         if link is not None and counted["repeated"] is not None:
@@ -218,7 +217,7 @@ class Connection:
             daemon_schema=f"{SCHEMA_HASH:08x}",
             protocol_version=PROTOCOL_VERSION,
             **counted,
-            round_trip_us=None if round_trip is None else RoundTripReport(**round_trip),
+            round_trip_us=None if link is None else link.round_trip.report(),
             # a State is on its way for about half of the shortest round trip
             clock=None if link is None else clock_report(link.clock.fit(), link.round_trip.least_s / 2.0),
             refused={} if statistics is None else dict(statistics.refused),

@@ -12,7 +12,7 @@ from itertools import compress
 from typing import ClassVar, Final, TypeAlias, final
 
 from firmware_protocol.value import Value
-from tormagd_client.messages import ClockReport
+from tormagd_client.messages import ClockReport, RoundTripReport
 
 LOOKED_S: Final = 0.1
 LOOKS: Final = 10
@@ -193,12 +193,11 @@ class RoundTrip:
     def least_s(self) -> float:
         return min(self._recent, default=0.0)
 
-    def report(self) -> dict[str, float] | None:
+    def report(self) -> RoundTripReport | None:
         ordered_s = sorted(self._recent)
         if not ordered_s:
             return None
-        shares = {"least": 0.0, "p50": 0.5, "p99": 0.99}
-        return {name: round(ordered_s[int(share * len(ordered_s))] * 1e6, 1) for name, share in shares.items()}
+        return RoundTripReport(*[round(ordered_s[int(share * len(ordered_s))] * 1e6, 1) for share in (0.0, 0.5, 0.99)])
 
 
 @final
