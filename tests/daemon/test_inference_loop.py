@@ -80,11 +80,6 @@ def test_without_setpoints_it_plans_when_due_and_never_chases_what_it_missed(
     assert len(rig.planned_ns()) == (1 if period_ns == TICK_NS else 0)
 
 
-def test_what_the_daemon_does_before_its_first_beat_is_no_stall_of_planning(rig: Rig) -> None:
-    rig.beat(50)
-    assert (rig.loop.timing.runs, rig.loop.timing.stalls, rig.loop.timing.lateness_us) == (1, 0, 50.0)
-
-
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), ZeroDivisionError(), RuntimeError()])
 def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(core: Core, error: Exception) -> None:
     rig = Rig(core)
