@@ -190,7 +190,7 @@ def test_every_beat_is_due_one_period_after_the_last_and_missed_ones_are_merged(
         assert due_ns <= time.monotonic_ns()
 
 
-# -- how well a rate group keeps its time ------------------------------------------------------------------------------
+# -- rate groups ------------------------------------------------------------------------------
 
 
 TICK_NS = MS

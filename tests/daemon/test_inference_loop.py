@@ -1,5 +1,3 @@
-"""Planning, a phase of every beat, and the search beside the plans, a process of its own."""
-
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -112,7 +110,7 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
     assert rig.journal.take() == [(PLAN, first_s, rejected), (AFRESH, first_s), (PLAN, second_s, None)]
 
 
-# -- the search beside the plans ---------------------------------------------------------------------------------------
+# -- beside the plans ---------------------------------------------------------------------------------------
 
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "scenes" / "thesis.toml"

@@ -1,4 +1,4 @@
-"""A device's profile: what is kept, what is less sure when it is read again, what is refused, and when."""
+"""A device's profile: what is kept, less sure when it is read again, or refused."""
 
 import asyncio
 import json
@@ -113,9 +113,6 @@ def test_every_fit_can_be_kept(
         lag_s,
     )
     assert math.isfinite(learned.device.surely_within_N(2.5, BOUNDS))
-
-
-# -- when a device's profile is read and written -----------------------------------------------------------------------
 
 
 STRONG = Learned(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)

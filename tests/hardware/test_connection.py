@@ -43,7 +43,6 @@ SENDING = {
     "gone": ("/dev/tormag: writing failed",),
     "bus-off": ("can0: bus-off", "look at the termination"),
 }
-"Troubles that a backend raises, with cause and remedy."
 COMMANDS = {Home: DeviceRequest.HOME, Retract: DeviceRequest.RETRACT, Clear: DeviceRequest.CLEAR}
 
 

@@ -31,6 +31,7 @@ import zmq.utils.monitor
 from zmq.utils import z85
 
 from tormagd.daemon.peers import Allowance, Arrivals, Peer, Tally, shown
+from tormagd.daemon.socket_file import CREDENTIALS
 from tormagd.ground.access_keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
@@ -59,7 +60,6 @@ WATCHED = (
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
-_CREDENTIALS = struct.Struct("3i")
 _EVENT = struct.Struct("=IQ" if platform.machine() == "x86_64" else "@IQ")
 "`struct epoll_event`, which is packed on x86-64 only."
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -273,8 +273,8 @@ def _address(descriptor: int) -> str:
     """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`."""
     with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
         if connection.family == socket.AF_UNIX:
-            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-            process, user, group = _CREDENTIALS.unpack(made)
+            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size)
+            process, user, group = CREDENTIALS.unpack(made)
             return f"localhost:{user}:{group}:{process}"
         return str(connection.getpeername()[0])
     return ""
