@@ -1,4 +1,5 @@
 import contextlib
+import os
 import select
 import time
 from collections.abc import Iterator
@@ -172,10 +173,12 @@ def wait(heartbeat: Heartbeat) -> None:
     assert select.select([heartbeat.fileno()], [], [], PATIENCE_S)[0]
 
 
-def test_nothing_is_due_before_the_first_period() -> None:
+def test_nothing_is_due_before_the_first_period_and_closing_gives_the_descriptor_back() -> None:
     with contextlib.closing(Heartbeat(3_600_000_000_000)) as slow:
-        due_ns = slow.due_ns
+        descriptor, due_ns = slow.fileno(), slow.due_ns
         assert (slow.beats(), slow.due_ns, select.select([slow.fileno()], [], [], 0.0)[0]) == (0, due_ns, [])
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(descriptor)
 
 
 def test_every_beat_is_due_one_period_after_the_last_and_missed_ones_are_merged(heartbeat: Heartbeat) -> None:
