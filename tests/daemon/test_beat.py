@@ -2,11 +2,16 @@ import contextlib
 import os
 import select
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 
+import numpy as np
 import pytest
+from hypothesis import given, strategies as st
+from msgspec.structs import astuple
 
 from tormagd.daemon.beat import COUNTED, KERNEL, NEWS_NS, Beat, Delay, Phases
+from tormagd.daemon.rate_group import ERROR_PERIODS, HORIZON_NS, SHARES, Histogram, RateGroup
 from tormagd.daemon.realtime import Heartbeat
 
 MS = 1_000_000
@@ -16,46 +21,38 @@ class Rig:
     """Each phase and slice takes as many ms as the test says, and drives judge the delay."""
 
     def __init__(self) -> None:
-        self.now_ns = 0
-        self.stopped_ns = 0
-        self.took = {"read": 0, "drive": 0}
+        self.now_ns = self.stopped_ns = 0
+        self.took: dict[str, int] = {}
         self.waiting: dict[str, int] = {"first": 0, "second": 0}
         self.ran: list[str] = []
         self.delays: list[Delay] = []
         self.errors: dict[str, Exception] = {}
         self.phases = Phases(6 * MS, lambda: self.now_ns, lambda: self.now_ns - self.stopped_ns)
         self.phases.begin(
-            [(name, self.phase(name)) for name in self.took], [(name, self.slice(name)) for name in self.waiting]
+            [(name, partial(self.phase, name)) for name in ("read", "drive")],
+            [(name, partial(self.slice, name)) for name in self.waiting],
         )
 
-    def phase(self, name: str) -> Callable[[Beat], None]:
-        def run(beat: Beat) -> None:
-            self.ran.append(name)
-            self.now_ns += self.took[name] * MS
-            if name in self.errors:
-                raise self.errors[name]
-            if name == "drive":
-                if self.now_ns - beat.due_ns > MS:
-                    self.delays.append(self.phases.blame(beat.due_ns))
-                else:
-                    self.phases.on_time()
+    def phase(self, name: str, beat: Beat) -> None:
+        self.ran.append(name)
+        self.now_ns += self.took.get(name, 0) * MS
+        if name in self.errors:
+            raise self.errors[name]
+        if name == "drive" and self.now_ns - beat.due_ns > MS:
+            self.delays.append(self.phases.blame(beat.due_ns))
+        elif name == "drive":
+            self.phases.on_time()
 
-        return run
-
-    def slice(self, name: str) -> Callable[[Beat], bool]:
-        def run(_beat: Beat) -> bool:
-            if not self.waiting[name]:
-                return False
+    def slice(self, name: str, beat: Beat) -> bool:
+        is_waiting = self.waiting[name] > 0
+        if is_waiting:
             self.waiting[name] -= 1
-            self.ran.append(name)
-            self.now_ns += self.took.get(name, 0) * MS
-            return True
-
-        return run
+            self.phase(name, beat)
+        return is_waiting
 
     def beat(self, due_ms: int, **took: int) -> list[str]:
         self.ran.clear()
-        self.took |= {"read": 0, "drive": 0, **took}
+        self.took = took
         self.now_ns = max(self.now_ns, due_ms * MS)
         self.phases.run(due_ms * MS, 0)
         return self.ran
@@ -151,9 +148,7 @@ def test_one_log_line_in_a_while_with_the_worst_of_all(rig: Rig, caplog: pytest.
 def test_the_times_of_the_parts_are_reported(rig: Rig) -> None:
     for due_ms in range(10 * COUNTED):
         rig.beat(10 * due_ms, read=2)
-    for spent in rig.phases.spent.values():
-        spent.refresh()
-    assert {name: spent.report.max for name, spent in rig.phases.spent.items()} == {
+    assert {name: spent.report().max for name, spent in rig.phases.spent.items()} == {
         "read": 2_000.0,
         "drive": 0.0,
         "first": 0.0,
@@ -178,35 +173,113 @@ def wait(heartbeat: Heartbeat) -> None:
     assert select.select([heartbeat.fileno()], [], [], PATIENCE_S)[0]
 
 
-def test_nothing_is_due_before_the_first_period() -> None:
+def test_nothing_is_due_before_the_first_period_and_closing_gives_the_descriptor_back() -> None:
     with contextlib.closing(Heartbeat(3_600_000_000_000)) as slow:
-        due_ns = slow.due_ns
+        descriptor, due_ns = slow.fileno(), slow.due_ns
         assert (slow.beats(), slow.due_ns, select.select([slow.fileno()], [], [], 0.0)[0]) == (0, due_ns, [])
-
-
-def test_every_beat_is_due_one_period_after_the_last(heartbeat: Heartbeat) -> None:
-    before_ns = heartbeat.due_ns
-    for _ in range(3):
-        wait(heartbeat)
-        due_ns = heartbeat.due_ns + PERIOD_NS * heartbeat.beats()
-        # a beat is never early
-        assert before_ns < due_ns == heartbeat.due_ns <= time.monotonic_ns()
-        before_ns = due_ns
-
-
-def test_missed_beats_are_merged_and_counted(heartbeat: Heartbeat) -> None:
-    before_ns = heartbeat.due_ns
-    with contextlib.closing(Heartbeat(5 * PERIOD_NS)) as other:
-        wait(other)
-    wait(heartbeat)
-    beats = heartbeat.beats()
-    assert beats >= 5
-    assert heartbeat.due_ns == before_ns + beats * PERIOD_NS
-
-
-def test_closing_gives_the_descriptor_back() -> None:
-    made = Heartbeat(PERIOD_NS)
-    descriptor = made.fileno()
-    made.close()
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(descriptor)
+
+
+def test_every_beat_is_due_one_period_after_the_last_and_missed_ones_are_merged(heartbeat: Heartbeat) -> None:
+    due_ns = heartbeat.due_ns
+    for missed in (0, 0, 5):
+        time.sleep(missed * PERIOD_NS * 1e-9)
+        wait(heartbeat)
+        beats = heartbeat.beats()
+        due_ns += beats * PERIOD_NS
+        # a beat is never early
+        assert (beats >= max(missed, 1), heartbeat.due_ns) == (True, due_ns)
+        assert due_ns <= time.monotonic_ns()
+
+
+# -- rate groups ------------------------------------------------------------------------------
+
+
+TICK_NS = MS
+
+
+def recorded(lateness_us: list[float]) -> RateGroup:
+    group = RateGroup("test", TICK_NS)
+    for number, late in enumerate(lateness_us):
+        due = number * TICK_NS
+        start = due + round(late * 1e3)
+        group.record(due, start, start + 10_000)
+    return group
+
+
+@pytest.fixture
+def group() -> RateGroup:
+    return RateGroup("test", TICK_NS)
+
+
+def test_before_the_first_run_everything_is_zero(group: RateGroup) -> None:
+    report = group.report()
+    assert (report.hz, report.runs, report.merged, report.overruns) == (0.0, 0, 0, 0)
+    assert set(astuple(report.lateness_us)) == set(astuple(report.exec_us)) == {0.0}
+
+
+@given(values=st.lists(st.floats(0.0, 1e5), min_size=1, max_size=300))
+def test_percentiles_are_exact_to_the_width_of_their_bin(values: list[float]) -> None:
+    histogram = Histogram()
+    for value in values:
+        histogram.add(0.0, value)
+    found = histogram.report()
+    assert found.max == pytest.approx(max(values), abs=0.05 + 1e-9)  # half a tenth rounds either way
+    for name, share in zip(("p50", "p99", "p999"), SHARES, strict=True):
+        exact = float(np.quantile(values, share, method="inverted_cdf"))
+        assert exact - 0.05 <= getattr(found, name) <= exact * (1.0 + 1.0 / 32.0) + 1.0
+
+
+def test_what_is_beyond_the_last_bin_is_still_the_largest() -> None:
+    histogram = Histogram()
+    histogram.add(0.0, 1e12)
+    assert histogram.report().max == 1e12
+
+
+def test_the_horizon_forgets_and_the_worst_does_not() -> None:
+    count = round(2.2 * HORIZON_NS / TICK_NS)
+    report = recorded([900.0] + [5.0] * count).report()
+    assert (report.runs, report.hz, report.lateness_us.worst, report.lateness_us.max) == (
+        count + 1,
+        pytest.approx(1_000.0, rel=1e-3),
+        900.0,
+        5.0,
+    )
+    assert recorded([900.0] + [5.0] * round(0.9 * HORIZON_NS / TICK_NS)).report().lateness_us.max == 900.0
+
+
+def test_the_rate_is_that_of_the_horizon(group: RateGroup) -> None:
+    for due in (*range(0, HORIZON_NS, TICK_NS), *range(HORIZON_NS, 5 * HORIZON_NS, 4 * TICK_NS)):
+        group.record(due, due, due)
+    assert group.report().hz == pytest.approx(250.0, rel=1e-2)
+
+
+def test_merged_runs_and_overruns_are_counted(group: RateGroup) -> None:
+    group.record(0, 100, TICK_NS)
+    assert group.overruns == 0
+    group.record(TICK_NS, TICK_NS, 2 * TICK_NS + 1)
+    # late is as bad as slow: the next one is due
+    group.record(2 * TICK_NS, 3 * TICK_NS, 3 * TICK_NS + 1, merged=3)
+    # the delay counts from the first run that was missed
+    assert (group.delay_ns, group.lateness_us) == (4 * TICK_NS + 1, pytest.approx(1e3))
+    group.record(6 * TICK_NS, 6 * TICK_NS, 6 * TICK_NS + 1)
+    assert (group.runs, group.merged, group.overruns, group.stalls) == (4, 3, 2, 0)
+
+
+def test_a_stall_is_an_error_and_an_overrun_a_warning_for_as_long_as_the_horizon(group: RateGroup) -> None:
+    stall_ns = round(ERROR_PERIODS * TICK_NS) + 1
+    assert group.report().grade == "good"
+    for due_ns, took_ns, grade in (
+        (0, TICK_NS, "good"),
+        (TICK_NS, TICK_NS + 1, "warning"),
+        (2 * TICK_NS, stall_ns - 1, "warning"),
+        (3 * TICK_NS, stall_ns, "error"),
+        (4 * TICK_NS, 0, "error"),
+        # forgotten after one to two horizons, while the counters stay
+        (HORIZON_NS + TICK_NS, 0, "error"),
+        (2 * HORIZON_NS + 2 * TICK_NS, 0, "good"),
+    ):
+        group.record(due_ns, due_ns, due_ns + took_ns)
+        assert group.report().grade == grade, due_ns
+    assert (group.overruns, group.stalls) == (3, 1)

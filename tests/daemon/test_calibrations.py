@@ -5,7 +5,7 @@ import msgspec
 import pytest
 
 from tormagd.config import Config
-from tormagd.daemon.calibrations import Calibrations
+from tormagd.daemon.configuration import Calibrations
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import CalibrationReport
 
@@ -35,7 +35,7 @@ class Rig:
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
     made = Rig(tmp_path)
-    monkeypatch.setattr("tormagd.daemon.calibrations.build_core", made.build)
+    monkeypatch.setattr("tormagd.daemon.configuration.build_core", made.build)
     return made
 
 
@@ -58,12 +58,6 @@ def test_a_device_waits_where_the_scene_runs_by_the_last_ones_calibration_alone(
     asyncio.run(rig.look(8))
     assert (rig.running.trim.least, rig.calibrations.is_awaited(8)) == (0.5, True)
     assert "force.most_N = 9" in rig.calibrations.report().refusal
-
-
-def test_a_refusal_of_the_core_names_the_calibration(rig: Rig, tmp_path: Path) -> None:
-    rig.is_refused = True
-    asyncio.run(rig.look(7))
-    assert rig.calibrations.report().refusal == f"{tmp_path / '00000007.toml'}: force.most_N = 9: allowed is less"
 
 
 async def test_a_scene_that_changed_while_the_device_was_away_stays(rig: Rig) -> None:

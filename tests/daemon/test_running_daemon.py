@@ -94,11 +94,7 @@ class Port:
         if not self.is_plugged_in:
             raise BackendError("no such port", "plug it in")
         self.line.open()
-        self._fd = os.eventfd(0)
         return self
-
-    def fileno(self) -> int:
-        return self._fd
 
     def receive(self) -> Any:
         if not self.is_plugged_in:
@@ -109,9 +105,6 @@ class Port:
         if self.is_mute:
             raise BackendError("the port takes nothing", "plug it in")
         self.line.send(message)
-
-    def close(self) -> None:
-        os.close(self._fd)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.line, name)
@@ -621,7 +614,7 @@ def test_a_device_runs_by_its_calibration_and_is_busy_until_then(
         gate.wait()
         return load_calibration(path, config, serial_number)
 
-    monkeypatch.setattr("tormagd.daemon.calibrations.load_calibration", once_open)
+    monkeypatch.setattr("tormagd.daemon.configuration.load_calibration", once_open)
 
     def in_force(text: str) -> tuple[float, dict[str, str]]:
         file.write_text(text)
@@ -645,7 +638,7 @@ def test_a_device_runs_by_its_calibration_and_is_busy_until_then(
     for refused, says in (
         (calibrated.replace("= 1", "= 2"), "serial_number = 2: allowed is 1, the device's (line 1)"),
         (calibrated.replace("2.5", "0.0"), "$.motor.resistance_ohm` (it is 0.0) (line 3)"),
-        ("serial_number = 1\n[position]\nproportional_per_mm = 900.0\n", "gain margin"),
+        ("serial_number = 1\n[position]\nproportional_per_mm = 900.0\n", f"{file}: position: these gains leave"),
     ):
         signal.raise_signal(signal.SIGHUP)
         resistance_ohm, known = in_force(refused)

@@ -235,13 +235,11 @@ def planned(stamp_s: float) -> Plan:
 def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -> None:
     way = ForceDelay()
     way.ticked(0.5, planned(-math.inf), 0.0)
-    way.to_duty.refresh()
     found = way.report(400.0, 0.013, Budget())
     assert (found.to_duty_us.max, found.total_ms) == (0.0, None)
     for tick in range(1_000):
         # a new one every 10 ms, first followed at 20 ms
         way.ticked(1.0 + tick * 1e-3, planned(1.0 + tick // 10 * 0.01 - 0.015), 0.005)
-    way.to_duty.refresh()
     found = way.report(400.0, 0.013, Budget())
     assert (found.to_duty_us.max, found.to_duty_us.p50) == (
         pytest.approx(20_000.0, abs=1.0),
@@ -254,7 +252,6 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
     )
     # a stale one ends no way
     way.ticked(9.0, planned(-math.inf), 0.0)
-    way.to_duty.refresh()
     found = way.report(None, 0.013, Budget())
     assert (found.to_duty_us.max, found.total_ms) == (pytest.approx(20_000.0, abs=1.0), None)
 

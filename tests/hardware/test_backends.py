@@ -97,7 +97,7 @@ def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
     port = open_serial(line.device, SerialOptions())
     os.write(line.far, FrameStream().pack(STATUS))
     wait_readable(port)
-    assert (port.receive(), port.statistics.corrupt) == ([STATUS], 0)
+    assert (port.receive(), port.stream.statistics.corrupt) == ([STATUS], 0)
     port.close()
 
 
@@ -120,13 +120,13 @@ def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
         port.send(Home(nonce))
     far = FrameStream()
     assert (far.unpack(bytes(taken)), far.statistics.lost) == ([Home(nonce) for nonce in range(1, 8)], 0)
-    assert port.statistics.unsent == 5, "after so many, bytes were left"
+    assert port.stream.statistics.unsent == 5, "after so many, bytes were left"
 
 
 @pytest.mark.parametrize(
     ("module", "name", "error"),
     [
-        (termios, "tcgetattr", termios.error(errno.EIO, "unplugged meanwhile")),
+        (termios, "tcflush", termios.error(errno.EIO, "unplugged meanwhile")),
         (serial, "Serial", ValueError("Failed to set custom baud rate")),
     ],
 )
@@ -185,7 +185,11 @@ def test_what_ends_a_connection_on_a_bus_is_said_with_a_remedy(
 
 def test_an_error_frame_that_is_not_bus_off_is_counted(bus: Bus) -> None:
     bus.put(PASSIVE, STATUS_FRAME)
-    assert (bus.backend.receive(), bus.backend.statistics.corrupt, bus.backend.statistics.resynchronisations) == (
+    assert (
+        bus.backend.receive(),
+        bus.backend.stream.statistics.corrupt,
+        bus.backend.stream.statistics.resynchronisations,
+    ) == (
         [STATUS],
         1,
         1,
@@ -303,7 +307,7 @@ def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBacke
     flags = {"is_extended_id": False, "data": b"" if flag == "is_remote_frame" else data} | {flag: True}
     other = can.Message(arbitration_id=identifier, **flags)
     backend = failing(other, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-    assert (backend.receive() + backend.receive(), backend.statistics.corrupt) == ([STATUS], 0)
+    assert (backend.receive() + backend.receive(), backend.stream.statistics.corrupt) == ([STATUS], 0)
 
 
 # -- finding one ---------------------------------------------------------------------------------------------------

@@ -2,8 +2,6 @@
 
 import itertools
 from collections import deque
-from types import SimpleNamespace
-from typing import Any
 
 import msgspec
 import pytest
@@ -31,12 +29,20 @@ from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import LinkState
 from tormagd.hardware.measurement import DeviceRequest
-from tormagd.record.journal import Journal
+from tormagd.hardware.streams import FrameStream
 from tormagd_client.messages import LinkReport
 
 TICK_S = 1e-3
 US, ANOTHER = Identity(SCHEMA_HASH, 1, 0, 7), Identity(0xBAD, 3, 1, 7)
 REFUSED = f"is 00000bad (firmware 3.1), this daemon's is {SCHEMA_HASH:08x}"
+OPENING = {
+    "gone": ("/dev/tormag: there is no such port", "plug the device in"),
+    "held": ("/dev/tormag: another process holds it", "tormagctl ports says who"),
+}
+SENDING = {
+    "gone": ("/dev/tormag: writing failed",),
+    "bus-off": ("can0: bus-off", "look at the termination"),
+}
 COMMANDS = {Home: DeviceRequest.HOME, Retract: DeviceRequest.RETRACT, Clear: DeviceRequest.CLEAR}
 
 
@@ -72,17 +78,15 @@ class Port:
     def __init__(self, bench: "Bench") -> None:
         self.bench = bench
         self.waiting: deque[Message] = deque()
-        self.statistics = SimpleNamespace(
-            frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0, unsent=0, refused={}
-        )
-        self.is_dead = self.is_closed = False
+        self.stream = FrameStream()
+        self.is_closed = False
 
     def receive(self) -> list[Message]:
         assert not self.is_closed
-        if self.is_dead:
+        if "gone" in self.bench.trouble:
             raise BackendError("/dev/tormag: the device was unplugged")
         messages, self.waiting = list(self.waiting), deque()
-        self.statistics.frames += len(messages)
+        self.stream.statistics.frames += len(messages)
         return messages
 
     def send(self, message: Message) -> None:
@@ -93,13 +97,11 @@ class Port:
         if isinstance(message, Home | Clear):
             assert COMMANDS[type(message)] is bench.request
             assert bench.asked_of == bench.losses, "a command that the last device was given moves no other"
-        if self.is_dead:
-            raise BackendError("/dev/tormag: writing failed")
-        if bench.is_bus_off:
-            raise BackendError("can0: bus-off", "look at the termination")
+        for trouble in bench.trouble & SENDING.keys():
+            raise BackendError(*SENDING[trouble])
         bench.sent.append(type(message))
-        if not bench.is_mute:
-            self.waiting.extend(bench.firmware.answers(message, bench.identity))
+        if "mute" not in bench.trouble:
+            self.waiting.extend(bench.firmware.answers(message, ANOTHER if "another" in bench.trouble else US))
 
     def close(self) -> None:
         assert not self.is_closed
@@ -113,15 +115,11 @@ class Bench:
         self.ports: list[Port] = []
         self.sent: list[type[Message]] = []
         self.attempts_s: list[float] = []
-        self.losses = 0
-        self.identity = US
-        self.is_there = self.has_status = self.is_armed = True
-        self.is_held = self.is_mute = self.is_bus_off = self.is_babbling = False
+        self.losses, self.is_armed = 0, True
+        self.trouble: set[str] = set()
         self.request, self.number = DeviceRequest.NONE, 0
         self.asked_of: int | None = None
-        self.seen = [LinkState.CLOSED]
-        self.host = ""
-        self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose, lambda _now_s: self.host)
+        self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose, self._host)
 
     @property
     def now_s(self) -> float:
@@ -134,10 +132,8 @@ class Bench:
     # what the connection is given
     def _open(self) -> Port:
         self.attempts_s.append(self.now_s)
-        if not self.is_there:
-            raise BackendError("/dev/tormag: there is no such port", "plug the device in")
-        if self.is_held:
-            raise BackendError("/dev/tormag: another process holds it", "tormagctl ports says who")
+        for trouble in self.trouble & OPENING.keys():
+            raise BackendError(*OPENING[trouble])
         self.ports.append(Port(self))
         return self.ports[-1]
 
@@ -145,6 +141,9 @@ class Bench:
         self.losses += 1
         if self.is_armed:
             self.ask(DeviceRequest.RETRACT)  # the core latches, and wants the gap open
+
+    def _host(self, _now_s: float) -> str:
+        return "this host slept" if "slept" in self.trouble else ""
 
     # what happens
     def ask(self, request: DeviceRequest) -> None:
@@ -156,10 +155,10 @@ class Bench:
         for _ in range(ms):
             self.ms += 1
             self.firmware.boot_ms += 1
-            if (port := self.port) is not None and self.is_there:
-                if self.is_babbling:
-                    port.statistics.corrupt += 1
-                elif self.ms % 20 == 0 and self.has_status and not self.is_mute:
+            if (port := self.port) is not None:
+                if "babble" in self.trouble:
+                    port.stream.statistics.corrupt += 1
+                elif self.ms % 20 == 0 and not self.trouble & {"mute", "no Status", "gone"}:
                     port.waiting.append(self.firmware.status())
             if not is_stalled:
                 self.beat()
@@ -174,13 +173,6 @@ class Bench:
         connection, still_open = self.connection, [port for port in self.ports if not port.is_closed]
         assert len(still_open) == (connection.state not in (LinkState.CLOSED, LinkState.BACK_OFF, LinkState.LOST))
         assert bool(connection.cause) == (connection.measurement is None)
-        if (state := self.connection.state) is not self.seen[-1]:
-            self.seen.append(state)
-
-    def unplug(self) -> None:
-        self.is_there = False
-        if self.port is not None:
-            self.port.is_dead = True
 
     def running(self) -> "Bench":
         self.connection.open(self.now_s)
@@ -198,28 +190,25 @@ def bench() -> Bench:
 @pytest.mark.parametrize(
     ("is_running", "trouble", "after_ms", "state", "cause", "remedy"),
     [
-        (False, {"is_there": False}, 1, LinkState.BACK_OFF, "no such port", "plug"),
-        (False, {"is_held": True}, 1, LinkState.BACK_OFF, "another process", "tormagctl ports"),
-        (False, {"has_status": False}, 100, LinkState.RUNNING, "no Status yet", "wait a moment"),
-        (False, {"identity": ANOTHER}, 60, LinkState.REFUSED, REFUSED, "same protocol schema"),
-        (True, {"identity": ANOTHER}, 1_100, LinkState.REFUSED, REFUSED, "same protocol schema"),
-        (False, {"is_mute": True}, 1_010, LinkState.UNANSWERED, "it is silent", "rate"),
-        (False, {"is_mute": True, "is_babbling": True}, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
-        (True, {"is_there": False}, 1, LinkState.LOST, "unplugged", "cable"),
-        (True, {"is_mute": True}, 82, LinkState.LOST, "no message for 80 ms", "cable"),
-        (True, {"is_mute": True, "host": "this host slept"}, 82, LinkState.LOST, "80 ms; this host slept", "doctor"),
-        (True, {"is_bus_off": True}, 1, LinkState.LOST, "bus-off", "termination"),
+        (False, {"gone"}, 1, LinkState.BACK_OFF, "no such port", "plug"),
+        (False, {"held"}, 1, LinkState.BACK_OFF, "another process", "tormagctl ports"),
+        (False, {"no Status"}, 100, LinkState.RUNNING, "no Status yet", "wait a moment"),
+        (False, {"another"}, 60, LinkState.REFUSED, REFUSED, "same protocol schema"),
+        (True, {"another"}, 1_100, LinkState.REFUSED, REFUSED, "same protocol schema"),
+        (False, {"mute"}, 1_010, LinkState.UNANSWERED, "it is silent", "rate"),
+        (False, {"mute", "babble"}, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
+        (True, {"gone"}, 1, LinkState.LOST, "unplugged", "cable"),
+        (True, {"mute"}, 82, LinkState.LOST, "no message for 80 ms", "cable"),
+        (True, {"mute", "slept"}, 82, LinkState.LOST, "80 ms; this host slept", "doctor"),
+        (True, {"bus-off"}, 1, LinkState.LOST, "bus-off", "termination"),
     ],
 )
 def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
-    bench: Bench, is_running: bool, trouble: dict[str, Any], after_ms: int, state: LinkState, cause: str, remedy: str
+    bench: Bench, is_running: bool, trouble: set[str], after_ms: int, state: LinkState, cause: str, remedy: str
 ) -> None:
     if is_running:
         bench.running()
-    for name, value in trouble.items():
-        setattr(bench, name, value)
-    if not bench.is_there:
-        bench.unplug()
+    bench.trouble |= trouble
     if not is_running:
         bench.connection.open(bench.now_s)
     bench.pass_ms(after_ms)
@@ -228,28 +217,18 @@ def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
     assert cause in report.cause
     assert remedy in report.remedy
     bench.pass_ms(3_000)  # it has given up asking often by now
-    heal(bench)
+    bench.trouble.clear()
     bench.pass_ms(1_200)
     assert (bench.connection.state, bench.connection.cause, bench.connection.remedy) == (LinkState.RUNNING, "", "")
     assert bench.connection.measurement is not None
-
-
-def heal(bench: Bench) -> None:
-    bench.is_there = bench.has_status = True
-    bench.is_held = bench.is_mute = bench.is_bus_off = bench.is_babbling = False
-    bench.identity = US
 
 
 def test_a_device_that_was_reset_is_a_loss_without_closing_the_port(bench: Bench) -> None:
     bench.running()
     bench.firmware.reset()
     bench.pass_ms(60)
-    assert (bench.seen[-2:], bench.losses, bench.connection.losses, len(bench.ports)) == (
-        [LinkState.IDENTIFYING, LinkState.RUNNING],
-        1,
-        1,
-        1,
-    )
+    assert bench.connection.state is LinkState.RUNNING
+    assert (bench.losses, bench.connection.losses, len(bench.ports)) == (1, 1, 1)
     assert "reset" in bench.connection.report().last_loss
 
 
@@ -260,38 +239,29 @@ def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(ben
     assert (bench.connection.state, bench.losses) == (LinkState.RUNNING, 0)
 
 
-def test_a_device_whose_first_word_is_who_it_is_runs_at_once(bench: Bench) -> None:
-    bench.is_mute = True
-    bench.connection.open(bench.now_s)
-    bench.pass_ms(1_100)
-    bench.is_mute = bench.has_status = False
-    bench.pass_ms(1_000)
-    assert bench.seen == [LinkState.CLOSED, LinkState.IDENTIFYING, LinkState.UNANSWERED, LinkState.RUNNING]
-
-
 def test_waiting_grows_to_a_second_and_starts_anew_with_the_next_device(bench: Bench) -> None:
-    bench.running().unplug()
+    bench.running().trouble.add("gone")
     first = len(bench.attempts_s)
     bench.pass_ms(6_000)
     waits_s = [after - before for before, after in itertools.pairwise(bench.attempts_s[first:])]
     assert waits_s[:4] == pytest.approx([0.1, 0.2, 0.4, 0.8], abs=2e-3)
     assert waits_s[4:] == pytest.approx([LONGEST_BACK_OFF_S] * len(waits_s[4:]), abs=2e-3)
-    heal(bench)
+    bench.trouble.clear()
     bench.pass_ms(1_100)
     lost_s = bench.now_s
-    bench.unplug()
+    bench.trouble.add("gone")
     bench.pass_ms(60)
     assert bench.attempts_s[-1] - lost_s == pytest.approx(FIRST_BACK_OFF_S, abs=2e-3)
 
 
 def test_opening_the_gap_waits_for_a_device_that_went_before_it_had_heard(bench: Bench) -> None:
     bench.running()
-    bench.is_armed, bench.is_mute = False, True
+    bench.is_armed, bench.trouble = False, {"mute"}
     bench.ask(DeviceRequest.RETRACT)
     bench.pass_ms(20)
     assert Retract in bench.sent
     bench.pass_ms(3_000)
-    heal(bench)
+    bench.trouble.clear()
     bench.pass_ms(1_200)
     assert bench.firmware.accepted == [Retract]
 
@@ -303,21 +273,13 @@ def test_a_command_is_for_the_device_that_runs_when_it_is_given(
     bench.running().ask(request_)
     bench.pass_ms(40)
     assert bench.firmware.accepted == [kind]
-    bench.is_armed, bench.is_mute = False, True
+    bench.is_armed, bench.trouble = False, {"mute"}
     bench.pass_ms(200)
     bench.ask(request_)
     bench.pass_ms(20)
-    heal(bench)
+    bench.trouble.clear()
     bench.pass_ms(1_200)
     assert (bench.connection.state, bench.firmware.accepted) == (LinkState.RUNNING, [kind])
-
-
-def test_a_backend_that_shows_no_stream_has_no_frames_in_a_black_box(bench: Bench) -> None:
-    journal = bench.connection.traffic = Journal()
-    bench.running()
-    bench.connection.close()
-    assert journal.take() == [("connected", None), ("connected", None)]
-    assert bench.connection.memory() is None
 
 
 def test_a_closed_connection_stays_closed(bench: Bench) -> None:

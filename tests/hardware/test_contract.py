@@ -381,9 +381,9 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     if case.named:
         settled = samples[-SETTLED_TICKS:]
         assert case.named & {name for sample in settled for name in (*sample.safety.faults, *sample.output.limits)}
-    assert [name for name in case.counted if getattr(line.backend.statistics, name) == 0] == []
+    assert [name for name in case.counted if getattr(line.backend.stream.statistics, name) == 0] == []
     # at most what is on its way at the end
-    assert [name for name in case.uncounted if getattr(line.backend.statistics, name) > 1] == []
+    assert [name for name in case.uncounted if getattr(line.backend.stream.statistics, name) > 1] == []
 
 
 def check_safe(loop: ClosedLoop, faulted: Sample) -> None:

@@ -13,6 +13,7 @@ connection is accepted each time that the door is opened. What epoll has to be t
 import contextlib
 import ctypes
 import logging
+import os
 import platform
 import re
 import select
@@ -20,7 +21,7 @@ import socket
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ import zmq.utils.monitor
 from zmq.utils import z85
 
 from tormagd.daemon.peers import Allowance, Arrivals, Peer, Tally, shown
+from tormagd.daemon.socket_file import CREDENTIALS
 from tormagd.ground.access_keys import Allowed, KeyRing
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
@@ -58,7 +60,6 @@ WATCHED = (
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
-_CREDENTIALS = struct.Struct("3i")
 _EVENT = struct.Struct("=IQ" if platform.machine() == "x86_64" else "@IQ")
 "`struct epoll_event`, which is packed on x86-64 only."
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -270,10 +271,10 @@ class Admission:
 
 def _address(descriptor: int) -> str:
     """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`."""
-    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
         if connection.family == socket.AF_UNIX:
-            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-            process, user, group = _CREDENTIALS.unpack(made)
+            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size)
+            process, user, group = CREDENTIALS.unpack(made)
             return f"localhost:{user}:{group}:{process}"
         return str(connection.getpeername()[0])
     return ""
@@ -281,20 +282,10 @@ def _address(descriptor: int) -> str:
 
 def _end(descriptor: int, address: str) -> None:
     """Shut down the connection `descriptor`, unless its peer is no longer `address`: descriptors are used again."""
-    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
         if _address(descriptor) == address:
             connection.shutdown(socket.SHUT_RDWR)
             connection.recv(1_048_576, socket.MSG_DONTWAIT)
-
-
-@contextlib.contextmanager
-def _borrowed(descriptor: int) -> Iterator[socket.socket]:
-    """Yield `descriptor` as a socket, which stays open."""
-    connection = socket.socket(fileno=descriptor)
-    try:
-        yield connection
-    finally:
-        connection.detach()
 
 
 def door(listening: int) -> tuple[int, int, int]:

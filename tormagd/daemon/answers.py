@@ -61,6 +61,7 @@ class Answers:
         self._said: Telemetry | None = None
         "The snapshot of which `_status` is made."
         self._reports: dict[str, Any] = {}
+        self._parts = self._report_device, self._report_peers, self._report_rates, self._report_phases
         self._steps: deque[Callable[[], None]] = deque()
         "What is left to do for the requests that wait."
         self.reset()
@@ -83,7 +84,7 @@ class Answers:
         now_s, state = time.monotonic(), self._commands.connection.state
         if now_s - self._reported_s >= REPORTED_S or state is not self._reported_state:
             self._reported_s, self._reported_state = now_s, state
-            self._steps.extend([self._report_device, self._report_peers, self._report_loops])
+            self._steps.extend(self._parts)
         if self._said is not self._telemetry.newest:
             self._steps.append(self._tell)
         self._steps.append(self._send)
@@ -146,8 +147,8 @@ class Answers:
         now_s = time.monotonic()
         if self._reported_s == -math.inf:  # a command may have changed all
             self._reported_s = now_s
-            for report in (self._report_device, self._report_peers, self._report_loops):
-                report()
+            for part in self._parts:
+                part()
         outside = ", ".join(f"{it.quantity} {it.asked:.4g} asked, {it.used:.4g} used" for it in plan.outside)
         return Status(
             **known,
@@ -214,9 +215,11 @@ class Answers:
             "black_box": self._commands.box.report(),
         }
 
-    def _report_loops(self) -> None:
+    def _report_rates(self) -> None:
+        self._reports["rates"] = {group.name: group.report() for group in self._telemetry.groups}
+
+    def _report_phases(self) -> None:
         self._reports |= {
-            "rates": {group.name: group.report() for group in self._telemetry.groups},
-            "phases_us": {name: spent.report for name, spent in self._phases.spent.items()},
+            "phases_us": {name: spent.report() for name, spent in self._phases.spent.items()},
             "late_ticks_by": dict(self._phases.blamed),
         }

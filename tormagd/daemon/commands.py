@@ -12,12 +12,11 @@ from tormagd.control.assembly.conditions import conditions
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.safety.operating_state import Conditions, RefusedError
 from tormagd.daemon.black_box import BlackBox
-from tormagd.daemon.calibrations import Calibrations
+from tormagd.daemon.configuration import Calibrations, SceneChange
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
-from tormagd.daemon.scene_change import SceneChange
 from tormagd.hardware.connection import Connection
 from tormagd.record.keeper import REQUEST
 from tormagd_client.messages import MAX_MARK_CHARACTERS, Mark, Request

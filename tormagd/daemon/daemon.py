@@ -6,7 +6,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import msgspec
 
@@ -17,17 +17,15 @@ from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.daemon.answers import Answers
 from tormagd.daemon.beat import Beat, Phases
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox, header
-from tormagd.daemon.calibrations import Calibrations
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.commands import Commands
+from tormagd.daemon.configuration import Calibrations, SceneChange, reread
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, gains_of, state_folder
-from tormagd.daemon.rate_group import ERROR_PERIODS, Histogram
+from tormagd.daemon.rate_group import ERROR_PERIODS
 from tormagd.daemon.realtime import Heartbeat, freeze_garbage, priority_of_threads
-from tormagd.daemon.reload import reread
-from tormagd.daemon.scene_change import SceneChange
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.daemon.service import Service, notify
 from tormagd.daemon.telemetry_loop import TelemetryLoop
@@ -43,7 +41,6 @@ SWITCH_S = 1e-4
 LONGEST_RETRACT_S = 10.0
 "The firmware needs 3 s for a full stroke; if it cannot retract, it reports that itself."
 TELL_S = 0.1
-REFRESHED = 2
 NAMED_S = 0.5
 "By then a gap that does not open is a fault, and in the log."
 
@@ -85,7 +82,6 @@ class Daemon:
             on_failure=self._fail_plan,
             beside=beside,
         )
-        self._profiles = self._profiles_of(core)
         self._calibrations = Calibrations(
             state_folder(config.device.calibrations, "calibrations"), config, self._run_core
         )
@@ -97,7 +93,7 @@ class Daemon:
             self._connection,
             endpoint.inbox,
             self._box,
-            self._profiles,
+            self._profiles_of(core),
             self._calibrations,
             SceneChange(self._build, self._require_disabled, self._run_scene),
         )
@@ -113,7 +109,7 @@ class Daemon:
             refused,
             config_file,
         )
-        self._service, self._told_s, self._histograms = Service(), 0.0, self._in_turn()
+        self._service, self._told_s = Service(), 0.0
         self._box.begin(self._control.stepper, self._inference.planner, self._connection)
         telemetry = self._telemetry
         self._phases.begin(
@@ -164,8 +160,8 @@ class Daemon:
         await self._ended.wait()
         notify("STOPPING=1")
         await self._open_gap()
-        self._profiles.look(None, is_driven=False)
-        await self._profiles.finished()
+        self._commands.profiles.look(None, is_driven=False)
+        await self._commands.profiles.finished()
         self._loop.remove_reader(heartbeat.fileno())
         self._connection.close()
         heartbeat.close()
@@ -221,8 +217,6 @@ class Daemon:
         if now_s - self._told_s < TELL_S:
             return False
         self._told_s = now_s
-        for _ in range(REFRESHED):
-            next(self._histograms).refresh()
         self._endpoint.inbox.refresh(now_s)
         self._endpoint.inbox.tell(now_s)
         self._box.look()
@@ -233,17 +227,13 @@ class Daemon:
         self._phases.tell()
         return True
 
-    def _in_turn(self) -> Iterator[Histogram]:
-        while True:
-            yield from (*self._telemetry.histograms(), *self._phases.spent.values())
-
     async def _build(self, scene: str) -> Core:
         """Build the core of another scene at the running rates."""
         # in a thread, so that no beat waits
         core = await asyncio.to_thread(build_core, msgspec.structs.replace(self._config, scene=scene))
         if core.element.is_beside or self._inference.beside is not None:
             raise ConfigError(f"scene {core.scene.name}: a search beside the plans begins with the daemon: restart it")
-        await self._profiles.finished()
+        await self._commands.profiles.finished()
         return core
 
     def _require_disabled(self) -> None:
@@ -265,9 +255,8 @@ class Daemon:
         self._config, self._core = config, core
         control.stepper, inference.planner = stepper, planner
         self._endpoint.inbox.begin_scene(core.scene)
-        self._profiles.close()
-        self._profiles = self._profiles_of(core)
-        self._commands.config, self._commands.profiles = config, self._profiles
+        self._commands.profiles.close()
+        self._commands.config, self._commands.profiles = config, self._profiles_of(core)
         self._telemetry.run_scene(core)
         self._answers.reset()
         self._box.begin_scene(header(self._config, core), stepper, planner)
@@ -288,19 +277,18 @@ class Daemon:
             log.error("the lists of keys stay as they were: %s; next: mend that and reload again", error)
         try:
             read = await asyncio.to_thread(self._read_again)
-            again, config = reread(self._calibrations.configured, read), reread(self._config, read).config
+            configured, taken, waiting = reread(self._calibrations.configured, read)
+            config, _, _ = reread(self._config, read)
         except ValueError as error:
             log.error("the configuration stays as it was: %s; next: mend that and reload again", error)
             return
-        self._calibrations.configured, self._config = again.config, config
+        self._calibrations.configured, self._config = configured, config
         self._calibrations.read_again()
         self._commands.config = self._config
-        self._endpoint.inbox.sources = again.config.sources
-        log.info(
-            "configuration read again: %s", f"now in force: {', '.join(again.taken)}" if again.taken else "no news"
-        )
-        if again.waiting:
-            log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
+        self._endpoint.inbox.sources = configured.sources
+        log.info("configuration read again: %s", f"now in force: {', '.join(taken)}" if taken else "no news")
+        if waiting:
+            log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(waiting))
 
     async def _open_gap(self) -> None:
         """Open the gap, and wait for it up to LONGEST_RETRACT_S while the beat goes on."""

@@ -167,8 +167,6 @@ class SetpointInbox:
     def refresh(self, now_s: float) -> None:
         if self._sources:
             self._turn += 1
-            if self.sources.playout_ms > 0.0:
-                self._held.refresh()
             source = tuple(self._sources.values())[self._turn % len(self._sources)]
             if source.refresh(now_s):
                 self._news.append(f"source {source.setpoint.source!r}: {source.cause}: {source.remedy}")
@@ -189,7 +187,7 @@ class SetpointInbox:
             if playout_ms == 0.0
             else PlayoutReport(
                 playout_ms=playout_ms,
-                held_us=self._held.report,
+                held_us=self._held.report(),
                 jitter_us=round(self._jitter_s * 1e6, 1),
                 setpoints=self._played,
                 late=self._late,

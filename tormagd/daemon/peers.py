@@ -97,7 +97,7 @@ class Listeners:
 
     def __init__(self) -> None:
         self._asked: dict[bytes, Counter[Peer | None]] = {topic: Counter() for topic in TOPICS}
-        self._gone = dict.fromkeys(TOPICS, 0)
+        "Of each topic, subscriptions by peer; less than 0 for None, which stands for those that have gone."
 
     def has(self, topic: bytes) -> bool:
         """Tell whether a peer subscribes to `topic` by its name."""
@@ -107,21 +107,19 @@ class Listeners:
         """Count what a subscriber says to an XPUB socket: byte 1 to subscribe or 0 to end, then the topic's name."""
         for topic in TOPICS:
             if word[1:] == topic:
-                self._count(topic, self._asked[topic], peer, is_subscription=word[0] == 1)
+                _count(self._asked[topic], peer, is_subscription=word[0] == 1)
 
-    def _count(self, topic: bytes, asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
-        """Count one subscription to `topic`, or its end, in `asked`."""
-        if peer not in asked and (len(asked) >= LISTENERS or not is_subscription):
-            peer = None if peer is None else OTHERS
-        if is_subscription:
-            asked[peer] += 1
-        elif peer is None:
-            self._gone[topic] += 1
-        elif asked[peer] > 0:
-            asked[peer] -= 1
-        if asked.total() <= self._gone[topic]:
-            asked.clear()
-            self._gone[topic] = 0
+
+def _count(asked: Counter[Peer | None], peer: Peer | None, *, is_subscription: bool) -> None:
+    """Count one subscription, or its end, in `asked`."""
+    if peer is not None and peer not in asked and (len(asked) >= LISTENERS or not is_subscription):
+        peer = OTHERS
+    if is_subscription:
+        asked[peer] += 1
+    elif peer is None or asked[peer] > 0:
+        asked[peer] -= 1
+    if asked.total() <= 0:
+        asked.clear()
 
 
 FIRST = ("stop", "disable")

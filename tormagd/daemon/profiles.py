@@ -59,8 +59,8 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     slow_factor: Annotated[float, Meta(gt=0.0, lt=20.0)]
     slow_learned: Annotated[float, Meta(ge=0.0, le=1.0)]
     sensor_zero_N: Annotated[float, Meta(ge=-MAX_ZERO_N, le=MAX_ZERO_N)]
-    lag_s: Annotated[float, Meta(ge=0.0, le=MAX_LAG_S)] = 0.0
-    gains: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")] = ""
+    lag_s: Annotated[float, Meta(ge=0.0, le=MAX_LAG_S)]
+    gains: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")]
 
     def learned(self, now_ns: int, gains: str = "") -> Learned:
         """Return what is still known at CLOCK_REALTIME `now_ns` of the device, driven with these `gains`."""

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from typing import Final, NamedTuple, final
+from typing import Final, TypeAlias, final
 
 from msgspec.structs import asdict
 
@@ -29,9 +29,6 @@ class Histogram:
         self._before = [0] * _BINS
         self._max_now = self._max_before = 0.0
         self._turned_s = -math.inf
-        self.report: ExecReport
-        "Percentiles are upper edges of their bins."
-        self.refresh()
 
     def add(self, now_s: float, value_us: float) -> None:
         """Count one duration that ended at `now_s`; negative ones, a clock's grain, and NaN count as 0."""
@@ -43,7 +40,8 @@ class Histogram:
         if value_us > self._max_now:
             self._max_now = value_us
 
-    def refresh(self) -> None:
+    def report(self) -> ExecReport:
+        """Return percentiles, each the upper edge of its bin."""
         most = round(max(self._max_now, self._max_before), 1)
         total, seen, used = sum(self._now) + sum(self._before), 0, 0
         edges = []
@@ -52,7 +50,7 @@ class Histogram:
                 seen += self._now[used] + self._before[used]
                 used += 1
             edges.append(min(float(_upper_edge(used - 1)), most))
-        self.report = ExecReport(p50=edges[0], p99=edges[1], p999=edges[2], max=most)
+        return ExecReport(p50=edges[0], p99=edges[1], p999=edges[2], max=most)
 
 
 def _bin(value_us: float) -> int:
@@ -70,11 +68,8 @@ def _upper_edge(index: int) -> int:
     return (part + 33) << (shift + 1)
 
 
-class _Mark(NamedTuple):
-    time_ns: int
-    runs: int
-    overruns: int
-    stalls: int
+_Mark: TypeAlias = tuple[int, int, int, int]
+"Time, ns, and runs, overruns and stalls until then."
 
 
 @final
@@ -98,8 +93,8 @@ class RateGroup:
         self._newest_ns = 0
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
-        if not self._marks or start_ns - self._marks[-1].time_ns > HORIZON_NS:
-            self._marks.append(_Mark(start_ns, self.runs, self.overruns, self.stalls))
+        if not self._marks or start_ns - self._marks[-1][0] > HORIZON_NS:
+            self._marks.append((start_ns, self.runs, self.overruns, self.stalls))
         self.lateness_us = (start_ns - due_ns) * 1e-3
         self.exec_us = (end_ns - start_ns) * 1e-3
         self.lateness.add(start_ns * 1e-9, self.lateness_us)
@@ -116,12 +111,12 @@ class RateGroup:
 
     def report(self) -> RateReport:
         """Return counts and worst lateness since the start; rate, grade and percentiles over one to two horizons."""
-        since = self._marks[0] if self._marks else _Mark(0, 0, 0, 0)
+        since_ns, runs, overruns, stalls = self._marks[0] if self._marks else (0, 0, 0, 0)
         hz, grade = 0.0, "good"
-        if self._newest_ns > since.time_ns:
-            hz = (self.runs - 1 - since.runs) / ((self._newest_ns - since.time_ns) * 1e-9)
-        if self.overruns > since.overruns:
-            grade = "error" if self.stalls > since.stalls else "warning"
+        if self._newest_ns > since_ns:
+            hz = (self.runs - 1 - runs) / ((self._newest_ns - since_ns) * 1e-9)
+        if self.overruns > overruns:
+            grade = "error" if self.stalls > stalls else "warning"
         return RateReport(
             grade=grade,
             hz=round(hz, 2),
@@ -129,6 +124,6 @@ class RateGroup:
             merged=self.merged,
             overruns=self.overruns,
             stalls=self.stalls,
-            lateness_us=LatenessReport(**asdict(self.lateness.report), worst=round(self._worst_us, 1)),
-            exec_us=self.exec.report,
+            lateness_us=LatenessReport(**asdict(self.lateness.report()), worst=round(self._worst_us, 1)),
+            exec_us=self.exec.report(),
         )

@@ -1,8 +1,8 @@
 """The search for the field in a process of its own, if it takes longer than a plan has.
 
 The process answers one question after another over a packet socket. The daemon never waits: a plan takes the newest
-answer. It asks the next question once the last is answered and a period has passed. Both ends belong to one
-installation and one parent, so packets are pickled.
+answer, and asks the next question if the last is answered. Both ends belong to one installation and one parent, so
+packets are pickled.
 """
 
 import logging
@@ -31,7 +31,7 @@ class SearchProcess:
 
     def __init__(self, core: Core) -> None:
         self.timing = RateGroup("search", 1_000_000_000 // core.config.rates.inference_hz)
-        self._asked_ns = self._due_ns = 0
+        self._asked_ns = 0
         self._is_idle, self._again_s = True, -math.inf
         self._searched = pickle.dumps((core.config, core.scene, core.models))
         self._begin()
@@ -53,7 +53,7 @@ class SearchProcess:
         self._is_idle = True
         if data == READY:
             return None
-        self.timing.record(self._due_ns, self._asked_ns, time.monotonic_ns())
+        self.timing.record(self._asked_ns, self._asked_ns, time.monotonic_ns())
         found: Answer | ValueError = pickle.loads(data)
         if isinstance(found, Answer):
             return found
@@ -61,21 +61,16 @@ class SearchProcess:
         return None
 
     def ask(self, question: Question | None) -> None:
-        """Send `question` to the search if it is idle and the next question is due; start one that has ended again."""
+        """Send `question` to the search if it is idle; start one that has ended again."""
         now_s = time.monotonic()
         if self._beside.is_gone and now_s >= self._again_s:
             log.error("the search beside the plans has ended; another one starts")
             self.close()
             self._again_s, self._is_idle = now_s + STARTS_S, False
             self._begin()
-        now_ns, period_ns = time.monotonic_ns(), self.timing.period_ns
-        if question is None or not self._is_idle or now_ns < self._due_ns + period_ns:
-            return
-        self._due_ns += period_ns
-        if now_ns - self._due_ns > period_ns:  # missed questions are not made up for
-            self._due_ns = now_ns
-        self._asked_ns = now_ns
-        self._is_idle = not self._beside.send(pickle.dumps(question))
+        if question is not None and self._is_idle:
+            self._asked_ns = time.monotonic_ns()
+            self._is_idle = not self._beside.send(pickle.dumps(question))
 
     def close(self) -> None:
         self._beside.close()

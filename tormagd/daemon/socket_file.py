@@ -5,10 +5,15 @@ import fcntl
 import os
 import socket
 import stat
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 from tormagd.ground.access_keys import require_own
 from tormagd.ground.files import is_left_socket
+
+CREDENTIALS = struct.Struct("3i")
+"Process, user and group of a connection's other end: `struct ucred` of unix(7)."
 
 
 class SocketFile:
@@ -16,20 +21,16 @@ class SocketFile:
     and ConfigError where others may write to its folder."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._lock_path = path, path.with_name(f"{path.name}.lock")
+        self._path, folder = path, path.parent
         try:
-            path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+            folder.mkdir(mode=0o755, parents=True, exist_ok=True)
         except OSError as error:
             raise OSError(
-                f"the directory {path.parent} cannot be made: {error.filename}: {error.strerror}; name another"
+                f"the directory {folder} cannot be made: {error.filename}: {error.strerror}; name another"
             ) from error
-        require_own(path.parent)
-        self._lock = _locked(self._lock_path)
-        try:
+        require_own(folder)
+        with _locked(folder):
             self.listener = _listening(path)
-        except OSError:
-            self._unlock()
-            raise
         self._identity = _identity(path)
 
     def is_gone(self) -> bool:
@@ -37,21 +38,11 @@ class SocketFile:
         return _identity(self._path) != self._identity
 
     def close(self) -> None:
-        """Close the socket, and remove its path and its lock, unless others have been put in their place."""
+        """Close the socket, and remove its path, unless another has been put in its place."""
         self.listener.close()
         if self._identity is not None and not self.is_gone():
             with contextlib.suppress(OSError):
                 self._path.unlink()
-        self._unlock()
-
-    def _unlock(self) -> None:
-        """Remove the lock's file, if it is still ours, and let the lock go."""
-        held = os.fstat(self._lock)
-        # before the lock is let go: a process that has opened the file then finds it gone, and tries again
-        if _identity(self._lock_path) == (held.st_dev, held.st_ino):
-            with contextlib.suppress(OSError):
-                self._lock_path.unlink()
-        os.close(self._lock)
 
 
 def ipc_path(address: str) -> Path | None:
@@ -61,40 +52,25 @@ def ipc_path(address: str) -> Path | None:
     return Path(address.removeprefix("ipc://"))
 
 
-def _locked(path: Path) -> int:
-    """Lock the file `path`, write our process number into it, and return its descriptor, which holds the lock."""
-    while True:
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o660)
-        except OSError as error:
-            raise OSError(f"{path} cannot be opened: {error.strerror}; name another path") from error
-        try:
-            _lock(path, descriptor)
-        except OSError:
-            os.close(descriptor)
-            raise
-        held = os.fstat(descriptor)
-        if _identity(path) == (held.st_dev, held.st_ino):
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-            return descriptor
-        os.close(descriptor)  # its owner removed it between our opening and our locking it
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep others that bind sockets in `folder` from doing so meanwhile, without waiting for them."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        _lock(folder, descriptor)
+        yield
+    finally:
+        os.close(descriptor)
 
 
-def _lock(path: Path, descriptor: int) -> None:
-    """Lock an open file without waiting."""
-    content = os.pread(descriptor, 32, 0).decode(errors="replace").strip()
-    if content and not content.isdecimal():
-        raise OSError(f"{path} is not a lock of this program; it is left alone: name another path")
+def _lock(folder: Path, descriptor: int) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise OSError(
-            f"already running, pid {content or 'not known'}; end it, or name other addresses in [endpoints]"
-        ) from error
+        raise OSError(f"another process binds a socket in {folder} at this moment; start again") from error
     except OSError as error:
         raise OSError(
-            f"{path} cannot be locked: {error.strerror}: its file system may have no locks; "
+            f"{folder} cannot be locked: {error.strerror}: its file system may have no locks; "
             "name a folder of another, as /run or /tmp is"
         ) from error
 
@@ -102,10 +78,7 @@ def _lock(path: Path, descriptor: int) -> None:
 def _listening(path: Path) -> socket.socket:
     """Return a socket that listens at `path`, in place of one that was left there."""
     if _identity(path) is not None:
-        if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
-        if not is_left_socket(path):
-            raise OSError(f"{path} is the socket of another program that runs; it is left alone: name another path")
+        _require_left(path)
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
     try:
         path.unlink(missing_ok=True)
@@ -115,6 +88,22 @@ def _listening(path: Path) -> socket.socket:
         made.close()
         raise OSError(f"{path} cannot be bound: {error.strerror or error}; name another path") from error
     return made
+
+
+def _require_left(path: Path) -> None:
+    """Raise OSError for what is no socket, and for one that somebody has open."""
+    if not stat.S_ISSOCK(path.lstat().st_mode):
+        raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
+    if not is_left_socket(path):
+        process = _listener(path) or "not known"
+        raise OSError(f"already running, pid {process}; end it, or name other addresses in [endpoints]")
+
+
+def _listener(path: Path) -> int:
+    """Return the process that listens at a socket, 0 if the kernel does not say."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+        probe.connect_ex(str(path))
+        return int(CREDENTIALS.unpack(probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))[0])
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

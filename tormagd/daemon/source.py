@@ -21,7 +21,7 @@ from tormagd.daemon.rate_group import Histogram
 from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S as LINE_S, DeviceClock
 from tormagd.scenes.scene import Scene
-from tormagd_client.messages import ClockReport, MessageError, Setpoint, SourceReport
+from tormagd_client.messages import MessageError, Setpoint, SourceReport
 
 LONGEST_JUMP = 1_000
 "A jump of `seq` by more steps is no loss: it is another run or a wrong number."
@@ -32,9 +32,7 @@ STRAYS_S = 1.0
 FACTORS = {"us": 10**3, "ms": 10**6, "s": 10**9}
 "ns in each unit that publishers send by mistake."
 FAR_S = 86_400.0
-"Stamps in a wrong unit are years away from our clock. No setpoint is older than this."
-LOOKED_AT, MIN_S = 8, 0.005
-SLOW = 0.03
+"A stamp that is no further from our clock if it counts another unit does so. No setpoint is older than this."
 
 MAX_WAY_S = 0.2
 "A least lateness up to this is the way's: half of the delay allowed from sensor to force."
@@ -68,10 +66,8 @@ PLAYOUT_STEP_MS = 10
 
 class Order(Enum):
     NEWER = "newer"
-    RESTARTED = "restarted"
-    "The first of a new run, announced by a `session` above every earlier one."
-    REPLACED = "replaced"
-    "The first of a new run that was not announced."
+    NEW_RUN = "new run"
+    "The first of a publisher that has restarted, or was replaced by another."
     STRAY = "stray"
     "Old, repeated, or from another run."
 
@@ -103,13 +99,13 @@ class Sequence:
                 return Order.NEWER
         if session is not None and (self._latest_session is None or session > self._latest_session):
             self._latest_session = session
-            return self._begin(session, seq, Order.RESTARTED)
+            return self._begin(session, seq)
         is_in_row = self._in_row > 0 and session == self._stray_session and seq > self._stray_seq
         self._in_row = self._in_row + 1 if is_in_row else 1
         self._stray_session, self._stray_seq = session, seq
         is_repeated = session == self.session and seq == self.seq
         if self._in_row >= RUN or (is_over and not is_repeated):
-            return self._begin(session, seq, Order.REPLACED)
+            return self._begin(session, seq)
         if now_s - self._strays_since_s > STRAYS_S:
             self._strays, self._strays_since_s = 0, now_s
         self._strays += 1
@@ -118,11 +114,11 @@ class Sequence:
     def is_doubled(self, now_s: float) -> bool:
         return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
 
-    def _begin(self, session: int | None, seq: int, order: Order) -> Order:
+    def _begin(self, session: int | None, seq: int) -> Order:
         self.session, self.seq, self._step = session, seq, 0
         self._in_row = self._strays = self.missing = 0
         self.restarts += 1
-        return order
+        return Order.NEW_RUN
 
 
 @final
@@ -170,7 +166,7 @@ class SourceClock:
             self._settle()
         return max(lateness_s - self.offset_s, 0.0)
 
-    def wrong(self, now_s: float, stamp_ns: int, fit: ClockReport | None) -> str:
+    def wrong(self, now_s: float, stamp_ns: int) -> str:
         causes = []
         if self.is_wrong and stamp_ns < NEVER_SET_NS:
             causes.append(f"it was never set (it says {time.gmtime(stamp_ns * 1e-9).tm_year}), and is corrected")
@@ -181,6 +177,7 @@ class SourceClock:
         if now_s - self.stepped_at_s < STEP_NAMED_S:
             way, often = "forward" if self.stepped_s > 0.0 else "back", f", the last of {self.steps} times"
             causes.append(f"it was set {way} by {abs(self.stepped_s):.3f} s{often if self.steps > 1 else ''}")
+        fit = self.line.fit()
         if fit is not None and fit.windows >= SURE_WINDOWS:
             # standard deviation of the slope, ppm, of a line through evenly spaced points
             sd_ppm = fit.residual_us * math.sqrt(12.0 / fit.windows) / (fit.windows * LINE_S)
@@ -268,11 +265,9 @@ class Source:
         self.accepted = self.refused = self.raised = 0
         self.found: dict[Limit, Explanation] = {}
         self.cause = self.remedy = ""
-        self._fit: ClockReport | None = None
         self._is_named = False
         self._begun = Order.NEWER
         self._unit = ""
-        self._far, self._far_s, self._far_ns = 0, 0.0, 0
         self._began_s: float | None = None
         self._sent_s = 0.0
         self._window: list[tuple[int, float, float]] = []
@@ -288,9 +283,9 @@ class Source:
             if order is not Order.NEWER:
                 self._begun = order
         self.heard_s = now_s
-        self._require_ns(setpoint, now_s, realtime_ns)
+        self._require_ns(setpoint, realtime_ns)
         lateness_s = (realtime_ns - setpoint.stamp_ns) * 1e-9
-        delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is not Order.REPLACED)
+        delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is Order.NEWER)
         if not -AHEAD_S <= delay_s <= FAR_S:
             raise MessageError(
                 f"stamp_ns is {abs(delay_s):.3f} s {'ahead of' if delay_s < 0.0 else 'behind'} this clock: allowed are "
@@ -310,15 +305,13 @@ class Source:
 
     def refresh(self, now_s: float) -> bool:
         """Update the report; return True if something is newly wrong."""
-        self.delays.refresh()
-        self._fit = self.clock.line.fit()
         self.cause = self.remedy = ""
-        if self._unit in FACTORS:
+        if self._unit:
             self.cause, self.remedy = f"its stamps count {self._unit}, and are refused", _in_ns(self._unit)
         elif not self.clock.is_settled:
             self.cause = "its stamps are far from this machine's clock: it is watched which of the two it is"
             self.remedy = "wait a moment"
-        elif wrong := self.clock.wrong(now_s, self.setpoint.stamp_ns, self._fit):
+        elif wrong := self.clock.wrong(now_s, self.setpoint.stamp_ns):
             self.cause, self.remedy = f"its clock: {wrong}", "keep the clocks of both machines by chrony or ptp4l"
         was_named, self._is_named = self._is_named, self.clock.is_settled and bool(self.cause)
         return self._is_named and not was_named
@@ -334,40 +327,25 @@ class Source:
             refused=self.refused,
             lost=sequence.lost,
             restarts=sequence.restarts,
-            delay_us=self.delays.report,
+            delay_us=self.delays.report(),
             jitter_us=round(clock.jitter_s * 1e6, 1),
             clock_behind_ms=round(clock.offset_s * 1e3, 3) if is_known else None,
             clock_steps=clock.steps,
-            clock=clock_report(self._fit),
+            clock=clock_report(clock.line.fit()),
             cause=self.cause,
             remedy=self.remedy,
             raised=self.raised,
         )
 
-    def _require_ns(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
-        """Raise MessageError if the stamps do not count ns, or if that is not known yet."""
+    def _require_ns(self, setpoint: Setpoint, realtime_ns: int) -> None:
+        """Raise MessageError if the stamp counts another unit."""
         stamp_ns = setpoint.stamp_ns
-        if abs(realtime_ns - stamp_ns) < FAR_S * 1e9:
-            self._unit, self._far = "ns", 0
-        else:
-            if self._far == 0:
-                self._far_s, self._far_ns = now_s, stamp_ns
-            self._far += 1
-            past_s = now_s - self._far_s
-            if self._far >= LOOKED_AT and past_s >= MIN_S:
-                is_slow = (stamp_ns - self._far_ns) * 1e-9 < SLOW * past_s
-                nearest = min(FACTORS, key=lambda unit: abs(stamp_ns * FACTORS[unit] - realtime_ns))
-                self._unit, self._far = nearest if is_slow else "ns", 0
-        if self._unit == "ns":
-            return
+        near = (unit for unit, factor in FACTORS.items() if abs(realtime_ns - stamp_ns * factor) < FAR_S * 1e9)
+        self._unit = next(near, "")
         if self._unit:
             raise MessageError(
                 f"stamp_ns = {stamp_ns} of {setpoint.source!r} counts {self._unit}: {_in_ns(self._unit)}"
             )
-        raise MessageError(
-            f"stamp_ns = {stamp_ns} of {setpoint.source!r} is days from this clock: allowed is less until "
-            f"{LOOKED_AT} messages show whether it counts ns"
-        )
 
     def _note_manner(self, now_s: float, delay_s: float, playout_s: float, needs: Needs) -> None:
         sent_s, missing = now_s - delay_s, self.sequence.missing

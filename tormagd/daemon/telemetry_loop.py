@@ -5,7 +5,6 @@ handle's motion, and the verdict on every setpoint.
 """
 
 import time
-from collections.abc import Iterator
 from typing import Any
 
 from tormagd.config import Config
@@ -17,7 +16,7 @@ from tormagd.daemon.commands import Commands
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.rate_group import Histogram, RateGroup
+from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.verdict import CANNOT, ForceDelay, Judged, judged
 from tormagd.record.force_following import Following
 from tormagd.record.journal import TOLD
@@ -203,8 +202,3 @@ class TelemetryLoop:
             why=found.why,
             is_raised=is_raised,
         )
-
-    def histograms(self) -> Iterator[Histogram]:
-        for group in self.groups:
-            yield from (group.lateness, group.exec)
-        yield self.way.to_duty

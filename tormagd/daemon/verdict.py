@@ -90,7 +90,7 @@ class ForceDelay:
                 self.to_duty.add(now_s, (now_s - stamp_s + playout_s) * 1e6)
 
     def report(self, device_us: float | None, lag_s: float, budget: Budget) -> WayReport:
-        to_duty_us, carriages_ms, total_ms = self.to_duty.report, 1e3 * lag_s, None
+        to_duty_us, carriages_ms, total_ms = self.to_duty.report(), 1e3 * lag_s, None
         if to_duty_us.max > 0.0 and device_us is not None:
             total_ms = round((to_duty_us.p99 + device_us) * 1e-3 + carriages_ms, 2)
         return WayReport(

@@ -35,21 +35,6 @@ class BackendError(OSError):
         self.remedy = remedy
 
 
-class LinkStatistics(Protocol):
-    """Counters of one open connection."""
-
-    frames: int
-    bytes: int
-    corrupt: int
-    lost: int
-    repeated: int
-    "Frames that the backend itself took for repetitions; the link counts repeated States."
-    resynchronisations: int
-    unsent: int
-    refused: dict[str, str]
-    """Why the newest refused message was refused, by its name, or by "frame" for bytes that were no message yet."""
-
-
 Stream: TypeAlias = FrameStream | CanStream
 Received: TypeAlias = bytes | list[tuple[int, bytes]]
 "What one read returned: serial bytes, or the identifier and data of each CAN frame."
@@ -58,11 +43,11 @@ Sent: TypeAlias = bytes | tuple[int, bytes]
 
 
 class Backend(Protocol):
-    """An open connection to one device. If it has a `stream: Stream`, the black box records its frames."""
+    """An open connection to one device."""
 
     @property
-    def statistics(self) -> LinkStatistics:
-        """Counters since the connection was opened."""
+    def stream(self) -> Stream:
+        """Codec of both directions, with the frames of the newest read and write, and counters since the opening."""
 
     def receive(self) -> Sequence[Message]:
         """Return the valid messages that have arrived, without blocking. Raises BackendError if the device is gone."""

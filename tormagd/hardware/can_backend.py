@@ -21,7 +21,7 @@ from msgspec import Meta
 from firmware_protocol.codec import Message
 from tormagd.config import Device, Rates
 from tormagd.ground.files import did_you_mean
-from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver, LinkStatistics
+from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver
 from tormagd.hardware.streams import CanStream, SecondHostError
 from tormagd_client.endpoints import ConfigError, Strict
 
@@ -65,10 +65,8 @@ class CanBackend:
         self._readable.register(self._fd, select.POLLIN)
         self._writable.register(self._fd, select.POLLOUT)
         self._unsent = 0
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        return self.stream.statistics
+        self._name = f"{options.interface} {port}"
+        self._look_at_the_bus = f"check the device's supply, wiring, termination and bit rate ({options.bitrate})"
 
     def receive(self) -> list[Message]:
         """Return the node's messages among the frames that have arrived, in order."""
@@ -121,14 +119,6 @@ class CanBackend:
         if self._held is not None:
             os.close(self._held)
             self._held = None
-
-    @property
-    def _name(self) -> str:
-        return f"{self._options.interface} {self._port}"
-
-    @property
-    def _look_at_the_bus(self) -> str:
-        return f"check the device's supply, wiring, termination and bit rate ({self._options.bitrate})"
 
     def _unpack(self, frame: can.Message) -> Message | None:
         """Return the message in a frame, or None if it is foreign, damaged or not from the device."""

@@ -13,15 +13,14 @@ from typing import Any, Protocol
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Message
 from tormagd.config import Device
 from tormagd.ground.plain_values import Kinds, plain, restore
-from tormagd.hardware.backend import Backend, BackendError, Received, Sent, Stream
+from tormagd.hardware.backend import Backend, BackendError, Received, Sent
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import DeviceRequest, Measurement
-from tormagd.hardware.streams import CanStream, FrameStream
-from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
+from tormagd_client.messages import ClockReport, LinkReport
 
 FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 1.0
-COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")
+COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations", "unsent")
 
 _REMEDIES = {
     LinkState.BACK_OFF: "check cable, supply, device.port and who holds it (tormagctl ports); it is tried again",
@@ -60,7 +59,6 @@ class Connection:
     ) -> None:
         self._device, self._open_backend, self._on_loss, self._host = device, open_backend, on_loss, host
         self._backend: Backend | None = None
-        self._stream: Stream | None = None
         self._link: DeviceLink | None = None
         self._waiting = LinkState.CLOSED
         self._cause, self._remedy = "not opened yet", ""
@@ -83,7 +81,7 @@ class Connection:
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return self._cause
-        heard = backend.statistics
+        heard = backend.stream.statistics
         if link.state is LinkState.RUNNING:
             return link.missing(heard.refused)
         if link.state is not LinkState.UNANSWERED:
@@ -127,8 +125,6 @@ class Connection:
         if self._unfinished is DeviceRequest.RETRACT:
             self._link.request(now_s, self._unfinished)
         self._unfinished = DeviceRequest.NONE
-        stream = getattr(self._backend, "stream", None)
-        self._stream = stream if isinstance(stream, FrameStream | CanStream) else None
         if self.traffic is not None:
             self.traffic.connected(self.memory())
         log.info("%s is open", self._device.port)
@@ -144,8 +140,8 @@ class Connection:
         except BackendError as error:
             self._lose(now_s, str(error), error.remedy)
             return
-        if self.traffic is not None and self._stream is not None and self._stream.received:
-            self.traffic.read(now_s, self._stream.received)
+        if self.traffic is not None and backend.stream.received:
+            self.traffic.read(now_s, backend.stream.received)
         for message in messages:
             link.receive(now_s, message)
             self._notice()
@@ -167,14 +163,13 @@ class Connection:
         sent: list[Sent] = []
         try:
             if link.state is LinkState.RUNNING:
-                self._send(backend, link.drive(left_duty, right_duty, mode), sent)
-            for message in link.due(now_s):
-                self._send(backend, message, sent)
+                sent.append(_sent(backend, link.drive(left_duty, right_duty, mode)))
+            sent += [_sent(backend, message) for message in link.due(now_s)]
         except BackendError as error:
             self._lose(now_s, str(error), error.remedy)
             return
-        heard = backend.statistics
-        if self.traffic is not None and self._stream is not None:
+        heard = backend.stream.statistics
+        if self.traffic is not None:
             self.traffic.wrote(now_s, sent, heard.unsent)
         link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
         if link.state is LinkState.LOST:
@@ -190,21 +185,22 @@ class Connection:
 
     def memory(self) -> Any:
         """Return the conversation's state as plain data, from which `remember` continues it elsewhere."""
-        if self._link is None or self._stream is None:
+        if self._link is None or self._backend is None:
             return None
-        return {"requested": self._requested, "link": plain(self._link), "stream": plain(self._stream)}
+        return {"requested": self._requested, "link": plain(self._link), "stream": plain(self._backend.stream)}
 
     def remember(self, memory: Any, known: Kinds) -> None:
         self._requested = memory["requested"]
+        assert self._backend is not None, "it has just been opened"
         restore(self._link, memory["link"], known)
-        restore(self._stream, memory["stream"], known)
+        restore(self._backend.stream, memory["stream"], known)
         self._seen = self.state
 
     def report(self) -> LinkReport:
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
-        round_trip = None if link is None else link.round_trip.report()
-        counted = {name: None if backend is None else getattr(backend.statistics, name) for name in COUNTERS}
+        statistics = None if backend is None else backend.stream.statistics
+        counted = {name: getattr(statistics, name, None) for name in COUNTERS}
         if link is not None and counted["repeated"] is not None:
             counted["repeated"] += link.repeated  # a repetition is counted by whoever drops it
         return LinkReport(
@@ -221,19 +217,13 @@ class Connection:
             daemon_schema=f"{SCHEMA_HASH:08x}",
             protocol_version=PROTOCOL_VERSION,
             **counted,
-            round_trip_us=None if round_trip is None else RoundTripReport(**round_trip),
+            round_trip_us=None if link is None else link.round_trip.report(),
             # a State is on its way for about half of the shortest round trip
             clock=None if link is None else clock_report(link.clock.fit(), link.round_trip.least_s / 2.0),
-            unsent=None if backend is None else backend.statistics.unsent,
-            refused={} if backend is None else dict(backend.statistics.refused),
+            refused={} if statistics is None else dict(statistics.refused),
             unanswered_share=None if link is None or link.measurement is None else round(link.quality.unanswered, 4),
             damaged_share=None if link is None or link.measurement is None else round(link.quality.damaged, 4),
         )
-
-    def _send(self, backend: Backend, message: Message, sent: list[Sent]) -> None:
-        backend.send(message)
-        if self._stream is not None:
-            sent.append(self._stream.sent)
 
     def _lose(self, now_s: float, cause: str, remedy: str) -> None:
         """End the conversation as lost for `cause`, close the port, and wait in LOST until it is opened again."""
@@ -246,7 +236,7 @@ class Connection:
             self._backend.close()
             if self.traffic is not None:
                 self.traffic.connected(None)
-        self._backend = self._link = self._stream = None
+        self._backend = self._link = None
 
     def _wait(self, now_s: float, state: LinkState, cause: str, remedy: str) -> None:
         """Wait in `state` before the port is opened again, twice as long each time, to LONGEST_BACK_OFF_S; tell it."""
@@ -270,6 +260,11 @@ class Connection:
             self._on_loss()
         elif state in (LinkState.REFUSED, LinkState.UNANSWERED):
             log.warning("%s: %s; next: %s", self._device.port, self.cause, self.remedy)
+
+
+def _sent(backend: Backend, message: Message) -> Sent:
+    backend.send(message)
+    return backend.stream.sent
 
 
 def clock_report(fit: ClockReport | None, way_s: float = 0.0) -> ClockReport | None:

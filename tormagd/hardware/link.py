@@ -25,7 +25,7 @@ from firmware_protocol.codec import (
     Switches,
     period,
 )
-from tormagd.hardware.link_statistics import UNKNOWN_QUALITY, Counts, DeviceClock, LinkQuality, LinkWatch, RoundTrip
+from tormagd.hardware.link_statistics import UNKNOWN_QUALITY, DeviceClock, LinkQuality, LinkWatch, RoundTrip
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 
 REPEAT_S: Final = 0.05
@@ -193,7 +193,7 @@ class DeviceLink:
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
         """Renew `quality` from the backend's counters, when that is due."""
         if self._quality_watch.is_due(now_s):
-            counts = Counts(self._drives, self._states, frames, damaged, unsent)
+            counts = self._drives, self._states, frames, damaged, unsent
             self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
             self._measurement = None
 

@@ -12,7 +12,7 @@ from itertools import compress
 from typing import ClassVar, Final, TypeAlias, final
 
 from firmware_protocol.value import Value
-from tormagd_client.messages import ClockReport
+from tormagd_client.messages import ClockReport, RoundTripReport
 
 LOOKED_S: Final = 0.1
 LOOKS: Final = 10
@@ -56,14 +56,8 @@ class LinkQuality(Value):
 UNKNOWN_QUALITY: Final = LinkQuality()
 
 
-@final
-class Counts(Value):
-    def __init__(self, drives: int = 0, states: int = 0, frames: int = 0, damaged: int = 0, unsent: int = 0) -> None:
-        self.drives: Final = drives
-        self.states: Final = states
-        self.frames: Final = frames
-        self.damaged: Final = damaged
-        self.unsent: Final = unsent
+Counts: TypeAlias = tuple[int, int, int, int, int]
+"Drives, States, frames and damaged frames, and messages that the wire did not take, since the conversation began."
 
 
 @final
@@ -82,16 +76,13 @@ class LinkWatch:
         """Return the quality over the last LOOKS looks, and set when the next is due."""
         self._due_s = now_s + LOOKED_S
         self._counts.append(counts)
-        before = self._counts[0]
+        drives, states, frames, damaged, unsent = [new - old for new, old in zip(counts, self._counts[0], strict=True)]
         # at 4 kHz one pause fills the window of the usual round trip; by the next look it has left
         least_s, self._round_trip_s = min(self._round_trip_s, round_trip_s), round_trip_s
         return LinkQuality(
-            1.0 - _share(counts.states - before.states, counts.drives - before.drives, of_none=1.0),
-            _share(
-                counts.damaged - before.damaged,
-                counts.frames + counts.damaged - before.frames - before.damaged,
-            ),
-            _share(counts.unsent - before.unsent, counts.drives - before.drives),
+            1.0 - _share(states, drives, of_none=1.0),
+            _share(damaged, frames + damaged),
+            _share(unsent, drives),
             least_s,
             clock_drift,
         )
@@ -202,12 +193,11 @@ class RoundTrip:
     def least_s(self) -> float:
         return min(self._recent, default=0.0)
 
-    def report(self) -> dict[str, float] | None:
+    def report(self) -> RoundTripReport | None:
         ordered_s = sorted(self._recent)
         if not ordered_s:
             return None
-        shares = {"least": 0.0, "p50": 0.5, "p99": 0.99}
-        return {name: round(ordered_s[int(share * len(ordered_s))] * 1e6, 1) for name, share in shares.items()}
+        return RoundTripReport(*[round(ordered_s[int(share * len(ordered_s))] * 1e6, 1) for share in (0.0, 0.5, 0.99)])
 
 
 @final
@@ -220,8 +210,6 @@ class DeviceClock:
         self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)
         self._least: tuple[float, float] = (math.inf, 0.0)
         self._ends_s = -math.inf
-        self._fit: ClockReport | None = None
-        self._is_fitted = True
         self._newest_s = -math.inf
         self._standing = 0
         self.drift = 0.0
@@ -243,16 +231,12 @@ class DeviceClock:
 
     def fit(self) -> ClockReport | None:
         """Return the line of the host's time less the device's."""
-        if not self._is_fitted:
-            self._fit = _newest_line(list(self._windows))
-            self._is_fitted = True
-        return self._fit
+        return _newest_line(list(self._windows))
 
     def _turn(self, host_s: float) -> None:
         """Begin the next window, and renew `drift`."""
         if self._least[0] < math.inf:
             self._windows.append(self._least)
-            self._is_fitted = False
             newest = _newest_line(list(self._windows)[-DRIFT_WINDOWS:])
             if self._standing <= STANDING:
                 self.drift = 0.0 if newest is None else newest.drift_ppm * 1e-6

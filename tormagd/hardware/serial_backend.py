@@ -74,7 +74,6 @@ def open_serial(device: Device, options: SerialOptions) -> SerialPort:
     try:
         port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()
-        _tell_nothing_from_gone(port.fileno())
         make_prompt(port)
     except OSError as error:  # SerialException is one too; its text repeats path and number
         reason = os.strerror(error.errno) if error.errno else str(error)
@@ -83,14 +82,6 @@ def open_serial(device: Device, options: SerialOptions) -> SerialPort:
     except (termios.error, ValueError) as error:  # unplugged during set-up, or a rate that the driver lacks
         raise BackendError(f"{device.port}: cannot be opened: {error.args[-1]}") from error
     return SerialPort(port)
-
-
-def _tell_nothing_from_gone(fd: int) -> None:
-    """Set VMIN to 1: a read without data then raises BlockingIOError."""
-    # with pyserial's VMIN = 0 a read returns no bytes both without data and from an unplugged device
-    attributes = termios.tcgetattr(fd)
-    attributes[6][termios.VMIN] = 1
-    termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
 
 DRIVER = Driver(SerialOptions, open_serial)

@@ -8,7 +8,7 @@ from typing import Final, final
 import serial
 
 from firmware_protocol.codec import Message
-from tormagd.hardware.backend import BackendError, LinkStatistics
+from tormagd.hardware.backend import BackendError
 from tormagd.hardware.streams import FrameStream
 
 READ_BYTES: Final = 4_096
@@ -25,10 +25,6 @@ class SerialPort:
         self._fd: int = port.fileno()
         self.stream = FrameStream()
         self._unsent = b""
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        return self.stream.statistics
 
     def receive(self) -> list[Message]:
         try:

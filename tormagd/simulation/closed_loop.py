@@ -20,7 +20,6 @@ from tormagd.control.move.actuator import Reference
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState
 from tormagd.element.inverse.solution import Question
-from tormagd.hardware.backend import LinkStatistics
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.hardware.streams import CanStream, FrameStream
@@ -81,10 +80,6 @@ class VirtualPort:
         self.now_s = now_s
         self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
 
-    @property
-    def statistics(self) -> LinkStatistics:
-        return self.stream.statistics
-
     def receive(self) -> list[Message]:
         arrived, self._unread = self._unread, b""
         return self.stream.unpack(arrived)
@@ -114,10 +109,6 @@ class VirtualBus:
         self.now_s = now_s
         arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
         self._unread = [*self._unread, *arrived][-MAX_UNREAD_FRAMES:]
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        return self.stream.statistics
 
     def receive(self) -> list[Message]:
         """Return the device's valid messages in the frames that wait."""

@@ -11,16 +11,16 @@ from firmware_protocol.framing import Frame, FramingStatistics
 from tormagd.config import Device
 from tormagd.control.records import Duty
 from tormagd.ground.plain_values import first_difference, kinds, packed, plain
-from tormagd.hardware.backend import BackendError, LinkStatistics, Sent, Stream
+from tormagd.hardware.backend import BackendError, Sent, Stream
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
-from tormagd.hardware.link_statistics import Counts, LinkQuality
+from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.hardware.streams import CanStream, FrameStream, SecondHostError
 
 KNOWN = kinds(
     *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
-    *(LinkQuality, Counts, Frame, FramingStatistics),
+    *(LinkQuality, Frame, FramingStatistics),
 )
 
 
@@ -84,7 +84,7 @@ class Conversation:
         if self._connection is None:
             return None
         _, now_s, recorded, unsent = entry
-        self._written, self.statistics.unsent = [], unsent
+        self._written, self.stream.statistics.unsent = [], unsent
         self._connection.exchange(
             now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
@@ -93,10 +93,6 @@ class Conversation:
                 return Found("written", _shown(told), _shown(own), number)
         self.frames += len(recorded)
         return None
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        return self.stream.statistics
 
     def receive(self) -> list[Message]:
         """Decode what `read` was last given; empty when called again."""
