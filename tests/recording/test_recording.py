@@ -17,10 +17,11 @@ import pytest
 from hypothesis import example, given, strategies as st
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 from sent import COLUMNS, START_NS, back, batch, telemetry
 
-from tormagd.record.overview import MAX_STRETCHES, Codes, Curves, Glance, OverviewBuilder, unpacked
-from tormagd.record.reader import RecordingError, RecordingFile, damage_in, summary_of
+from tormagd.record.overview import MAX_STRETCHES, Codes, Glance, OverviewBuilder, unpacked
+from tormagd.record.reader import RecordingError, RecordingFile, damage_in, overview_of
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import THINNED, RecordingWriter
 from tormagd.view.plot import figure, save_plot
@@ -32,18 +33,11 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("written") / "a.mcap"
     with RecordingWriter(path, {"scene": "pulse"}) as writer:
         for k in range(5):
-            writer.ticks(batch(*((20 * k + i, 1.5, 1.6, 35.0, 36.0, 0.25) for i in range(20))))
-            writer.telemetry(
-                telemetry(
-                    20 * k,
-                    k,
-                    operating_state="FAULT" if k == 4 else "ENABLED",
-                    limits=("RATE",) if k in (1, 2) else (),
-                    faults=("SKEW",) if k == 4 else (),
-                    gap_setpoint_mm=70.0,
-                    measured_cf=9.0,
-                )
-            )
+            limits, faults = ("RATE",) if k in (1, 2) else (), ("SKEW",) if k == 4 else ()
+            codes = {"operating_state": "FAULT" if faults else "ENABLED", "limits": limits, "faults": faults}
+            rows = [(20 * k + i, 1.5, 1.6, 35.0, 36.0, 0.25, 70.0, *codes.values()) for i in range(20)]
+            writer.ticks(batch(*rows, columns=(*COLUMNS, "reference_gap_mm", *codes)))
+            writer.telemetry(telemetry(20 * k, k, **codes, measured_cf=9.0))
     return path
 
 
@@ -192,11 +186,16 @@ def test_a_damaged_file_gives_a_recording_or_a_recording_error(written, place, v
         assert "damaged.mcap" in str(error)  # noqa: PT017
 
 
-def test_quantities_come_from_the_ticks_and_else_from_telemetry(written):
+def test_quantities_come_from_the_ticks_and_else_from_telemetry(written, tmp_path):
     series = RecordingFile(written).overview.series
     force, gap = series("measured_cf"), series("gap_mm")
     assert (force.low.tolist(), gap.high.tolist()) == (pytest.approx([1.6] * 100), [71.0] * 100)
-    assert series("gap_setpoint_mm").t_s.tolist() == pytest.approx([0.0005, 0.0205, 0.0405, 0.0605, 0.0805])
+    assert (series("gap_setpoint_mm").low.tolist(), series("right_duty")) == ([70.0] * 100, None)
+    with RecordingWriter(tmp_path / "no_ticks.mcap") as writer:
+        for k in range(5):
+            writer.telemetry(telemetry(20 * k, k))
+    series = RecordingFile(tmp_path / "no_ticks.mcap").overview.series
+    assert series("right_duty").t_s.tolist() == pytest.approx([0.0005, 0.0205, 0.0405, 0.0605, 0.0805])
     assert (series("right_duty").low.tolist(), series("field_mT")) == ([-0.5] * 5, None)
 
 
@@ -295,37 +294,40 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("overview") / "a.mcap")
 
 
+def chunks_in(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as file:
+        return make_reader(file).get_summary().chunk_indexes
+
+
 @pytest.mark.parametrize("hole_at", [0.2, 0.45, 0.7, 0.9])
 def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path: Path, hole_at: float) -> None:
-    data, summary = bytearray(path.read_bytes()), summary_of(path)
-    assert summary is not None
-    places = summary[0].places
-    first = int(hole_at * places[-1].at)
+    data, chunks = bytearray(path.read_bytes()), chunks_in(path)
+    first = int(hole_at * chunks[-1].chunk_start_offset)
     data[first : first + 4096] = bytes(4096)
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(data)
-    ends = [each.at for each in places[1:]] + [len(data)]
-    hit = [each for each, end in zip(places, ends, strict=True) if each.at < first + 4096 and end > first]
-    lost = sum(len(RecordingFile(path).between(each.from_ns, each.to_ns - 1, Glance)) for each in hit)
+    hit = [each for each in chunks if first - each.chunk_length < each.chunk_start_offset < first + 4096]
+    times_ns = [(each.message_start_time, each.message_end_time - 1) for each in hit]
+    lost = sum(len(RecordingFile(path).between(*each_ns, Glance)) for each_ns in times_ns)
     known = RecordingFile(spoilt)
     assert known.overview.ticks + known.overview.snapshots >= 31_500 - lost - 2 * len(hit)
     assert known.overview.duration_s == pytest.approx(30.0, abs=0.1)
     assert ("damaged" in known.notes[0], f"left out: {len(hit)}" in known.notes[1]) == (True, True)
-    everything = known.between(places[0].from_ns, places[-1].to_ns, Glance)
+    everything = known.between(chunks[0].message_start_time, chunks[-1].message_end_time, Glance)
     assert len(everything) == known.overview.ticks + known.overview.snapshots
 
 
 def test_a_damaged_chunk_of_a_file_that_was_not_ended_costs_no_other(path: Path, tmp_path: Path) -> None:
-    summary = summary_of(path)
-    assert summary is not None
-    places = summary[0].places
-    data = bytearray(path.read_bytes()[: places[20].at])  # its recorder was killed there
-    data[places[10].at + 200] ^= 1
+    chunks = chunks_in(path)
+    data = bytearray(path.read_bytes()[: chunks[20].chunk_start_offset])  # its recorder was killed there
+    data[chunks[10].chunk_start_offset + 200] ^= 1
     spoilt = tmp_path / "killed.mcap"
     spoilt.write_bytes(data)
     known = RecordingFile(spoilt)
     assert (known.is_complete, "left out: 1" in known.notes[0]) == (False, True)
-    assert known.overview.duration_s == pytest.approx((places[19].to_ns - places[0].from_ns) * 1e-9)
+    assert known.overview.duration_s == pytest.approx(
+        1e-9 * (chunks[19].message_end_time - chunks[0].message_start_time)
+    )
 
 
 def test_zeros_where_a_tail_was_are_a_cut(path: Path, tmp_path: Path) -> None:
@@ -389,7 +391,7 @@ def test_no_byte_is_changed_unnoticed(path, place, value) -> None:
     data[int(place * (len(data) - 1))] ^= value
     changed.write_bytes(data)
     with changed.open("rb") as file:
-        assert damage_in(file) or summary_of(changed) is None
+        assert damage_in(file) or overview_of(changed) is None
 
 
 def test_neither_approach_nor_decay_is_in_how_well_a_force_was_followed(path: Path) -> None:
@@ -432,7 +434,7 @@ def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_p
         {"width_ns": 0},
         {"codes": {"limits": {"$\\frac{": Codes([], 0)}, "faults": {}, "operating_state": {}}},
         {"codes": {"limits": {"RATE": Codes([(0, 1)] * 2_000, 0)}, "faults": {}, "operating_state": {}}},
-        {"of_ticks": Curves(b"12345678", {"gap_mm": b"1234"}, {"gap_mm": b""})},
+        {"stretches": b"12345678", "sides": b"1234"},
         {"marks": [Mark(t_ns=0, text="x")] * 2_000},
     ],
 )

@@ -22,8 +22,8 @@ from tormagd.element.inverse.solution import Answer, Question
 from tormagd.record.black_box import write_black_box
 from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal, core_hash, packed
 from tormagd.record.keeper import Part, Ring
-from tormagd.record.replay.rerun import Rerun, rerun
-from tormagd.record.telemetry import COLUMNS, Moment
+from tormagd.record.rerun import Rerun, rerun
+from tormagd.record.telemetry import Moment
 from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
@@ -157,7 +157,7 @@ class Flight:
 
 
 def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
-    return rerun(core, COLUMNS, entries, from_s)
+    return rerun(core, entries, from_s)
 
 
 def frames(path: Path) -> list[dict[str, Any]]:

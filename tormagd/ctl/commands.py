@@ -226,7 +226,7 @@ COMMANDS = {
     "replay": Command(
         "run a black box again bit for bit, or with --set or --fault on the simulator",
         "replay.replay",
-        ("config_file",),
+        (),
         (
             option("path", type=Path, metavar="FILE.mcap"),
             option(

@@ -21,7 +21,7 @@ from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_
 from tormagd.ground.files import new_file
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
-from tormagd.record.reader import RecordingError, damage_in, summary_of
+from tormagd.record.reader import RecordingError, damage_in, overview_of
 from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
@@ -209,13 +209,12 @@ def _row(segment: Segment) -> dict[str, Any]:
     """Describe one segment by its overview; without one, `said` tells why."""
     seconds, faults, marks = None, [], []
     try:
-        known = summary_of(segment.path)
+        overview = overview_of(segment.path)
     except RecordingError as error:
         said = [str(error).removeprefix(f"{segment.path}: ")]
     else:
         said = ["no overview: still written, not ended by its recorder, or older"]
-        if known is not None:
-            _, overview = known
+        if overview is not None:
             seconds = round(overview.duration_s, 3)
             faults, marks = list(overview.spans_s("faults")), [each.text for each in overview.marks]
             said = [*faults, *(f"“{text}”" for text in marks)]

@@ -12,9 +12,9 @@ from typing import Any
 import msgspec
 
 from tormagd.ctl.outcome import Exit, Outcome, answer_of, as_usage_error, usage_error
-from tormagd.record.black_box import BlackBoxFile
+from tormagd.record.black_box import Recorded, ReplayError, rebuilt, told
 from tormagd.record.reader import RecordingError
-from tormagd.record.replay.rerun import Recorded, ReplayError, rebuilt, rerun, told
+from tormagd.record.rerun import rerun
 from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 900.0
@@ -28,7 +28,6 @@ def replay(
     settings: Sequence[str],
     plant: str | None,
     faults: Sequence[str],
-    config_file: Path | None,
 ) -> Outcome:
     """Replay a black box; with `settings` or `faults`, on the simulated `plant`."""
     changes = [*(f"--set={setting}" for setting in settings), *(f"--fault={fault}" for fault in faults)]
@@ -36,7 +35,7 @@ def replay(
         said = "--from: allowed only without" if changes else "--plant: allowed only with"
         raise usage_error(f"{said} --set or --fault", "tormagctl replay --help")
     rehearsed = [f"--plant={plant or 'sample_1'}", *changes]
-    result = _rehearsed(path, config_file, rehearsed) if changes else _again(path, config_file, from_s)
+    result = _rehearsed(path, rehearsed) if changes else _again(path, from_s)
     head = f"altered: {result['odd']}\n" if result["odd"] else ""
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
     notes += "" if result["is_complete"] else "\nthe file is cut short"
@@ -46,21 +45,20 @@ def replay(
     return Outcome(result, head + text + notes, Exit.DONE if is_exact and not result["odd"] else Exit.REFUSED)
 
 
-def _again(path: Path, config_file: Path | None, from_s: float) -> dict[str, Any]:
+def _again(path: Path, from_s: float) -> dict[str, Any]:
     """Run the same core over the recorded inputs."""
     logging.getLogger("tormagd").addHandler(logging.NullHandler())  # a replayed connection has no news
 
-    def run(known: Recorded, box: BlackBoxFile) -> dict[str, Any]:
-        return {"rerun": msgspec.to_builtins(rerun(rebuilt(known), known.columns, box.entries, from_s))}
+    def run(known: Recorded) -> dict[str, Any]:
+        return {"rerun": msgspec.to_builtins(rerun(rebuilt(known), known.box.entries, from_s))}
 
     with as_usage_error(ConfigError, RecordingError, ReplayError, OSError, hint=HINT):
-        return told(path, config_file, run)
+        return told(path, run)
 
 
-def _rehearsed(path: Path, config_file: Path | None, arguments: list[str]) -> dict[str, Any]:
-    configured = [f"--config={config_file}"] if config_file else []
+def _rehearsed(path: Path, arguments: list[str]) -> dict[str, Any]:
     try:
-        answer = answer_of("tormagd.simulation.rehearse", [*arguments, *configured, "--", str(path)], LONGEST_S)
+        answer = answer_of("tormagd.simulation.rehearse", [*arguments, "--", str(path)], LONGEST_S)
     except TimeoutError as error:
         raise usage_error(f"{path}: {error}", "is it a black box?") from error
     except ChildProcessError as error:

@@ -6,7 +6,6 @@ daemon ends.
 """
 
 import contextlib
-import hashlib
 import importlib.util
 import logging
 import math
@@ -39,8 +38,6 @@ OF_CORE = (
     "format",
     "sources_sha256",
     "platform",
-    "configuration_sha256",
-    "scene_sha256",
     "scene_folder",
     "core_sha256",
     "columns",
@@ -60,17 +57,14 @@ log = logging.getLogger(__name__)
 
 def header(config: Config, core: Core) -> dict[str, str]:
     """Return what a replay needs to build the same core again."""
-    configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
         "format": str(FORMAT),
         "version": __version__,
         "build": str(settle()),
         "sources_sha256": sources_hash(),
         "platform": platform_name(),
-        "configuration": configured.decode(),
-        "configuration_sha256": hashlib.sha256(configured).hexdigest(),
-        "scene": scene.decode(),
-        "scene_sha256": hashlib.sha256(scene).hexdigest(),
+        "configuration": msgspec.json.encode(config).decode(),
+        "scene": msgspec.json.encode(core.scene).decode(),
         "scene_folder": str(core.models),
         "model": core.model,
         "core_sha256": core_hash(core.config, core.scene, core.model),

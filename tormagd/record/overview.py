@@ -66,12 +66,6 @@ def glance(*numbers: str, **others: Any) -> Any:
 Glance = glance()
 
 
-class Curves(msgspec.Struct, frozen=True):
-    stretches: bytes
-    low: dict[str, bytes]
-    high: dict[str, bytes]
-
-
 class Series(msgspec.Struct, frozen=True):
     """One quantity over time: middle of each stretch in seconds since the start, least and greatest value; all shape
     (n,)."""
@@ -89,15 +83,18 @@ class Codes(msgspec.Struct, frozen=True):
 
 
 class Overview(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole recording in bounded size. Its start, end and marks are timed since 1970, the rest since `start_ns`."""
+    """A whole recording in bounded size: of its ticks, or where it has none of its snapshots. Its start, end and marks
+    are timed since 1970, the rest since `start_ns`."""
 
     start_ns: int
     end_ns: int
     width_ns: Annotated[int, Meta(gt=0)]
     ticks: int
     snapshots: int
-    of_ticks: Curves
-    of_snapshots: Curves
+    stretches: bytes
+    "Number of each stretch that has a message: int64, shape (n,)."
+    sides: bytes
+    "Least and greatest values of QUANTITIES: float32, shape (2, n, 8)."
     codes: dict[str, Annotated[dict[Code, Codes], Meta(max_length=MAX_CODES)]]
     "By kind, then by code in the order of their first appearance."
     following: FollowingReport | None
@@ -115,14 +112,13 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("the recording has no messages: was the daemon running?")
 
     def series(self, name: str) -> Series | None:
-        """Return one of QUANTITIES, from the ticks or else from the snapshots."""
-        for curves in (self.of_ticks, self.of_snapshots):
-            if name in curves.low:
-                low, high = _numbers(curves.low[name]), _numbers(curves.high[name])
-                if np.isfinite(low).any():
-                    numbers = np.frombuffer(curves.stretches, np.int64)
-                    return Series(np.array((numbers + 0.5) * (self.width_ns * 1e-9), np.float64), low, high)
-        return None
+        """Return one of QUANTITIES; None where it was never known."""
+        sides = np.frombuffer(self.sides, np.float32).reshape(2, -1, len(QUANTITIES))
+        low, high = np.array(sides[:, :, QUANTITIES.index(name)], np.float64)
+        if not np.isfinite(low).any():
+            return None
+        middles = np.frombuffer(self.stretches, np.int64) + np.float64(0.5)
+        return Series(np.array(middles * (self.width_ns * 1e-9), np.float64), low, high)
 
     def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
         """Return the spans of each code of this kind, seconds since the start."""
@@ -140,11 +136,8 @@ def unpacked(data: bytes) -> Overview:
         found = msgspec.msgpack.decode(data, type=Overview)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(f"its overview: {error}") from error
-    for curves in (found.of_ticks, found.of_snapshots):
-        count = len(curves.stretches) // 8
-        sizes = {len(side) for sides in (curves.low, curves.high) for side in sides.values()}
-        if len(curves.stretches) % 8 or not sizes <= {4 * count} or set(curves.low) != set(curves.high):
-            raise ValueError("its overview: curves of unequal length")
+    if len(found.stretches) % 8 or len(found.sides) != len(QUANTITIES) * len(found.stretches):
+        raise ValueError("its overview: curves of unequal length")
     if set(found.codes) != set(KINDS):
         raise ValueError(f"its overview: allowed are codes of {', '.join(KINDS)}")
     return found
@@ -154,10 +147,7 @@ class OverviewBuilder:
     def __init__(self) -> None:
         self._start_ns: int | None = None
         self._end_ns = 0
-        self._stretches = {True: _Stretches(), False: _Stretches()}
-        self._spans = {True: _Codes(), False: _Codes()}
-        self._following = {True: _Followed(), False: _Followed()}
-        self._counts = {True: 0, False: 0}
+        self._ticks, self._snapshots = _Messages(), _Messages()
         self._late = [0] * (len(LATE_US) + 1)
         self._marks: list[Mark] = []
         self._mark: Mark | None = None
@@ -166,14 +156,9 @@ class OverviewBuilder:
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
         """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970, by an `Axis`."""
         if self._start_ns is None:
-            self._start_ns = self._end_ns = t_ns
-        since_ns = t_ns - self._start_ns
+            self._start_ns = t_ns
         self._end_ns = max(self._end_ns, t_ns)
-        self._counts[is_tick] += 1
-        values = quantities(message)
-        self._stretches[is_tick].add(since_ns, values)
-        self._spans[is_tick].add(since_ns, message)
-        self._following[is_tick].add(since_ns, values[0], values[2], message)
+        (self._ticks if is_tick else self._snapshots).add(t_ns - self._start_ns, message)
         late_us = _number(message.get("lateness_us"))
         if late_us is not None:
             self._late[bisect_right(LATE_US, late_us)] += 1
@@ -193,25 +178,37 @@ class OverviewBuilder:
             self._marks.append(mark)
 
     def made(self) -> Overview:
-        width_ns = max(each.width_ns for each in self._stretches.values())
-        for each in self._stretches.values():
-            each.widen(width_ns)
-        ticks, snapshots = self._spans[True].made(), self._spans[False].made()
-        followed = self._following[self._following[True].counted_s > 0.0]
+        shown = self._ticks if self._ticks.count else self._snapshots
+        stretches, sides = shown.stretches.made()
         return Overview(
             start_ns=self._start_ns or 0,
             end_ns=self._end_ns,
-            width_ns=width_ns,
-            ticks=self._counts[True],
-            snapshots=self._counts[False],
-            of_ticks=self._stretches[True].made(),
-            of_snapshots=self._stretches[False].made(),
-            codes={kind: ticks[kind] or snapshots[kind] for kind in KINDS},
-            following=followed.report(),
-            followed_s=followed.counted_s,
+            width_ns=shown.stretches.width_ns,
+            ticks=self._ticks.count,
+            snapshots=self._snapshots.count,
+            stretches=stretches,
+            sides=sides,
+            codes=shown.codes.made(),
+            following=shown.following.report(),
+            followed_s=shown.following.counted_s,
             late_counts=self._late,
             marks=self._marks,
         )
+
+
+class _Messages:
+    """All ticks or all snapshots."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.stretches, self.codes, self.following = _Stretches(), _Codes(), _Followed()
+
+    def add(self, since_ns: int, message: Mapping[str, Any]) -> None:
+        self.count += 1
+        values = quantities(message)
+        self.stretches.add(since_ns, values)
+        self.codes.add(since_ns, message)
+        self.following.add(since_ns, values[0], values[2], message)
 
 
 def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
@@ -244,10 +241,6 @@ def codes_in(told: object) -> tuple[str, ...]:
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 
 
-def _numbers(data: bytes) -> Floats:
-    return np.array(np.frombuffer(data, np.float32), np.float64)
-
-
 class _Followed(Following):
     _number = 0
 
@@ -276,7 +269,7 @@ class _Stretches:
         # a clock that was set back must not set the curve back
         if not self._numbers or number > self._numbers[-1]:
             if len(self._numbers) >= MAX_STRETCHES:
-                self.widen(2 * self.width_ns)
+                self._widen()
                 self.add(since_ns, values)
                 return
             self._numbers.append(number)
@@ -284,20 +277,19 @@ class _Stretches:
         for side, of in zip(self._sides[:, len(self._numbers) - 1], (np.fmin, np.fmax), strict=True):
             of(side, known, out=side)
 
-    def widen(self, width_ns: int) -> None:
-        ratio, self.width_ns = width_ns // self.width_ns, width_ns
-        if ratio > 1 and self._numbers:
-            numbers, firsts = np.unique(np.array(self._numbers) // ratio, return_index=True)
-            known, self._numbers = self._sides[:, : len(self._numbers)].copy(), numbers.tolist()
-            self._sides[:] = np.nan
-            for side, kept, of in zip(self._sides, known, (np.fmin, np.fmax), strict=True):
-                side[: len(firsts)] = of.reduceat(kept, firsts, axis=0)
+    def _widen(self) -> None:
+        self.width_ns *= 2
+        numbers, firsts = np.unique(np.array(self._numbers) // 2, return_index=True)
+        known, self._numbers = self._sides[:, : len(self._numbers)].copy(), numbers.tolist()
+        self._sides[:] = np.nan
+        for side, kept, of in zip(self._sides, known, (np.fmin, np.fmax), strict=True):
+            side[: len(firsts)] = of.reduceat(kept, firsts, axis=0)
 
-    def made(self) -> Curves:
+    def made(self) -> tuple[bytes, bytes]:
+        """Return the stretches' numbers, and their values."""
         with np.errstate(over="ignore"):  # a file may say any number
             sides = self._sides[:, : len(self._numbers)].astype(np.float32)
-        low, high = ({name: side[:, at].tobytes() for at, name in enumerate(QUANTITIES)} for side in sides)
-        return Curves(np.array(self._numbers, np.int64).tobytes(), low, high)
+        return np.array(self._numbers, np.int64).tobytes(), sides.tobytes()
 
 
 def _joined(spans: list[list[int]]) -> list[list[int]]:
