@@ -61,9 +61,7 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
 
 
 def write_black_box(path: Path, header: dict[str, str], parts: Iterable[bytes]) -> None:
-    """Write a new black box of these entries, whole or not at all."""
-    if path.exists():
-        raise FileExistsError(17, "exists", str(path))
+    """Write a black box of these entries, whole or not at all."""
     columns = msgspec.json.decode(header["columns"], type=tuple[str, ...])
     with in_place_of(path) as beside, RecordingWriter(beside, header) as writer:
         for part in parts:
