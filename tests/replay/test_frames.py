@@ -18,7 +18,7 @@ from tormagd.config import Config, Limits
 from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
 from tormagd.ctl.main import main
-from tormagd.ctl.replay import _instead
+from tormagd.ctl.record import _instead
 from tormagd.record.black_box import BlackBoxFile, ReplayError, read_black_box, rebuilt, recorded
 from tormagd.record.rerun import ticks_of
 from tormagd.simulation.rehearse import changed, main as run_changed, rehearse, script

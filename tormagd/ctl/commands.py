@@ -225,7 +225,7 @@ COMMANDS = {
     ),
     "replay": Command(
         "run a black box again bit for bit, or with --set or --fault on the simulator",
-        "replay.replay",
+        "record.replay",
         (),
         (
             option("path", type=Path, metavar="FILE.mcap"),

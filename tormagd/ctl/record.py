@@ -1,15 +1,19 @@
-"""`tormagctl record`, `mark` and `recordings`: write what the daemon publishes to MCAP files, and look after a folder.
+"""`tormagctl record`, `mark`, `recordings` and `replay`: write what the daemon publishes to MCAP files, look after a
+folder of them, and run one again.
 
-The recorder is a process of its own.
+The recorder is a process of its own. A replay runs the same core here, or `tormagd.simulation.rehearse`, in a process
+of its own, with the simulator in place of the device.
 """
 
 import contextlib
 import hashlib
+import json
+import logging
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +21,26 @@ import msgspec
 import zmq
 
 from tormagd.config import Config
-from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_error, refused, usage_error
+from tormagd.ctl.outcome import (
+    WRITABLE,
+    CommandError,
+    Exit,
+    Outcome,
+    answer_of,
+    as_usage_error,
+    refused,
+    usage_error,
+)
 from tormagd.ground.files import new_file
 from tormagd.ground.terminal import interrupted_by, write_line
+from tormagd.record.black_box import Recorded, ReplayError, rebuilt, told
 from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
 from tormagd.record.reader import RecordingError, damage_in, overview_of
+from tormagd.record.rerun import rerun
 from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
-from tormagd_client.endpoints import Endpoints
+from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import TELEMETRY_TOPIC, MessageError, Telemetry, decode
 from tormagd_client.printable import printable
@@ -37,6 +52,9 @@ POLL_MS = 100
 LONGEST_END_S = 60.0
 SILENT_S = 1.0
 "After this silence at the end, the daemon has gone."
+LONGEST_REHEARSAL_S = 900.0
+"Half a minute, interpreted and simulated twice, takes some minutes."
+REPLAYED = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
 
 
 def listening(
@@ -252,3 +270,92 @@ def _export(path: Path, target: Path | None) -> Outcome:
     text = "\n".join([f"{copy}: SHA-256 {digest}", *([f"damaged: {damage}"] if damage else [])])
     result = {"file": str(copy), "sha256": digest, "damage": damage}
     return Outcome(result, text, Exit.REFUSED if damage else Exit.DONE)
+
+
+def replay(
+    path: Path,
+    from_s: float,
+    settings: Sequence[str],
+    plant: str | None,
+    faults: Sequence[str],
+) -> Outcome:
+    """Replay a black box; with `settings` or `faults`, on the simulated `plant`."""
+    changes = [*(f"--set={setting}" for setting in settings), *(f"--fault={fault}" for fault in faults)]
+    if from_s if changes else plant:
+        said = "--from: allowed only without" if changes else "--plant: allowed only with"
+        raise usage_error(f"{said} --set or --fault", "tormagctl replay --help")
+    rehearsed = [f"--plant={plant or 'sample_1'}", *changes]
+    result = _rehearsed(path, rehearsed) if changes else _again(path, from_s)
+    head = f"altered: {result['odd']}\n" if result["odd"] else ""
+    notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
+    notes += "" if result["is_complete"] else "\nthe file is cut short"
+    if "rerun" not in result:
+        return Outcome(result, head + _instead(result) + notes, Exit.REFUSED if result["odd"] else Exit.DONE)
+    text, is_exact = _rerun(result["rerun"])
+    return Outcome(result, head + text + notes, Exit.DONE if is_exact and not result["odd"] else Exit.REFUSED)
+
+
+def _again(path: Path, from_s: float) -> dict[str, Any]:
+    """Run the same core over the recorded inputs."""
+    logging.getLogger("tormagd").addHandler(logging.NullHandler())  # a replayed connection has no news
+
+    def run(known: Recorded) -> dict[str, Any]:
+        return {"rerun": msgspec.to_builtins(rerun(rebuilt(known), known.box.entries, from_s))}
+
+    with as_usage_error(ConfigError, RecordingError, ReplayError, OSError, hint=REPLAYED):
+        return told(path, run)
+
+
+def _rehearsed(path: Path, arguments: list[str]) -> dict[str, Any]:
+    try:
+        answer = answer_of("tormagd.simulation.rehearse", [*arguments, "--", str(path)], LONGEST_REHEARSAL_S)
+    except TimeoutError as error:
+        raise usage_error(f"{path}: {error}", "is it a black box?") from error
+    except ChildProcessError as error:
+        raise usage_error(str(error), REPLAYED) from error
+    result: dict[str, Any] = json.loads(answer)  # names in it need not be UTF-8
+    return result
+
+
+def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
+    """Return the text on the report's `rerun`, and whether it was bit-exact."""
+    notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
+    difference = done["difference"]
+    span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
+    if difference is None:
+        frames = f"{done['frames']:,} frames give the measurements again" if done["frames"] else "no frames are in it"
+        return f"bit-exact, {span}; {done['snapshots']} snapshots of the state between them, too; {frames}{notes}", True
+    frame = "" if difference["frame"] is None else f" at frame {difference['frame']:,}"
+    return (
+        f"tick {difference['tick']:,} at {difference['time_s']:.3f} s differs{frame}: {difference['field']} was "
+        f"{difference['recorded']}, is {difference['replayed']}; before it bit-exact, {done['ticks']:,} ticks{notes}"
+    ), False
+
+
+def _instead(result: dict[str, Any]) -> str:
+    """Say what was recorded, and what the simulator met with the old and the new settings."""
+    ran = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
+    if result["instead"] is not None:
+        ran[f"simulated with {', '.join(result['settings'])}"] = result["instead"]
+    lines = [f"{name}: {_happened(what)}" for name, what in ran.items()]
+    faults = "".join(f", with {fault}" for fault in result["faults"])
+    missing = set(result["recorded"]["faults"]) - set(result["simulated"]["faults"])
+    if missing:
+        lines.append(
+            f"{', '.join(sorted(missing))} did not come in the simulation as configured then: what the change does to "
+            "that is not known"
+        )
+    return "\n".join(
+        (
+            *lines,
+            f"The simulated device is {result['plant']}{faults}, with the recorded setpoints, commands and handle. "
+            "What else the recorded device did, it does only where --fault says so.",
+        )
+    )
+
+
+def _happened(what: dict[str, Any]) -> str:
+    faults = ", ".join(f"{name} at {at_s:.3f} s" for name, at_s in what["faults"].items()) or "no fault"
+    limits = ", ".join(f"{name} {held_s:.3f} s" for name, held_s in what["limits"].items()) or "none"
+    refused = f"; refused: {', '.join(what['refused'])}" if what["refused"] else ""
+    return f"{faults}; limits: {limits}{refused}"

@@ -8,7 +8,6 @@ reader makes it from the messages in the same way.
 import re
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
-from itertools import pairwise
 from typing import Annotated, Any, TypedDict
 
 import msgspec
@@ -35,7 +34,7 @@ BREAK_NS = round(BREAK_S * 1e9)
 FIRST_WIDTH_NS = 1_000_000
 MAX_STRETCHES = 1_500
 MAX_SPANS = 1_000
-"Beyond these, the nearest spans of one code are joined."
+"Beyond these, each two neighbours of one code are joined."
 STEP_NS = 100_000_000
 "A wall clock that is set further is said."
 MAX_CODES, MAX_MARKS = 66, 1_000
@@ -292,18 +291,6 @@ class _Stretches:
         return np.array(self._numbers, np.int64).tobytes(), sides.tobytes()
 
 
-def _joined(spans: list[list[int]]) -> list[list[int]]:
-    """Join about half of the spans, across the smaller gaps."""
-    gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
-    near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
-    for span, gap_ns in zip(spans[1:-1], gaps, strict=True):
-        if gap_ns <= near_ns:
-            joined[-1][1] = span[1]
-        else:
-            joined.append(span)
-    return [*joined, spans[-1]]
-
-
 class _Held:
     def __init__(self) -> None:
         self.spans: list[list[int]] = []
@@ -317,7 +304,8 @@ class _Held:
         self.ns += to_ns - from_ns
         self.spans.append([from_ns, to_ns])
         if len(self.spans) > MAX_SPANS:
-            self.spans = _joined(self.spans)
+            newest = self.spans.pop()
+            self.spans = [[a, b] for (a, _), (_, b) in zip(self.spans[::2], self.spans[1::2], strict=True)] + [newest]
 
 
 class _Codes:

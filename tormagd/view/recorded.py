@@ -1,5 +1,6 @@
 """A recording as the page shows it: its whole length once, and a frame for any moment."""
 
+import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Sequence
@@ -33,16 +34,7 @@ CURVES = {
 "The recorded quantity of each curve."
 
 
-class Believed(msgspec.Struct, frozen=True):
-    """A BeliefReport as recorded; fields that were not known are None."""
-
-    value: float | None = None
-    sd: float | None = None
-    unit: str = ""
-    acts: bool = False
-
-
-Moment = glance(belief=dict[str, Believed])
+Moment = glance(belief=dict[str, dict[str, Any]])
 
 
 class Moments:
@@ -167,14 +159,13 @@ def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Mom
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
-    """Return the belief in the newest snapshot up to `at_s`, by quantity."""
+    """Return the belief in the newest snapshot up to `at_s`, by quantity, without what was not known."""
     place = (snapshots.newest(np.array([at_s]), BELIEVED_S) or [-1])[0]
-    told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
-    return {
-        name: BeliefReport(value=each.value, sd=each.sd, unit=each.unit, acts=each.acts)
-        for name, each in told.items()
-        if each.value is not None
-    }
+    found = {}
+    for name, told in snapshots.messages[place].get("belief", {}).items() if place >= 0 else ():
+        with contextlib.suppress(msgspec.ValidationError):
+            found[name] = msgspec.convert({"sd": None, **told}, BeliefReport)
+    return found
 
 
 def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
