@@ -221,7 +221,9 @@ def test_a_recording_shows_what_was_believed_then(tmp_path: Path, telemetry_with
         for seq, at_s in enumerate((0.0, 0.02, 0.04, 2.0)):
             scale = BeliefReport(value=1.0 + at_s, sd=0.17, unit="", acts=True)
             belief = {"scale": scale, "carriage_lag": idle, "field_lag": lag} if at_s else {}
-            writer.telemetry(telemetry_with(seq, START_NS + round(at_s * 1e9), belief=belief))
+            t_ns = START_NS + round(at_s * 1e9)
+            writer.ticks(TickBatch(v=1, columns=("t_ns", "tick"), rows=((t_ns, seq),)))
+            writer.telemetry(telemetry_with(seq, t_ns, belief=belief))
     shown = Recorded(RecordingFile(tmp_path / "b.mcap"))
     assert [shown.frame(at_s).believed for at_s in (0.01, 1.2)] == [{}, {}]
     for at_s, value in ((0.03, "1.02"), (1.0, "1.04"), (2.0, "3")):

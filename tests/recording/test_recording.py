@@ -186,17 +186,12 @@ def test_a_damaged_file_gives_a_recording_or_a_recording_error(written, place, v
         assert "damaged.mcap" in str(error)  # noqa: PT017
 
 
-def test_quantities_come_from_the_ticks_and_else_from_telemetry(written, tmp_path):
+def test_quantities_come_from_the_ticks(written):
     series = RecordingFile(written).overview.series
     force, gap = series("measured_cf"), series("gap_mm")
     assert (force.low.tolist(), gap.high.tolist()) == (pytest.approx([1.6] * 100), [71.0] * 100)
     assert (series("gap_setpoint_mm").low.tolist(), series("right_duty")) == ([70.0] * 100, None)
-    with RecordingWriter(tmp_path / "no_ticks.mcap") as writer:
-        for k in range(5):
-            writer.telemetry(telemetry(20 * k, k))
-    series = RecordingFile(tmp_path / "no_ticks.mcap").overview.series
-    assert series("right_duty").t_s.tolist() == pytest.approx([0.0005, 0.0205, 0.0405, 0.0605, 0.0805])
-    assert (series("right_duty").low.tolist(), series("field_mT")) == ([-0.5] * 5, None)
+    assert force.t_s[:3].tolist() == pytest.approx([0.0005, 0.0015, 0.0025])
 
 
 def test_the_picture_names_what_happened_and_a_line_that_lies_on_another_leaves_it_visible(written):
@@ -244,7 +239,7 @@ def test_other_formats_and_empty_recordings_are_refused(written, tmp_path):
         save_plot(figure(RecordingFile(written).overview, "x"), tmp_path / "a.docx")
     with RecordingWriter(tmp_path / "empty.mcap"):
         pass
-    with pytest.raises(ValueError, match="no messages"):
+    with pytest.raises(ValueError, match="no control ticks"):
         figure(RecordingFile(tmp_path / "empty.mcap").overview, "x")
 
 
@@ -449,12 +444,12 @@ def test_any_length_is_held_in_bounds() -> None:
     late_us = [edge_us - early_us for edge_us in (10, 20, 50, 100, 200, 500, 1e3, 2e3, 5e3) for early_us in (0.1, 0.0)]
     for k in range(19_800):
         builder.add(
-            *(k * 1_600_000_000_000, False),
-            {"limits": ("RATE",) if k % 2 else (), "gap_mm": float(k), "lateness_us": late_us[k % 18]},
+            *(k * 1_600_000_000_000, True),
+            {"limits": ("RATE",) if k % 2 else (), "measured_cf": float(k), "lateness_us": late_us[k % 18]},
         )
     made = builder.made()
     assert made.late_counts == [1_100, *[2_200] * 8, 1_100]
     assert len(made.packed()) < 200_000
-    gap = made.series("gap_mm")
-    assert (gap.low.min(), gap.high.max()) == (0.0, 19_799.0)
+    force = made.series("measured_cf")
+    assert (force.low.min(), force.high.max()) == (0.0, 19_799.0)
     assert len(made.codes["limits"]["RATE"].spans_ns) <= 1_000

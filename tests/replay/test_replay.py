@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from flight import COLUMNS, Flight, again, asked, frames, planted
+from flight import Flight, again, asked, frames, planted
 from hostile import messages
 
 from firmware_protocol.build import SWITCH, settle
@@ -33,6 +33,7 @@ from tormagd.record.black_box import (
 from tormagd.record.journal import ANSWER, CONFIRM, FORMAT, MISSING
 from tormagd.record.reader import RecordingError, Seen, read_recording
 from tormagd.record.rerun import rerun, ticks_of
+from tormagd.record.telemetry import COLUMNS
 from tormagd.record.writer import Derived
 
 CHANGED_TICK = 3_210

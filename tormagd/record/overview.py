@@ -23,10 +23,11 @@ Floats = NDArray[np.float64]
 QUANTITIES = (
     "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "gap_setpoint_mm", "left_duty", "right_duty", "field_mT",
 )  # fmt: skip
-LOOKED_AT = (
-    *(*QUANTITIES, "t_ns", "left_mm", "right_mm", "reference_gap_mm", "lateness_us"),
-    *("handle_mm", "handle_rate_mm_s", "handle_mm_s"),
-)
+GIVES = (
+    "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "reference_gap_mm", "left_duty", "right_duty",
+    "field_mT",
+)  # fmt: skip
+"Columns of a tick that give them."
 KINDS = ("operating_state", "limits", "faults")
 BREAK_S = 0.1
 "Between messages further apart, nothing is known."
@@ -55,9 +56,10 @@ Code = Annotated[str, Meta(pattern=rf"\A{CODE.pattern}\Z")]
 
 def glance(*numbers: str, **others: Any) -> Any:
     """Return the type as which a message is decoded: what an overview shows of it, and further fields."""
-    fields = dict.fromkeys((*LOOKED_AT, *numbers), float | None) | {
+    fields = {
+        **dict.fromkeys((*GIVES, "t_ns", "lateness_us", "handle_mm", "handle_rate_mm_s", *numbers), float | None),
         **dict.fromkeys(("limits", "faults"), Words | None),
-        **{"duty": tuple[float, float] | None, "operating_state": Word | None, "mark": Mark | None},
+        **{"operating_state": Word | None, "mark": Mark | None},
     }
     return TypedDict("Glance", fields | others, total=False)  # type: ignore[operator]
 
@@ -82,8 +84,7 @@ class Codes(msgspec.Struct, frozen=True):
 
 
 class Overview(msgspec.Struct, frozen=True, kw_only=True):
-    """A whole recording in bounded size: of its ticks, or where it has none of its snapshots. Its start, end and marks
-    are timed since 1970, the rest since `start_ns`."""
+    """A whole recording in bounded size. Its start, end and marks are timed since 1970, the rest since `start_ns`."""
 
     start_ns: int
     end_ns: int
@@ -107,8 +108,8 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return (self.end_ns - self.start_ns) * 1e-9
 
     def require_messages(self) -> None:
-        if not self.ticks and not self.snapshots:
-            raise ValueError("the recording has no messages: was the daemon running?")
+        if not self.ticks:
+            raise ValueError("the recording has no control ticks: was the daemon running?")
 
     def series(self, name: str) -> Series | None:
         """Return one of QUANTITIES; None where it was never known."""
@@ -146,7 +147,8 @@ class OverviewBuilder:
     def __init__(self) -> None:
         self._start_ns: int | None = None
         self._end_ns = 0
-        self._ticks, self._snapshots = _Messages(), _Messages()
+        self._ticks = self._snapshots = 0
+        self._stretches, self._codes, self._following = _Stretches(), _Codes(), _Followed()
         self._late = [0] * (len(LATE_US) + 1)
         self._marks: list[Mark] = []
         self._mark: Mark | None = None
@@ -157,77 +159,56 @@ class OverviewBuilder:
         if self._start_ns is None:
             self._start_ns = t_ns
         self._end_ns = max(self._end_ns, t_ns)
-        (self._ticks if is_tick else self._snapshots).add(t_ns - self._start_ns, message)
-        late_us = _number(message.get("lateness_us"))
-        if late_us is not None:
-            self._late[bisect_right(LATE_US, late_us)] += 1
-        wall_ns = _number(message.get("t_ns")) if is_tick else None
-        if wall_ns is not None:
-            step_ns = round(wall_ns) - t_ns - self._ahead_ns
-            if abs(step_ns) > STEP_NS:
-                self._ahead_ns += step_ns
-                self._add_mark(Mark(t_ns=t_ns, text=f"the clock stepped by {step_ns * 1e-9:+.6g} s"))
+        if is_tick:
+            self._ticks += 1
+            self._add_tick(t_ns - self._start_ns, t_ns, message)
+            return
+        self._snapshots += 1
         mark = message.get("mark")
         if mark and mark != self._mark:  # every snapshot has the newest
             self._mark = mark
             self._add_mark(Mark(t_ns=mark.t_ns - self._ahead_ns, text=mark.text))
+
+    def _add_tick(self, since_ns: int, t_ns: int, tick: Mapping[str, Any]) -> None:
+        values = quantities(tick)
+        self._stretches.add(since_ns, values)
+        self._codes.add(since_ns, tick)
+        self._following.add(since_ns, values[0], values[2], tick)
+        late_us, wall_ns = _number(tick.get("lateness_us")), _number(tick.get("t_ns"))
+        if late_us is not None:
+            self._late[bisect_right(LATE_US, late_us)] += 1
+        step_ns = 0 if wall_ns is None else round(wall_ns) - t_ns - self._ahead_ns
+        if abs(step_ns) > STEP_NS:
+            self._ahead_ns += step_ns
+            self._add_mark(Mark(t_ns=t_ns, text=f"the clock stepped by {step_ns * 1e-9:+.6g} s"))
 
     def _add_mark(self, mark: Mark) -> None:
         if mark.t_ns >= (self._start_ns or 0) and len(self._marks) < MAX_MARKS:
             self._marks.append(mark)
 
     def made(self) -> Overview:
-        shown = self._ticks if self._ticks.count else self._snapshots
-        stretches, sides = shown.stretches.made()
+        stretches, sides = self._stretches.made()
         return Overview(
             start_ns=self._start_ns or 0,
             end_ns=self._end_ns,
-            width_ns=shown.stretches.width_ns,
-            ticks=self._ticks.count,
-            snapshots=self._snapshots.count,
+            width_ns=self._stretches.width_ns,
+            ticks=self._ticks,
+            snapshots=self._snapshots,
             stretches=stretches,
             sides=sides,
-            codes=shown.codes.made(),
-            following=shown.following.report(),
-            followed_s=shown.following.counted_s,
+            codes=self._codes.made(),
+            following=self._following.report(),
+            followed_s=self._following.counted_s,
             late_counts=self._late,
             marks=self._marks,
         )
 
 
-class _Messages:
-    """All ticks or all snapshots."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.stretches, self.codes, self.following = _Stretches(), _Codes(), _Followed()
-
-    def add(self, since_ns: int, message: Mapping[str, Any]) -> None:
-        self.count += 1
-        values = quantities(message)
-        self.stretches.add(since_ns, values)
-        self.codes.add(since_ns, message)
-        self.following.add(since_ns, values[0], values[2], message)
-
-
-def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """Return the QUANTITIES of a tick or a snapshot; None for what is missing or no number."""
-    get = message.get
-    gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
-    if gap_mm is None and left_mm is not None and right_mm is not None:
-        gap_mm = left_mm + right_mm
-    wanted_mm = _number(get("gap_setpoint_mm"))
-    left, right = get("duty") or (get("left_duty"), get("right_duty"))
-    return (
-        _number(get("setpoint_cf")),
-        _number(get("governed_cf")),
-        _number(get("measured_cf")),
-        gap_mm,
-        _number(get("reference_gap_mm")) if wanted_mm is None else wanted_mm,
-        _number(left),
-        _number(right),
-        _number(get("field_mT")),
-    )
+def quantities(tick: Mapping[str, Any]) -> tuple[float | None, ...]:
+    """Return the QUANTITIES of a tick; None for what is missing or no number."""
+    asked_N, governed_N, measured_N, left_mm, right_mm, *others = [_number(tick.get(name)) for name in GIVES]
+    gap_mm = None if left_mm is None or right_mm is None else left_mm + right_mm
+    return asked_N, governed_N, measured_N, gap_mm, *others
 
 
 def _number(value: object) -> float | None:
@@ -250,13 +231,12 @@ class _Followed(Following):
         if not 0 < number - self._number <= BREAK_NS // _LOOK_NS:
             self.begin()
         self._number, get = number, message.get
-        rate_mm_s = get("handle_rate_mm_s", get("handle_mm_s"))
         limits = get("limits") or ()
-        self.look(get("operating_state"), limits, asked_N, measured_N, get("handle_mm"), rate_mm_s)
+        self.look(get("operating_state"), limits, asked_N, measured_N, get("handle_mm"), get("handle_rate_mm_s"))
 
 
 class _Stretches:
-    """The least and greatest values of one kind of message, in stretches of `width_ns`; NaN where there is none."""
+    """The least and greatest values of the ticks, in stretches of `width_ns`; NaN where there is none."""
 
     def __init__(self) -> None:
         self.width_ns = FIRST_WIDTH_NS
