@@ -266,12 +266,6 @@ def refusal(path: Path) -> str:
     return text
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.01])
-def test_one_that_breaks_off_early_is_refused(path: Path, tmp_path: Path, share: float) -> None:
-    (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    assert refusal(tmp_path / "broken.mcap")
-
-
 def test_one_that_breaks_off_late_is_replayed_so_far(core: Core, path: Path, tmp_path: Path) -> None:
     (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     box = read_black_box(tmp_path / "broken.mcap")
