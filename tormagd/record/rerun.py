@@ -224,18 +224,18 @@ def rerun(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
 
 def _start(entries: list[Any], records: dict[int, Any], until_s: float) -> int:
     """Return the index of the newest snapshot that a tick follows by `until_s`, else of the first."""
-    found: int | None = None
+    found: list[int] = []
     waiting: int | None = None
     for place, entry in enumerate(entries):
         if name_of(entry) == journal.STATE:
             waiting = place
         elif place in records and waiting is not None:
-            if found is not None and records[place].monotonic_s > until_s:
-                return found
-            found, waiting = waiting, None
-    if found is None:
+            if not found or records[place].monotonic_s <= until_s:
+                found.append(waiting)
+            waiting = None
+    if not found:
         raise ReplayError("there is no snapshot in it that is followed by a tick: under a second was kept")
-    return found
+    return found[-1]
 
 
 class _Running:
