@@ -42,7 +42,7 @@ from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, unreachable
-from tormagd_client.messages import TELEMETRY_TOPIC, MessageError, Telemetry, decode
+from tormagd_client.messages import MessageError
 from tormagd_client.printable import printable
 from tormagd_client.wire import Keys, connect, keys_of
 
@@ -57,14 +57,12 @@ LONGEST_REHEARSAL_S = 900.0
 REPLAYED = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
 
 
-def listening(
-    context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
-) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket for telemetry or ticks."""
+def listening(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
+    """Connect a new SUB socket for ticks."""
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
-    socket.subscribe(topic)
+    socket.subscribe(b"")
     connect(socket, address, keys)
     return socket
 
@@ -76,11 +74,10 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
     keys = keys_of(endpoints.curve)
     context = zmq.Context()
     try:
-        telemetry = listening(context, endpoints.telemetry, keys, TELEMETRY_TOPIC)
         ticks = listening(context, endpoints.recording, keys)
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
-                raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
+            if not _is_ready(ticks, wait_s, is_interrupted):
+                raise unreachable(endpoints.recording, f"nothing is published there within {wait_s:g} s")
             about = _about(endpoints, wait_s)
             try:
                 place = RecordingFolder(path, config.recordings) if is_folder else path
@@ -92,7 +89,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
                 raise refused(error, WRITABLE) from error
             try:
                 with writer:
-                    outcome = _record(writer, telemetry, ticks, duration_s, is_interrupted)
+                    outcome = _record(writer, ticks, duration_s, is_interrupted)
                     with contextlib.suppress(ClientError):  # if the daemon has gone, what was true at the start remains
                         writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
                     return outcome
@@ -120,21 +117,17 @@ def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
     }
 
 
-def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
-    """Wait until a socket has a message; return False after `wait_s` or an interrupt."""
+def _is_ready(socket: "zmq.Socket[bytes]", wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
+    """Wait until the socket has a message; return False after `wait_s` or an interrupt."""
     end_s = time.monotonic() + wait_s
     while True:
-        ready, _, _ = zmq.select(list(sockets), [], [], POLL_MS / 1e3)
-        if ready or time.monotonic() >= end_s or is_interrupted():
-            return bool(ready)
+        is_ready = bool(socket.poll(POLL_MS))
+        if is_ready or time.monotonic() >= end_s or is_interrupted():
+            return is_ready
 
 
 def _record(
-    writer: RecordingWriter,
-    telemetry: "zmq.Socket[bytes]",
-    ticks: "zmq.Socket[bytes]",
-    duration_s: float,
-    is_interrupted: Callable[[], bool],
+    writer: RecordingWriter, ticks: "zmq.Socket[bytes]", duration_s: float, is_interrupted: Callable[[], bool]
 ) -> Outcome:
     unreadable = 0
     start_s = heard_s = time.monotonic()
@@ -143,30 +136,23 @@ def _record(
         left_s = start_s + duration_s - time.monotonic()
         is_over = is_interrupted() or left_s <= 0.0
         if not is_over:
-            _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
+            ticks.poll(round(min(left_s * 1e3, POLL_MS)))
         # what waits at the end came before it
         until_s = time.monotonic() + (LONGEST_END_S if is_over else POLL_MS / 1e3)
-        # in turn: a recorder that is starved keeps some of both
-        while (ready := [each for each in (ticks, telemetry) if each.poll(0)]) and time.monotonic() < until_s:
-            for socket in ready:
-                data = socket.recv_multipart()[-1]
-                try:
-                    if socket is telemetry:
-                        writer.telemetry(decode(data, Telemetry))
-                    else:
-                        writer.ticks(decode_ticks(data))
-                        heard_s = time.monotonic()
-                except MessageError as error:
-                    unreadable += 1
-                    if unreadable == 1:
-                        write_line(f"tormagctl record: left out a message: {printable(str(error))}", sys.stderr)
+        while ticks.poll(0) and time.monotonic() < until_s:
+            try:
+                writer.ticks(decode_ticks(ticks.recv_multipart()[-1]))
+                heard_s = time.monotonic()
+            except (MessageError, msgspec.MsgspecError, TypeError, LookupError) as error:
+                unreadable += 1
+                if unreadable == 1:
+                    write_line(f"tormagctl record: left out a message: {printable(str(error))}", sys.stderr)
     end_s = time.monotonic()
     silent_s = end_s - heard_s
     result = {
         "file": str(writer.path),
         "seconds": round(end_s - start_s, 3),
         "telemetry": writer.telemetry_count,
-        "telemetry_lost": writer.telemetry_lost,
         "ticks": writer.tick_count,
         "ticks_lost": writer.ticks_lost,
         "restarts": writer.restarts,
@@ -174,7 +160,7 @@ def _record(
         "unreadable": unreadable,
     }
     text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots"
-    text += f"; {writer.ticks_lost} ticks and {writer.telemetry_lost} snapshots lost"
+    text += f"; {writer.ticks_lost} ticks lost"
     if writer.restarts:
         text += f"; the daemon began anew {writer.restarts} times, and nothing is known of between"
     if silent_s > SILENT_S:

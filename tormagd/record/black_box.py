@@ -1,8 +1,8 @@
 """The black box's file, and every recording that may be run again: the entries of `/core`, exact to the bit.
 
 Each message of `/core` is one part that the daemon handed over. The metadata say which core it was: it is built again
-from them, and what differs between there and here is told. What people see, `/ticks` and `/frames`, is compared with
-what `/core` gives.
+from them, and what differs between there and here is told. What people see, in the other topics, is compared with what
+`/core` gives.
 """
 
 from collections import deque
@@ -18,13 +18,14 @@ from tormagd import __version__
 from tormagd.config import Config, checked
 from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
 from tormagd.ground.files import in_place_of
-from tormagd.record.journal import FORMAT, MISSING, TOLD
+from tormagd.record.journal import FORMAT, MISSING
 from tormagd.record.reader import Contents, RecordingError, damage_in, opened
 from tormagd.record.telemetry import COLUMNS
 from tormagd.record.writer import (
     CORE_TOPIC,
     FRAMES_TOPIC,
     NUMBER_COLUMN,
+    TELEMETRY_TOPIC,
     TICKS_TOPIC,
     Derived,
     RecordingWriter,
@@ -32,7 +33,6 @@ from tormagd.record.writer import (
 )
 from tormagd.scenes.scene import Scene
 from tormagd_client.endpoints import ConfigError
-from tormagd_client.messages import Telemetry
 
 MAX_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
 "Bounds on what is read of one file, a minute of 1 kHz; what comes after is passed over."
@@ -57,7 +57,7 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
     is_complete: bool = True
     "False for a file that was cut short, or is longer than what is read: entries up to there are there."
     odd: str = ""
-    """The first message of `/ticks` or `/frames` that `/core` does not give, or why an entry of `/core` gives none."""
+    """The first message of another topic that `/core` does not give, or why an entry of `/core` gives none."""
 
 
 def write_black_box(path: Path, header: dict[str, str], parts: Iterable[bytes]) -> None:
@@ -65,10 +65,7 @@ def write_black_box(path: Path, header: dict[str, str], parts: Iterable[bytes]) 
     columns = msgspec.json.decode(header["columns"], type=tuple[str, ...])
     with in_place_of(path) as beside, RecordingWriter(beside, header) as writer:
         for part in parts:
-            entries = msgspec.msgpack.decode(part, type=list[Any])
-            writer.entries(columns, entries, part)
-            for told in (each for each in entries if isinstance(each, list) and each[:1] == [TOLD]):
-                writer.telemetry(msgspec.convert(told[1], Telemetry))
+            writer.entries(columns, msgspec.msgpack.decode(part, type=list[Any]), part)
 
 
 def read_black_box(path: Path) -> BlackBoxFile:
@@ -93,11 +90,12 @@ def read_black_box(path: Path) -> BlackBoxFile:
 
 
 class _Reading:
-    """A black box while it is read: each message of `/ticks` and `/frames` is compared with what `/core` gives."""
+    """A black box while it is read: each message of another topic is compared with what `/core` gives."""
 
     def __init__(self) -> None:
         self.entries: list[Any] = []
-        self.expected: dict[str, deque[tuple[int, int, bytes]]] = {TICKS_TOPIC: deque(), FRAMES_TOPIC: deque()}
+        topics = TICKS_TOPIC, FRAMES_TOPIC, TELEMETRY_TOPIC
+        self.expected: dict[str, deque[tuple[int, int, bytes]]] = {topic: deque() for topic in topics}
         self.odd, self.is_over = "", False
         self._derived = Derived()
         self._size = 0

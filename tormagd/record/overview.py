@@ -155,7 +155,7 @@ class OverviewBuilder:
         self._ahead_ns = 0
 
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
-        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970, by an `Axis`."""
+        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970, as `Derived` places it."""
         if self._start_ns is None:
             self._start_ns = t_ns
         self._end_ns = max(self._end_ns, t_ns)

@@ -1,8 +1,8 @@
 """Writing a recording or a black box: MCAP, compressed with zstd.
 
-`/core` has the journal's entries as they came, in msgpack, for a replay. `/ticks` and `/frames` are derived of them,
-and `/telemetry` has snapshots, in JSON with plain schemas, for Foxglove and PlotJuggler: a number there cannot be null,
-so what is not known is left out. An overview stands at the end.
+`/core` has the journal's entries as they came, in msgpack, for a replay. `/ticks`, `/frames` and `/telemetry` are
+derived of them, in JSON with plain schemas, for Foxglove and PlotJuggler: a number there cannot be null, so what is not
+known is left out. An overview stands at the end.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ from mcap.writer import Writer
 from tormagd import __version__
 from tormagd.ground.files import new_file
 from tormagd.record.folder import RecordingFolder
-from tormagd.record.journal import READ, WROTE
+from tormagd.record.journal import READ, TOLD, WROTE
 from tormagd.record.overview import OverviewBuilder
 from tormagd.record.telemetry import COLUMNS, kind_of
-from tormagd.record.ticks import Axis, TickBatch, Value
+from tormagd.record.ticks import TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry
 
 ABOUT = "tormagd"
@@ -127,25 +127,45 @@ class Thinning:
 
 
 class Derived:
-    """Derives the messages of `/ticks` and `/frames` from the journal's entries."""
+    """Derives the messages of the other topics from the journal's entries. Their times go on with the monotonic clock,
+    whatever steps the wall clock takes."""
 
     def __init__(self) -> None:
-        self.axis = Axis()
-        self._numbers = {TICKS_TOPIC: count(), FRAMES_TOPIC: count(1)}
+        self._numbers = {TELEMETRY_TOPIC: count(), TICKS_TOPIC: count(), FRAMES_TOPIC: count(1)}
+        self._offset_ns: int | None = None
+        self._newest_ns = self._monotonic_ns = 0
+        self.ahead_ns = 0
+        "How far the wall clock has gone ahead."
 
     def of(self, columns: Sequence[str], entries: Sequence[Any]) -> Iterator[Shown]:
-        """Yield a message for each tick and frame."""
+        """Yield a message for each tick, frame and snapshot, which is of the newest tick."""
         monotonic_at = columns.index("monotonic_s") if "monotonic_s" in columns else 0
         for tick in filter(is_tick, entries):  # frames before it have its offset
-            self.axis.of_tick(tick[0], tick[monotonic_at])
+            self._place(tick[0], tick[monotonic_at])
             break
         for entry in entries:
             if is_tick(entry):
-                t_ns, message = self.axis.of_tick(entry[0], entry[monotonic_at]), known_values(columns, entry)
-                yield Shown(TICKS_TOPIC, t_ns, next(self._numbers[TICKS_TOPIC]), message)
+                t_ns = self._place(entry[0], entry[monotonic_at])
+                yield self._shown(TICKS_TOPIC, t_ns, known_values(columns, entry))
+            elif isinstance(entry, list) and entry[:1] == [TOLD]:
+                yield self._shown(TELEMETRY_TOPIC, self._newest_ns or entry[1]["t_ns"], only_known(entry[1]))
             for frame in frames_in(entry):
-                t_ns = self.axis.of_frame(frame.monotonic_s)
-                yield Shown(FRAMES_TOPIC, t_ns, next(self._numbers[FRAMES_TOPIC]), frame)
+                t_ns = max(round(frame.monotonic_s * 1e9) + (self._offset_ns or 0), 0)
+                yield self._shown(FRAMES_TOPIC, t_ns, frame)
+
+    def _shown(self, topic: str, t_ns: int, message: Any) -> Shown:
+        return Shown(topic, t_ns, next(self._numbers[topic]), message)
+
+    def _place(self, t_ns: int, monotonic_s: object) -> int:
+        """Return the time of a tick, in ns since 1970."""
+        if not isinstance(monotonic_s, float) or not 0.0 <= monotonic_s < 1e9:
+            return t_ns
+        monotonic_ns = round(monotonic_s * 1e9)
+        if self._offset_ns is None or monotonic_ns < self._monotonic_ns:  # the first, or of another machine
+            self._offset_ns = max(t_ns - self.ahead_ns, self._newest_ns) - monotonic_ns
+        self._monotonic_ns, self._newest_ns = monotonic_ns, monotonic_ns + self._offset_ns
+        self.ahead_ns = t_ns - self._newest_ns
+        return self._newest_ns
 
 
 class RecordingWriter:
@@ -162,11 +182,9 @@ class RecordingWriter:
         self._about = {"version": __version__, **(metadata or {})}
         if every > 1:
             self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
-        self._last_seq: int | None = None
         self._last_tick: int | None = None
         self._mark: Mark | None = None
-        self.telemetry_count = self.telemetry_lost = 0
-        self.tick_count = self.ticks_lost = self.restarts = 0
+        self.telemetry_count = self.tick_count = self.ticks_lost = self.restarts = 0
         self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
     def _begin(self, path: Path) -> None:
@@ -206,25 +224,6 @@ class RecordingWriter:
         self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 
-    def telemetry(self, message: Telemetry) -> None:
-        if self._last_seq is not None and message.seq > self._last_seq + 1:
-            self.telemetry_lost += message.seq - self._last_seq - 1
-        self._last_seq = message.seq
-        axis = self._derived.axis
-        at_ns, known = axis.of_snapshot(message.t_ns), only_known(msgspec.to_builtins(message))
-        is_new = message.mark is not None and message.mark != self._mark
-        if is_new:
-            self._thinning.happened(at_ns)
-        self._add(Shown(TELEMETRY_TOPIC, at_ns, self.telemetry_count, known))
-        self._overview.add(at_ns, False, known | {"mark": message.mark})
-        self.telemetry_count += 1
-        if message.mark is not None:
-            self._mark = message.mark
-            # every snapshot has the newest mark, even one from before
-            is_within = is_new and message.mark.t_ns - axis.ahead_ns >= self._begin_ns
-            if is_within and self._folder is not None:
-                self.path = self._folder.mark_around(self.path)
-
     def ticks(self, batch: TickBatch) -> None:
         """Write a batch; of ticks that are thinned, nothing for a replay."""
         core = batch.core if self._thinning.every == 1 else b""
@@ -239,11 +238,24 @@ class RecordingWriter:
         shown = list(self._derived.of(columns, entries))
         if core:
             self._add(Shown(CORE_TOPIC, shown[-1].t_ns if shown else self._chunk_ns, 0, core))
+        adds = {TICKS_TOPIC: self._tick, TELEMETRY_TOPIC: self._snapshot, FRAMES_TOPIC: self._add}
         for each in shown:
-            if each.topic == TICKS_TOPIC:
-                self._tick(each)
-            else:
-                self._add(each)
+            adds[each.topic](each)
+
+    def _snapshot(self, shown: Shown) -> None:
+        mark = msgspec.convert(shown.message.get("mark"), Mark | None)
+        is_new = mark is not None and mark != self._mark
+        if is_new:
+            self._thinning.happened(shown.t_ns)
+        self._add(shown)
+        self._overview.add(shown.t_ns, False, {"mark": mark})
+        self.telemetry_count += 1
+        if mark is not None:
+            self._mark = mark
+            # every snapshot has the newest mark, even one from before
+            is_within = is_new and mark.t_ns - self._derived.ahead_ns >= self._begin_ns
+            if is_within and self._folder is not None:
+                self.path = self._folder.mark_around(self.path)
 
     def _tick(self, shown: Shown) -> None:
         if isinstance(number := shown.message.get(NUMBER_COLUMN), int):
