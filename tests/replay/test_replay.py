@@ -217,12 +217,13 @@ def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> No
         (lambda shown: shown._replace(t_ns=shown.t_ns + 1), "message 300 in /ticks is not"),
         (lambda shown: None, "message 301 in /ticks is not"),
         (lambda shown: shown._replace(sequence=7), "message 7 in /ticks is not"),
+        (lambda shown: shown._replace(topic="/telemetry", sequence=1), "message 1 in /telemetry is not"),
     ],
 )
 def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path, monkeypatch: Any, edit, said) -> None:
     box = read_black_box(path)
     assert box.odd == ""
-    head = box.entries[: list(ticks_of(box.entries))[600]]
+    head = [*box.entries[: list(ticks_of(box.entries))[600]], ["told", {"t_ns": 1, "seq": 0}]]
     derived = Derived.of
 
     def other(self: Derived, columns: Any, entries: Any) -> Any:
