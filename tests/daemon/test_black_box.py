@@ -189,7 +189,6 @@ def test_a_keeper_that_ended_is_replaced_and_no_tick_is_lost(rig: Rig, monkeypat
     assert (waits, rig.box.report().refusal, rig.box.report().dropped) == ([1] * 4, "", 0)
     told = [name for part in rig.parts() for name in names(part)]
     assert (told.count("tick"), told.count("missing")) == (4 * PART_TICKS - PART_TICKS // 2, 0)
-    # what waits for a keeper, or was not written by the last one, is asked for
     paths = [rig.box.write("SKEW", 0.0, {})]
     rig.its.close()
     rig.box.look()

@@ -28,7 +28,6 @@ from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, Virtual
 from tormagd.simulation.device import VirtualDevice
 
 SNAPSHOT_HZ = 500
-"As if a second had so many ticks."
 NS = 1_000_000_000
 
 

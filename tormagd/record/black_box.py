@@ -1,8 +1,7 @@
 """The black box's file, and every recording that may be run again: the entries of `/core`, exact to the bit.
 
-Each message of `/core` is one part that the daemon handed over. The metadata say which core it was: it is built again
-from them, and what differs between there and here is told. What people see, in the other topics, is compared with what
-`/core` gives.
+Each message of `/core` is one part that the daemon handed over. The metadata say which core it was, and it is built
+again from them. What people see, in the other topics, is compared with what `/core` gives.
 """
 
 from collections import deque

@@ -1,7 +1,7 @@
 """Reading a recording: its overview, some seconds of it, or message by message.
 
-A closed file says at its end where its chunks are; in any other they are looked for from the beginning. Each chunk is
-read by itself, so that damage costs no other. `mcap` parses the file. A file costs no more memory and time than its
+A closed file says at its end where its chunks are; in any other they are looked for. Each is read by itself, so damage
+costs no other. `mcap` parses the file. A file costs no more memory and time than its
 size explains: a record, or a chunk unpacked, has at most MAX_RECORD_BYTES, and all chunks together MAX_RATIO times the
 file's bytes.
 """
@@ -73,7 +73,6 @@ class Seen(NamedTuple):
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file; what is wrong with it or in it becomes a RecordingError."""
     try:
         require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file, readable(str(path)):
@@ -139,7 +138,6 @@ def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
 
 
 def _end(file: BinaryIO) -> tuple[Footer | None, int]:
-    """Return the footer of a closed file, and where it is."""
     at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
     file.seek(at)
     footer = _at(file, at, Footer) if file.read().endswith(MCAP0_MAGIC) else None
