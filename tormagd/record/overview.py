@@ -76,11 +76,25 @@ class Series(msgspec.Struct, frozen=True):
     high: Floats
 
 
-class Codes(msgspec.Struct, frozen=True):
+Span = Annotated[list[int], Meta(min_length=2, max_length=2)]
+
+
+class Codes(msgspec.Struct):
     """When a code was present, ns since the start; spans may be joined, `held_ns` is the exact total."""
 
-    spans_ns: Annotated[list[tuple[int, int]], Meta(max_length=MAX_SPANS)]
-    held_ns: int
+    spans_ns: Annotated[list[Span], Meta(max_length=MAX_SPANS)] = []
+    held_ns: int = 0
+
+    def hold(self, from_ns: int, to_ns: int) -> None:
+        spans = self.spans_ns
+        if spans and from_ns <= spans[-1][1] <= to_ns:
+            self.held_ns += to_ns - spans[-1][1]
+            spans[-1][1] = to_ns
+            return
+        self.held_ns += to_ns - from_ns
+        if len(spans) == MAX_SPANS:
+            self.spans_ns = spans = [[a, b] for (a, _), (_, b) in zip(spans[::2], spans[1::2], strict=True)]
+        spans.append([from_ns, to_ns])
 
 
 class Overview(msgspec.Struct, frozen=True, kw_only=True):
@@ -271,26 +285,9 @@ class _Stretches:
         return np.array(self._numbers, np.int64).tobytes(), sides.tobytes()
 
 
-class _Held:
-    def __init__(self) -> None:
-        self.spans: list[list[int]] = []
-        self.ns = 0
-
-    def hold(self, from_ns: int, to_ns: int) -> None:
-        if self.spans and from_ns <= self.spans[-1][1] <= to_ns:
-            self.ns += to_ns - self.spans[-1][1]
-            self.spans[-1][1] = to_ns
-            return
-        self.ns += to_ns - from_ns
-        self.spans.append([from_ns, to_ns])
-        if len(self.spans) > MAX_SPANS:
-            newest = self.spans.pop()
-            self.spans = [[a, b] for (a, _), (_, b) in zip(self.spans[::2], self.spans[1::2], strict=True)] + [newest]
-
-
 class _Codes:
     def __init__(self) -> None:
-        self._known: dict[str, dict[str, _Held]] = {kind: {} for kind in KINDS}
+        self._known: dict[str, dict[str, Codes]] = {kind: {} for kind in KINDS}
         self._now: list[tuple[str, str]] = []
         self._now_ns = self._step_ns = 0
 
@@ -307,14 +304,10 @@ class _Codes:
         for kind, code in self._now:
             known = self._known[kind]
             is_kept = code in known or len(known) < MAX_CODES - 1
-            held = known.setdefault(code if is_kept else OTHER, _Held())
-            held.hold(self._now_ns, self._now_ns + for_ns)
+            known.setdefault(code if is_kept else OTHER, Codes()).hold(self._now_ns, self._now_ns + for_ns)
 
     def made(self) -> dict[str, dict[str, Codes]]:
         """Hold the last codes for one usual step, and return all spans by kind and code."""
         self._hold(self._step_ns)
         self._now = []
-        return {
-            kind: {code: Codes([(a, b) for a, b in held.spans], held.ns) for code, held in known.items()}
-            for kind, known in self._known.items()
-        }
+        return self._known

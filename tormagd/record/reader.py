@@ -273,7 +273,7 @@ class Contents:
             said = f"no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
             raise RecordingError(f"{self._name}: {said}")
 
-    def overview(self, file: BinaryIO) -> Overview | None:
+    def read_overview(self, file: BinaryIO) -> Overview | None:
         """Read the overview of a closed file, if there is one."""
         if not self._is_closed or not self._overview_at:
             return None
@@ -301,27 +301,25 @@ def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Con
         return read_open(file, str(path), wanted, each)
 
 
-class RecordingFile:
+class RecordingFile(Contents):
     """A recording of any length on the disk."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, printable(path.name)
         with opened(path) as file:
+            super().__init__(file, str(path))
             self.damage = damage_in(file)
-            self._contents = known = Contents(file, str(path))
-            overview = None if self.damage else known.overview(file)
+            overview = None if self.damage else self.read_overview(file)
             if overview is None:
                 builder = OverviewBuilder()
-                known.read(file, Glance, lambda seen: builder.add(*seen))
+                self.read(file, Glance, lambda seen: builder.add(*seen))
                 overview = builder.made()
-        self.overview = overview
-        self.metadata, self.described, self.is_complete = known.metadata, known.described, known.is_complete
-        lost = list(known.lost.values())
+        self.overview, lost, known = overview, list(self.lost.values()), self.metadata
         self.notes = [
             *([f"damaged: {self.damage}"] if self.damage else []),
             *([f"left out: {len(lost)} damaged, {lost[0]}"] if lost else []),
-            *([] if self.is_complete else [f"cut short: {known.metadata.get(CUT, 'its recorder did not end it')}"]),
-            *([f"thinned: {known.metadata[THINNED]}"] if THINNED in known.metadata else []),
+            *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
+            *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
         ]
         "What its reader has to know, in words."
 
@@ -336,11 +334,11 @@ class RecordingFile:
                     raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
 
         with opened(self.path) as file:
-            self._contents.read(file, wanted, keep, from_ns, to_ns)
+            self.read(file, wanted, keep, from_ns, to_ns)
         return found
 
 
 def overview_of(path: Path) -> Overview | None:
     """Read the overview at the end of the file, if there is one."""
     with opened(path) as file:
-        return Contents(file, str(path)).overview(file)
+        return Contents(file, str(path)).read_overview(file)
