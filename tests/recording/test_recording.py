@@ -408,7 +408,7 @@ def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_p
         {"codes": {}},
         {"width_ns": 0},
         {"codes": {"limits": {"$\\frac{": Codes([], 0)}, "faults": {}, "operating_state": {}}},
-        {"codes": {"limits": {"RATE": Codes([(0, 1)] * 2_000, 0)}, "faults": {}, "operating_state": {}}},
+        {"codes": {"limits": {"RATE": Codes([[0, 1]] * 2_000, 0)}, "faults": {}, "operating_state": {}}},
         {"stretches": b"12345678", "sides": b"1234"},
         {"marks": [Mark(t_ns=0, text="x")] * 2_000},
     ],
