@@ -49,7 +49,7 @@ AFTER_FAULT_S = 2.0
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
 MAX_REQUESTED = 8
-"Boxes that somebody asked for and that are still to be written, at most. A fault's wait for a person between them."
+"Boxes that somebody asked for and that are still to be written, at most."
 
 log = logging.getLogger(__name__)
 
