@@ -196,7 +196,6 @@ def test_a_keeper_that_ended_is_replaced_and_no_tick_is_lost(rig: Rig, monkeypat
     monkeypatch.setattr(rig.box, "_due_s", ended_s)
     assert rig.box.is_missing
     rig.box.look()
-    rig.box.look()
     assert ([said.path for said in rig.heard()], rig.box.is_missing) == ([*map(str, paths)], False)
 
 
