@@ -21,6 +21,7 @@ import pytest
 import zmq
 
 from tormagd.ctl.main import main
+from tormagd.record.journal import TOLD
 from tormagd.scenes.scene import load_scene
 from tormagd_client.messages import (
     MOTION_TOPIC,
@@ -253,7 +254,8 @@ class FakeDaemon(threading.Thread):
             telemetry_out.send_multipart([VERDICT_TOPIC, encode(VERDICT)])
             felt_N = [1.5 + 0.1 * math.sin(seq + k) for k in range(20)]
             rows = [(t_ns + k * 1_000_000, 1.5, 1.5, felt_N[k], 35.0, 36.0, 0.1, -0.1) for k in range(20)]
-            recording.send(msgpack.packb({"v": VERSION, "columns": COLUMNS, "rows": rows}))
+            core = msgpack.packb([*rows, (TOLD, msgspec.to_builtins(telemetry(seq, t_ns)))])
+            recording.send(msgpack.packb({"v": VERSION, "columns": COLUMNS, "rows": rows, "core": core}))
             for data in self.rubbish:
                 recording.send(data)
             seq += 1

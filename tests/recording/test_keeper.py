@@ -20,7 +20,6 @@ from tormagd.record.keeper import (
     DIED,
     KEPT_S,
     MAX_BYTES,
-    MAX_DUE,
     MAX_FILES,
     Begin,
     End,
@@ -167,9 +166,12 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     assert len(list(folder.iterdir())) == 2 * MAX_FILES + 3
     process.say(written(folder, "20300101T000000.000Z-REQUEST.mcap"))
     assert (process.heard().refusal, len(list(folder.iterdir()))) == ("", 2 * MAX_FILES)
-    # a name that is taken, or a folder that is none, says so
-    process.say(written(folder, "20300101T000000.000Z-SKEW.mcap"))
-    assert "exists" in process.heard().refusal
+    # what is there already is not written again
+    data = (folder / "20300101T000000.000Z-SKEW.mcap").read_bytes()
+    process.say(ticks(41, 20), written(folder, "20300101T000000.000Z-SKEW.mcap"))
+    assert process.heard().refusal == ""
+    assert (folder / "20300101T000000.000Z-SKEW.mcap").read_bytes() == data
+    # a folder that is none says so
     process.say(written(folder / "20300101T000000.000Z-SKEW.mcap", "x-SKEW.mcap"))
     assert "x-SKEW.mcap" in process.heard().refusal
     # what is due later is of the scene of which it was asked for
@@ -187,16 +189,6 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     for path, first in ((left, 61), (folder / "20300102T000000.000Z-DUE.mcap", 1), (folder / "2031Z-LATER.mcap", 61)):
         assert next(entry[0] for entry in read_black_box(path).entries if entry != "step") == first, path
     assert not process.ring_path.exists()
-
-
-def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Process, tmp_path: Path) -> None:
-    process.say(Begin(str(tmp_path), HEADER), ticks(1, 20))
-    process.say(*[written(tmp_path, f"{n}Z-{'X' if n % 2 else 'REQUEST'}.mcap", 3_600.0) for n in range(MAX_DUE + 1)])
-    assert "others are still to be written" in process.heard().refusal
-    process.say(End())
-    assert process.child.wait(PATIENCE_S) == 0
-    assert [process.heard().name for _ in range(3)] == ["1Z-X.mcap", "3Z-X.mcap", "5Z-X.mcap"]
-    assert len(list(tmp_path.iterdir())) == MAX_DUE
 
 
 @pytest.mark.parametrize("is_daemon_killed", [True, False], ids=["both were killed", "the keeper was killed"])

@@ -15,20 +15,19 @@ from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.beat import Beat
-from tormagd.daemon.black_box import PART_TICKS, header
+from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd.record.black_box import write_black_box
-from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal, core_hash, packed
-from tormagd.record.keeper import Part, Ring
-from tormagd.record.replay.rerun import Rerun, rerun
-from tormagd.record.telemetry import COLUMNS, Moment
+from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP
+from tormagd.record.rerun import Rerun, rerun
+from tormagd.record.telemetry import Moment
 from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
 
-SNAPSHOT_TICKS = 500
+SNAPSHOT_HZ = 500
 NS = 1_000_000_000
 
 
@@ -42,9 +41,14 @@ class Flight:
 
     def __init__(self, config: Config, core: Core, device: VirtualDevice | VirtualBus) -> None:
         self.config, self.core, self.planner = config, core, core.planner()
-        self.ring, self._journal, self._ticks = Ring(), Journal(), 0
-        self._is_stepped, self._now_ns = False, 0
+        self.parts: list[bytes] = []
+        self._is_stepped = False
+        self._now_ns = self._ticks = 0
         self.loop = ClosedLoop(config, core.stepper(), self.planner, device)
+        self._box = BlackBox(None, header(config, core), SNAPSHOT_HZ)
+        self._journal, self._box.is_heard = self._box.journal, True
+        self._journal.is_kept, self._box._ticks = True, 0
+        self._box.begin(self.loop.stepper, self.planner, self.loop.connection)
         self.loop.connection.traffic = self
         self._inbox = SetpointInbox()
         period_ns = NS // config.rates.inference_hz
@@ -58,7 +62,6 @@ class Flight:
             beside=self if core.element.is_beside else None,  # type: ignore[arg-type]
         )
         self._question: Question | None = None
-        self._remember()
 
     def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
         self._is_stepped = False
@@ -69,13 +72,10 @@ class Flight:
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
         self._inference.foresee(beat)
-        record = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, self._ticks).row()
-        self._journal.add(record)
+        moment = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, self._ticks)
         self._ticks += 1
-        if self._ticks % PART_TICKS == 0:
-            self.ring.put(Part(sample.time_s, self._packed()))
-            if self._ticks % SNAPSHOT_TICKS == 0:
-                self._remember()
+        if (part := self._box.ticked(moment, self.loop.stepper, self.planner)) is not None:
+            self.parts.append(part[0])
         return sample
 
     def answer(self) -> Answer | None:
@@ -105,10 +105,6 @@ class Flight:
             self._journal.note(STEP)
         self._is_stepped = True
 
-    def _remember(self) -> None:
-        core = core_hash(self.core.config, self.core.scene, self.core.model)
-        self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory(), core)
-
     def _drain(self, setpoint: TimedSetpoint | None) -> bool:
         before = self._inbox.newest
         self._inbox.in_force = None if setpoint is None else Taken(setpoint, "a", 0, setpoint.stamp_s)
@@ -117,9 +113,6 @@ class Flight:
     def _fail(self, _why: str) -> None:
         self._journal.note(LATCH, str(Fault.PLAN_FAILED))
         self.loop.stepper.latch(Fault.PLAN_FAILED)
-
-    def _packed(self) -> bytes:
-        return packed(self._journal.take())
 
     def command(self, name: str) -> None:
         conditions, is_refused = self.loop.conditions(), False
@@ -148,16 +141,12 @@ class Flight:
         self.command("enable")
 
     def write(self, path: Path, **changes: str) -> Path:
-        write_black_box(
-            path,
-            {**header(self.config, self.core), "reason": "TEST", **changes},
-            [part.entries for _, part in self.ring.kept()],
-        )
+        write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.parts)
         return path
 
 
 def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
-    return rerun(core, COLUMNS, entries, from_s)
+    return rerun(core, entries, from_s)
 
 
 def frames(path: Path) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import InexactError, first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link_statistics import RoundTrip
 from tormagd.record.journal import KNOWN
-from tormagd.record.replay import conversation
+from tormagd.record.rerun import KNOWN_OF_LINK
 
 ROOT = Path(__file__).parents[2]
 FLOATS = st.one_of(st.floats(), st.sampled_from([-0.0, math.nan, -math.inf, 5e-324]))
@@ -151,4 +151,4 @@ def test_what_nobody_remembers_is_refused(data: Any) -> None:
     if isinstance(data, str):
         data = {"RoundTrip": plain(RoundTrip())["RoundTrip"] | {data: {"Unheard": {}}}}
     with pytest.raises(InexactError):
-        restore(RoundTrip(), data, conversation.KNOWN)
+        restore(RoundTrip(), data, KNOWN_OF_LINK)

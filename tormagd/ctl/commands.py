@@ -212,8 +212,8 @@ COMMANDS = {
     ),
     "replay": Command(
         "run a black box again bit for bit, or with --set or --fault on the simulator",
-        "replay.replay",
-        ("config_file",),
+        "record.replay",
+        (),
         (
             option("path", type=Path, metavar="FILE.mcap"),
             option(

@@ -1,15 +1,19 @@
-"""`tormagctl record`, `mark` and `recordings`: write what the daemon publishes to MCAP files, and look after a folder.
+"""`tormagctl record`, `mark`, `recordings` and `replay`: write what the daemon publishes to MCAP files, look after a
+folder of them, and run one again.
 
-The recorder is a process of its own.
+The recorder is a process of its own. A replay runs the same core here, or `tormagd.simulation.rehearse`, in a process
+of its own, with the simulator in place of the device.
 """
 
 import contextlib
 import hashlib
+import json
+import logging
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +21,28 @@ import msgspec
 import zmq
 
 from tormagd.config import Config
-from tormagd.ctl.outcome import WRITABLE, CommandError, Exit, Outcome, as_usage_error, refused, usage_error
+from tormagd.ctl.outcome import (
+    WRITABLE,
+    CommandError,
+    Exit,
+    Outcome,
+    answer_of,
+    as_usage_error,
+    refused,
+    usage_error,
+)
 from tormagd.ground.files import new_file
 from tormagd.ground.terminal import interrupted_by, write_line
+from tormagd.record.black_box import Recorded, ReplayError, rebuilt, told
 from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
-from tormagd.record.reader import RecordingError, damage_in, summary_of
+from tormagd.record.reader import RecordingError, damage_in, overview_of
+from tormagd.record.rerun import rerun
 from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
-from tormagd_client.endpoints import Endpoints
+from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, unreachable
-from tormagd_client.messages import TELEMETRY_TOPIC, MessageError, Telemetry, decode
+from tormagd_client.messages import MessageError
 from tormagd_client.printable import printable
 from tormagd_client.wire import Keys, connect, keys_of
 
@@ -37,16 +52,17 @@ POLL_MS = 100
 LONGEST_END_S = 60.0
 SILENT_S = 1.0
 "After this silence at the end, the daemon has gone."
+LONGEST_REHEARSAL_S = 900.0
+"Half a minute, interpreted and simulated twice, takes some minutes."
+REPLAYED = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
 
 
-def listening(
-    context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None, topic: bytes = b""
-) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket for telemetry or ticks."""
+def listening(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
+    """Connect a new SUB socket for ticks."""
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
-    socket.subscribe(topic)
+    socket.subscribe(b"")
     connect(socket, address, keys)
     return socket
 
@@ -58,11 +74,10 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
     keys = keys_of(endpoints.curve)
     context = zmq.Context()
     try:
-        telemetry = listening(context, endpoints.telemetry, keys, TELEMETRY_TOPIC)
         ticks = listening(context, endpoints.recording, keys)
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
-                raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
+            if not _is_ready(ticks, wait_s, is_interrupted):
+                raise unreachable(endpoints.recording, f"nothing is published there within {wait_s:g} s")
             about = _about(endpoints, wait_s)
             try:
                 place = RecordingFolder(path, config.recordings) if is_folder else path
@@ -74,7 +89,7 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
                 raise refused(error, WRITABLE) from error
             try:
                 with writer:
-                    outcome = _record(writer, telemetry, ticks, duration_s, is_interrupted)
+                    outcome = _record(writer, ticks, duration_s, is_interrupted)
                     with contextlib.suppress(ClientError):  # if the daemon has gone, what was true at the start remains
                         writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
                     return outcome
@@ -102,21 +117,17 @@ def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
     }
 
 
-def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
-    """Wait until a socket has a message; return False after `wait_s` or an interrupt."""
+def _is_ready(socket: "zmq.Socket[bytes]", wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
+    """Wait until the socket has a message; return False after `wait_s` or an interrupt."""
     end_s = time.monotonic() + wait_s
     while True:
-        ready, _, _ = zmq.select(list(sockets), [], [], POLL_MS / 1e3)
-        if ready or time.monotonic() >= end_s or is_interrupted():
-            return bool(ready)
+        is_ready = bool(socket.poll(POLL_MS))
+        if is_ready or time.monotonic() >= end_s or is_interrupted():
+            return is_ready
 
 
 def _record(
-    writer: RecordingWriter,
-    telemetry: "zmq.Socket[bytes]",
-    ticks: "zmq.Socket[bytes]",
-    duration_s: float,
-    is_interrupted: Callable[[], bool],
+    writer: RecordingWriter, ticks: "zmq.Socket[bytes]", duration_s: float, is_interrupted: Callable[[], bool]
 ) -> Outcome:
     unreadable = 0
     start_s = heard_s = time.monotonic()
@@ -125,30 +136,23 @@ def _record(
         left_s = start_s + duration_s - time.monotonic()
         is_over = is_interrupted() or left_s <= 0.0
         if not is_over:
-            _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
+            ticks.poll(round(min(left_s * 1e3, POLL_MS)))
         # what waits at the end came before it
         until_s = time.monotonic() + (LONGEST_END_S if is_over else POLL_MS / 1e3)
-        # in turn: a recorder that is starved keeps some of both
-        while (ready := [each for each in (ticks, telemetry) if each.poll(0)]) and time.monotonic() < until_s:
-            for socket in ready:
-                data = socket.recv_multipart()[-1]
-                try:
-                    if socket is telemetry:
-                        writer.telemetry(decode(data, Telemetry))
-                    else:
-                        writer.ticks(decode_ticks(data))
-                        heard_s = time.monotonic()
-                except MessageError as error:
-                    unreadable += 1
-                    if unreadable == 1:
-                        write_line(f"tormagctl record: left out a message: {printable(str(error))}", sys.stderr)
+        while ticks.poll(0) and time.monotonic() < until_s:
+            try:
+                writer.ticks(decode_ticks(ticks.recv_multipart()[-1]))
+                heard_s = time.monotonic()
+            except (MessageError, msgspec.MsgspecError, TypeError, LookupError) as error:
+                unreadable += 1
+                if unreadable == 1:
+                    write_line(f"tormagctl record: left out a message: {printable(str(error))}", sys.stderr)
     end_s = time.monotonic()
     silent_s = end_s - heard_s
     result = {
         "file": str(writer.path),
         "seconds": round(end_s - start_s, 3),
         "telemetry": writer.telemetry_count,
-        "telemetry_lost": writer.telemetry_lost,
         "ticks": writer.tick_count,
         "ticks_lost": writer.ticks_lost,
         "restarts": writer.restarts,
@@ -156,7 +160,7 @@ def _record(
         "unreadable": unreadable,
     }
     text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots"
-    text += f"; {writer.ticks_lost} ticks and {writer.telemetry_lost} snapshots lost"
+    text += f"; {writer.ticks_lost} ticks lost"
     if writer.restarts:
         text += f"; the daemon began anew {writer.restarts} times, and nothing is known of between"
     if silent_s > SILENT_S:
@@ -209,13 +213,12 @@ def _row(segment: Segment) -> dict[str, Any]:
     """Describe one segment by its overview; without one, `said` tells why."""
     seconds, faults, marks = None, [], []
     try:
-        known = summary_of(segment.path)
+        overview = overview_of(segment.path)
     except RecordingError as error:
         said = [str(error).removeprefix(f"{segment.path}: ")]
     else:
         said = ["no overview: still written, not ended by its recorder, or older"]
-        if known is not None:
-            _, overview = known
+        if overview is not None:
             seconds = round(overview.duration_s, 3)
             faults, marks = list(overview.spans_s("faults")), [each.text for each in overview.marks]
             said = [*faults, *(f"“{text}”" for text in marks)]
@@ -253,3 +256,92 @@ def _export(path: Path, target: Path | None) -> Outcome:
     text = "\n".join([f"{copy}: SHA-256 {digest}", *([f"damaged: {damage}"] if damage else [])])
     result = {"file": str(copy), "sha256": digest, "damage": damage}
     return Outcome(result, text, Exit.REFUSED if damage else Exit.DONE)
+
+
+def replay(
+    path: Path,
+    from_s: float,
+    settings: Sequence[str],
+    plant: str | None,
+    faults: Sequence[str],
+) -> Outcome:
+    """Replay a black box; with `settings` or `faults`, on the simulated `plant`."""
+    changes = [*(f"--set={setting}" for setting in settings), *(f"--fault={fault}" for fault in faults)]
+    if from_s if changes else plant:
+        said = "--from: allowed only without" if changes else "--plant: allowed only with"
+        raise usage_error(f"{said} --set or --fault", "tormagctl replay --help")
+    rehearsed = [f"--plant={plant or 'sample_1'}", *changes]
+    result = _rehearsed(path, rehearsed) if changes else _again(path, from_s)
+    head = f"altered: {result['odd']}\n" if result["odd"] else ""
+    notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
+    notes += "" if result["is_complete"] else "\nthe file is cut short"
+    if "rerun" not in result:
+        return Outcome(result, head + _instead(result) + notes, Exit.REFUSED if result["odd"] else Exit.DONE)
+    text, is_exact = _rerun(result["rerun"])
+    return Outcome(result, head + text + notes, Exit.DONE if is_exact and not result["odd"] else Exit.REFUSED)
+
+
+def _again(path: Path, from_s: float) -> dict[str, Any]:
+    """Run the same core over the recorded inputs."""
+    logging.getLogger("tormagd").addHandler(logging.NullHandler())  # a replayed connection has no news
+
+    def run(known: Recorded) -> dict[str, Any]:
+        return {"rerun": msgspec.to_builtins(rerun(rebuilt(known), known.box.entries, from_s))}
+
+    with as_usage_error(ConfigError, RecordingError, ReplayError, OSError, hint=REPLAYED):
+        return told(path, run)
+
+
+def _rehearsed(path: Path, arguments: list[str]) -> dict[str, Any]:
+    try:
+        answer = answer_of("tormagd.simulation.rehearse", [*arguments, "--", str(path)], LONGEST_REHEARSAL_S)
+    except TimeoutError as error:
+        raise usage_error(f"{path}: {error}", "is it a black box?") from error
+    except ChildProcessError as error:
+        raise usage_error(str(error), REPLAYED) from error
+    result: dict[str, Any] = json.loads(answer)  # names in it need not be UTF-8
+    return result
+
+
+def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
+    """Return the text on the report's `rerun`, and whether it was bit-exact."""
+    notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
+    difference = done["difference"]
+    span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
+    if difference is None:
+        frames = f"{done['frames']:,} frames give the measurements again" if done["frames"] else "no frames are in it"
+        return f"bit-exact, {span}; {done['snapshots']} snapshots of the state between them, too; {frames}{notes}", True
+    frame = "" if difference["frame"] is None else f" at frame {difference['frame']:,}"
+    return (
+        f"tick {difference['tick']:,} at {difference['time_s']:.3f} s differs{frame}: {difference['field']} was "
+        f"{difference['recorded']}, is {difference['replayed']}; before it bit-exact, {done['ticks']:,} ticks{notes}"
+    ), False
+
+
+def _instead(result: dict[str, Any]) -> str:
+    """Say what was recorded, and what the simulator met with the old and the new settings."""
+    ran = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
+    if result["instead"] is not None:
+        ran[f"simulated with {', '.join(result['settings'])}"] = result["instead"]
+    lines = [f"{name}: {_happened(what)}" for name, what in ran.items()]
+    faults = "".join(f", with {fault}" for fault in result["faults"])
+    missing = set(result["recorded"]["faults"]) - set(result["simulated"]["faults"])
+    if missing:
+        lines.append(
+            f"{', '.join(sorted(missing))} did not come in the simulation as configured then: what the change does to "
+            "that is not known"
+        )
+    return "\n".join(
+        (
+            *lines,
+            f"The simulated device is {result['plant']}{faults}, with the recorded setpoints, commands and handle. "
+            "What else the recorded device did, it does only where --fault says so.",
+        )
+    )
+
+
+def _happened(what: dict[str, Any]) -> str:
+    faults = ", ".join(f"{name} at {at_s:.3f} s" for name, at_s in what["faults"].items()) or "no fault"
+    limits = ", ".join(f"{name} {held_s:.3f} s" for name, held_s in what["limits"].items()) or "none"
+    refused = f"; refused: {', '.join(what['refused'])}" if what["refused"] else ""
+    return f"{faults}; limits: {limits}{refused}"

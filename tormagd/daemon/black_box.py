@@ -6,10 +6,8 @@ daemon ends.
 """
 
 import contextlib
-import hashlib
 import importlib.util
 import logging
-import math
 import subprocess
 import time
 from collections import deque
@@ -39,8 +37,6 @@ OF_CORE = (
     "format",
     "sources_sha256",
     "platform",
-    "configuration_sha256",
-    "scene_sha256",
     "scene_folder",
     "core_sha256",
     "columns",
@@ -52,25 +48,22 @@ AFTER_FAULT_S = 2.0
 "How long a black box goes on after its fault: the gap opens."
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
-MAX_REQUESTED, MAX_ASKED = 8, 28
-"Boxes that somebody asked for and that are still to be written, at most; and all that wait for the keeper."
+MAX_REQUESTED = 8
+"Boxes that somebody asked for and that are still to be written, at most."
 
 log = logging.getLogger(__name__)
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
     """Return what a replay needs to build the same core again."""
-    configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
     return {
         "format": str(FORMAT),
         "version": __version__,
         "build": str(settle()),
         "sources_sha256": sources_hash(),
         "platform": platform_name(),
-        "configuration": configured.decode(),
-        "configuration_sha256": hashlib.sha256(configured).hexdigest(),
-        "scene": scene.decode(),
-        "scene_sha256": hashlib.sha256(scene).hexdigest(),
+        "configuration": msgspec.json.encode(config).decode(),
+        "scene": msgspec.json.encode(core.scene).decode(),
         "scene_folder": str(core.models),
         "model": core.model,
         "core_sha256": core_hash(core.config, core.scene, core.model),
@@ -86,7 +79,10 @@ class BlackBox:
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
         self._ring: Ring | None = None
-        self._due_s, self.is_heard = math.inf, False
+        self._due_s, self.is_heard = 0.0, False
+        self._unwritten: dict[str, Write] = {}
+        "By name: what the keeper has not answered. A new keeper is asked for all of it."
+        self._unsent: deque[Write] = deque()
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
@@ -94,14 +90,12 @@ class BlackBox:
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
             self._ring = Ring(in_shared_memory(str(folder)))
-            self._begin_ring(self._ring)
-            self._start(self._ring)
+            self._ring.begin(self.begun)
+            self.look()
         self.journal = Journal(is_kept=self._ring is not None)
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._connection: Connection | None = None
-        self._asked: deque[Write] = deque(maxlen=MAX_ASKED)
-        self._requested: set[str] = set()
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with a snapshot of both states, which are those before the first tick."""
@@ -110,21 +104,17 @@ class BlackBox:
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
         """Begin anew with the core of another scene, from a snapshot of these states."""
-        self.journal.take()
         self.begun = Begin(str(self._folder), header)
         if self._ring is not None:
-            self._begin_ring(self._ring)
-        self.journal.note(MISSING)
-        self._snapshot(stepper, planner)
+            self._ring.begin(self.begun)
+        self._begin_anew(stepper, planner)
 
     def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
         """Add a tick to the journal; when there are PART_TICKS, return all entries and the ticks, encoded."""
         was_kept, self.journal.is_kept = self.journal.is_kept, self._ring is not None or self.is_heard
         if not (was_kept and self.journal.is_kept):  # from the end of this period
-            self.journal.take()
             self._ticks = 0
-            self.journal.note(MISSING)
-            self._snapshot(stepper, planner)
+            self._begin_anew(stepper, planner)
             return None
         part: tuple[bytes, list[Any]] | None = None
         try:
@@ -154,39 +144,45 @@ class BlackBox:
                 f"there is no black box: {self._refusal}",
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
+        if reason == REQUEST and [each.reason for each in self._unwritten.values()].count(REQUEST) >= MAX_REQUESTED:
+            raise RefusedError(
+                "busy", f"{MAX_REQUESTED} black boxes are still to be written", "ask again in a few seconds"
+            )
         path = box_path(str(self._folder), reason)
-        if reason == REQUEST:
-            if len(self._requested) >= MAX_REQUESTED:
-                raise RefusedError(
-                    "busy", f"{MAX_REQUESTED} black boxes are still to be written", "ask again in a few seconds"
-                )
-            self._requested.add(path.name)
         self._refusal = ""
-        self._asked.append(Write(str(path), reason, after_s, self.begun.header | details))
+        self._unwritten[path.name] = asked = Write(str(path), reason, after_s, self.begun.header | details)
+        self._unsent.append(asked)
         self._send_requests()
         return path
 
     @property
     def is_missing(self) -> bool:
         """Whether another keeper is due."""
-        return self._due_s < math.inf
+        return self._ring is not None and self._beside is None
 
     def look(self) -> None:
-        """Send the keeper the requests that wait, and note its answers in `report` and in the log."""
+        """Start a keeper where one is due, send it the requests that wait, and note its answers."""
+        if self._ring is not None and self._beside is None and time.monotonic() >= self._due_s:
+            try:
+                self._beside = ChildProcess(KEEPER, self._ring.file)
+            except OSError as error:
+                self._wait(f"the process that writes it did not start: {error.strerror}")
+            else:
+                self._refusal, self._unsent = "", deque(self._unwritten.values())
         self._send_requests()
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
-            self._requested.discard(answer.name)
+            self._unwritten.pop(answer.name, None)
             if answer.refusal:
                 log.error("the black box %s was not written: %s", answer.name, answer.refusal)
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
         if self._beside is not None and self._beside.is_gone:
-            self._stop("the process that writes it has ended")
-        if self._ring is not None and time.monotonic() >= self._due_s:
-            self._start(self._ring)
+            self._beside.close()
+            self._beside = None
+            self._wait("the process that writes it has ended")
 
     def report(self) -> BlackBoxReport:
         """Return the state of the black box: its folder, the newest file, what went wrong, parts lost since
@@ -204,44 +200,27 @@ class BlackBox:
         if self._ring is not None:
             self._ring.path.unlink(missing_ok=True)
         if (beside := self._beside) is not None:
-            self._send(End())
-            self._beside, self._due_s = None, math.inf
+            beside.send(msgspec.msgpack.encode(End()))
             beside.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
 
     def _send_requests(self) -> None:
-        while self._asked and self._send(self._asked[0]):
-            self._asked.popleft()
+        while self._beside is not None and self._unsent and self._beside.send(msgspec.msgpack.encode(self._unsent[0])):
+            self._unsent.popleft()
+
+    def _begin_anew(self, stepper: Stepper, planner: Planner) -> None:
+        """Forget what was not handed over."""
+        self.journal.take()
+        self.journal.note(MISSING)
+        self._snapshot(stepper, planner)
 
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
         if self.journal.is_kept:
             memory = None if self._connection is None else self._connection.memory()
             self.journal.snapshot(stepper, planner, memory, self.begun.header.get("core_sha256", ""))
 
-    def _send(self, what: Write | End) -> bool:
-        """Send one message to the keeper, and return whether the socket took it."""
-        return self._beside is not None and self._beside.send(msgspec.msgpack.encode(what))
-
-    def _begin_ring(self, ring: Ring) -> None:
-        try:
-            ring.begin(self.begun)
-        except OSError as error:  # control goes on
-            self._refusal = f"no room in shared memory: {error.strerror}"
-            log.error("black boxes may be without what comes now: %s; next: make room there", self._refusal)
-
-    def _start(self, ring: Ring) -> None:
-        """Start the keeper; where that fails, it is tried again."""
-        self._due_s, self._refusal = math.inf, ""
-        try:
-            self._beside = ChildProcess(KEEPER, ring.file)
-        except OSError as error:
-            self._stop(f"the process that writes it did not start: {error.strerror}")
-
-    def _stop(self, reason: str) -> None:
-        """Close the socket, and start another keeper soon."""
+    def _wait(self, reason: str) -> None:
+        """Have another keeper started soon."""
         log.error("no black box is written: %s; another one starts in %g s", reason, AGAIN_S)
         self._refusal, self._due_s = reason, time.monotonic() + AGAIN_S
-        if self._beside is not None:
-            self._beside.close()
-        self._beside = None

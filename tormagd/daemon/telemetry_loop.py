@@ -118,7 +118,8 @@ class TelemetryLoop:
         box.is_heard = connections["recording"] > 0
         # requests that wait now are answered with this snapshot, later ones with the next
         self.waiting = min(endpoint.requests.count, REQUESTS)
-        is_kept = box.journal.is_kept and self.timing.runs % self._hz == 0  # once a second
+        # a recorder gets each snapshot, a black box one a second
+        is_kept = box.journal.is_kept and (box.is_heard or self.timing.runs % self._hz == 0)
         if not (connections["telemetry"] or self.waiting or is_kept):
             return
         in_force, measured = endpoint.inbox.in_force, control.stepper.measured

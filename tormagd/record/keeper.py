@@ -35,8 +35,6 @@ HALVES = 0, 1 << 30
 MAX_FILES = 20
 "Of faults, and of requests; the oldest goes."
 MAX_PACKET = 1_000_000
-MAX_DUE = 28
-"Files that wait to be written."
 LOOK_S = 0.05
 DIED = "DAEMON-DIED"
 SHARED_MEMORY = "/dev/shm"
@@ -104,14 +102,13 @@ class Ring:
     def __init__(self, file: int | None = None, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
         self.file = os.memfd_create("tormagd", os.MFD_CLOEXEC) if file is None else file
         self._kept_s, self._most_bytes = kept_s, most_bytes // 2
-        self._begun = Begin("", {})
+        self._begun, self._is_begun = Begin("", {}), False
         self._half = self._at = self._bytes = 0
         self._first_s = math.inf
 
     def begin(self, begun: Begin) -> None:
         """Begin a scene: parts belong to the newest one before them."""
-        self._begun = begun
-        self._append(begun)
+        self._begun, self._is_begun = begun, False
 
     def put(self, part: Part) -> None:
         """Add a part, which comes later than those before."""
@@ -120,8 +117,10 @@ class Ring:
             self._half = 1 - self._half
             self._at = HALVES[self._half]
             os.pwrite(self.file, END, self._at)
-            self._first_s, self._bytes = part.time_s, 0
+            self._first_s, self._bytes, self._is_begun = part.time_s, 0, False
+        if not self._is_begun:
             self._append(self._begun)
+            self._is_begun = True
         self._append(part)
         self._bytes += len(part.entries)
 
@@ -201,12 +200,11 @@ class Keeper:
             self._write_of_a_dead(self._ring)
             return False
         said = msgspec.msgpack.decode(data, type=Write | End)
-        if isinstance(said, Write) and len(self._due) < MAX_DUE:
-            self._due.append((time.monotonic() + said.after_s, said))
-            self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
-        elif isinstance(said, Write):
-            self._answer(Written(Path(said.path).name, f"{MAX_DUE} others are still to be written"))
-        return not isinstance(said, End)
+        if isinstance(said, End):
+            return False
+        self._due.append((time.monotonic() + said.after_s, said))
+        self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
+        return True
 
     def _write_of_a_dead(self, ring: Ring) -> None:
         """Write what the ring of a daemon has that did not say that it ends."""
@@ -215,32 +213,34 @@ class Keeper:
             self._write(Write(str(box_path(begun.folder, DIED)), DIED, 0.0, begun.header), ring)
 
     def _write(self, write: Write, ring: Ring) -> None:
-        """Write one black box, delete the oldest of its kind beyond MAX_FILES, and answer the daemon."""
-        from tormagd.record.black_box import write_black_box
-
+        """Write one black box, unless it is there, and answer the daemon."""
         path, refusal = Path(write.path), ""
         try:
-            parts = [part.entries for begun, part in ring.kept() if begun.header.items() <= write.header.items()]
-            if not parts:
-                raise OSError(0, "nothing is kept yet")
-            path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
-            write_black_box(path, {**write.header, "reason": write.reason}, parts)
-            # a name is a clock's word: what this daemon has written is newer than the rest
-            self._written.append(path.name)
-            known = sorted(path.parent.glob("*Z-*.mcap"), key=lambda each: (each.name in self._written, each.name))
-            alike = [each for each in known if each.match(f"*-{REQUEST}.mcap") is (write.reason == REQUEST)]
-            for old in alike[:-MAX_FILES]:
-                old.unlink()
+            if not path.exists():  # a keeper may have ended before it could say so
+                self._new_box(path, write, ring)
         except (OSError, ValueError, TypeError, KeyError, msgspec.MsgspecError) as error:
             refusal = f"{path}: {getattr(error, 'strerror', None) or error!r}"
             if isinstance(error, OSError):
                 refusal += "; next: make room there, or name another [black_box] folder"
             write_line(f"tormagd: no black box: {refusal}", sys.stderr)
-        self._answer(Written(path.name, refusal))
-
-    def _answer(self, answer: Written) -> None:
         with contextlib.suppress(OSError):  # there may be nobody any more
-            self._socket.send(msgspec.msgpack.encode(answer), socket.MSG_DONTWAIT)
+            self._socket.send(msgspec.msgpack.encode(Written(path.name, refusal)), socket.MSG_DONTWAIT)
+
+    def _new_box(self, path: Path, write: Write, ring: Ring) -> None:
+        """Write a black box, and delete the oldest of its kind beyond MAX_FILES."""
+        from tormagd.record.black_box import write_black_box
+
+        parts = [part.entries for begun, part in ring.kept() if begun.header.items() <= write.header.items()]
+        if not parts:
+            raise OSError(0, "nothing is kept yet")
+        path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
+        write_black_box(path, {**write.header, "reason": write.reason}, parts)
+        # a name is a clock's word: what this daemon has written is newer than the rest
+        self._written.append(path.name)
+        known = sorted(path.parent.glob("*Z-*.mcap"), key=lambda each: (each.name in self._written, each.name))
+        alike = [each for each in known if each.match(f"*-{REQUEST}.mcap") is (write.reason == REQUEST)]
+        for old in alike[:-MAX_FILES]:
+            old.unlink()
 
 
 def main() -> None:

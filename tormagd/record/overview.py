@@ -8,7 +8,6 @@ reader makes it from the messages in the same way.
 import re
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
-from itertools import pairwise
 from typing import Annotated, Any, TypedDict
 
 import msgspec
@@ -24,10 +23,11 @@ Floats = NDArray[np.float64]
 QUANTITIES = (
     "setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "gap_setpoint_mm", "left_duty", "right_duty", "field_mT",
 )  # fmt: skip
-LOOKED_AT = (
-    *(*QUANTITIES, "t_ns", "left_mm", "right_mm", "reference_gap_mm", "lateness_us"),
-    *("handle_mm", "handle_rate_mm_s", "handle_mm_s"),
-)
+GIVES = (
+    "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "reference_gap_mm", "left_duty", "right_duty",
+    "field_mT",
+)  # fmt: skip
+"Columns of a tick that give them."
 KINDS = ("operating_state", "limits", "faults")
 BREAK_S = 0.1
 "Between messages further apart, nothing is known."
@@ -35,7 +35,7 @@ BREAK_NS = round(BREAK_S * 1e9)
 FIRST_WIDTH_NS = 1_000_000
 MAX_STRETCHES = 1_500
 MAX_SPANS = 1_000
-"Beyond these, the nearest spans of one code are joined."
+"Beyond these, each two neighbours of one code are joined."
 STEP_NS = 100_000_000
 "A wall clock that is set further is said."
 MAX_CODES, MAX_MARKS = 66, 1_000
@@ -56,20 +56,15 @@ Code = Annotated[str, Meta(pattern=rf"\A{CODE.pattern}\Z")]
 
 def glance(*numbers: str, **others: Any) -> Any:
     """Return the type as which a message is decoded: what an overview shows of it, and further fields."""
-    fields = dict.fromkeys((*LOOKED_AT, *numbers), float | None) | {
+    fields = {
+        **dict.fromkeys((*GIVES, "t_ns", "lateness_us", "handle_mm", "handle_rate_mm_s", *numbers), float | None),
         **dict.fromkeys(("limits", "faults"), Words | None),
-        **{"duty": tuple[float, float] | None, "operating_state": Word | None, "mark": Mark | None},
+        **{"operating_state": Word | None, "mark": Mark | None},
     }
     return TypedDict("Glance", fields | others, total=False)  # type: ignore[operator]
 
 
 Glance = glance()
-
-
-class Curves(msgspec.Struct, frozen=True):
-    stretches: bytes
-    low: dict[str, bytes]
-    high: dict[str, bytes]
 
 
 class Series(msgspec.Struct, frozen=True):
@@ -81,11 +76,25 @@ class Series(msgspec.Struct, frozen=True):
     high: Floats
 
 
-class Codes(msgspec.Struct, frozen=True):
+Span = Annotated[list[int], Meta(min_length=2, max_length=2)]
+
+
+class Codes(msgspec.Struct):
     """When a code was present, ns since the start; spans may be joined, `held_ns` is the exact total."""
 
-    spans_ns: Annotated[list[tuple[int, int]], Meta(max_length=MAX_SPANS)]
-    held_ns: int
+    spans_ns: Annotated[list[Span], Meta(max_length=MAX_SPANS)] = []
+    held_ns: int = 0
+
+    def hold(self, from_ns: int, to_ns: int) -> None:
+        spans = self.spans_ns
+        if spans and from_ns <= spans[-1][1] <= to_ns:
+            self.held_ns += to_ns - spans[-1][1]
+            spans[-1][1] = to_ns
+            return
+        self.held_ns += to_ns - from_ns
+        if len(spans) == MAX_SPANS:
+            self.spans_ns = spans = [[a, b] for (a, _), (_, b) in zip(spans[::2], spans[1::2], strict=True)]
+        spans.append([from_ns, to_ns])
 
 
 class Overview(msgspec.Struct, frozen=True, kw_only=True):
@@ -96,8 +105,10 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     width_ns: Annotated[int, Meta(gt=0)]
     ticks: int
     snapshots: int
-    of_ticks: Curves
-    of_snapshots: Curves
+    stretches: bytes
+    "Number of each stretch that has a message: int64, shape (n,)."
+    sides: bytes
+    "Least and greatest values of QUANTITIES: float32, shape (2, n, 8)."
     codes: dict[str, Annotated[dict[Code, Codes], Meta(max_length=MAX_CODES)]]
     "By kind, then by code in the order of their first appearance."
     following: FollowingReport | None
@@ -111,18 +122,17 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         return (self.end_ns - self.start_ns) * 1e-9
 
     def require_messages(self) -> None:
-        if not self.ticks and not self.snapshots:
-            raise ValueError("the recording has no messages: was the daemon running?")
+        if not self.ticks:
+            raise ValueError("the recording has no control ticks: was the daemon running?")
 
     def series(self, name: str) -> Series | None:
-        """Return one of QUANTITIES, from the ticks or else from the snapshots."""
-        for curves in (self.of_ticks, self.of_snapshots):
-            if name in curves.low:
-                low, high = _numbers(curves.low[name]), _numbers(curves.high[name])
-                if np.isfinite(low).any():
-                    numbers = np.frombuffer(curves.stretches, np.int64)
-                    return Series(np.array((numbers + 0.5) * (self.width_ns * 1e-9), np.float64), low, high)
-        return None
+        """Return one of QUANTITIES; None where it was never known."""
+        sides = np.frombuffer(self.sides, np.float32).reshape(2, -1, len(QUANTITIES))
+        low, high = np.array(sides[:, :, QUANTITIES.index(name)], np.float64)
+        if not np.isfinite(low).any():
+            return None
+        middles = np.frombuffer(self.stretches, np.int64) + np.float64(0.5)
+        return Series(np.array(middles * (self.width_ns * 1e-9), np.float64), low, high)
 
     def spans_s(self, kind: str) -> dict[str, list[tuple[float, float]]]:
         """Return the spans of each code of this kind, seconds since the start."""
@@ -140,11 +150,8 @@ def unpacked(data: bytes) -> Overview:
         found = msgspec.msgpack.decode(data, type=Overview)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(f"its overview: {error}") from error
-    for curves in (found.of_ticks, found.of_snapshots):
-        count = len(curves.stretches) // 8
-        sizes = {len(side) for sides in (curves.low, curves.high) for side in sides.values()}
-        if len(curves.stretches) % 8 or not sizes <= {4 * count} or set(curves.low) != set(curves.high):
-            raise ValueError("its overview: curves of unequal length")
+    if len(found.stretches) % 8 or len(found.sides) != len(QUANTITIES) * len(found.stretches):
+        raise ValueError("its overview: curves of unequal length")
     if set(found.codes) != set(KINDS):
         raise ValueError(f"its overview: allowed are codes of {', '.join(KINDS)}")
     return found
@@ -154,84 +161,68 @@ class OverviewBuilder:
     def __init__(self) -> None:
         self._start_ns: int | None = None
         self._end_ns = 0
-        self._stretches = {True: _Stretches(), False: _Stretches()}
-        self._spans = {True: _Codes(), False: _Codes()}
-        self._following = {True: _Followed(), False: _Followed()}
-        self._counts = {True: 0, False: 0}
+        self._ticks = self._snapshots = 0
+        self._stretches, self._codes, self._following = _Stretches(), _Codes(), _Followed()
         self._late = [0] * (len(LATE_US) + 1)
         self._marks: list[Mark] = []
         self._mark: Mark | None = None
         self._ahead_ns = 0
 
     def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
-        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970, by an `Axis`."""
+        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970, as `Derived` places it."""
         if self._start_ns is None:
-            self._start_ns = self._end_ns = t_ns
-        since_ns = t_ns - self._start_ns
+            self._start_ns = t_ns
         self._end_ns = max(self._end_ns, t_ns)
-        self._counts[is_tick] += 1
-        values = quantities(message)
-        self._stretches[is_tick].add(since_ns, values)
-        self._spans[is_tick].add(since_ns, message)
-        self._following[is_tick].add(since_ns, values[0], values[2], message)
-        late_us = _number(message.get("lateness_us"))
-        if late_us is not None:
-            self._late[bisect_right(LATE_US, late_us)] += 1
-        wall_ns = _number(message.get("t_ns")) if is_tick else None
-        if wall_ns is not None:
-            step_ns = round(wall_ns) - t_ns - self._ahead_ns
-            if abs(step_ns) > STEP_NS:
-                self._ahead_ns += step_ns
-                self._add_mark(Mark(t_ns=t_ns, text=f"the clock stepped by {step_ns * 1e-9:+.6g} s"))
+        if is_tick:
+            self._ticks += 1
+            self._add_tick(t_ns - self._start_ns, t_ns, message)
+            return
+        self._snapshots += 1
         mark = message.get("mark")
         if mark and mark != self._mark:  # every snapshot has the newest
             self._mark = mark
             self._add_mark(Mark(t_ns=mark.t_ns - self._ahead_ns, text=mark.text))
+
+    def _add_tick(self, since_ns: int, t_ns: int, tick: Mapping[str, Any]) -> None:
+        values = quantities(tick)
+        self._stretches.add(since_ns, values)
+        self._codes.add(since_ns, tick)
+        self._following.add(since_ns, values[0], values[2], tick)
+        late_us, wall_ns = _number(tick.get("lateness_us")), _number(tick.get("t_ns"))
+        if late_us is not None:
+            self._late[bisect_right(LATE_US, late_us)] += 1
+        step_ns = 0 if wall_ns is None else round(wall_ns) - t_ns - self._ahead_ns
+        if abs(step_ns) > STEP_NS:
+            self._ahead_ns += step_ns
+            self._add_mark(Mark(t_ns=t_ns, text=f"the clock stepped by {step_ns * 1e-9:+.6g} s"))
 
     def _add_mark(self, mark: Mark) -> None:
         if mark.t_ns >= (self._start_ns or 0) and len(self._marks) < MAX_MARKS:
             self._marks.append(mark)
 
     def made(self) -> Overview:
-        width_ns = max(each.width_ns for each in self._stretches.values())
-        for each in self._stretches.values():
-            each.widen(width_ns)
-        ticks, snapshots = self._spans[True].made(), self._spans[False].made()
-        followed = self._following[self._following[True].counted_s > 0.0]
+        stretches, sides = self._stretches.made()
         return Overview(
             start_ns=self._start_ns or 0,
             end_ns=self._end_ns,
-            width_ns=width_ns,
-            ticks=self._counts[True],
-            snapshots=self._counts[False],
-            of_ticks=self._stretches[True].made(),
-            of_snapshots=self._stretches[False].made(),
-            codes={kind: ticks[kind] or snapshots[kind] for kind in KINDS},
-            following=followed.report(),
-            followed_s=followed.counted_s,
+            width_ns=self._stretches.width_ns,
+            ticks=self._ticks,
+            snapshots=self._snapshots,
+            stretches=stretches,
+            sides=sides,
+            codes=self._codes.made(),
+            following=self._following.report(),
+            followed_s=self._following.counted_s,
             late_counts=self._late,
             marks=self._marks,
         )
 
 
-def quantities(message: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """Return the QUANTITIES of a tick or a snapshot; None for what is missing or no number."""
-    get = message.get
-    gap_mm, left_mm, right_mm = _number(get("gap_mm")), _number(get("left_mm")), _number(get("right_mm"))
-    if gap_mm is None and left_mm is not None and right_mm is not None:
-        gap_mm = left_mm + right_mm
-    wanted_mm = _number(get("gap_setpoint_mm"))
-    left, right = get("duty") or (get("left_duty"), get("right_duty"))
-    return (
-        _number(get("setpoint_cf")),
-        _number(get("governed_cf")),
-        _number(get("measured_cf")),
-        gap_mm,
-        _number(get("reference_gap_mm")) if wanted_mm is None else wanted_mm,
-        _number(left),
-        _number(right),
-        _number(get("field_mT")),
-    )
+def quantities(tick: Mapping[str, Any]) -> tuple[float | None, ...]:
+    """Return the QUANTITIES of a tick; None for what is missing or no number."""
+    asked_N, governed_N, measured_N, left_mm, right_mm, *others = [_number(tick.get(name)) for name in GIVES]
+    gap_mm = None if left_mm is None or right_mm is None else left_mm + right_mm
+    return asked_N, governed_N, measured_N, gap_mm, *others
 
 
 def _number(value: object) -> float | None:
@@ -244,10 +235,6 @@ def codes_in(told: object) -> tuple[str, ...]:
     return tuple(word if CODE.fullmatch(word) else ODD.sub("?", word[:64]) or "?" for word in map(str, words))
 
 
-def _numbers(data: bytes) -> Floats:
-    return np.array(np.frombuffer(data, np.float32), np.float64)
-
-
 class _Followed(Following):
     _number = 0
 
@@ -258,13 +245,12 @@ class _Followed(Following):
         if not 0 < number - self._number <= BREAK_NS // _LOOK_NS:
             self.begin()
         self._number, get = number, message.get
-        rate_mm_s = get("handle_rate_mm_s", get("handle_mm_s"))
         limits = get("limits") or ()
-        self.look(get("operating_state"), limits, asked_N, measured_N, get("handle_mm"), rate_mm_s)
+        self.look(get("operating_state"), limits, asked_N, measured_N, get("handle_mm"), get("handle_rate_mm_s"))
 
 
 class _Stretches:
-    """The least and greatest values of one kind of message, in stretches of `width_ns`; NaN where there is none."""
+    """The least and greatest values of the ticks, in stretches of `width_ns`; NaN where there is none."""
 
     def __init__(self) -> None:
         self.width_ns = FIRST_WIDTH_NS
@@ -276,7 +262,7 @@ class _Stretches:
         # a clock that was set back must not set the curve back
         if not self._numbers or number > self._numbers[-1]:
             if len(self._numbers) >= MAX_STRETCHES:
-                self.widen(2 * self.width_ns)
+                self._widen()
                 self.add(since_ns, values)
                 return
             self._numbers.append(number)
@@ -284,53 +270,24 @@ class _Stretches:
         for side, of in zip(self._sides[:, len(self._numbers) - 1], (np.fmin, np.fmax), strict=True):
             of(side, known, out=side)
 
-    def widen(self, width_ns: int) -> None:
-        ratio, self.width_ns = width_ns // self.width_ns, width_ns
-        if ratio > 1 and self._numbers:
-            numbers, firsts = np.unique(np.array(self._numbers) // ratio, return_index=True)
-            known, self._numbers = self._sides[:, : len(self._numbers)].copy(), numbers.tolist()
-            self._sides[:] = np.nan
-            for side, kept, of in zip(self._sides, known, (np.fmin, np.fmax), strict=True):
-                side[: len(firsts)] = of.reduceat(kept, firsts, axis=0)
+    def _widen(self) -> None:
+        self.width_ns *= 2
+        numbers, firsts = np.unique(np.array(self._numbers) // 2, return_index=True)
+        known, self._numbers = self._sides[:, : len(self._numbers)].copy(), numbers.tolist()
+        self._sides[:] = np.nan
+        for side, kept, of in zip(self._sides, known, (np.fmin, np.fmax), strict=True):
+            side[: len(firsts)] = of.reduceat(kept, firsts, axis=0)
 
-    def made(self) -> Curves:
+    def made(self) -> tuple[bytes, bytes]:
+        """Return the stretches' numbers, and their values."""
         with np.errstate(over="ignore"):  # a file may say any number
             sides = self._sides[:, : len(self._numbers)].astype(np.float32)
-        low, high = ({name: side[:, at].tobytes() for at, name in enumerate(QUANTITIES)} for side in sides)
-        return Curves(np.array(self._numbers, np.int64).tobytes(), low, high)
-
-
-def _joined(spans: list[list[int]]) -> list[list[int]]:
-    """Join about half of the spans, across the smaller gaps."""
-    gaps = [after[0] - before[1] for before, after in pairwise(spans[:-1])]
-    near_ns, joined = sorted(gaps)[len(gaps) // 2], [spans[0]]
-    for span, gap_ns in zip(spans[1:-1], gaps, strict=True):
-        if gap_ns <= near_ns:
-            joined[-1][1] = span[1]
-        else:
-            joined.append(span)
-    return [*joined, spans[-1]]
-
-
-class _Held:
-    def __init__(self) -> None:
-        self.spans: list[list[int]] = []
-        self.ns = 0
-
-    def hold(self, from_ns: int, to_ns: int) -> None:
-        if self.spans and from_ns <= self.spans[-1][1] <= to_ns:
-            self.ns += to_ns - self.spans[-1][1]
-            self.spans[-1][1] = to_ns
-            return
-        self.ns += to_ns - from_ns
-        self.spans.append([from_ns, to_ns])
-        if len(self.spans) > MAX_SPANS:
-            self.spans = _joined(self.spans)
+        return np.array(self._numbers, np.int64).tobytes(), sides.tobytes()
 
 
 class _Codes:
     def __init__(self) -> None:
-        self._known: dict[str, dict[str, _Held]] = {kind: {} for kind in KINDS}
+        self._known: dict[str, dict[str, Codes]] = {kind: {} for kind in KINDS}
         self._now: list[tuple[str, str]] = []
         self._now_ns = self._step_ns = 0
 
@@ -347,14 +304,10 @@ class _Codes:
         for kind, code in self._now:
             known = self._known[kind]
             is_kept = code in known or len(known) < MAX_CODES - 1
-            held = known.setdefault(code if is_kept else OTHER, _Held())
-            held.hold(self._now_ns, self._now_ns + for_ns)
+            known.setdefault(code if is_kept else OTHER, Codes()).hold(self._now_ns, self._now_ns + for_ns)
 
     def made(self) -> dict[str, dict[str, Codes]]:
         """Hold the last codes for one usual step, and return all spans by kind and code."""
         self._hold(self._step_ns)
         self._now = []
-        return {
-            kind: {code: Codes([(a, b) for a, b in held.spans], held.ns) for code, held in known.items()}
-            for kind, known in self._known.items()
-        }
+        return self._known

@@ -1,13 +1,14 @@
 """Reading a recording: its overview, some seconds of it, or message by message.
 
-`mcap` parses the file. A file costs no more memory and time than its size explains: a record, or a chunk unpacked, has
-at most MAX_RECORD_BYTES, and all chunks together MAX_RATIO times the file's bytes.
+A closed file says at its end where its chunks are; in any other they are looked for. Each is read by itself, so damage
+costs no other. `mcap` parses the file. A file costs no more memory and time than its
+size explains: a record, or a chunk unpacked, has at most MAX_RECORD_BYTES, and all chunks together MAX_RATIO times the
+file's bytes.
 """
 
 import contextlib
 import struct
 import zlib
-from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -49,6 +50,7 @@ MAX_INDEX = 1_000_000
 "Chunks of one file: some days."
 MAX_SEEN = 400_000
 "Messages read at once: at 4 kHz more than a minute."
+END_NS = 2**64 - 1
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
     McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
@@ -73,7 +75,7 @@ class Seen(NamedTuple):
 def opened(path: Path) -> Iterator[BinaryIO]:
     try:
         require_regular(path, MAX_FILE_BYTES)
-        with path.open("rb") as file:
+        with path.open("rb") as file, readable(str(path)):
             yield file
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
@@ -127,83 +129,6 @@ def _within(chunk: Chunk) -> list[McapRecord]:
     return breakup_chunk(chunk, validate_crc=True)
 
 
-def scan(file: BinaryIO, name: str, found: "Contents") -> bool:
-    """Read an MCAP file into `found`; return False for one that was cut short.
-
-    After damage, reading goes on with the next chunk.
-    """
-    size, is_whole = 0, True
-    with readable(name):
-        try:
-            for at, record, within in _intact(file, found.lose):
-                if isinstance(record, Chunk):
-                    found.take(record, at)
-                    size += record.uncompressed_size
-                    if size > MAX_RATIO * file.tell() + FREE_BYTES:
-                        raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
-                for each in within:
-                    if isinstance(each, Message):
-                        found.message(each)
-                    else:
-                        found.take(each, at)
-        except EOFError:
-            is_whole = False
-        if found.lost and not size:
-            raise ValueError(found.lost[0])
-        if is_whole and file.read(1):
-            raise ValueError("it does not end as MCAP does")
-    return is_whole
-
-
-def _intact(file: BinaryIO, lost: Callable[[str], None]) -> Iterator[tuple[int, McapRecord, list[McapRecord]]]:
-    """Yield where each record begins, the record, and what is in a chunk; EOFError where no more can be read.
-
-    After damage the summary says where the next chunk is; without one, reading goes on after a chunk.
-    """
-    at, records = MAGIC_SIZE, _records(file, has_magic=True)
-    chunks: list[int] | None = None
-    while True:
-        record: McapRecord | None = None
-        try:
-            record = next(records, None)
-            if record is None:
-                return
-            within = _within(record) if isinstance(record, Chunk) else [record]
-        except UNREADABLE as error:
-            if record is None and isinstance(error, EOFError):
-                raise
-            lost(f"byte {at}: {str(error)[:80] or repr(error)}")
-            end = file.tell()
-            if chunks is None:
-                chunks = _indexed(file)
-            following = bisect_right(chunks, at)
-            if following == len(chunks) and record is None:
-                raise EOFError from error
-            at = file.seek(chunks[following] if following < len(chunks) else end)
-            records = _records(file)
-        else:
-            yield at, record, within
-            at = file.tell()
-
-
-def _indexed(file: BinaryIO) -> list[int]:
-    """List where the chunks begin that the file's summary names; none where it is not there."""
-    found = Contents()
-    with contextlib.suppress(*UNREADABLE):
-        for record in _summary(file):
-            if isinstance(record, ChunkIndex):
-                found.place(record, record.chunk_start_offset)
-    return sorted(place.at for place in found.places)
-
-
-def _summary(file: BinaryIO) -> Iterator[McapRecord]:
-    """Yield the records of a file's summary; none of one that was cut short."""
-    footer, _ = _end(file)
-    if footer is not None:
-        file.seek(footer.summary_start)
-        yield from _records(file)
-
-
 def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
     file.seek(at)
     record = next(_records(file))
@@ -220,20 +145,13 @@ def _end(file: BinaryIO) -> tuple[Footer | None, int]:
 
 
 def damage_in(file: BinaryIO) -> str:
-    """Say which CRC of a whole MCAP file is wrong; empty for none, and for a file cut short."""
+    """Say which CRC of a closed MCAP file is wrong; empty for none, and for a file cut short."""
     try:
         footer, at = _end(file)
         if footer is None:
             return ""
         data_end_at = footer.summary_start - DATA_END_BYTES
-        data_crc = _at(file, data_end_at, DataEnd).data_section_crc
-        if not data_crc:
-            file.seek(0)
-            found = Contents()
-            scan(file, file.name, found)
-            if found.lost:
-                return found.lost[0]
-        elif data_crc != _crc(file, 0, data_end_at):
+        if _at(file, data_end_at, DataEnd).data_section_crc not in (0, _crc(file, 0, data_end_at)):
             return "the CRC of its data is wrong"
         if footer.summary_crc not in (0, _crc(file, footer.summary_start, at + FOOTER_SIZE - 4)):
             return "the CRC of its summary is wrong"
@@ -259,41 +177,108 @@ class Place(NamedTuple):
 
 
 class Contents:
-    """Collects topics, metadata, places of chunks, and damage, in the file's order. Messages are passed over."""
+    """What is in an MCAP file: topics, metadata, where its chunks are, and which of those read are damaged."""
 
-    def __init__(self) -> None:
+    def __init__(self, file: BinaryIO, name: str) -> None:
+        self._name = name
         self.topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
-        self.lost: list[str] = []
-        self.is_complete = True
-        "False if the recorder was killed or the disk was full: earlier messages are there."
+        self.lost: dict[int, str] = {}
+        "What is wrong, by where the chunk begins."
+        self._overview_at = 0
+        self._is_closed = self._read_summary(file)
 
-    def take(self, record: McapRecord, at: int) -> None:
+    @property
+    def is_complete(self) -> bool:
+        """False if the recorder was killed or the disk was full: earlier messages are there."""
+        return self._is_closed and CUT not in self.metadata
+
+    def _read_summary(self, file: BinaryIO) -> bool:
+        """Read what stands at the end, and return whether all of that is there."""
+        told: list[int] = []
+        with contextlib.suppress(*UNREADABLE):
+            footer, _ = _end(file)
+            if footer is None:
+                return False
+            file.seek(footer.summary_start)
+            for record in _records(file):
+                self._take(record, 0)
+                if isinstance(record, MetadataIndex):
+                    told.append(record.offset)
+                elif isinstance(record, AttachmentIndex) and record.name == OVERVIEW:
+                    self._overview_at = record.offset
+            for at in told:
+                self._take(_at(file, at, Metadata), at)
+            return True
+        self.places = []
+        return False
+
+    def _look_for_chunks(self, file: BinaryIO) -> None:
+        """Look for chunks from the beginning, as far as records follow each other."""
+        at = file.seek(0) + MAGIC_SIZE
+        try:
+            for record in _records(file, has_magic=True):
+                if isinstance(record, DataEnd):
+                    break
+                self._take(record, at)
+                at = file.tell()
+        except UNREADABLE:
+            if not self.places:
+                raise
+
+    def _take(self, record: McapRecord, at: int) -> None:
         if isinstance(record, Channel):
             self.topics[record.id] = record.topic
         elif isinstance(record, Metadata):
             self.metadata.update(record.metadata)
-        elif isinstance(record, Chunk):
-            self.place(record, at)
+        elif isinstance(record, Chunk | ChunkIndex) and len(self.places) < MAX_INDEX:
+            at = record.chunk_start_offset if isinstance(record, ChunkIndex) else at
+            self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
-    def place(self, chunk: Chunk | ChunkIndex, at: int) -> None:
-        if len(self.places) < MAX_INDEX:
-            self.places.append(Place(chunk.message_start_time, chunk.message_end_time, at))
+    def messages(self, file: BinaryIO, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[tuple[str, Message]]:
+        """Yield the messages, with their topics, of the chunks that have some of this time, and are not damaged."""
+        if not self.places:
+            self._look_for_chunks(file)
+        size = 0
+        for place in self.places:
+            if place.from_ns > to_ns or place.to_ns < from_ns:
+                continue
+            try:
+                chunk = _at(file, place.at, Chunk)
+                records = _within(chunk)
+            except UNREADABLE as error:
+                self.lost[place.at] = f"byte {place.at}: {str(error)[:80] or repr(error)}"
+                continue
+            size += chunk.uncompressed_size
+            if size > MAX_RATIO * file.tell() + FREE_BYTES:
+                raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
+            for record in records:
+                self._take(record, place.at)
+                if isinstance(record, Message):
+                    yield self.topics.get(record.channel_id, ""), record
 
-    def message(self, sent: Message) -> None:
-        pass
+    def read(self, file: BinaryIO, wanted: Any, each: Callable[[Seen], None], *times_ns: int) -> None:
+        """Hand the ticks and snapshots of `messages` to `each`, decoded as `wanted`."""
+        decode = msgspec.json.Decoder(wanted).decode
+        for topic, sent in self.messages(file, *times_ns):
+            if topic in TOPICS:
+                each(Seen(sent.log_time, topic == TICKS_TOPIC, decode(sent.data)))
+        if len(self.lost) == len(self.places) > 0:
+            raise ValueError(next(iter(self.lost.values())))
+        self._require_topics()
 
-    def lose(self, what: str) -> None:
-        self.lost.append(what)
-
-    def end(self, name: str, *, is_whole: bool) -> None:
-        """Note whether all was read. Raises RecordingError where the file `name` is no recording."""
+    def _require_topics(self) -> None:
         if set(self.topics.values()).isdisjoint(TOPICS):
-            raise RecordingError(
-                f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
-            )
-        self.is_complete = is_whole and CUT not in self.metadata
+            said = f"no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
+            raise RecordingError(f"{self._name}: {said}")
+
+    def read_overview(self, file: BinaryIO) -> Overview | None:
+        """Read the overview of a closed file, if there is one."""
+        if not self._is_closed or not self._overview_at:
+            return None
+        self._require_topics()
+        return unpacked(_at(file, self._overview_at, Attachment).data)
 
     def described(self, name: str, kind: Any) -> Any:
         try:
@@ -302,23 +287,11 @@ class Contents:
             return None
 
 
-class Recording(Contents):
-    """Hands each tick and snapshot to `each`, decoded as `wanted`."""
-
-    def __init__(self, wanted: Any, each: Callable[[Seen], None]) -> None:
-        super().__init__()
-        self._decode, self._each = msgspec.json.Decoder(wanted).decode, each
-
-    def message(self, sent: Message) -> None:
-        topic = self.topics.get(sent.channel_id)
-        if topic in TOPICS:
-            self._each(Seen(sent.log_time, topic == TICKS_TOPIC, self._decode(sent.data)))
-
-
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
     """Read an open recording: each tick and snapshot goes to `each`."""
-    found = Recording(wanted, each)
-    found.end(name, is_whole=scan(file, name, found))
+    with readable(name):
+        found = Contents(file, name)
+        found.read(file, wanted, each)
     return found
 
 
@@ -328,28 +301,23 @@ def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Con
         return read_open(file, str(path), wanted, each)
 
 
-class RecordingFile:
+class RecordingFile(Contents):
     """A recording of any length on the disk."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, printable(path.name)
         with opened(path) as file:
+            super().__init__(file, str(path))
             self.damage = damage_in(file)
-        found = None if self.damage else summary_of(path)
-        if found is None:
-            builder = OverviewBuilder()
-            found = read_recording(path, Glance, lambda seen: builder.add(*seen)), builder.made()
-        self._contents, self.overview = found
-        self.metadata, self.described = self._contents.metadata, self._contents.described
-        self.is_complete = self._contents.is_complete
-        known = self.metadata
+            overview = None if self.damage else self.read_overview(file)
+            if overview is None:
+                builder = OverviewBuilder()
+                self.read(file, Glance, lambda seen: builder.add(*seen))
+                overview = builder.made()
+        self.overview, lost, known = overview, list(self.lost.values()), self.metadata
         self.notes = [
             *([f"damaged: {self.damage}"] if self.damage else []),
-            *(
-                [f"left out: {len(self._contents.lost)} damaged, {self._contents.lost[0]}"]
-                if self._contents.lost
-                else []
-            ),
+            *([f"left out: {len(lost)} damaged, {lost[0]}"] if lost else []),
             *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
             *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
         ]
@@ -365,33 +333,12 @@ class RecordingFile:
                 if len(found) > MAX_SEEN:
                     raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
 
-        reading = Recording(wanted, keep)
-        reading.topics = self._contents.topics
-        with opened(self.path) as file, readable(str(self.path)):
-            for place in self._contents.places:
-                if place.from_ns <= to_ns and place.to_ns >= from_ns:
-                    for each in _within(_at(file, place.at, Chunk)):
-                        if isinstance(each, Message):
-                            reading.message(each)
+        with opened(self.path) as file:
+            self.read(file, wanted, keep, from_ns, to_ns)
         return found
 
 
-def summary_of(path: Path) -> tuple[Contents, Overview] | None:
-    """Read contents and overview from the end of the file, if they are there."""
-    found, told, overview_at = Contents(), [], 0
-    with opened(path) as file, readable(str(path)):
-        for record in _summary(file):
-            if isinstance(record, ChunkIndex):
-                found.place(record, record.chunk_start_offset)
-            elif isinstance(record, MetadataIndex):
-                told.append(record.offset)
-            elif isinstance(record, AttachmentIndex) and record.name == OVERVIEW:
-                overview_at = record.offset
-            else:
-                found.take(record, 0)
-        if not overview_at:
-            return None
-        for at in told:
-            found.take(_at(file, at, Metadata), at)
-        found.end(str(path), is_whole=True)
-        return found, unpacked(_at(file, overview_at, Attachment).data)
+def overview_of(path: Path) -> Overview | None:
+    """Read the overview at the end of the file, if there is one."""
+    with opened(path) as file:
+        return Contents(file, str(path)).read_overview(file)

@@ -68,7 +68,12 @@ def kind_of(column: str) -> Any:
 
 
 TickRecord: Any = msgspec.defstruct(
-    "TickRecord", [(name, kind_of(name)) for name in COLUMNS], array_like=True, frozen=True, gc=False
+    "TickRecord",
+    [(name, kind_of(name)) for name in COLUMNS],
+    array_like=True,
+    frozen=True,
+    gc=False,
+    forbid_unknown_fields=True,
 )
 "A row whose values have their columns' names."
 

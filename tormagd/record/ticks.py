@@ -40,34 +40,6 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
                 raise ValueError(f"rows[{number}].{TIME_COLUMN} = {time_ns!r}: allowed is 0..2^63-1 ns since 1970")
 
 
-class Axis:
-    """Times of messages in ns since 1970 by the monotonic clock, whatever steps the wall clock takes later."""
-
-    def __init__(self) -> None:
-        self._offset_ns: int | None = None
-        self._newest_ns = self._monotonic_ns = self.ahead_ns = 0
-        "`ahead_ns`: how far the wall clock has gone ahead since."
-
-    def of_tick(self, t_ns: int, monotonic_s: object) -> int:
-        if not isinstance(monotonic_s, float) or not 0.0 <= monotonic_s < 1e9:
-            return t_ns
-        monotonic_ns = round(monotonic_s * 1e9)
-        if self._offset_ns is None or monotonic_ns < self._monotonic_ns:  # the first, or of another machine
-            self._offset_ns = max(t_ns - self.ahead_ns, self._newest_ns) - monotonic_ns
-        self._monotonic_ns, self._newest_ns = monotonic_ns, monotonic_ns + self._offset_ns
-        self.ahead_ns = t_ns - self._newest_ns
-        return self._newest_ns
-
-    def of_frame(self, monotonic_s: float) -> int:
-        """Place what passed between daemon and device."""
-        return max(round(monotonic_s * 1e9) + (self._offset_ns or 0), 0)
-
-    def of_snapshot(self, t_ns: int) -> int:
-        """Place a snapshot, which may know of a step before the ticks do."""
-        at_ns = t_ns - self.ahead_ns
-        return at_ns if self._offset_ns is None or abs(at_ns - self._newest_ns) < 1_000_000_000 else self._newest_ns
-
-
 _ENCODER, _DECODER = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(TickBatch)
 
 

@@ -1,8 +1,8 @@
 """Writing a recording or a black box: MCAP, compressed with zstd.
 
-`/core` has the journal's entries as they came, in msgpack, for a replay. `/ticks` and `/frames` are derived of them,
-and `/telemetry` has snapshots, in JSON with plain schemas, for Foxglove and PlotJuggler: a number there cannot be null,
-so what is not known is left out. An overview stands at the end.
+`/core` has the journal's entries as they came, in msgpack, for a replay. `/ticks`, `/frames` and `/telemetry` are
+derived of them, in JSON with plain schemas, for Foxglove and PlotJuggler: a number there cannot be null, so what is not
+known is left out. An overview stands at the end.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ from mcap.writer import Writer
 from tormagd import __version__
 from tormagd.ground.files import new_file
 from tormagd.record.folder import RecordingFolder
-from tormagd.record.journal import READ, WROTE
+from tormagd.record.journal import READ, TOLD, WROTE
 from tormagd.record.overview import OverviewBuilder
 from tormagd.record.telemetry import COLUMNS, kind_of
-from tormagd.record.ticks import Axis, TickBatch, Value
+from tormagd.record.ticks import TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry
 
 ABOUT = "tormagd"
@@ -35,8 +35,8 @@ CUT = "cut_by"
 "Metadata key: why the recording ended early."
 THINNED = "thinned"
 "Metadata key: which ticks are there, if not all."
-OVERVIEW = "overview 2"
-"Version 2 counts handle and limits in how well a force is followed."
+OVERVIEW = "overview 3"
+"Version 3 has its curves in two arrays."
 TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC, FRAMES_TOPIC, CORE_TOPIC = "/ticks", "/frames", "/core"
 NUMBER_COLUMN = "tick"
@@ -99,8 +99,7 @@ class Thinning:
     def __init__(self, every: int) -> None:
         self.every = every
         self._waiting: deque[Shown] = deque()
-        self._count = 0
-        self._full_to_ns = 0
+        self._count = self._full_to_ns = 0
         self._faults: Any = ()
 
     def happened(self, t_ns: int) -> None:
@@ -108,51 +107,65 @@ class Thinning:
 
     def take(self, tick: Shown) -> list[Shown]:
         """Add a tick, and return the ticks to be written now, often none."""
-        if self.every == 1:
-            return [tick]
-        t_ns, faults = tick.t_ns, tick.message.get("faults", ())
-        if faults != self._faults and faults:
-            self.happened(t_ns)
+        faults = tick.message.get("faults", ())
+        if faults and faults != self._faults:
+            self.happened(tick.t_ns)
         self._faults = faults
         self._waiting.append(tick)
-        if t_ns <= self._full_to_ns:
-            return self.rest(1)
+        is_full = self.every == 1 or tick.t_ns <= self._full_to_ns
+        return self.until(tick.t_ns if is_full else tick.t_ns - AROUND_NS)
+
+    def until(self, t_ns: float = math.inf) -> list[Shown]:
+        """Take the waiting ticks up to this time, and return those to be written."""
         given = []
-        while self._waiting and self._waiting[0].t_ns < t_ns - AROUND_NS:
-            given += self._thinned(self._waiting.popleft(), self.every)
+        while self._waiting and self._waiting[0].t_ns <= t_ns:
+            tick = self._waiting.popleft()
+            self._count += 1
+            if tick.t_ns <= self._full_to_ns or not self._count % self.every:
+                given.append(tick)
         return given
-
-    def rest(self, every: int) -> list[Shown]:
-        """Return one of `every` waiting ticks, and forget them all."""
-        given = [kept for tick in self._waiting for kept in self._thinned(tick, every)]
-        self._waiting.clear()
-        return given
-
-    def _thinned(self, tick: Shown, every: int) -> list[Shown]:
-        self._count += 1
-        return [] if self._count % every else [tick]
 
 
 class Derived:
-    """Derives the messages of `/ticks` and `/frames` from the journal's entries."""
+    """Derives the messages of the other topics from the journal's entries. Their times go on with the monotonic clock,
+    whatever steps the wall clock takes."""
 
     def __init__(self) -> None:
-        self.axis = Axis()
-        self._numbers = {TICKS_TOPIC: count(), FRAMES_TOPIC: count(1)}
+        self._numbers = {TELEMETRY_TOPIC: count(), TICKS_TOPIC: count(), FRAMES_TOPIC: count(1)}
+        self._offset_ns: int | None = None
+        self._newest_ns = self._monotonic_ns = 0
+        self.ahead_ns = 0
+        "How far the wall clock has gone ahead."
 
     def of(self, columns: Sequence[str], entries: Sequence[Any]) -> Iterator[Shown]:
-        """Yield a message for each tick and frame."""
+        """Yield a message for each tick, frame and snapshot, which is of the newest tick."""
         monotonic_at = columns.index("monotonic_s") if "monotonic_s" in columns else 0
         for tick in filter(is_tick, entries):  # frames before it have its offset
-            self.axis.of_tick(tick[0], tick[monotonic_at])
+            self._place(tick[0], tick[monotonic_at])
             break
         for entry in entries:
             if is_tick(entry):
-                t_ns, message = self.axis.of_tick(entry[0], entry[monotonic_at]), known_values(columns, entry)
-                yield Shown(TICKS_TOPIC, t_ns, next(self._numbers[TICKS_TOPIC]), message)
+                t_ns = self._place(entry[0], entry[monotonic_at])
+                yield self._shown(TICKS_TOPIC, t_ns, known_values(columns, entry))
+            elif isinstance(entry, list) and entry[:1] == [TOLD]:
+                yield self._shown(TELEMETRY_TOPIC, self._newest_ns or entry[1]["t_ns"], only_known(entry[1]))
             for frame in frames_in(entry):
-                t_ns = self.axis.of_frame(frame.monotonic_s)
-                yield Shown(FRAMES_TOPIC, t_ns, next(self._numbers[FRAMES_TOPIC]), frame)
+                t_ns = max(round(frame.monotonic_s * 1e9) + (self._offset_ns or 0), 0)
+                yield self._shown(FRAMES_TOPIC, t_ns, frame)
+
+    def _shown(self, topic: str, t_ns: int, message: Any) -> Shown:
+        return Shown(topic, t_ns, next(self._numbers[topic]), message)
+
+    def _place(self, t_ns: int, monotonic_s: object) -> int:
+        """Return the time of a tick, in ns since 1970."""
+        if not isinstance(monotonic_s, float) or not 0.0 <= monotonic_s < 1e9:
+            return t_ns
+        monotonic_ns = round(monotonic_s * 1e9)
+        if self._offset_ns is None or monotonic_ns < self._monotonic_ns:  # the first, or of another machine
+            self._offset_ns = max(t_ns - self.ahead_ns, self._newest_ns) - monotonic_ns
+        self._monotonic_ns, self._newest_ns = monotonic_ns, monotonic_ns + self._offset_ns
+        self.ahead_ns = t_ns - self._newest_ns
+        return self._newest_ns
 
 
 class RecordingWriter:
@@ -164,16 +177,14 @@ class RecordingWriter:
         metadata: Mapping[str, str] | None = None,
         every: int = 1,
     ) -> None:
-        self._thinning = Thinning(every)
+        self._thinning, self._schemas = Thinning(every), dict(SCHEMAS)
         self._folder = place if isinstance(place, RecordingFolder) else None
         self._about = {"version": __version__, **(metadata or {})}
         if every > 1:
             self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
-        self._last_seq: int | None = None
         self._last_tick: int | None = None
         self._mark: Mark | None = None
-        self.telemetry_count = self.telemetry_lost = 0
-        self.tick_count = self.ticks_lost = self.restarts = 0
+        self.telemetry_count = self.tick_count = self.ticks_lost = self.restarts = 0
         self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
     def _begin(self, path: Path) -> None:
@@ -188,8 +199,8 @@ class RecordingWriter:
             self._mcap.start(profile="", library=f"tormagd {__version__}")
             self._mcap.add_metadata(ABOUT, self._about)
             self._file.flush()
-        self._channels: dict[tuple[str, bool], int] = {}
-        self._channel_of(TELEMETRY_TOPIC, None)
+        self._channels: dict[tuple[str, str], int] = {}
+        self._channel_of(TELEMETRY_TOPIC)
         self._begin_ns = self._chunk_ns = 0
 
     def _rotate(self, folder: RecordingFolder) -> None:
@@ -213,58 +224,53 @@ class RecordingWriter:
         self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 
-    def telemetry(self, message: Telemetry) -> None:
-        if self._last_seq is not None and message.seq > self._last_seq + 1:
-            self.telemetry_lost += message.seq - self._last_seq - 1
-        self._last_seq = message.seq
-        mark, before, self._mark = message.mark, self._mark, message.mark or self._mark
-        at_ns = self._derived.axis.of_snapshot(message.t_ns)
-        if mark is not None and mark != before:
-            self._thinning.happened(at_ns)
-        known = only_known(msgspec.to_builtins(message))
-        self._add(Shown(TELEMETRY_TOPIC, at_ns, self.telemetry_count, known))
-        self._overview.add(at_ns, False, known | {"mark": mark})
-        self.telemetry_count += 1
-        # every snapshot has the newest mark, even one from before
-        if (
-            mark is not None
-            and mark != before
-            and mark.t_ns - self._derived.axis.ahead_ns >= self._begin_ns
-            and self._folder is not None
-        ):
-            self.path = self._folder.mark_around(self.path)
-
     def ticks(self, batch: TickBatch) -> None:
         """Write a batch; of ticks that are thinned, nothing for a replay."""
-        entries = [list(row) for row in batch.rows]
-        if batch.core and self._thinning.every == 1:
-            entries = msgspec.msgpack.decode(batch.core, type=list[Any])
-        self.entries(batch.columns, entries, batch.core)
+        core = batch.core if self._thinning.every == 1 else b""
+        entries = msgspec.msgpack.decode(core, type=list[Any]) if core else [list(row) for row in batch.rows]
+        self.entries(batch.columns, entries, core)
         if self._folder is not None:
             self._rotate(self._folder)
 
     def entries(self, columns: Sequence[str], entries: Sequence[Any], core: bytes) -> None:
         """Write `core`, which has these entries, and then what is derived of them."""
+        self._schemas[TICKS_TOPIC] = TICK_SCHEMA if set(columns) <= set(COLUMNS) else OTHER_SCHEMA
         shown = list(self._derived.of(columns, entries))
-        if core and self._thinning.every == 1:
+        if core:
             self._add(Shown(CORE_TOPIC, shown[-1].t_ns if shown else self._chunk_ns, 0, core))
+        adds = {TICKS_TOPIC: self._tick, TELEMETRY_TOPIC: self._snapshot, FRAMES_TOPIC: self._add}
         for each in shown:
-            if each.topic != TICKS_TOPIC:
-                self._add(each)
-                continue
-            if isinstance(number := each.message.get(NUMBER_COLUMN), int):
-                if self._last_tick is not None:
-                    self.ticks_lost += max(number - self._last_tick - 1, 0)
-                    self.restarts += number < self._last_tick
-                self._last_tick = number
-            for kept in self._thinning.take(each):
-                self._add(kept)
-            self._overview.add(each.t_ns, True, each.message)
-            self.tick_count += 1
+            adds[each.topic](each)
+
+    def _snapshot(self, shown: Shown) -> None:
+        mark = msgspec.convert(shown.message.get("mark"), Mark | None)
+        is_new = mark is not None and mark != self._mark
+        if is_new:
+            self._thinning.happened(shown.t_ns)
+        self._add(shown)
+        self._overview.add(shown.t_ns, False, {"mark": mark})
+        self.telemetry_count += 1
+        if mark is not None:
+            self._mark = mark
+            # every snapshot has the newest mark, even one from before
+            is_within = is_new and mark.t_ns - self._derived.ahead_ns >= self._begin_ns
+            if is_within and self._folder is not None:
+                self.path = self._folder.mark_around(self.path)
+
+    def _tick(self, shown: Shown) -> None:
+        if isinstance(number := shown.message.get(NUMBER_COLUMN), int):
+            if self._last_tick is not None:
+                self.ticks_lost += max(number - self._last_tick - 1, 0)
+                self.restarts += number < self._last_tick
+            self._last_tick = number
+        for kept in self._thinning.take(shown):
+            self._add(kept)
+        self._overview.add(shown.t_ns, True, shown.message)
+        self.tick_count += 1
 
     def close(self) -> None:
         if not self._file.closed:
-            for kept in self._thinning.rest(self._thinning.every):
+            for kept in self._thinning.until():
                 self._add(kept)
             self._end()
 
@@ -288,18 +294,16 @@ class RecordingWriter:
         else:
             self.close()
 
-    def _channel_of(self, topic: str, message: Any) -> int:
-        fits = topic != TICKS_TOPIC or all(
-            TICK_KINDS.get(name) == _KINDS[type(value)] for name, value in message.items()
-        )
-        if (topic, fits) not in self._channels:
-            schema, schema_id = SCHEMAS[topic] if fits else OTHER_SCHEMA, 0
-            if schema is not None:
+    def _channel_of(self, topic: str) -> int:
+        schema, schema_id = self._schemas[topic], 0
+        title = schema["title"] if schema else ""
+        if (topic, title) not in self._channels:
+            if schema:
                 data = msgspec.json.encode(schema)
-                schema_id = self._mcap.register_schema(name=schema["title"], encoding="jsonschema", data=data)
-            encoding = "msgpack" if schema is None else "json"
-            self._channels[topic, fits] = self._mcap.register_channel(topic, encoding, schema_id)
-        return self._channels[topic, fits]
+                schema_id = self._mcap.register_schema(name=title, encoding="jsonschema", data=data)
+            encoding = "json" if schema else "msgpack"
+            self._channels[topic, title] = self._mcap.register_channel(topic, encoding, schema_id)
+        return self._channels[topic, title]
 
     def _add(self, shown: Shown) -> None:
         topic, t_ns, sequence, message = shown
@@ -312,7 +316,7 @@ class RecordingWriter:
             self._file.flush()
             self._begin_ns, self._chunk_ns = self._begin_ns or t_ns, t_ns
         data = message if topic == CORE_TOPIC else msgspec.json.encode(message)
-        self._mcap.add_message(self._channel_of(topic, message), t_ns, data, t_ns, sequence % 2**32)
+        self._mcap.add_message(self._channel_of(topic), t_ns, data, t_ns, sequence % 2**32)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
@@ -348,14 +352,12 @@ def known_values(columns: Sequence[str], row: Sequence[Value]) -> dict[str, Valu
     }
 
 
-_KINDS = {bool: "boolean", str: "string", tuple: "array", list: "array", int: "number", float: "number"}
 _TYPES = {tuple[str, ...]: {"type": "array", "items": {"type": "string"}}, str | None: {"type": "string"}}
 TICK_SCHEMA: dict[str, Any] = {
     "title": "tormagd.Tick",
     "type": "object",
     "properties": {name: _TYPES.get(kind_of(name), {"type": "number"}) for name in COLUMNS},
 }
-TICK_KINDS = {name: kind["type"] for name, kind in TICK_SCHEMA["properties"].items()}
 SCHEMAS: dict[str, Any] = {
     TELEMETRY_TOPIC: plain_schema(Telemetry),
     TICKS_TOPIC: TICK_SCHEMA,

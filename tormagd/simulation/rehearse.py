@@ -24,9 +24,9 @@ from tormagd.ground.command_line import add, option
 from tormagd.ground.plain_values import InexactError
 from tormagd.ground.terminal import write_line
 from tormagd.record import journal
-from tormagd.record.black_box import BlackBoxFile
+from tormagd.record.black_box import Recorded, ReplayError, rebuilt, told
 from tormagd.record.reader import RecordingError
-from tormagd.record.replay.rerun import Recorded, ReplayError, name_of, planned_for, rebuilt, ticks_of, told
+from tormagd.record.rerun import name_of, planned_for, ticks_of
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
@@ -42,7 +42,6 @@ SEED = 1
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
 OPTIONS = (
     option("file", type=Path),
-    option("--config", type=Path),
     option("--set", dest="settings", action="append", default=[]),
     option("--plant", default="sample_1"),
     option("--fault", dest="faults", action="append", default=[]),
@@ -104,10 +103,9 @@ def changed(config: Config, settings: Sequence[str]) -> Config:
         raise ReplayError(f"--set: {error}") from error
 
 
-def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
+def script(entries: list[Any]) -> Script:
     """Return the setpoints, taken commands and handle positions of a black box's entries."""
-    records = ticks_of(columns, entries)
-    ticks = list(records.values())
+    ticks = list(ticks_of(entries).values())
     first_s = ticks[0].monotonic_s
     setpoints: list[tuple[float, TimedSetpoint | None]] = []
     commands: list[tuple[float, str]] = []
@@ -208,8 +206,8 @@ def main(arguments: list[str] | None = None) -> int:
     add(parser, OPTIONS)
     options = parser.parse_args(arguments)
 
-    def run(known: Recorded, box: BlackBoxFile) -> dict[str, Any]:
-        todo = script(known.columns, box.entries)
+    def run(known: Recorded) -> dict[str, Any]:
+        todo = script(known.box.entries)
         config = changed(known.config, options.settings)
         # a file keeps its own scene only: another one is this machine's
         core = rebuilt(known, config) if config.scene == known.config.scene else build_core(config)
@@ -225,7 +223,7 @@ def main(arguments: list[str] | None = None) -> int:
         }
 
     try:
-        result = told(options.file, options.config, run)
+        result = told(options.file, run)
     except (ConfigError, RecordingError, ReplayError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

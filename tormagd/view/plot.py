@@ -49,15 +49,8 @@ def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
     overview.require_messages()
     states, limits, faults = (overview.spans_s(kind) for kind in ("operating_state", "limits", "faults"))
     lanes = bool(states) + len(limits) + max(1, len(faults))
-    headline = _headline(overview, title, notes)
-    longest = max(
-        map(len, ("state", *(f"limit {name} 100.0%" for name in limits), *(f"FAULT {name}" for name in faults)))
-    )
-    fig = Figure(figsize=(WIDE_IN, 7.6 + 0.25 * lanes))
-    heights = (4.2, 2.2, 1.6, 0.3 + 0.3 * lanes)
-    # computed here: matplotlib would draw everything once more to find it
-    place = _place(fig.get_figheight(), headline.count("\n") + 1, longest)
-    force, gap, duty, lane = fig.subplots(4, 1, sharex=True, height_ratios=heights, gridspec_kw=place)
+    fig = Figure(figsize=(WIDE_IN, 7.6 + 0.25 * lanes), layout="constrained")
+    force, gap, duty, lane = fig.subplots(4, 1, sharex=True, height_ratios=(4.2, 2.2, 1.6, 0.3 + 0.3 * lanes))
 
     for axes, quantity, label in (
         (force, "force", "force (N)"),
@@ -83,23 +76,9 @@ def figure(overview: Overview, title: str, notes: Sequence[str] = ()) -> Figure:
 
     when = datetime.fromtimestamp(overview.start_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     lane.set_xlabel(f"seconds since {when}")
-    fig.suptitle(
-        headline, x=0.01, y=1.0 - 0.12 / fig.get_figheight(), ha="left", va="top", fontsize=13, fontweight="bold"
-    )
+    fig.suptitle(_headline(overview, title, notes), x=0.01, ha="left", fontsize=13, fontweight="bold")
     lane.set_xlim(0.0, max(overview.duration_s, 1e-3))
     return fig
-
-
-def _place(high_in: float, lines: int, longest: int) -> dict[str, float]:
-    left_in, top_in, bottom_in, between_in = max(0.9, 0.25 + 0.078 * longest), 0.45 + 0.24 * lines, 0.6, 0.34
-    panel_in = (high_in - top_in - bottom_in - 3.0 * between_in) / 4.0
-    return {
-        "left": left_in / WIDE_IN,
-        "right": 1.0 - 0.15 / WIDE_IN,
-        "top": 1.0 - top_in / high_in,
-        "bottom": bottom_in / high_in,
-        "hspace": between_in / panel_in,
-    }
 
 
 def picture(drawn: Figure, form: str) -> bytes:

@@ -1,5 +1,6 @@
 """A recording as the page shows it: its whole length once, and a frame for any moment."""
 
+import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Sequence
@@ -33,39 +34,29 @@ CURVES = {
 "The recorded quantity of each curve."
 
 
-class Believed(msgspec.Struct, frozen=True):
-    """A BeliefReport as recorded; fields that were not known are None."""
-
-    value: float | None = None
-    sd: float | None = None
-    unit: str = ""
-    acts: bool = False
-
-
-Moment = glance(belief=dict[str, Believed])
+Moment = glance(belief=dict[str, dict[str, Any]])
 
 
 class Moments:
-    """Ticks or snapshots of a recording: times since its start (n), and quantities (n, 8)."""
+    """Ticks or snapshots of a recording: times since its start (n), and of ticks the quantities (n, 8)."""
 
     def __init__(self, seen: Sequence[Seen], start_ns: int) -> None:
         self.messages = [each.message for each in seen]
         self.t_s = np.array([each.t_ns - start_ns for each in seen]) * 1e-9
-        known = np.array([quantities(each.message) for each in seen], float)
-        self._values = known if seen else np.empty((0, len(QUANTITIES)))
+        # the last row is of no message
+        self._values = np.array([quantities(each) for each in (*self.messages, {})], float)
 
     def newest(self, times_s: Floats, most_s: float = BREAK_S) -> list[int]:
         """Return for each time the index of the newest message; -1 where it is over `most_s` old."""
         at = np.searchsorted(self.t_s, times_s, side="right") - 1
-        return [] if not self.t_s.size else np.where(times_s - self.t_s[at] <= most_s, at, -1).tolist()
+        ages_s = times_s - np.append(self.t_s, -math.inf)[at]
+        found: list[int] = np.where(ages_s <= most_s, at, -1).tolist()
+        return found
 
-    def curve(self, name: str, times_s: Floats) -> list[float | None] | None:
+    def curve(self, name: str, times_s: Floats) -> list[float | None]:
         """Return the newest value of `name` at each time, None where too old."""
-        values = self._values[:, QUANTITIES.index(name)]
-        if not np.isfinite(values).any():
-            return None
-        found = [values[place] if place >= 0 else math.nan for place in self.newest(times_s)]
-        return [float(value) if math.isfinite(value) else None for value in found]
+        found = self._values[self.newest(times_s), QUANTITIES.index(name)]
+        return [value if math.isfinite(value) else None for value in found.tolist()]
 
     def within(self, from_s: float, to_s: float) -> range:
         first, last = np.searchsorted(self.t_s, (from_s, to_s))
@@ -109,28 +100,19 @@ class Recorded:
         at_ns = self._start_ns + round(at_s * 1e9)
         # what held at a moment is in the message before it, and ends with the one after
         ticks, snapshots = self._between(at_ns - round((SHOWN_S + BREAK_S) * 1e9), at_ns + BREAK_NS)
-        shown = ticks if ticks.messages else snapshots
         times_s = np.append(np.arange(from_s, at_s, STEP_S), at_s)
-        nothing: list[float | None] = [None] * len(times_s)
-        curves = {
-            ours: ticks.curve(theirs, times_s) or snapshots.curve(theirs, times_s) or nothing
-            for ours, theirs in CURVES.items()
-        }
-        told = [shown.messages[place] if place >= 0 else {} for place in shown.newest(times_s)]
-        if told:
-            states = [message.get("operating_state") for message in told]
-            curves["field_mT"] = [
-                field_mT if state in (None, *DRIVEN) else None
-                for field_mT, state in zip(curves["field_mT"], states, strict=True)
-            ]
-        now = told[-1] if told else {}
-        within = ticks.within(from_s, at_s)
-        late_us = [ticks.messages[place].get("lateness_us") for place in within]
+        curves = {ours: ticks.curve(theirs, times_s) for ours, theirs in CURVES.items()}
+        told = [ticks.messages[place] if place >= 0 else {} for place in ticks.newest(times_s)]
+        curves["field_mT"] = [
+            field_mT if tick.get("operating_state") in (None, *DRIVEN) else None
+            for field_mT, tick in zip(curves["field_mT"], told, strict=True)
+        ]
+        now, late_us = told[-1], [ticks.messages[place].get("lateness_us") for place in ticks.within(from_s, at_s)]
         return Frame(
             t_s=(self._start_ns * 1e-9 + times_s).tolist(),
             **curves,
             operating_state=now.get("operating_state") or "",
-            held=_held(shown, from_s, at_s, codes_in(now.get("limits"))),
+            held=_held(ticks, from_s, at_s, codes_in(now.get("limits"))),
             faults=list(codes_in(now.get("faults"))),
             believed=as_said(believed(snapshots, at_s)),
             late_counts=late_counts(each for each in late_us if each is not None),
@@ -167,21 +149,20 @@ def moments(file: RecordingFile, from_ns: int, to_ns: int) -> tuple[Moments, Mom
 
 
 def believed(snapshots: Moments, at_s: float) -> dict[str, BeliefReport]:
-    """Return the belief in the newest snapshot up to `at_s`, by quantity."""
-    place = (snapshots.newest(np.array([at_s]), BELIEVED_S) or [-1])[0]
-    told: dict[str, Believed] = snapshots.messages[place].get("belief", {}) if place >= 0 else {}
-    return {
-        name: BeliefReport(value=each.value, sd=each.sd, unit=each.unit, acts=each.acts)
-        for name, each in told.items()
-        if each.value is not None
-    }
+    """Return the belief in the newest snapshot up to `at_s`, by quantity, without what was not known."""
+    (place,) = snapshots.newest(np.array([at_s]), BELIEVED_S)
+    found = {}
+    for name, told in snapshots.messages[place].get("belief", {}).items() if place >= 0 else ():
+        with contextlib.suppress(msgspec.ValidationError):
+            found[name] = msgspec.convert({"sd": None, **told}, BeliefReport)
+    return found
 
 
-def _held(shown: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
+def _held(ticks: Moments, from_s: float, at_s: float, now: Sequence[str]) -> list[Held]:
     held_s: defaultdict[str, float] = defaultdict(float)
-    steps_s = np.minimum(np.diff(shown.t_s, append=at_s), BREAK_S)
-    for place in shown.within(from_s, at_s):
-        for code in codes_in(shown.messages[place].get("limits")):
+    steps_s = np.minimum(np.diff(ticks.t_s, append=at_s), BREAK_S)
+    for place in ticks.within(from_s, at_s):
+        for code in codes_in(ticks.messages[place].get("limits")):
             held_s[code] += float(steps_s[place])
     found = [Held(code, each_s / max(at_s - from_s, STEP_S), code in now) for code, each_s in held_s.items()]
     return sorted(found, key=lambda held: -held.share)

@@ -1,20 +1,19 @@
 """Runs a core again over its recorded inputs: the same bits, or the first tick and field that differ.
 
-The core is rebuilt from the file's header, and what differs between its origin and here is told.
+The conversation with the device is run again, too: the same `Connection`, fed what was read at the recorded times.
 """
 
-import hashlib
 from bisect import bisect_right
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from itertools import zip_longest
+from typing import Any
 
 import msgspec
 
-from firmware_protocol.build import settle
-from tormagd import __version__
-from tormagd.config import Config, checked, load_config
-from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
+from firmware_protocol.codec import DeviceFault, DeviceMode, Identity, Message, Sense, State, Status, Switches
+from firmware_protocol.framing import Frame, FramingStatistics
+from tormagd.config import Device
+from tormagd.control.assembly.build import Core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import PLAN_ERRORS
@@ -22,145 +21,120 @@ from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.element.inverse.solution import Answer
-from tormagd.ground.plain_values import packed, plain, restore, restored
-from tormagd.hardware.measurement import Measurement
+from tormagd.ground.plain_values import first_difference, kinds, packed, plain, restore, restored
+from tormagd.hardware.backend import BackendError, Sent, Stream
+from tormagd.hardware.connection import Connection
+from tormagd.hardware.link import LinkState
+from tormagd.hardware.link_statistics import LinkQuality
+from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.streams import CanStream, FrameStream, SecondHostError
 from tormagd.record import journal
-from tormagd.record.black_box import BlackBoxFile, read_black_box
-from tormagd.record.journal import FORMAT, KNOWN, core_hash
-from tormagd.record.replay.conversation import Conversation, Found, differing
+from tormagd.record.black_box import ReplayError
+from tormagd.record.journal import KNOWN, core_hash
 from tormagd.record.telemetry import COLUMNS, Moment, TickRecord, measurement_of
 from tormagd.record.writer import frames_in, is_tick
-from tormagd.scenes.scene import Scene, load_scene
-from tormagd_client.endpoints import ConfigError
 
-NEEDED = (
-    "format", "version", "sources_sha256", "platform", "configuration", "configuration_sha256", "scene",
-    "scene_sha256", "scene_folder", "model", "core_sha256", "columns",
-)  # fmt: skip
-SHOWN = 12
-"Digits of a hash that messages show."
+KNOWN_OF_LINK = kinds(
+    *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
+    *(LinkQuality, Frame, FramingStatistics),
+)
 
 
-class ReplayError(ValueError):
-    """A black box that cannot be run again here."""
+class Found(msgspec.Struct, frozen=True):
+    """The first difference: its field, both values, and the frame that it belongs to. `tick` counts from 1, `time_s`
+    from the file's first tick."""
+
+    field: str
+    recorded: Any
+    replayed: Any
+    frame: int | None = None
+    tick: int = 0
+    time_s: float = 0.0
 
 
-class Recorded(NamedTuple):
-    config: Config
-    scene: Scene
-    model: str
-    model_folders: tuple[Path, ...]
-    columns: tuple[str, ...]
-    header: dict[str, str]
+def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
+    """Return the first difference between two plain values, its field prefixed with `where`."""
+    found = first_difference(recorded, replayed)
+    return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
 
 
-def told(
-    path: Path, config_file: Path | None, run: Callable[[Recorded, BlackBoxFile], dict[str, Any]]
-) -> dict[str, Any]:
-    """Return what a black box is, what differs here, and what `run` gives for it."""
-    configured = None if config_file is None else load_config(config_file)
-    box = read_black_box(path)
-    try:
-        known = recorded(box, path.absolute().parent)
-        return {
-            "file": str(path),
-            "odd": box.odd,
-            "version": known.header["version"],
-            "reason": box.header.get("reason", ""),
-            "build": str(settle()),
-            "is_complete": box.is_complete,
-            "differences": differences(known, configured),
-            **run(known, box),
-        }
-    except ReplayError as error:
-        other = box.header.get("sources_sha256", "") not in ("", sources_hash())
-        hint = "; another tormagd wrote it: replay it with that one" if other else ""
-        raise ReplayError(f"{path}: {error}{hint}") from error
+class Conversation:
+    def __init__(self, frame: int) -> None:
+        self._connection: Connection | None = None
+        self.stream: Stream = FrameStream()
+        self._unread: Sequence[Any] = ()
+        self._written: list[Sent] = []
+        self.frame = frame
+        self.frames = 0
 
+    def begin(self, memory: Any) -> None:
+        self._connection = None
+        if memory is not None:
+            told = memory["stream"]
+            is_serial = FrameStream.__name__ in told
+            self.stream = FrameStream() if is_serial else CanStream(told[CanStream.__name__]["node"])
+            connection = Connection(Device(), lambda: self, lambda: None)
+            connection.open(0.0)
+            connection.remember(memory, KNOWN_OF_LINK)
+            self._connection = connection
 
-def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
-    """Check a black box's header and return its contents; the model may also lie in `beside`."""
-    header = box.header
-    missing = [name for name in NEEDED if name not in header]
-    if missing:
-        raise ReplayError(f"its header has no {missing[0]!r}: it is no black box of this version")
-    if header["format"] != str(FORMAT):
-        raise ReplayError(
-            f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed is {FORMAT}, "
-            f"which tormagd {__version__} writes; replay it with the version that wrote it"
+    def compare_memory(self, recorded: Any) -> Found | None:
+        """Return where the connection's memory differs from the `recorded` one."""
+        own = self._connection
+        return None if own is None else differing("state.connection", recorded, own.memory(), self.frame)
+
+    def compare(self, recorded: Measurement | None) -> Found | None:
+        """Return where the newest measurement differs from the recorded step's."""
+        own = self._connection
+        return None if own is None else differing("measurement", plain(recorded), plain(own.measurement), self.frame)
+
+    def read(self, entry: Any) -> None:
+        if self._connection is not None:
+            _, now_s, raw = entry
+            self._unread = pieces = raw if isinstance(raw, list) else [raw]
+            self._connection.receive(now_s)
+            self.frames += len(pieces)
+
+    def wrote(self, entry: Any, output: Duty) -> Found | None:
+        """Send a step's `output` again, and return the first frame that differs from the WROTE entry's."""
+        if self._connection is None:
+            return None
+        _, now_s, recorded, unsent = entry
+        self._written, self.stream.statistics.unsent = [], unsent
+        self._connection.exchange(
+            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
-    columns = _json(header, "columns", tuple[str, ...])
-    lacking = [name for name in COLUMNS if name not in columns]
-    if lacking:
-        raise ReplayError(f"its ticks have no column {lacking[0]!r}: tormagd {header['version'][:20]!r} wrote it")
-    try:
-        return Recorded(
-            checked(_intact(header, "configuration"), Config),
-            checked(_intact(header, "scene"), Scene),
-            header["model"],
-            (Path(header["scene_folder"]), beside),
-            columns,
-            header,
-        )
-    except (ConfigError, RecursionError) as error:
-        raise ReplayError(f"its configuration is refused: {error}") from error
+        for number, (told, own) in enumerate(zip_longest(recorded, self._written), self.frame - len(recorded) + 1):
+            if packed(told) != packed(own):
+                return Found("written", _shown(told), _shown(own), number)
+        self.frames += len(recorded)
+        return None
 
-
-def rebuilt(known: Recorded, config: Config | None = None) -> Core:
-    found = ""
-    for folder in known.model_folders:
+    def receive(self) -> list[Message]:
+        """Decode what `read` was last given; empty when called again."""
+        pieces, self._unread = self._unread, ()
+        if isinstance(self.stream, FrameStream):
+            return [message for piece in pieces for message in self.stream.unpack(piece)]
         try:
-            core = build_core(config or known.config, known.scene, folder)
-        except (ConfigError, ValueError, OSError) as error:
-            found = found or str(error)
-            continue
-        if core.model == known.model:
-            return core
-        found = f"the model {known.scene.insert.model!r} that is here has the hash {core.model[:SHOWN]}"
-    raise ReplayError(f"the model with the hash {known.model[:SHOWN]!r} has to be beside the file: {found}")
+            return self.stream.unpack_all(msgspec.convert(pieces, list[tuple[int, bytes]]))
+        except SecondHostError as error:
+            raise BackendError("another host drives the node") from error
+
+    def send(self, message: Message) -> None:
+        self._written.append(self.stream.pack(message))
+
+    def close(self) -> None:
+        """Do nothing: no port is open."""
 
 
-def differences(known: Recorded, configured: Config | None) -> list[str]:
-    """List what differs since the file was written: build, platform, scene, configuration."""
-    found = []
-    here, there = sources_hash(), known.header["sources_sha256"]
-    if here != there:
-        found.append(
-            f"build: tormagd {known.header['version'][:20]} with the sources {there[:SHOWN]} was recorded, here is "
-            f"tormagd {__version__} with {here[:SHOWN]}"
-        )
-    if known.header["platform"] != platform_name():
-        found.append(f"platform: {known.header['platform'][:80]} was recorded, here is {platform_name()}")
-    try:
-        scene = load_scene((configured or known.config).scene)
-    except ConfigError as error:
-        found.append(f"scene: the recorded one is used; here is none: {error}")
-    else:
-        _compare(found, "scene", known.header["scene_sha256"], msgspec.json.encode(scene))
-    if configured is not None:
-        _compare(found, "configuration", known.header["configuration_sha256"], msgspec.json.encode(configured))
-    return found
-
-
-def _compare(found: list[str], what: str, there: str, data: bytes) -> None:
-    here = hashlib.sha256(data).hexdigest()
-    if here != there:
-        found.append(f"{what}: {there[:SHOWN]} was recorded and is used, here is {here[:SHOWN]}")
-
-
-def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
-    told = hashlib.sha256(header[name].encode()).hexdigest()
-    if told != header[f"{name}_sha256"]:
-        raise ReplayError(f"{name}: its hash is {told[:SHOWN]}, beside it stands {header[f'{name}_sha256'][:SHOWN]!r}")
-    tables: dict[str, Any] = _json(header, name, dict[str, Any])
-    return tables
-
-
-def _json(header: dict[str, str], name: str, kind: Any) -> Any:
-    try:
-        return msgspec.json.decode(header[name], type=kind)
-    except (msgspec.MsgspecError, RecursionError) as error:
-        raise ReplayError(f"{name}: {str(error)[:100]}") from error
+def _shown(frame: Any) -> str:
+    """Return a frame as hexadecimal text, behind the identifier and "#" on a bus."""
+    if frame is None:
+        return "nothing"
+    if isinstance(frame, bytes):
+        return frame.hex()
+    identifier, data = frame
+    return f"{identifier:03X}#{data.hex()}"
 
 
 UNTAKEN = (
@@ -193,16 +167,13 @@ class Rerun(msgspec.Struct, frozen=True):
     difference: Found | None
 
 
-def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, Any]:
-    order = None if columns == COLUMNS else [columns.index(name) for name in COLUMNS]
+def ticks_of(entries: list[Any]) -> dict[int, Any]:
+    """Return the ticks by their place among the entries."""
     records: dict[int, Any] = {}
     for place, entry in enumerate(entries):
         if is_tick(entry):
-            if len(entry) != len(columns):
-                raise ReplayError(f"tick {len(records) + 1} has {len(entry)} values: allowed is {len(columns)}")
             try:
-                row = entry if order is None else [entry[index] for index in order]
-                records[place] = msgspec.convert(row, TickRecord)
+                records[place] = msgspec.convert(entry, TickRecord)
             except msgspec.ValidationError as error:
                 raise ReplayError(f"tick {len(records) + 1}: {error}") from error
     if not records:
@@ -210,9 +181,9 @@ def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, Any]:
     return records
 
 
-def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: float = 0.0) -> Rerun:
+def rerun(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
     """Run `core` over the entries, up to the first difference or the last tick."""
-    records = ticks_of(columns, entries)
+    records = ticks_of(entries)
     places = list(records)
     first_s = records[places[0]].monotonic_s
     lasts_s = records[places[-1]].monotonic_s - first_s
@@ -249,18 +220,18 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
 
 def _start(entries: list[Any], records: dict[int, Any], until_s: float) -> int:
     """Return the index of the newest snapshot that a tick follows by `until_s`, else of the first."""
-    found: int | None = None
+    found: list[int] = []
     waiting: int | None = None
     for place, entry in enumerate(entries):
         if name_of(entry) == journal.STATE:
             waiting = place
         elif place in records and waiting is not None:
-            if found is not None and records[place].monotonic_s > until_s:
-                return found
-            found, waiting = waiting, None
-    if found is None:
+            if not found or records[place].monotonic_s <= until_s:
+                found.append(waiting)
+            waiting = None
+    if not found:
         raise ReplayError("there is no snapshot in it that is followed by a tick: under a second was kept")
-    return found
+    return found[-1]
 
 
 class _Running:
