@@ -21,6 +21,8 @@ PLACES: Final = 36
 "Waves of up to three a turn are cut by 4 % at most."
 STEEPEST: Final = 0.12
 "No ripple changes by a greater share from place to place, nor moves the gap by as much."
+HEARD: Final = 12
+"Fewer readings at a place leave noise that looks like a ripple: three at 300 mm/s, ten at 100."
 SETTLES: Final = 3
 "After a change of rate or gap so many passes teach nothing."
 STEADY_MM_S: Final = 8.0
@@ -86,7 +88,7 @@ class Ripple:
         rose = mean - self.mean
         is_even = max(abs(rose), abs(self.force_N / force_N - 1.0)) <= STEEPEST
         is_steady = abs(way) == 1 and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S
-        self.passes = self.passes + 1 if is_even and is_steady else -SETTLES
+        self.passes = self.passes + 1 if is_even and is_steady and self.readings >= HEARD else -SETTLES
         if self.passes > 0:
             rise = way * rose - self.slopes[at]
             self.risen = way * rise + (self.risen if self.passes > 1 else 0.0)
