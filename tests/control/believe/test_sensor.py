@@ -147,7 +147,9 @@ def test_what_has_fallen_at_a_known_force_has_fallen_at_a_new_one(core, known, h
     assert believe.sensor.anchor.force_N(here_N) == pytest.approx(here_N, abs=0.02)
 
 
-@pytest.mark.parametrize(("before_s", "share", "learned_N"), [(0.0, 0.96, -0.035), (0.8, 0.96, 0.0), (0.8, 1.04, 0.032)])
+@pytest.mark.parametrize(
+    ("before_s", "share", "learned_N"), [(0.0, 0.96, -0.035), (0.8, 0.96, 0.0), (0.8, 1.04, 0.032)]
+)
 def test_a_calibration_is_learned_anew_at_once_and_then_upward_only(
     planner, hear, moving, before_s: float, share: float, learned_N: float
 ) -> None:
@@ -161,8 +163,9 @@ def test_where_the_fit_has_fallen_a_new_force_is_learned_downward_to_half_only(c
     hear(known, 2.0, moving(force_N=0.96 * MODEL_N))
     known.believe.handle = HandleWatch()
     here_N = core.portrait.force_N_at(60.0)
-    anchor = hear(known, 4.0, moving(force_N=0.9 * here_N, **{**CLOSER, "gap_mm": 60.0})).believe.sensor.anchor
-    assert KNOWN_N < anchor.deviation_N(here_N) <= 2.0 * KNOWN_N
+    sensor = hear(known, 4.0, moving(force_N=0.9 * here_N, **{**CLOSER, "gap_mm": 60.0})).believe.sensor
+    assert KNOWN_N < sensor.anchor.deviation_N(here_N) <= 2.0 * KNOWN_N
+    assert sensor.fallen == pytest.approx(0.96, abs=5e-3)
 
 
 @pytest.mark.parametrize(("seconds", "is_known"), [(4.0, True), (0.3, False)])

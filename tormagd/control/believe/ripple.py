@@ -5,8 +5,8 @@
     update    a slope by what its two newest passes agree in
 
 A pass compares the mean readings at two neighbouring places, the known ripple taken off, each as a share of what the
-device first showed. A force that falls all the while rises on the way back, or has fallen by as much as a whole turn
-did: it has no slope. In a pass the rate stays. Places not yet seen close the turn.
+device first showed. A force that falls all the while rises on the way back, or falls alike at all places: it has no
+slope. In a pass the rate stays. Places not yet seen close the turn.
 """
 
 import math
@@ -56,10 +56,6 @@ class Ripple:
     "And its rate."
     passes: int = -SETTLES
     "How many passes one after the other have taught; less than 0 while something settles."
-    risen: float = 0.0
-    "By how much the share rose in them, along the way."
-    fade: float = 0.0
-    "By how much it rose in a mean pass of the last whole turn: whatever the angle."
 
     def __init__(self) -> None:
         self.shares, self.slopes, self.before = [0.0] * PLACES, [0.0] * PLACES, [0.0] * PLACES
@@ -90,11 +86,7 @@ class Ripple:
         is_steady = abs(way) == 1 and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S
         self.passes = self.passes + 1 if is_even and is_steady and self.readings >= HEARD else -SETTLES
         if self.passes > 0:
-            rise = way * rose - self.slopes[at]
-            self.risen = way * rise + (self.risen if self.passes > 1 else 0.0)
-            if self.passes == PLACES:
-                self.fade, self.passes = self.risen / PLACES, 0
-            self._learn(at, rise - way * self.fade)
+            self._learn(at, way * rose - self.slopes[at])
         self.last, self.mean, self.force_N, self.rate_mm_s = self.place, mean, force_N, rate_mm_s
 
     def _learn(self, at: int, rise: float) -> None:
