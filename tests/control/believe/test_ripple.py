@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from tormagd.control.believe.ripple import Ripple
@@ -72,3 +73,10 @@ def test_another_rate_is_no_ripple() -> None:
         rate_mm_s += 0.1 * ((300.0 if step % 400 < 200 else 42.0) - rate_mm_s)
         ripple.update(step * STEP_RAD, rate_mm_s, 1.0, 1.0 + 5e-4 * rate_mm_s)
     assert [ripple.share(angle) for angle in range(7)] == pytest.approx([0.0] * 7, abs=1e-3)
+
+
+def test_few_readings_at_a_place_are_no_ripple() -> None:
+    ripple, noise_N = Ripple(), np.random.default_rng(1).normal(0.0, 0.01, 4000).tolist()
+    for step in range(4000):
+        ripple.update(0.05 * step, 300.0, 0.6, 0.6 + noise_N[step])
+    assert [ripple.share(angle) for angle in range(7)] == [0.0] * 7

@@ -147,13 +147,25 @@ def test_what_has_fallen_at_a_known_force_has_fallen_at_a_new_one(core, known, h
     assert believe.sensor.anchor.force_N(here_N) == pytest.approx(here_N, abs=0.02)
 
 
-@pytest.mark.parametrize(("share", "learned_N"), [(0.97, 0.0), (1.03, 0.02)])
-def test_what_a_calibration_half_knows_is_learned_upward_only(
-    planner, hear, moving, share: float, learned_N: float
+@pytest.mark.parametrize(
+    ("before_s", "share", "learned_N"), [(0.0, 0.96, -0.035), (0.8, 0.96, 0.0), (0.8, 1.04, 0.032)]
+)
+def test_a_calibration_is_learned_anew_at_once_and_then_upward_only(
+    planner, hear, moving, before_s: float, share: float, learned_N: float
 ) -> None:
-    planner.believe.teach(Learned(DeviceFit(scale_variance=0.0, offset_variance_N2=0.035**2)))
+    planner.believe.teach(Learned(DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)))
+    hear(planner, before_s, moving())
     anchor = hear(planner, 4.0, moving(force_N=share * MODEL_N)).believe.sensor.anchor
-    assert anchor.force_N(MODEL_N) - MODEL_N == pytest.approx(learned_N, abs=5e-3)
+    assert anchor.force_N(MODEL_N) - MODEL_N == pytest.approx(learned_N, abs=6e-3)
+
+
+def test_where_the_fit_has_fallen_a_new_force_is_learned_downward_to_half_only(core, known, hear, moving) -> None:
+    hear(known, 2.0, moving(force_N=0.96 * MODEL_N))
+    known.believe.handle = HandleWatch()
+    here_N = core.portrait.force_N_at(60.0)
+    sensor = hear(known, 4.0, moving(force_N=0.9 * here_N, **{**CLOSER, "gap_mm": 60.0})).believe.sensor
+    assert KNOWN_N < sensor.anchor.deviation_N(here_N) <= 2.0 * KNOWN_N
+    assert sensor.fallen == pytest.approx(0.96, abs=5e-3)
 
 
 @pytest.mark.parametrize(("seconds", "is_known"), [(4.0, True), (0.3, False)])

@@ -153,8 +153,8 @@ class Believe:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan."""
         if self.learns and self._terms.motor and measured is not None:
             is_ahead = measured.is_homed and foresight >= MIN_FORESIGHT
-            gap_mm, speed_mm_s = measured.gap_mm, measured.gap_speed_mm_s
-            self.carriages.update(dt_s, planned_mm if is_ahead else None, gap_mm, speed_mm_s, self._top_speed_mm_s)
+            known_mm = planned_mm if is_ahead else None
+            self.carriages.update(dt_s, known_mm, measured.gap_mm, measured.gap_speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, ripple: float, predicted_N: float | None) -> Belief:
         at_speed, has_slid = self.device, self.sensor.has_slid

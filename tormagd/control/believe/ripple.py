@@ -5,8 +5,8 @@
     update    a slope by what its two newest passes agree in
 
 A pass compares the mean readings at two neighbouring places, the known ripple taken off, each as a share of what the
-device first showed. A force that falls all the while rises on the way back, or has fallen by as much as a whole turn
-did: it has no slope. In a pass the rate stays. Places not yet seen close the turn.
+device first showed. A force that falls all the while rises on the way back, or falls alike at all places: it has no
+slope. In a pass the rate stays. Places not yet seen close the turn.
 """
 
 import math
@@ -21,6 +21,8 @@ PLACES: Final = 36
 "Waves of up to three a turn are cut by 4 % at most."
 STEEPEST: Final = 0.12
 "No ripple changes by a greater share from place to place, nor moves the gap by as much."
+HEARD: Final = 12
+"Fewer readings at a place leave noise that looks like a ripple: three at 300 mm/s, ten at 100."
 SETTLES: Final = 3
 "After a change of rate or gap so many passes teach nothing."
 STEADY_MM_S: Final = 8.0
@@ -54,10 +56,6 @@ class Ripple:
     "And its rate."
     passes: int = -SETTLES
     "How many passes one after the other have taught; less than 0 while something settles."
-    risen: float = 0.0
-    "By how much the share rose in them, along the way."
-    fade: float = 0.0
-    "By how much it rose in a mean pass of the last whole turn: whatever the angle."
 
     def __init__(self) -> None:
         self.shares, self.slopes, self.before = [0.0] * PLACES, [0.0] * PLACES, [0.0] * PLACES
@@ -86,13 +84,9 @@ class Ripple:
         rose = mean - self.mean
         is_even = max(abs(rose), abs(self.force_N / force_N - 1.0)) <= STEEPEST
         is_steady = abs(way) == 1 and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S
-        self.passes = self.passes + 1 if is_even and is_steady else -SETTLES
+        self.passes = self.passes + 1 if is_even and is_steady and self.readings >= HEARD else -SETTLES
         if self.passes > 0:
-            rise = way * rose - self.slopes[at]
-            self.risen = way * rise + (self.risen if self.passes > 1 else 0.0)
-            if self.passes == PLACES:
-                self.fade, self.passes = self.risen / PLACES, 0
-            self._learn(at, rise - way * self.fade)
+            self._learn(at, way * rose - self.slopes[at])
         self.last, self.mean, self.force_N, self.rate_mm_s = self.place, mean, force_N, rate_mm_s
 
     def _learn(self, at: int, rise: float) -> None:

@@ -36,8 +36,6 @@ VISCOUS_N_S_MM: Final = 5e-4
 "The half sum is off by so much for each mm/s of speed changed: devices' viscous friction differs by that."
 RELAXES_N_S: Final = 0.01
 "The half sum is off by so much for each second between the levels: the elastomer relaxes."
-LONGEST_TURN_S: Final = 10.0
-"Levels further apart are not compared."
 
 
 @final
@@ -126,7 +124,7 @@ class SensorZero:
         """Learn zero and way from the levels before and after a reversal."""
         by_model_N = level.model_N - before.model_N
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - fit.scale * by_model_N)
-        if between_s > LONGEST_TURN_S or abs(found_N) > MAX_ZERO_N:
+        if abs(found_N) > MAX_ZERO_N:
             return 0.0
         by_scale_N = 0.5 * fit.scale_sd * by_model_N
         by_speed_N = 0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s)

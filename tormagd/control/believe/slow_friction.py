@@ -78,5 +78,4 @@ def factor_bounds(bounds: Trim) -> tuple[float, float]:
 
 
 def _slowness(rate_mm_s: float) -> float:
-    ratio = rate_mm_s / STRIBECK_MM_S
-    return math.exp(-ratio * ratio)
+    return math.exp(-math.pow(rate_mm_s / STRIBECK_MM_S, 2.0))

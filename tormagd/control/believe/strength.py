@@ -181,13 +181,16 @@ def observe(
 
 @final
 class Anchor:
-    """Estimator of a device's force that forgets nothing. It keeps (s, o, q, h) with their covariance."""
+    """Estimator of a device's force that forgets nothing. It keeps (s, o, q, h) with their covariance.
+
+    Since a fit was learned the elastomer has rested: its offset is as wide as an unseen device's.
+    """
 
     def __init__(self, fit: DeviceFit) -> None:
         self.values: list[float] = [fit.scale, fit.offset_N, 0.0, 0.0]
         self.covariance: list[list[float]] = [
             [fit.scale_variance, fit.covariance_N, 0.0, 0.0],
-            [fit.covariance_N, fit.offset_variance_N2, 0.0, 0.0],
+            [fit.covariance_N, OFFSET_VARIANCE_N2, 0.0, 0.0],
             [0.0, 0.0, CURVE_VARIANCE, 0.0],
             [0.0, 0.0, 0.0, HOOK_VARIANCE],
         ]
