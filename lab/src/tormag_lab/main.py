@@ -38,7 +38,6 @@ class Found(NamedTuple):
 
 COMMANDS = {
     "reproduce-thesis": ("thesis.reproduction", "the thesis's tables and figures beside ours"),
-    "tactile-experiment": ("tactile.experiment", "chapter 4 on a simulated pad: models, the pulse, holds"),
     "optimise-design": ("design.optimisation", "the brake's geometry for a task"),
     "bound": ("ideal_carriage", "what a device's ideal carriages miss of a force"),
     "bench-sweep": ("training.bench_sweep", "training data from the simulated device on a bench"),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tormag_lab.arrays import Json
+from tormag_lab.arrays import Array, Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormag_lab.design.energy import energy_at_shaft
 from tormag_lab.design.force_law import stretch_minus_one
@@ -47,7 +47,7 @@ PULSE_S, PULSE_HZ = 20.0, 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write reproduction.md and its pictures there")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write both pages and their pictures there")
     parser.add_argument("--gap-speed", type=GAP_SPEED, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=WORKERS, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=SEED, default=1)
@@ -72,23 +72,25 @@ def run(options: argparse.Namespace) -> Found:
             result["phase_portrait"] = phase_portrait(GAP_SPEED_MM_S, tests[0].gap_speed_mm_s, options.gap_speed)
             runs = table_3_2_runs(options.gap_speed, options.seed)
             result["table_3_2"] = table_3_2(runs, sweep(runs.values(), pool), options.gap_speed)
-            result |= {name: learned.result()[name] for name in ("table_4_1", "pulse")}
+            of_pad, traces = learned.result()
+            result |= of_pad
         except KeyboardInterrupt:
             pool.shutdown(cancel_futures=True)
     if options.out is not None:
+        from tormag_lab.tactile.report import write_report
         from tormag_lab.thesis.plots import pictures
 
         folder = options.out / "reproduction"
         write_page(options.out / "reproduction.md", page.sections(result), folder, pictures(result, tests))
+        if "pulse" in result:
+            write_report(options.out, result, traces)
     return Found(result, page.sections(result), 0 if "pulse" in result else 130)
 
 
-def chapter_4() -> Json:
-    from tormag_lab.tactile.experiment import contract
-    from tormag_lab.tactile.models import FULL
+def chapter_4() -> tuple[Json, dict[str, Array]]:
+    from tormag_lab.tactile import models, report  # load torch and scikit-learn
 
-    found, *_ = contract(FULL)
-    return found
+    return report.chapter_4(models.FULL)
 
 
 def table_2_3() -> Json:

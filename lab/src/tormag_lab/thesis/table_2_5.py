@@ -5,12 +5,12 @@ from its own least force on, and a passive brake does not reach 0 N.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, Brake
-from tormag_lab.design.force_law import radial_moment_for_force_Tm
 from tormag_lab.thesis.values import TABLE_2_5, ForceTask
 from tormagd.element.physics.inserts import INSERTS
 
@@ -103,9 +103,8 @@ def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float | None:
     tolerated_N = task.least_N + task.resolution_N
     if tolerated_N >= brake.least_N:
         return brake.open_mm
-    moment_Tm = radial_moment_for_force_Tm(tolerated_N, brake.elastomer, brake.geometry)
-    is_given = moment_Tm >= brake.field.radial_moment_Tm(brake.field.gap_range_mm[1])
-    return brake.field.gap_mm(moment_Tm) if is_given else None
+    wider = replace(brake, open_mm=brake.field.gap_range_mm[1])
+    return wider.gap_mm(tolerated_N) if tolerated_N >= wider.least_N else None
 
 
 def readings(table: Json) -> list[tuple[str, ...]]:
