@@ -12,7 +12,7 @@ from tormag_lab.design.phase_portrait import Region
 from tormag_lab.pages import subplots
 from tormag_lab.thesis.page import best_start
 from tormag_lab.thesis.step_test import StepTest
-from tormag_lab.thesis.values import AS_BUILT, USE_CASES
+from tormag_lab.thesis.values import USE_CASES
 from tormagd.view.drawing import Axes, Figure
 
 MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e", "#e9ecf2"
@@ -20,34 +20,11 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
     drawn: dict[str, tuple[str, Callable[[Json], Figure]]] = {
-        "table_2_4": ("table_2_4", _table_2_4),
         "figure_2_5": ("figure_2_5", _figure_2_5),
         "figure_2_7": ("figure_2_7", partial(_figure_2_7, tests=tests)),
-        "figure_3_2": ("table_3_2", _figure_3_2),
         "figure_3_4": ("table_3_2", _figure_3_4),
     }
     return {name: draw(result[part]) for name, (part, draw) in drawn.items() if part in result}
-
-
-def _table_2_4(table: Json) -> Figure:
-    """Draw each insert's force range: measured, the thesis's, and ours in two fits."""
-    figure, axes = subplots((9.5, 4.2))
-    rows = table["rows"]
-    place = np.arange(len(rows))
-    bars = (
-        ("thesis estimate", THESIS, "thesis_N"),
-        ("ours, friction fitted", OURS, "ours_N"),
-        ("ours, exponent free too", FREE, "ours_free_exponent_N"),
-    )
-    for offset, (label, colour, key) in zip((-0.26, 0.0, 0.26), bars, strict=True):
-        axes.bar(place + offset, [row[key] for row in rows], 0.24, color=colour, label=label)
-    for row, x in zip(rows, place, strict=True):
-        named = "measured, with deviation" if x == 0 else None
-        axes.errorbar([x - 0.26, x, x + 0.26], [row["measured_N"]] * 3, row["deviation_N"], color=MEASURED, label=named)
-    axes.set_xticks(place, [row["insert"].removeprefix("MRE-") for row in rows])
-    axes.set(xlabel="insert (matrix-iron %)", ylabel="F(45 mm) - F(95 mm), N")
-    axes.legend(frameon=False)
-    return figure
 
 
 def _figure_2_5(data: Json) -> Figure:
@@ -95,18 +72,6 @@ def _force_ranges(axes: Axes, rows: list[Json]) -> None:
     axes.plot([], [], "_", color=MEASURED, label="range measured in the thesis")
     axes.set(xlabel="iron, % by volume", ylabel="least to greatest force, N", ylim=(0, None))
     axes.legend(frameon=False, loc="upper left")
-
-
-def _figure_3_2(table: Json) -> Figure:
-    """Draw the portrait of the device as built over both use cases, at both gap speeds."""
-    figure, axes = subplots((9.5, 4.0), 1, 2)
-    speeds = (table["gap_speed_mm_s"]["true_thesis_speed"], table["gap_speed_mm_s"]["true"])
-    for axis, (number, case) in zip(axes, USE_CASES.items(), strict=True):
-        _region(axis, case.region)
-        for speed, colour in zip(speeds, (OURS, FREE), strict=True):
-            _portrait(axis, Problem(case.region, "true", speed), AS_BUILT, colour, f"{speed:.3g} mm/s")
-        _frame(axis, case.region, f"Device as built, use case {number}")
-    return figure
 
 
 def _figure_3_4(table: Json) -> Figure:

@@ -314,51 +314,36 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
         "trapezoid": Problem(region, "trapezoid", GAP_SPEED_MM_S),
         "true": Problem(region, "true", gap_speed_mm_s),
         "true_thesis_speed": Problem(region, "true", GAP_SPEED_MM_S),
-        "corners": Problem(region, "corners", GAP_SPEED_MM_S),
     }
 
 
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Json], gap_speed_mm_s: float) -> Json:
-    """Return the optima by each measure and by the thesis's cost, beside the thesis's designs."""
-    rows: list[Json] = [
-        {
-            "use_case": use_case,
-            "start": start,
-            "objective": objective,
-            "design": _design(outcomes[run]["design"]),
-            "volume_cm3": 1e-3 * outcomes[run]["volume_mm3"],
-            **{name: outcomes[run][name] for name in ("coverage", "corner_cost", "seconds")},
-        }
-        for (use_case, start, objective), run in runs.items()
-    ]
-    starts = [row for row in rows if row["objective"] != "corners"]
+    """Return the optima by each measure, beside the thesis's designs."""
     designs = []
     for number, case in USE_CASES.items():
+        problems = _problems(number, gap_speed_mm_s)
         found = [
             (f"thesis, start {index}", each.thesis, each.thesis_percent) for index, each in enumerate(case.starts, 1)
         ]
         for name, design, percent in (("as built", AS_BUILT, case.initial_percent), *found):
-            reached = {
-                objective: coverage(problem, design)
-                for objective, problem in _problems(number, gap_speed_mm_s).items()
-                if objective != "corners"
-            }
+            reached = {objective: coverage(problem, design) for objective, problem in problems.items()}
             designs.append(
                 {"use_case": number, "name": name, "design": _design(design), "thesis": percent / 100, "ours": reached}
             )
-    groups: dict[tuple[int, str], list[float]] = {}
-    for each in starts:
-        groups.setdefault((each["use_case"], each["objective"]), []).append(each["coverage"])
     return {
-        "starts": starts,
-        "corner_cost_starts": [row for row in rows if row["objective"] == "corners"],
-        "thesis_designs": designs,
-        "best": [
-            {"use_case": number, "objective": objective, "coverage": max(values), "spread": max(values) - min(values)}
-            for (number, objective), values in groups.items()
+        "starts": [
+            {
+                "use_case": use_case,
+                "start": start,
+                "objective": objective,
+                "design": _design(outcomes[run]["design"]),
+                "volume_cm3": 1e-3 * outcomes[run]["volume_mm3"],
+                **{name: outcomes[run][name] for name in ("coverage", "seconds")},
+            }
+            for (use_case, start, objective), run in runs.items()
         ],
+        "thesis_designs": designs,
         "gap_speed_mm_s": {"trapezoid": GAP_SPEED_MM_S, "true": gap_speed_mm_s, "true_thesis_speed": GAP_SPEED_MM_S},
-        "max_seconds": max(row["seconds"] for row in starts),
         "note": "R_i 4 mm, bounds of Eq. 40-42, G0 300 kPa, mu_r 3.8, mu_d 0.2, power field law. Use case 1 starts at "
         "(0 N, 0 N/s).",
     }
