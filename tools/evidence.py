@@ -64,11 +64,10 @@ PARTS = {
         "{cases:,} cases, {stage_cases:,} hostile steps of the core's stages: [errors](../measurements.md)",
     ),
     "inverse": Part(
-        "tools/benchmark.py inverse --json --write",
+        "tools/benchmark.py inverse --json",
         "the daemon's search is {speedup_vs_thesis_linear:.0f} times as fast as the thesis's: "
         "[the trade](../inverse_trade.md)",
         judges=False,
-        is_kept=True,
     ),
     "envelope": Part(
         "tools/judge.py envelope --json --picture docs/images/envelope.png",

@@ -197,7 +197,7 @@ def test_no_message_sends_an_operator_to_a_file_of_the_checkout():
 
 
 DOCS = ROOT / "docs"
-GENERATED = ("inverse_trade.md", "learned_inverse.md", "reproduction.md")
+GENERATED = ("learned_inverse.md", "reproduction.md")
 SHOWN = re.compile(r"\]\(([\w/]+\.png)\)")
 DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 
