@@ -47,7 +47,7 @@ PARTS = {
     "fuzz": Part(
         "tools/judge.py endure fuzz --json",
         "{executions[codec]:,} payloads, {executions[framing]:,} streams and {executions[device]:,} lives "
-        "under sanitizers: {lines} of the lines that bytes can reach. C and Python differ {languages_differ} times",
+        "under sanitizers. C and Python differ {languages_differ} times",
     ),
     "replug-serial": Part(
         "tools/judge.py endure replug-serial --json", "{cycles} cycles. Lost after {lost_after_ms} ms at most"
@@ -70,7 +70,7 @@ PARTS = {
         judges=False,
     ),
     "envelope": Part(
-        "tools/judge.py envelope --json --picture docs/images/envelope.png",
+        "tools/judge.py envelope --json",
         "{cases} runs on samples and {draws} draws: [bounds and worst](../control.md#the-envelope)",
     ),
     "models": Part(

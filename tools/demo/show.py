@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
-from judge.following import RATE_HZ, Tracking, tracking
-from judge.signals import with_approach
+from judge.following import PULSE_N, RATE_HZ, Tracking, tracking, with_approach
 from machines.host import Host, HostWatch
 from machines.own import own_machine
 
@@ -57,7 +56,7 @@ fifo_priority = {DAEMON_FIFO}  # each is refused where it is not allowed; then t
 lock_memory = true
 """
 CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--json", "--wait", "60")
-MIN_N, MAX_N = 1.4, 1.7
+MIN_N, MAX_N = PULSE_N
 PULSE_S = 20.0
 RAMP_S, HOLD_S = 1.0, 3.0
 "Approach to the pulse's first force, and a hold there in which the trim learns this device."
