@@ -205,13 +205,6 @@ def test_forces_out_of_range_are_clipped_before_they_count() -> None:
     assert found.figures()["foresight_rms_N"] <= 0.002
 
 
-def test_a_force_may_be_held_until_the_next() -> None:
-    times_s, forces_N = np.array([0.0, 0.2, 0.6]), np.array([1.0, 1.5, 1.5])
-    held = best(SAMPLES[0], times_s, forces_N, is_held=True)
-    assert held.asked_N[[0, 199, 200, 600]] == pytest.approx([1.0, 1.0, 1.5, 1.5], abs=1e-4)
-    assert held.figures(0.55)["no_delay_rms_N"] <= 1e-3
-
-
 def test_the_command_prints_its_figures(capsys, tmp_path) -> None:
     path = tmp_path / "force.csv"
     path.write_text("t_s,force_N\n0,1.0\n0.2,1.0\n0.21,1.4\n0.5,1.4\n")

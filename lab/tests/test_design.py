@@ -23,7 +23,6 @@ from tormag_lab.design.optimisation import (
     Design,
     Problem,
     Run,
-    corner_cost,
     coverage,
     solve,
     sweep,
@@ -169,9 +168,8 @@ def test_no_design_on_a_grid_is_better_or_as_good_and_smaller() -> None:
 
 @pytest.mark.usefixtures("few_generations")
 def test_nothing_less_than_the_start_is_returned() -> None:
-    covering, corners = (Problem(USE_CASE_1, measure, THESIS_SPEED_MM_S) for measure in ("true", "corners"))
+    covering = Problem(USE_CASE_1, "true", THESIS_SPEED_MM_S)
     assert solve(Run(covering, AS_BUILT))["coverage"] >= coverage(covering, AS_BUILT) - SLACK
-    assert solve(Run(corners, AS_BUILT))["corner_cost"] <= corner_cost(corners, AS_BUILT)
 
 
 @pytest.mark.usefixtures("few_generations")
@@ -342,4 +340,4 @@ def test_a_reproduction_that_is_stopped_writes_what_it_has(tmp_path: Path, monke
         "Figure 2.5",
         "Errata",
     ]
-    assert "table_2_4.png" in {path.name for path in (tmp_path / "reproduction").iterdir()}
+    assert [path.name for path in (tmp_path / "reproduction").iterdir()] == ["figure_2_5.png"]

@@ -13,13 +13,11 @@ import argparse
 import concurrent.futures
 import contextlib
 import signal
-import time
 from collections.abc import Iterator
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from judge.following import Case, Rehearsals, Tracking, rehearse
 from judge.touching import Touch
 
@@ -37,7 +35,7 @@ from demo.show import (
     show,
     staged,
 )
-from tormag_lab.arrays import Array, Json
+from tormag_lab.arrays import Array
 from tormagd.config import Config
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.parameters import PlantError, load_plant
@@ -79,14 +77,13 @@ def main() -> int:
         parser.error(str(error))
     # the show runs in a folder of its own
     plant = str(Path(plant).absolute()) if Path(plant).exists() else plant
-    started_s = time.monotonic()
     times_s, forces_N = profile()
     config = Config(scene="pulse")
     scene = load_scene(config.scene)
     print("A hand meets one wall three times; it feels the brake of a simulated device, through the daemon.")
     with folder("touch"):
         touched = staged(felt)
-    print("", *touch_told(scene, touched)[1], "", sep="\n")
+    print("", *touch_told(scene, touched), "", sep="\n")
     print("A measured human pulse (photoplethysmogram, heartpy) as a force, through the daemon and a simulated device.")
     for number in range(1, SHOWS + 1):
         shown = show(times_s, forces_N, plant=plant)
@@ -98,7 +95,7 @@ def main() -> int:
     rehearsals = rehearse_all(config, times_s, forces_N)
     print("The same pulse, its field searched as it was ordered, in real time:")
     ordered = show_ordered()
-    return conclude(scene, touched, shown, rehearsals, ordered, verdict, sentence, time.monotonic() - started_s)
+    return conclude(scene, touched, shown, rehearsals, ordered, verdict, sentence)
 
 
 def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
@@ -193,41 +190,21 @@ def conclude(
     ordered: dict[str, Shown | Aborted],
     verdict: Verdict,
     sentence: str,
-    seconds: float,
 ) -> int:
     met = in_virtual_time = virtual_time_checks(scene, rehearsals)
     print_forces(shown, rehearsals)
     print_ordered(scene, shown, ordered)
-    summary: dict[str, Any] = {
-        "touch": touch_told(scene, touched)[0],
-        "virtual_time": {case.label: found.since(PULSE_START_S)._asdict() for case, found in rehearsals.items()},
-        "host": shown.host._asdict(),
-        "verdict": verdict.name,
-        "sentence": sentence,
-        "seconds": round(seconds, 1),
-    }
-    written = [f"figures {RUN_DIR / 'summary.json'}"]
     from demo.pictures import show_picture, touch_picture
 
-    if isinstance(touched, list):
-        touch_picture(RUN_DIR / "touch.png", touched, touch_told(scene, touched)[1])
-        written = [f"picture {RUN_DIR / 'touch.png'}", *written]
+    written: list[str] = []
     if isinstance(shown, Shown):
         print_timing(shown)
         met = checks(scene, shown) | in_virtual_time
         show_picture(RUN_DIR / "pulse.png", scene, shown, rehearsals, force_table(shown, rehearsals))
-        written = [f"recording {RECORDING}", f"picture {RUN_DIR / 'pulse.png'}", *written]
-        summary |= {
-            "tracking": scored(shown.time_s, shown.asked_N, shown.rendered_N)._asdict(),
-            "rates": shown.status["rates"],
-            "control_kept": shown.kept,
-            "worst_stall_ms": shown.worst_stall_ms,
-            "link": shown.status["link"],
-            "limits_share": shown.limits,
-            "exit_codes": shown.exit_codes,
-        }
-    summary["checks"] = met
-    (RUN_DIR / "summary.json").write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2))
+        written += [f"recording {RECORDING}", f"picture {RUN_DIR / 'pulse.png'}"]
+    if isinstance(touched, list):
+        touch_picture(RUN_DIR / "touch.png", touched, touch_told(scene, touched))
+        written.append(f"picture {RUN_DIR / 'touch.png'}")
     print("\n" + "   ".join(written))
     for text, is_met in met.items():
         print(f"  {'met   ' if is_met else 'MISSED'} {text}")
@@ -249,10 +226,9 @@ def virtual_time_checks(scene: Scene, rehearsals: Rehearsals) -> dict[str, bool]
     }
 
 
-def touch_told(scene: Scene, touched: list[Touch] | Aborted) -> tuple[Json, list[str]]:
+def touch_told(scene: Scene, touched: list[Touch] | Aborted) -> list[str]:
     if isinstance(touched, Aborted):
-        _, sentence = judge(scene, touched)
-        return {"ended_early": sentence}, [sentence]
+        return [judge(scene, touched)[1]]
     found = [figures(*each) for each in zip(touched, bounds(), strict=True)]
     width = max(map(len, TOUCHES))
     lines = [
@@ -262,7 +238,7 @@ def touch_told(scene: Scene, touched: list[Touch] | Aborted) -> tuple[Json, list
     for name, told in zip(TOUCHES, found, strict=True):
         late, bound = (lateness(told[key]) for key in ("felt_later_ms", "bound_later_ms"))
         lines.append(f"  {name:{width}s} {told['wall_N']:5.2f} N {told['felt_N']:5.2f} N {late:>11s}  {bound}")
-    return dict(zip(TOUCHES, found, strict=True)), lines
+    return lines
 
 
 def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:
