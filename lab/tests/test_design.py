@@ -248,12 +248,6 @@ def test_each_lack_is_a_reason(task_N: tuple[float, float, float], reasons: list
     assert [" ".join(reason.split()[:2]) for reason in judged(*task_N)["reasons"]] == reasons
 
 
-def test_the_sufficient_gap_makes_the_brake_serve() -> None:
-    gap_mm = judged(0.0, 2.0, 0.1)["sufficient_gap_mm"]
-    assert gap_mm > BRAKE.open_mm
-    assert judged(0.0, 2.0, 0.1, dataclasses.replace(BRAKE, open_mm=gap_mm * 1.0001))["serves"]
-
-
 def test_ranking_puts_the_finest_that_serves_first() -> None:
     weakly = dataclasses.replace(BRAKE.elastomer, friction_coefficient=0.15)
     inserts = {

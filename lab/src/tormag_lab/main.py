@@ -48,7 +48,7 @@ COMMANDS = {
     "twin": ("twin.command", "a plant file of one device from its recordings"),
     "identify-motor": ("motor.command", "a motor and its screw from a log"),
     "tune-position": ("tune_position", "the gains of the position loop for a motor"),
-    "fleet": ("consoles.command", "what the recordings of many consoles say of each"),
+    "fleet": ("fleet", "what the recordings of many consoles say of each"),
 }
 
 

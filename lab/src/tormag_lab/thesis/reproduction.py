@@ -13,8 +13,7 @@ import numpy as np
 
 from tormag_lab.arrays import Array, Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
-from tormag_lab.design.energy import energy_at_shaft
-from tormag_lab.design.force_law import stretch_minus_one
+from tormag_lab.design.force_law import energy_at_shaft, stretch_minus_one
 from tormag_lab.design.optimisation import Design, Problem, Run, coverage, sweep
 from tormag_lab.design.phase_portrait import PhasePortrait
 from tormag_lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error

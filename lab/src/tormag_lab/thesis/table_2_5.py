@@ -5,7 +5,6 @@ from its own least force on, and a passive brake does not reach 0 N.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -94,17 +93,7 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
         "resolution_mN": 1e3 * resolution_N,
         "served_share": max(high - low, 0.0) / width_N,
         "reasons": reasons,
-        "sufficient_gap_mm": _sufficient_gap_mm(brake, task),
     }
-
-
-def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float | None:
-    """Return the gap, the open one or wider, that gives the task's least force plus its resolution."""
-    tolerated_N = task.least_N + task.resolution_N
-    if tolerated_N >= brake.least_N:
-        return brake.open_mm
-    wider = replace(brake, open_mm=brake.field.gap_range_mm[1])
-    return wider.gap_mm(tolerated_N) if tolerated_N >= wider.least_N else None
 
 
 def readings(table: Json) -> list[tuple[str, ...]]:
