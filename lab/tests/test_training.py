@@ -28,7 +28,7 @@ from tormag_lab.training.dataset import (
     write_csv,
 )
 from tormag_lab.training.fitting import fit_network
-from tormag_lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series, relaxed_N
+from tormag_lab.training.grey_box import GreyBox, GreyBoxMemory, fit_series, relaxed_N
 from tormag_lab.training.law import Law, fit_bend, fit_law, fit_law_model
 from tormag_lab.training.levenberg_marquardt import jacobian, train
 from tormag_lab.training.unremembered import identify
@@ -441,20 +441,9 @@ def records(displacement: np.ndarray, time_s: np.ndarray, fields: tuple[float, .
 
 
 @pytest.fixture(scope="module")
-def cycles() -> Dataset:
-    time_s = np.arange(1, 401) * 0.1
-    return records(2 - 2 * np.cos(2 * np.pi * time_s / 10), time_s + 200, (0.0, 75.0, 150.0, 225.0, 300.0))
-
-
-@pytest.fixture(scope="module")
 def holds() -> Dataset:
     time_s = np.concatenate((np.linspace(0, 4, 21), 4 + np.geomspace(0.1, 3600, 120)))
     return records(np.minimum(time_s, 4.0), time_s, (0.0, 150.0, 300.0))
-
-
-@pytest.fixture(scope="module")
-def grey(cycles: Dataset, holds: Dataset) -> GreyBox:
-    return fit_grey_box(cycles, np.ones(len(cycles), dtype=bool), holds, hidden=20, epochs=40, settling_epochs=20)
 
 
 def test_a_series_is_recovered_from_holds_even_when_the_level_is_wrong(holds: Dataset) -> None:
@@ -477,24 +466,15 @@ def test_records_that_begin_late_were_run_before() -> None:
         assert force[-1] == pytest.approx(4.0 + remembered, rel=1e-9)
 
 
-def test_the_grey_box_sees_through_the_memory(grey: GreyBox, cycles: Dataset, holds: Dataset) -> None:
-    alone, _ = fit_network(cycles, np.ones(len(cycles), dtype=bool), 20, epochs=40)
-    error, error_alone = (
-        np.abs(found_N - holds.force_N).mean() for found_N in (grey.predict(holds), alone.predict(holds.features))
-    )
-    assert 5 * error < error_alone
-    assert error < 3 * NOISE_N
-
-
-def test_a_memory_needs_times(grey: GreyBox, cycles: Dataset) -> None:
+def test_a_memory_needs_times() -> None:
     with pytest.raises(DomainError, match="time_s"):
-        grey.predict(Dataset(cycles.features, cycles.force_N))
+        relaxed_N(SERIES, np.zeros(2), Dataset(np.zeros((2, 4)), np.zeros(2)))
 
 
-def test_forces_held_out_are_not_looked_at(cycles: Dataset) -> None:
-    known = np.arange(len(cycles)) % 3 > 0
-    spoiled = Dataset(cycles.features, np.where(known, cycles.force_N, 900.0), cycles.cycle, cycles.time_s)
-    models = [fit_network(data, known, 5, epochs=3)[0].predict(cycles.features) for data in (cycles, spoiled)]
+def test_forces_held_out_are_not_looked_at() -> None:
+    data, known = synthetic(200, 0), np.arange(200) % 3 > 0
+    spoiled = replace(data, force_N=np.where(known, data.force_N, 900.0))
+    models = [fit_network(each, known, 5, epochs=3)[0].predict(data.features) for each in (data, spoiled)]
     assert models[0] == pytest.approx(models[1])
 
 
