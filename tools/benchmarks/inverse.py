@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.optimize import brentq
 from tqdm import tqdm
 
 from tormag_lab.arrays import Array
@@ -112,15 +113,16 @@ def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
     grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
     found: list[Array] = []
     for displacement, rate, force in along.rows():
-        excess = _network(model, displacement, rate, grid) - force
-        left = np.flatnonzero((excess[1:] < 0) != (excess[:-1] < 0))
-        low, high, rises = grid[left], grid[left + 1], excess[left] < 0
-        for _ in range(40 if left.size else 0):
-            middle = (low + high) / 2
-            under = (_network(model, displacement, rate, middle) < force) == rises
-            low, high = np.where(under, middle, low), np.where(under, high, middle)
-        found.append((low + high) / 2)
+        is_over = _network(model, displacement, rate, grid) >= force
+        begins = np.flatnonzero(is_over[1:] != is_over[:-1]).tolist()
+        of_solve = model, displacement, rate, force
+        roots = [brentq(_excess_N, grid[place], grid[place + 1], args=of_solve, xtol=1e-10) for place in begins]
+        found.append(np.array(roots))
     return found
+
+
+def _excess_N(field_mT: float, model: ForceModel, displacement_mm: float, rate_mm_s: float, force_N: float) -> float:
+    return model.predict_one(displacement_mm, rate_mm_s, field_mT, CIP_PERCENT) - force_N
 
 
 def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields_mT: Array) -> Array:
