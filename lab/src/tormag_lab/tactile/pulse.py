@@ -81,7 +81,6 @@ class Course(NamedTuple):
     """The pulse experiment on one pad: the rows to solve, and the pad's slope at each."""
 
     pad: PadParameters
-    time_s: Array
     features: Array
     force_N: Array
     slope_N_mT: Array
@@ -109,34 +108,31 @@ def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
     done = program(shape)
     force_N = worked_pad(pad).run(*done)
     features = done.features(pad.cip_percent)[::every]
-    return Course(
-        pad, done.time_s[::every], features, force_N[::every], slope_N_per_mT(pad, features[:, :3]), every / RATE_HZ
-    )
+    return Course(pad, features, force_N[::every], slope_N_per_mT(pad, features[:, :3]), every / RATE_HZ)
 
 
 def nearest() -> NearestFieldSearch:
     return NearestFieldSearch(field_grid(FIELDS_MT, 2.0))
 
 
-def pulse(trained: Trained, effort: Effort) -> tuple[Json, dict[str, Array]]:
-    """Return scores and traces (n each) of the network alone and of the relaxation-aware model, by name."""
+def pulse(trained: Trained, effort: Effort) -> Json:
+    """Return scores of the network alone and of the relaxation-aware model."""
     along = course(PADS[PAD_IN_USE], pulse_shape(HELD_S, RATE_HZ), effort.pulse_every)
-    ways = {
-        name: fields_of(solve_all(nearest(), model, along.features, along.force_N, memory))
-        for name, model, memory in (
-            ("mlp", trained.model, None),
-            ("relaxation_aware", trained.grey.model, GreyBoxMemory(trained.grey, along.dt_s)),
-        )
-    }
+    ways = (
+        ("mlp", trained.model, None),
+        ("relaxation_aware", trained.grey.model, GreyBoxMemory(trained.grey, along.dt_s)),
+    )
     bound_mT = np.sqrt(2.0 / np.pi) * NOISE_N / along.slope_N_mT[along.scored]
-    scores = {
+    return {
         "synthetic": True,
         "shape": SHAPE,
-        **{name: along.scores(fields) for name, fields in ways.items()},
+        **{
+            name: along.scores(fields_of(solve_all(nearest(), model, along.features, along.force_N, memory)))
+            for name, model, memory in ways
+        },
         "noise_bound_mae_mT": float(bound_mT.mean()),
         "scored_share": float(along.scored.mean()),
     }
-    return scores, {"time_s": along.time_s, "reference": along.features[:, 2], "slope_N_mT": along.slope_N_mT, **ways}
 
 
 def hold(trained: Trained, duration_s: float) -> dict[str, float]:

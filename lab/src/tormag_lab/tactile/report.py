@@ -1,34 +1,25 @@
-"""docs/learned_inverse.md and its picture, from chapter 4 on a synthetic tactile pad: table 4.1, the pulse, holds."""
+"""Chapter 4 on a synthetic tactile pad (table 4.1, the pulse, a hold), and docs/learned_inverse.md."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
 
-from tormag_lab.arrays import Array, Json
-from tormag_lab.pages import subplots, table, write_page
-from tormag_lab.tactile.models import SCORED_SLOPE_N_MT, Effort, table_4_1, train
+from tormag_lab.arrays import Json
+from tormag_lab.pages import table
+from tormag_lab.tactile.models import Effort, table_4_1, train
 from tormag_lab.tactile.pulse import hold, pulse
 from tormag_lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT
-from tormagd.view.drawing import Figure
 
 WAYS = {"mlp": "network alone", "relaxation_aware": "with relaxation"}
 "Ways from a force to a field, with their names on the page."
 
 
-def chapter_4(effort: Effort) -> tuple[Json, dict[str, Array]]:
-    """Run the experiment, and return its figures, and the pulse's traces by name."""
+def chapter_4(effort: Effort) -> Json:
     torch.set_num_threads(1)
     trained = train(effort)
-    rendered, traces = pulse(trained, effort)
     held = hold(trained, effort.hold_s)
-    rendered |= {"hold": held, "hold_1h_force_error": held["with"]}
-    return {"table_4_1": table_4_1(trained, effort), "pulse": rendered}, traces
-
-
-def write_report(folder: Path, figures: Json, traces: dict[str, Array]) -> None:
-    pictures = {"tactile_pulse": _pulse_picture(traces)}
-    write_page(folder / "learned_inverse.md", sections(figures), folder / "images", pictures)
+    rendered = pulse(trained, effort) | {"hold": held, "hold_1h_force_error": held["with"]}
+    return {"table_4_1": table_4_1(trained, effort), "pulse": rendered}
 
 
 def sections(figures: Json) -> Iterator[str]:
@@ -47,12 +38,6 @@ def sections(figures: Json) -> Iterator[str]:
         "elastomer's and the field's, fitted to MRE-C."
     )
     yield _pulse(figures["pulse"])
-    held = figures["pulse"]["hold"]
-    yield (
-        "## Held for an hour\n\n"
-        "Greatest force error for pulses between 148 and 154 N by feed-forward alone at 10 Hz, in virtual time: "
-        f"{held['without']:.2%} by the network alone, {held['with']:.2%} with relaxation.\n"
-    )
 
 
 def _table_4_1(data: Json) -> str:
@@ -94,23 +79,5 @@ def _pulse(pulse: Json) -> str:
         f"measured {PULSE_MAE_MT} ± {PULSE_SD_MT} mT, at most {PULSE_MAX_MT} mT.\n\n"
         + table(("way", "MAE, mT", "max, mT", "elsewhere, N"), rows)
         + "\nThe network alone drifts with [the pad's](tactile.md) relaxation. Pads whose constants are 3 to 15 % off "
-        "gave 7 and 17 mT with relaxation.\n\n"
-        "![the pulse experiment](images/tactile_pulse.png)\n"
+        "gave 7 and 17 mT with relaxation.\n"
     )
-
-
-def _pulse_picture(traces: dict[str, Array]) -> Figure:
-    time_s, reference_mT = traces["time_s"], traces["reference"]
-    figure, (fields, errors) = subplots((11.0, 6.0), 2, 1, sharex=True)
-    fields.plot(time_s, reference_mT, color="black", lw=1.5, label="reference")
-    for way, label in WAYS.items():
-        fields.plot(time_s, traces[way], lw=0.9, label=label)
-        errors.plot(time_s, traces[way] - reference_mT, lw=0.9, label=label)
-    fields.set(ylabel="field, mT", title="Reference field and the fields found (like figure 4.7a)")
-    errors.set(xlabel="time, s", ylabel="field error, mT", ylim=(-40, 60), title="Error (like figure 4.7b)")
-    errors.fill_between(
-        time_s, -40, 60, where=traces["slope_N_mT"] < SCORED_SLOPE_N_MT, color="grey", alpha=0.3, label="not scored"
-    )
-    for axes in (fields, errors):
-        axes.legend(loc="upper right")
-    return figure

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tormag_lab.arrays import Array, Json
+from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
 from tormag_lab.design.force_law import energy_at_shaft, stretch_minus_one
 from tormag_lab.design.optimisation import Design, Problem, Run, coverage, sweep
@@ -71,22 +71,21 @@ def run(options: argparse.Namespace) -> Found:
             result["phase_portrait"] = phase_portrait(GAP_SPEED_MM_S, tests[0].gap_speed_mm_s, options.gap_speed)
             runs = table_3_2_runs(options.gap_speed, options.seed)
             result["table_3_2"] = table_3_2(runs, sweep(runs.values(), pool), options.gap_speed)
-            of_pad, traces = learned.result()
-            result |= of_pad
+            result |= learned.result()
         except KeyboardInterrupt:
             pool.shutdown(cancel_futures=True)
     if options.out is not None:
-        from tormag_lab.tactile.report import write_report
+        from tormag_lab.tactile import report
         from tormag_lab.thesis.plots import pictures
 
         folder = options.out / "reproduction"
         write_page(options.out / "reproduction.md", page.sections(result), folder, pictures(result, tests))
         if "pulse" in result:
-            write_report(options.out, result, traces)
+            write_page(options.out / "learned_inverse.md", report.sections(result), folder, {})
     return Found(result, page.sections(result), 0 if "pulse" in result else 130)
 
 
-def chapter_4() -> tuple[Json, dict[str, Array]]:
+def chapter_4() -> Json:
     from tormag_lab.tactile import models, report  # load torch and scikit-learn
 
     return report.chapter_4(models.FULL)
