@@ -118,10 +118,8 @@ def nearest() -> NearestFieldSearch:
 def pulse(trained: Trained, effort: Effort) -> Json:
     """Return scores of the network alone and of the relaxation-aware model."""
     along = course(PADS[PAD_IN_USE], pulse_shape(HELD_S, RATE_HZ), effort.pulse_every)
-    ways = (
-        ("mlp", trained.model, None),
-        ("relaxation_aware", trained.grey.model, GreyBoxMemory(trained.grey, along.dt_s)),
-    )
+    aware = GreyBoxMemory(trained.grey, along.dt_s)
+    ways = (("mlp", trained.model, None), ("relaxation_aware", trained.grey.model, aware))
     bound_mT = np.sqrt(2.0 / np.pi) * NOISE_N / along.slope_N_mT[along.scored]
     return {
         "synthetic": True,

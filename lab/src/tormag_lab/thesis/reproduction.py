@@ -75,12 +75,13 @@ def run(options: argparse.Namespace) -> Found:
         except KeyboardInterrupt:
             pool.shutdown(cancel_futures=True)
     if options.out is not None:
-        from tormag_lab.tactile import report
         from tormag_lab.thesis.plots import pictures
 
         folder = options.out / "reproduction"
         write_page(options.out / "reproduction.md", page.sections(result), folder, pictures(result, tests))
         if "pulse" in result:
+            from tormag_lab.tactile import report  # loads torch
+
             write_page(options.out / "learned_inverse.md", report.sections(result), folder, {})
     return Found(result, page.sections(result), 0 if "pulse" in result else 130)
 
