@@ -170,8 +170,7 @@ def _table_3_2(data: Json) -> str:
         f"## Table 3.2: structural optimisation\n\n{data['note']} Gap speeds, mm/s: {speeds}. Differential evolution, "
         "then COBYQA. Minima of the thesis's cost, Eq. 39, cover less.\n\n"
         + table(columns, rows)
-        + "\n![Optimised portraits](reproduction/figure_3_4.png)\n\n"
-        "The thesis's designs by the same measures, over its five starts:\n\n"
+        + "\nThe thesis's designs by the same measures, over its five starts:\n\n"
         + table(("use case", "design", "R_o t s_max, mm", "thesis", "trapezoid", "true", "true, thesis speed"), designs)
     )
 
