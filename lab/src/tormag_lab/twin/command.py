@@ -25,7 +25,6 @@ from tormag_lab.twin.force import EXPONENT, PIVOT_MM, STRENGTH
 from tormagd.ground.files import new_file
 from tormagd.simulation.parameters import Assumed, PlantParameters, load_plant
 
-MAX_FILES = 10
 BELIEVED = 0.4
 "No device of the plant card is further from sample 1's strength."
 
@@ -69,8 +68,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     if options.out is not None and options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
-    if len(options.files) > MAX_FILES:
-        raise LabError(f"{len(options.files)} recordings: allowed are {MAX_FILES}")
     prior = load_plant(options.prior)
     ways = [excerpt_of(path) for path in options.files]
     twin = twin_of(prior, ways)
