@@ -125,7 +125,6 @@ tactile-model: $(VENV)/.dev
 # docs/reproduction.md and docs/learned_inverse.md with their plots: the thesis's tables and figures beside ours
 reproduction: $(VENV)/.dev
 	$(BIN)/tormag-lab reproduce-thesis --out docs
-	$(BIN)/tormag-lab tactile-experiment --out docs
 
 # docs/evidence: the judges and the benchmarks in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev

@@ -47,7 +47,7 @@ PARTS = {
     "fuzz": Part(
         "tools/judge.py endure fuzz --json",
         "{executions[codec]:,} payloads, {executions[framing]:,} streams and {executions[device]:,} lives "
-        "under sanitizers: {lines} of the lines that bytes can reach. C and Python differ {languages_differ} times",
+        "under sanitizers. C and Python differ {languages_differ} times",
     ),
     "replug-serial": Part(
         "tools/judge.py endure replug-serial --json", "{cycles} cycles. Lost after {lost_after_ms} ms at most"
@@ -64,14 +64,13 @@ PARTS = {
         "{cases:,} cases, {stage_cases:,} hostile steps of the core's stages: [errors](../measurements.md)",
     ),
     "inverse": Part(
-        "tools/benchmark.py inverse --json --write",
+        "tools/benchmark.py inverse --json",
         "the daemon's search is {speedup_vs_thesis_linear:.0f} times as fast as the thesis's: "
         "[the trade](../inverse_trade.md)",
         judges=False,
-        is_kept=True,
     ),
     "envelope": Part(
-        "tools/judge.py envelope --json --picture docs/images/envelope.png",
+        "tools/judge.py envelope --json",
         "{cases} runs on samples and {draws} draws: [bounds and worst](../control.md#the-envelope)",
     ),
     "models": Part(

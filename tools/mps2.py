@@ -12,8 +12,7 @@ from statistics import mean
 from typing import final
 
 import numpy as np
-from judge.following import RATE_HZ, Case, rehearse
-from judge.signals import pulse_signal
+from judge.following import PULSE_N, RATE_HZ, Case, rehearse
 from virtual_port import VirtualPort
 
 from firmware_protocol.c.build import BuildError, Target, build, debian_tool
@@ -21,6 +20,7 @@ from firmware_protocol.conformance.check import run
 from firmware_protocol.conformance.examination import checks_on
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import SerialLine
+from tormag_lab.human_pulse import pulse_profile
 from tormag_lab.told import table
 from tormagd.config import Config
 from tormagd.simulation.compiled_firmware import CompiledFirmware
@@ -97,7 +97,7 @@ def is_passed(boot: FirmwareKind) -> bool:
 
 
 def is_followed(boot: FirmwareKind, pulses: int) -> bool:
-    forces_N = np.tile(pulse_signal(PULSE_S).force_N, pulses)
+    forces_N = np.tile(pulse_profile(PULSE_S, *PULSE_N, RATE_HZ)[1], pulses)
     times_s = np.arange(forces_N.size) / RATE_HZ
     there_N, here_N = (
         rehearse(Config(scene="pulse"), Case("sample 1"), times_s, forces_N, made).rendered_N

@@ -43,7 +43,7 @@ class Target(Enum):
     SANITIZED_EXCHANGE = ("host/bridge", "host/exchange"), (*SANITIZED, "-fsanitize=address,undefined")
     FUZZ = (
         ("fuzz/fuzz", "fuzz/codec", "fuzz/framing", "fuzz/device"),
-        (*SANITIZED, "-fsanitize=fuzzer,address,undefined", "-fprofile-instr-generate", "-fcoverage-mapping"),
+        (*SANITIZED, "-fsanitize=fuzzer,address,undefined"),
         "clang",
     )
     MPS2 = (

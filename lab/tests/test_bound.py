@@ -25,8 +25,7 @@ from tormag_lab.ideal_carriage import (
 )
 from tormag_lab.main import main
 from tormagd.config import Config
-from tormagd.control.assembly.build import Core, build_core
-from tormagd.control.core import Stepper
+from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.element.physics.relaxation import PronySeries
 from tormagd.simulation.closed_loop import ClosedLoop
@@ -205,13 +204,6 @@ def test_forces_out_of_range_are_clipped_before_they_count() -> None:
     assert found.figures()["foresight_rms_N"] <= 0.002
 
 
-def test_a_force_may_be_held_until_the_next() -> None:
-    times_s, forces_N = np.array([0.0, 0.2, 0.6]), np.array([1.0, 1.5, 1.5])
-    held = best(SAMPLES[0], times_s, forces_N, is_held=True)
-    assert held.asked_N[[0, 199, 200, 600]] == pytest.approx([1.0, 1.0, 1.5, 1.5], abs=1e-4)
-    assert held.figures(0.55)["no_delay_rms_N"] <= 1e-3
-
-
 def test_the_command_prints_its_figures(capsys, tmp_path) -> None:
     path = tmp_path / "force.csv"
     path.write_text("t_s,force_N\n0,1.0\n0.2,1.0\n0.21,1.4\n0.5,1.4\n")
@@ -221,27 +213,6 @@ def test_the_command_prints_its_figures(capsys, tmp_path) -> None:
     assert 0.0 < result["foresight_rms_N"] < result["no_delay_rms_N"]
     assert main(["bound", str(path)]) == 0
     assert re.search(r"^no_delay_rms_N +0\.1713$", capsys.readouterr().out, re.MULTILINE)
-
-
-def missed_N(core: Core, device: VirtualDevice, stepper: Stepper) -> float:
-    loop = ClosedLoop(core.config, stepper, core.planner(), device)
-    loop.arm()
-    errors_N = []
-    for sample in loop.run(4.0, lambda now_s: TimedSetpoint(1.4 + 0.2 * math.sin(math.tau * 3.0 * now_s), now_s, 0.1)):
-        assert sample.safety.faults == ()
-        assert sample.truth.gap_mm > sample.plan.min_gap_mm - 0.01
-        errors_N.append(sample.truth.force_N - 1.4 - 0.2 * math.sin(math.tau * 3.0 * sample.time_s))
-    return rms(np.array(errors_N[2_200:]))
-
-
-def test_the_same_core_misses_less_with_carriages_that_lose_no_time() -> None:
-    core = build_core(Config())
-    own, ideal = (VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1) for _ in range(2))
-    assert (
-        0.0
-        < missed_N(core, ideal, ideal_stepper(core, ideal.messages.plant))
-        < 0.9 * missed_N(core, own, core.stepper())
-    )
 
 
 @pytest.mark.parametrize("command", ["pause", "disable"])

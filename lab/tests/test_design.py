@@ -23,7 +23,6 @@ from tormag_lab.design.optimisation import (
     Design,
     Problem,
     Run,
-    corner_cost,
     coverage,
     solve,
     sweep,
@@ -110,7 +109,6 @@ def test_end_forces_come_back_as_end_gaps(law: FieldLaw, g0_Pa: float) -> None:
     ends = [device.most_N, device.least_N]
     # Eq. 7 is flat at 95 mm, so its inverse has half of the digits there
     assert [device.gap_mm(force) for force in ends] == pytest.approx([45.0, 95.0], abs=1e-4)
-    assert device.gap_mm(np.array(ends)) == pytest.approx([45.0, 95.0], abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -170,9 +168,8 @@ def test_no_design_on_a_grid_is_better_or_as_good_and_smaller() -> None:
 
 @pytest.mark.usefixtures("few_generations")
 def test_nothing_less_than_the_start_is_returned() -> None:
-    covering, corners = (Problem(USE_CASE_1, measure, THESIS_SPEED_MM_S) for measure in ("true", "corners"))
+    covering = Problem(USE_CASE_1, "true", THESIS_SPEED_MM_S)
     assert solve(Run(covering, AS_BUILT))["coverage"] >= coverage(covering, AS_BUILT) - SLACK
-    assert solve(Run(corners, AS_BUILT))["corner_cost"] <= corner_cost(corners, AS_BUILT)
 
 
 @pytest.mark.usefixtures("few_generations")
@@ -251,12 +248,6 @@ def test_each_lack_is_a_reason(task_N: tuple[float, float, float], reasons: list
     assert [" ".join(reason.split()[:2]) for reason in judged(*task_N)["reasons"]] == reasons
 
 
-def test_the_sufficient_gap_makes_the_brake_serve() -> None:
-    gap_mm = judged(0.0, 2.0, 0.1)["sufficient_gap_mm"]
-    assert gap_mm > BRAKE.open_mm
-    assert judged(0.0, 2.0, 0.1, dataclasses.replace(BRAKE, open_mm=gap_mm * 1.0001))["serves"]
-
-
 def test_ranking_puts_the_finest_that_serves_first() -> None:
     weakly = dataclasses.replace(BRAKE.elastomer, friction_coefficient=0.15)
     inserts = {
@@ -316,16 +307,6 @@ def test_every_insert_stands_before_every_task_in_both_readings() -> None:
             assert not row["serves"]  # every task begins at 0 N
 
 
-def test_of_what_the_thesis_names_one_is_not_wide_enough() -> None:
-    rows = [dict(zip(table_2_5.COLUMNS, row, strict=True)) for row in table_2_5.readings(FOUND)]
-    assert len(rows) == sum(len(named) for _, named in TABLE_2_5)
-    short = [row for row in rows if row["range matched"] != "100%"]
-    assert [row["insert the thesis names"] for row in short] == ["MRE-30-30"]
-    assert "0.67 N of the width" in short[0]["missed"]
-    named = {row["task"].split(",")[0]: row["narrowest that matches"] for row in rows}
-    assert all(named[task.name] in inserts for task, inserts in TABLE_2_5)
-
-
 def test_the_page_has_it() -> None:
     assert page.table_2_5(FOUND) in Path(__file__).parents[2].joinpath("docs/reproduction.md").read_text("utf-8")
 
@@ -343,4 +324,4 @@ def test_a_reproduction_that_is_stopped_writes_what_it_has(tmp_path: Path, monke
         "Figure 2.5",
         "Errata",
     ]
-    assert "table_2_4.png" in {path.name for path in (tmp_path / "reproduction").iterdir()}
+    assert [path.name for path in (tmp_path / "reproduction").iterdir()] == ["figure_2_5.png"]

@@ -12,7 +12,7 @@ import pyarrow.parquet
 import pytest
 from distributed import LocalCluster
 
-from tormag_lab.consoles.summary import Console, Drift, Summary, consoles, files, read, read_all
+from tormag_lab.fleet import Console, Drift, Summary, consoles, files, read, read_all
 from tormag_lab.main import main
 from tormagd.commission.finding import Finding
 from tormagd.commission.sequence import Report

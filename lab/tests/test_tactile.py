@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tormag_lab.tactile import experiment, models, report, shipped
+from tormag_lab.tactile import models, report, shipped
 from tormag_lab.tactile.models import QUICK
 from tormag_lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, holding_records
 from tormag_lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape
@@ -96,13 +96,12 @@ def test_impossible_places_are_refused(place: tuple[float, float, float], name: 
 
 
 @pytest.fixture(scope="module")
-def run():
+def figures():
     # whole groups left out are only looked at for their shape
-    return experiment.contract(replace(models.QUICK, samples_per_cycle=16, hold_samples=140, thin=48, group_epochs=1))
+    return report.chapter_4(replace(models.QUICK, samples_per_cycle=16, hold_samples=140, thin=48, group_epochs=1))
 
 
-def test_the_contract_s_keys_are_there_and_finite(run):
-    figures = run[0]
+def test_the_contract_s_keys_are_there_and_finite(figures):
     table, pulse = figures["table_4_1"], figures["pulse"]
     assert set(table["random"]) == {"r2", "mae_N", "noise_mae_N"}
     assert [row["class"] for row in table["rows"]] == ["MRE-A", "MRE-B", "MRE-C", "All"]
@@ -120,23 +119,16 @@ def test_the_contract_s_keys_are_there_and_finite(run):
     assert 0.95 * table["random"]["noise_mae_N"] < table["random"]["mae_N"] < 1.26
 
 
-def test_without_relaxation_the_field_drifts(run):
-    figures, _, traces = run
+def test_without_relaxation_the_field_is_missed(figures):
     pulse, hold = figures["pulse"], figures["pulse"]["hold"]
     assert pulse["mlp"]["mae_mT"] > 3 * pulse["relaxation_aware"]["mae_mT"]
-    assert hold["without"]["mean_force_error"] > 3 * hold["with"]["mean_force_error"]
-    error = traces["mlp"] - traces["reference"]
-    time_s = traces["time_s"]
-    early, late = (error[(time_s > start) & (time_s < start + 5.0)].mean() for start in (5.0, 21.0))
-    assert late < early - 5.0
+    assert hold["without"] > 3 * hold["with"]
 
 
-def test_the_page_and_its_pictures_are_written(run, tmp_path):
-    report.write_report(tmp_path, *run)
-    page = (tmp_path / "learned_inverse.md").read_text(encoding="utf-8")
-    assert "synthetic" in page
-    shown = re.findall(r"^!\[.*\((.*)\)$", page, re.MULTILINE)
-    assert [(tmp_path / name).read_bytes()[:4] for name in shown] == [b"\x89PNG"] * 2
+def test_the_page_says_that_all_is_synthetic(figures):
+    page = "\n".join(report.sections(figures))
+    assert "**All data on this page are synthetic**" in page
+    assert f"| {figures['pulse']['noise_bound_mae_mT']:.2f} |" in page
 
 
 def test_the_program_is_the_thesis_s():

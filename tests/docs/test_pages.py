@@ -3,7 +3,6 @@
 import ast
 import importlib
 import importlib.util
-import json
 import re
 import shlex
 from pathlib import Path
@@ -197,18 +196,12 @@ def test_no_message_sends_an_operator_to_a_file_of_the_checkout():
 
 
 DOCS = ROOT / "docs"
-GENERATED = ("inverse_trade.md", "learned_inverse.md", "reproduction.md")
+GENERATED = ("learned_inverse.md", "reproduction.md")
 SHOWN = re.compile(r"\]\(([\w/]+\.png)\)")
-DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 
 
 def drawn():
     yield "images/scenes.png", [measured_as(name, load_scene(name)) for name in shipped_scenes()]
-    for path in sorted(DOCS.glob("evidence/*.json")):
-        evidence = json.loads(path.read_text(encoding="utf-8"))
-        for picture in DRAWN.findall(evidence["command"]):
-            evidence["figures"].pop("machine_us", None)  # of the machine, not of what was measured
-            yield picture, evidence["figures"]
     summary = (ROOT / "README.md").read_text(encoding="utf-8").partition("\nforce asked")[2].partition("```")[0]
     yield "images/pulse.png", [line for line in summary.splitlines() if line.startswith("  ")]
     for name in GENERATED:

@@ -76,4 +76,3 @@ def test_a_motor_log_becomes_a_motor(here: Path, capsys: pytest.CaptureFixture[s
     run("tune.md", "--json")
     found = msgspec.json.decode(capsys.readouterr().out)["parameters"]
     assert found["mass_kg"]["value"] == pytest.approx(95.0, rel=0.03)
-    assert (here / "emps.png").exists()

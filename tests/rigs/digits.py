@@ -76,17 +76,12 @@ def reference(batch: Batch, x: float) -> Reference:
         slope, curvature = _differences(forces, step)
         stretch_slope = _differences(stretches, step)[0]
         compression = 1 - stretches[1]
-        values = {"stretch": stretches[1] - 1, "force": forces[1], "slope": slope, "round trip": mp.mpf(x)}
+        values = {"stretch": stretches[1] - 1, "force": forces[1], "slope": slope}
         conditions = {
             "stretch": _ratio(x * stretch_slope, compression),
             "force": _ratio(x * slope, forces[1]),
             "slope": _ratio(x * curvature, slope),
-            "round trip": _ratio(forces[1], x * slope),
         }
-        if batch.field is not None:
-            moments = [_moment(batch.field, mp.mpf(x) + place * step) for place in (-1, 0, 1)]
-            of_moment = _ratio(moments[1], x * _differences(moments, step)[0])
-            conditions["round trip"] = max(conditions["round trip"], of_moment)
         return Reference(bool(stretches[1] >= mp.mpf("0.05")), float(stretches[1]), values, conditions)
 
 

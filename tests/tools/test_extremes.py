@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from judge import numerics
@@ -11,7 +10,6 @@ from judge.stage_table import stages
 from judge.stages import HOSTILE_STEPS, Draw, Stage, tried
 from leaves import leaves
 
-import tormagd.control
 from tormag_lab.arrays import Json
 from tormagd.config import Position
 from tormagd.control.move.pid import Pid
@@ -34,15 +32,6 @@ def test_nothing_travels_through_any_stage(rows: list[Json]) -> None:
 
 def test_a_stage_before_which_no_check_stands_refuses_by_name(rows: list[Json]) -> None:
     assert [row["stage"] for row in rows if not row["border"] and row["refused"] == 0] == []
-
-
-def test_every_module_of_the_core_has_a_row(rows: list[Json]) -> None:
-    folder = Path(tormagd.control.__file__).parent
-    modules = {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.py")}
-    modules = {name for name in modules if not name.startswith(("safety/", "assembly/"))}
-    # `core` is the rows Stepper and Planner; believe and aim ask `nominal`
-    beside = {"core", "records", "nominal", "move/actuator"}
-    assert {name for name in modules if not name.endswith("__init__")} - {row["stage"] for row in rows} == beside
 
 
 def test_the_same_seed_gives_the_same_row(rows: list[Json]) -> None:

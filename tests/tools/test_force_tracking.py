@@ -7,25 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from judge import envelope, models, tracking
-from judge.following import Followed, publisher, tracking as scored
+from judge.following import PULSE_N, RATE_HZ, Followed, publisher, tracking as scored
 from judge.frame import parsed, told
-from judge.signals import (
-    Signal,
-    pulse_signal,
-    recorded_signals,
-)
 from judge.tracking import (
     ARRIVES_S,
     LATER_S,
     STEP_S,
-    compared,
-    ideal,
     step_figures,
     track,
 )
 
 from tormag_lab.arrays import Json, rms
 from tormag_lab.human_pulse import pulse_profile
+from tormag_lab.ideal_carriage import bound
 from tormag_lab.training.dataset import not_rising_share
 from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.inserts import INSERTS, insert
@@ -34,7 +28,7 @@ from tormagd.simulation.parameters import load_plant
 BEGINS_S, IDEAL_S = 4.0, 0.9
 
 
-@pytest.mark.parametrize(("named", "measured"), [([], tracking.CASES), (["pulse", "steps"], ("steps", "pulse"))])
+@pytest.mark.parametrize(("named", "measured"), [([], tuple(tracking.CASES)), (["pulse", "steps"], ("steps", "pulse"))])
 def test_without_a_name_every_case_is_measured(monkeypatch: pytest.MonkeyPatch, capsys, named, measured) -> None:
     monkeypatch.setattr(tracking, "of_case", lambda case: {"of": [case]})
     module, options = parsed("judge", {"tracking": ""}, ["tracking", "--json", *named])
@@ -53,14 +47,14 @@ def course(*errors: tuple[float, float, float]) -> Followed:
     return Followed(time_s, asked_N, felt_N, still, still, {})
 
 
-def swing(seconds: float) -> Signal:
-    times = np.arange(round(seconds * 500)) / 500
-    return Signal("swing", times, 1.5 + 0.1 * np.sin(2.0 * np.pi * 1.5 * times))
+def swing(amplitude_N: float, hz: float) -> tuple[np.ndarray, np.ndarray]:
+    time_s = np.arange(800) / 500
+    return time_s, 1.5 + amplitude_N * np.sin(2.0 * np.pi * hz * time_s)
 
 
 @pytest.fixture(scope="module")
 def swung() -> Followed:
-    return track(load_plant("sample_1"), swing(1.6), "pulse", 0.07)
+    return track(load_plant("sample_1"), *swing(0.1, 1.5), 0.07)
 
 
 def test_a_swing_is_rendered_and_nothing_holds_it_back(swung: Followed) -> None:
@@ -73,21 +67,20 @@ def test_a_swing_is_rendered_and_nothing_holds_it_back(swung: Followed) -> None:
 
 
 def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Followed) -> None:
-    beside = compared(swung, ideal("sample_1", swing(1.6)), 0.8)
-    assert beside["rms_N"] == swung.since(0.8).rms_N
-    assert max(beside["foresight_rms_N"], beside["no_delay_rms_N"]) <= 1e-6 <= beside["rms_N"]
-    fast = swing(1.6)._replace(force_N=1.5 + 0.2 * np.sin(2.0 * np.pi * 6.0 * swing(1.6).time_s))
-    least = ideal("sample_1", fast).figures()
+    plant, (time_s, fast_N) = load_plant("sample_1"), swing(0.2, 6.0)
+    slowly = bound(plant, *swing(0.1, 1.5)).figures(0.8)
+    assert max(slowly["foresight_rms_N"], slowly["no_delay_rms_N"]) <= 1e-6 <= swung.since(0.8).rms_N
+    least = bound(plant, time_s, fast_N).figures()
     assert 0.01 <= least["foresight_rms_N"] < least["no_delay_rms_N"]
-    rushed = track(load_plant("sample_1"), fast, "pulse", 0.0)
+    rushed = track(plant, time_s, fast_N, 0.0)
     assert rushed.since(0.0).rms_N >= least["foresight_rms_N"]
     # nothing is foreseen yet, for which three swings are too few
-    at_first = ideal("sample_1", fast._replace(time_s=fast.time_s[:250], force_N=fast.force_N[:250])).figures()
+    at_first = bound(plant, time_s[:250], fast_N[:250]).figures()
     assert rms(rushed.error_N[rushed.time_s < 0.5]) >= at_first["no_delay_rms_N"]
 
 
 def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:
-    found = track(load_plant("sample_2"), pulse_signal(6.5), "pulse", 0.0)
+    found = track(load_plant("sample_2"), *pulse_profile(6.5, *PULSE_N, RATE_HZ), 0.0)
     assert found.since(4.5).rms_N <= 0.02
     assert found.shown.lag_s > 0.005
 
@@ -139,17 +132,6 @@ def test_a_publisher_sends_what_follows() -> None:
         pytest.approx(forces[6:16]),
     )
     assert publisher(times, forces, 0.0)(0.1).preview_N == ()
-
-
-def test_recorded_signals_are_in_the_devices_range(recordings, monkeypatch) -> None:
-    monkeypatch.setenv("TORMAG_DATA", str(recordings))
-    found = recorded_signals()
-    assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "haptic"}
-    for signal in found:
-        assert np.all(np.diff(signal.time_s) > 0.0)
-        assert (
-            0.55 <= signal.force_N.min() <= signal.force_N.max() <= (2.0 if signal.name.startswith("haptic") else 1.75)
-        )
 
 
 ROOT = Path(__file__).parents[2]

@@ -1,4 +1,4 @@
-"""`benchmark inverse`: every search for the field on one workload: time, memory, errors; `--write`: its page and plot.
+"""`benchmark inverse`: every search for the field on one workload: time, memory, errors.
 
 It runs in one thread with the garbage collector frozen, as in the daemon. The plant is the simulator's torque element
 without memory: its force law, field law, pre-sliding and Stribeck friction. Hysteresis and relaxation are left out,
@@ -14,15 +14,14 @@ import platform
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.optimize import brentq
 from tqdm import tqdm
 
 from tormag_lab.arrays import Array
-from tormag_lab.pages import figures_of, stamp, subplots, table
 from tormag_lab.training.dataset import Dataset
 from tormag_lab.training.fitting import fit_model
 from tormagd.control.nominal import FieldOfGap
@@ -40,7 +39,6 @@ from tormagd.element.physics.inserts import insert
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.static_laws import radial_moment_Tm
-from tormagd.view.drawing import Axes
 
 INSERT = insert("MRE-50-40")
 CIP_PERCENT = 100.0 * INSERT.cip_fraction
@@ -115,15 +113,16 @@ def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
     grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
     found: list[Array] = []
     for displacement, rate, force in along.rows():
-        excess = _network(model, displacement, rate, grid) - force
-        left = np.flatnonzero((excess[1:] < 0) != (excess[:-1] < 0))
-        low, high, rises = grid[left], grid[left + 1], excess[left] < 0
-        for _ in range(40 if left.size else 0):
-            middle = (low + high) / 2
-            under = (_network(model, displacement, rate, middle) < force) == rises
-            low, high = np.where(under, middle, low), np.where(under, high, middle)
-        found.append((low + high) / 2)
+        is_over = _network(model, displacement, rate, grid) >= force
+        begins = np.flatnonzero(is_over[1:] != is_over[:-1]).tolist()
+        of_solve = model, displacement, rate, force
+        roots = [brentq(_excess_N, grid[place], grid[place + 1], args=of_solve, xtol=1e-10) for place in begins]
+        found.append(np.array(roots))
     return found
+
+
+def _excess_N(field_mT: float, model: ForceModel, displacement_mm: float, rate_mm_s: float, force_N: float) -> float:
+    return model.predict_one(displacement_mm, rate_mm_s, field_mT, CIP_PERCENT) - force_N
 
 
 def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields_mT: Array) -> Array:
@@ -131,99 +130,7 @@ def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields
     return model.predict(np.column_stack((*of_all[:2], fields_mT, of_all[2])))
 
 
-ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "inverse_trade.md"
-PLOT = ROOT / "docs" / "images" / "inverse_trade.png"
-
 USUAL_HIDDEN = 50
-COLUMNS = {
-    "search": "{name}",
-    "p50 us": "{p50_us:.1f}",
-    "p99 us": "{p99_us:.1f}",
-    "solver MAE mT": "{solver_mae_mT:.2g}",
-    "plant MAE mT": "{plant_mae_mT:.3f}",
-    "force MAE N": "{force_mae_N:.4f}",
-    "Pareto": "{pareto}",
-}
-MIN_SHOWN_MT = 1e-6
-"Newton comes to 1e-11 mT, which would squeeze what matters; the page says so."
-MARKERS = {
-    "thesis-linear": "v",
-    "linear-argmin": "^",
-    "vectorised-argmin": "s",
-    "nearest": "o",
-    "torch": "D",
-    "newton": "*",
-}
-TEXT = """# Speed against accuracy of the inverse
-
-Written by `python tools/evidence.py inverse` with [all its figures](evidence/inverse.json); do not edit. All data are
-synthetic: {workload}. One process, one thread, garbage collector frozen ({environment}).
-
-The *solver error* is the distance to the network's own nearest root, the *plant error* to the field at which the
-simulated element gives the force. *Force* is the plant's force at the answer minus the force asked.
-
-![p50 against the solver error and against the plant error](images/inverse_trade.png)
-
-- `thesis-linear`, the daemon's `thesis`, goes row by row in torch at 1 mT by the thesis's rule. `linear-argmin`
-  looks at every row, `vectorised-argmin` at the whole grid at once.
-- `torch` is the network over the grid in torch, the k nearest, then interpolation. `nearest` is the same in NumPy.
-- `newton` is Newton's method from the last field, on the same network {speedup_vs_thesis_linear:.0f} times as fast
-  as the thesis's search.
-
-*Pareto* marks variants that no faster one equals in plant error, to an encoder count of the gap (about 0.02 mT).
-[The shipped networks](guides/insert.md#the-shipped-models) are others.
-
-## All searches on {usual} units, and the Pareto variants of every size
-
-{table}"""
-
-
-def write(result: dict[str, Any]) -> None:
-    text = page(result)
-    plot(result, figures_of(text))
-    PAGE.write_text(text, encoding="utf-8")
-
-
-def page(result: dict[str, Any]) -> str:
-    shown = [row for row in result["variants"] if row["pareto"] or row["hidden"] == USUAL_HIDDEN]
-    stars = [
-        row
-        | {"pareto": "*" if row["pareto"] else ""}
-        | {"name": row["name"] + (f", {row['hidden']} units" if row["hidden"] != USUAL_HIDDEN else "")}
-        for row in shown
-    ]
-    texts = {
-        "environment": ", ".join(f"{name} {value}" for name, value in result["environment"].items()),
-        "usual": USUAL_HIDDEN,
-        "table": table(COLUMNS, [[form.format(**row) for form in COLUMNS.values()] for row in stars]),
-    }
-    return TEXT.format(**(result | texts))
-
-
-def plot(result: dict[str, Any], figures: list[str]) -> None:
-    """Draw two panels over p50: the solver's error at one network, and the plant's for every network."""
-    figure, (left, right) = subplots((11, 5), 1, 2)
-    rows = result["variants"]
-    _scatter(left, [row for row in rows if row["hidden"] == USUAL_HIDDEN], "solver_mae_mT")
-    _scatter(right, rows, "plant_mae_mT")
-    front = sorted((row["p50_us"], row["plant_mae_mT"]) for row in rows if row["pareto"])
-    right.step(*zip(*front, strict=True), where="post", color="0.5", linewidth=1, zorder=0)
-    left.set(title=f"against the network's own root, {USUAL_HIDDEN} units", ylabel="mean field error, mT")
-    right.set(title="against the plant, all sizes")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
-    figure.savefig(PLOT, dpi=130, metadata=stamp(figures))
-
-
-def _scatter(axes: Axes, rows: list[dict[str, Any]], error: str) -> None:
-    for solver, marker in MARKERS.items():
-        found = [row for row in rows if row["solver"] == solver]
-        errors_mT = [max(row[error], MIN_SHOWN_MT) for row in found]
-        axes.scatter([row["p50_us"] for row in found], errors_mT, marker=marker, s=40, alpha=0.8, label=solver)
-    axes.set(xscale="log", yscale="log", xlabel="time of a solve, us (p50)")
-    axes.grid(alpha=0.3)
-
-
 PLANT = "sample_1"
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9}
 NEWTON = "newton"
@@ -416,7 +323,6 @@ def mark_pareto(rows: list[dict[str, Any]]) -> None:
 
 OPTIONS = {
     "--quick": {"action": "store_true", "help": "two small networks and few solves, for a test"},
-    "--write": {"action": "store_true", "help": "also write docs/inverse_trade.md and its plot"},
 }
 
 
@@ -434,7 +340,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         for name, tolerance_N in scenes.items()
     }
     p50_us = next(iter(chosen.values()))["p50_us"]
-    result = {
+    return {
         "workload": f"synthetic torque element ({PLANT}, no memory), {effort.course} points of a smooth course",
         "environment": {  # what the times depend on besides
             "processors": os.cpu_count(),
@@ -448,6 +354,3 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         "chosen": chosen,
         "speedup_vs_thesis_linear": usual["thesis-linear"]["p50_us"] / p50_us,
     }
-    if options.write:
-        write(result)
-    return result

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
-from judge.following import RATE_HZ, Tracking, tracking
-from judge.signals import with_approach
+from judge.following import PULSE_N, RATE_HZ, Tracking, tracking, with_approach
 from machines.host import Host, HostWatch
 from machines.own import own_machine
 
@@ -57,7 +56,7 @@ fifo_priority = {DAEMON_FIFO}  # each is refused where it is not allowed; then t
 lock_memory = true
 """
 CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--json", "--wait", "60")
-MIN_N, MAX_N = 1.4, 1.7
+MIN_N, MAX_N = PULSE_N
 PULSE_S = 20.0
 RAMP_S, HOLD_S = 1.0, 3.0
 "Approach to the pulse's first force, and a hold there in which the trim learns this device."
@@ -69,7 +68,6 @@ PATIENCE_S = 60.0
 ANSWER_S = 5.0
 BEFORE_FAULT_S = 1.0
 "A stall explains a fault only if it ended less than this before the fault was seen."
-FASTEST = 0.1
 OF_TIME = frozenset(
     {
         Fault.HOST_STALL,
@@ -109,7 +107,6 @@ class Shown(NamedTuple):
     limits: dict[str, float]
     exit_codes: dict[str, int]
     kept: float
-    spacing_s: float
     worst_stall_ms: float
     host: Host
     core_share: float
@@ -117,11 +114,10 @@ class Shown(NamedTuple):
 
 
 class Aborted(NamedTuple):
-    """What ended the show early, what the host took just before, and the least time between ticks (0: no ticks)."""
+    """What ended the show early, and what the host took just before."""
 
     error: ShowError
     host: Host
-    spacing_s: float
 
 
 def profile(duration_s: float = PULSE_S) -> tuple[Array, Array]:
@@ -147,9 +143,9 @@ def staged(played: Callable[[HostWatch], Found]) -> Found | Aborted:
             return played(watched)
         except ShowError as error:
             watched.end()
-            until_s, spacing_s = early_end(began_s, error.time_s)
+            until_s = early_end(error.time_s)
             host = watched.between(max(began_s, until_s - BEFORE_FAULT_S), until_s)
-            return Aborted(error, host, spacing_s)
+            return Aborted(error, host)
 
 
 class Rig(NamedTuple):
@@ -235,7 +231,6 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
         limits=limits,
         exit_codes=exit_codes,
         kept=runs / max(runs + merged, 1),
-        spacing_s=float(np.quantile(spacings_s, FASTEST)),
         worst_stall_ms=float(spacings_s.max()) * 1e3,
         host=watched.between(start_s, end_s),
         core_share=core_share,
@@ -270,14 +265,11 @@ def between(known: list[Tick], start_s: float, end_s: float) -> Array:
     return moments_s[(moments_s >= start_s) & (moments_s <= end_s)]
 
 
-def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
-    try:
-        known = ticks()
-    except RecordingError:
-        return seen_s, 0.0
-    latched_s = next((tick["monotonic_s"] for tick in known if tick.get("faults")), seen_s)
-    spacings_s = np.diff(between(known, start_s, seen_s))
-    return latched_s, float(np.quantile(spacings_s, FASTEST)) if len(spacings_s) else 0.0
+def early_end(seen_s: float) -> float:
+    """Return when the first fault was latched, at the latest `seen_s`."""
+    with contextlib.suppress(RecordingError):
+        return next((tick["monotonic_s"] for tick in ticks() if tick.get("faults")), seen_s)
+    return seen_s
 
 
 def ended(name: str) -> ShowError:

@@ -19,7 +19,6 @@ from tormagd.simulation.closed_loop import ClosedLoop, stream
 from tormagd.simulation.device import FirmwareKind, VirtualDevice
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import Hand, parse_hand
-from tormagd.simulation.ideal_actuator import ideal_stepper
 from tormagd.simulation.parameters import PlantParameters
 
 Levels = list[tuple[float, float]]
@@ -27,8 +26,8 @@ Levels = list[tuple[float, float]]
 Publisher = Callable[[float], TimedSetpoint | None]
 
 RATE_HZ = 500
+PULSE_N = (1.4, 1.7)
 PREVIEW_S = 0.07
-FILE_PREVIEW_S = 0.4
 VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2
@@ -92,13 +91,11 @@ def armed(
     hand: Hand,
     shown: Learned = NOTHING_LEARNED,
     *,
-    is_ideal: bool = False,
     boot: FirmwareKind = Firmware,
 ) -> ClosedLoop:
     """Return a loop that was homed and enabled, with a device that has `shown` so much of itself."""
     device = VirtualDevice(plant, hand, seed=1, boot=boot)
-    stepper = ideal_stepper(core, device.messages.plant) if is_ideal else core.stepper()
-    loop = ClosedLoop(core.config, stepper, core.planner(), device)
+    loop = ClosedLoop(core.config, core.stepper(), core.planner(), device)
     taught(loop).teach(shown)
     loop.arm()
     return loop
@@ -168,6 +165,14 @@ def publisher(times_s: Array, forces_N: Array, preview_s: float) -> Publisher:
         return setpoint.replaced(preview_N=tuple(preview.tolist()), preview_dt_s=period_s)
 
     return newest
+
+
+def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
+    """Return the signal after a ramp to its first force, and a hold there."""
+    period_s = float(times_s[1] - times_s[0])
+    ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
+    forces = np.concatenate([ramp, np.full(round(hold_s / period_s), forces_N[0]), forces_N])
+    return np.arange(len(forces), dtype=np.float64) * period_s, forces
 
 
 def played(

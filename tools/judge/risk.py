@@ -1,7 +1,6 @@
 """The risk page: a row for each fault, limit, cause without a code, and check of the conformance kit.
 
-Which tests name a code or a check comes from a scan of the test tree, which runs nothing. A test names what is in its
-function, in its decorators, and in whatever else of its module these use.
+Which files of tests name a code or a check comes from a scan of the test tree, which runs nothing.
 """
 
 import ast
@@ -27,43 +26,27 @@ BEHAVIOUR = (
 )
 "Folders whose tests drive something: elsewhere a code is an example."
 ENUMERATIONS = {"Fault": "fault.", "Limit": "limit.", "DeviceFault": "fault.DEVICE_"}
-Named = Mapping[str, Counter[str]]
-"How many tests of each file name a member, a text or a capital word; and a test itself, as FILE::FUNCTION."
+Named = Mapping[str, set[str]]
+"The files that name a member, a text or a capital word, or have a test, as FILE::FUNCTION."
 
 
 def named_tests(folder: Path) -> Named:
-    named: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    named: defaultdict[str, set[str]] = defaultdict(set)
     for path in sorted({path for place in BEHAVIOUR for path in folder.glob(place)}):
-        file, said = path.relative_to(folder).as_posix(), _said_by_part(ast.parse(path.read_text(encoding="utf-8")))
-        for test in (name for name in said if name.startswith(("test_", "Test"))):
-            names: set[str] = set()
-            added = {test}
-            while added:
-                now = names.union(*(said[part] for part in added), added)
-                names, added = now, (now - names - added) & said.keys()
-            for name in names | {f"{file}::{test}"}:
-                named[name][file] += 1
+        file = path.relative_to(folder).as_posix()
+        for name in _said(ast.parse(path.read_text(encoding="utf-8")), file):
+            named[name].add(file)
     return named
 
 
-def _said_by_part(module: ast.Module) -> dict[str, set[str]]:
-    """Return what each part of a module names, by the names that the part defines."""
-    said: defaultdict[str, set[str]] = defaultdict(set)
-    for part in module.body:
-        stored = (each.id for each in ast.walk(part) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store))
-        for name in (part.name,) if isinstance(part, ast.FunctionDef | ast.ClassDef) else stored:
-            said[name] |= _said(part)
-    return said
-
-
-def _said(part: ast.stmt) -> set[str]:
-    """Return the names, fixtures, members of ENUMERATIONS and texts of a part, and the texts' capital words."""
-    docstrings = {each.value for each in ast.walk(part) if isinstance(each, ast.Expr)}
+def _said(module: ast.Module, file: str) -> set[str]:
+    """Return members of ENUMERATIONS, texts, capital words in them, and tests, as FILE::FUNCTION, of a module."""
+    docstrings = {each.value for each in ast.walk(module) if isinstance(each, ast.Expr)}
     said: set[str] = set()
-    for each in ast.walk(part):
+    for each in ast.walk(module):
         match each:
-            case ast.Name(name) | ast.arg(name):
-                said.add(name)
+            case ast.FunctionDef(name):
+                said.add(f"{file}::{name}")
             case ast.Attribute(ast.Name(owner), member) if owner in ENUMERATIONS:
                 said.add(ENUMERATIONS[owner] + member)
             case ast.Constant(str(text)) if each not in docstrings:
@@ -135,10 +118,10 @@ def _of_codes(
 ) -> Iterator[Row]:
     for code in (code for code in codes if code not in _harmless(table)):
         name, row = f"{kind}.{code}", table.get(code)
-        files = named.get(name, Counter[str]()).copy()
+        files = set(named.get(name, ()))
         if code not in FAULTS or code not in LIMITS:  # otherwise a word may mean either
-            files[WORDED] += named.get(code, Counter())[WORDED]
-        tests, evidence = _listed(files), _in_cells(told[name])
+            files |= {WORDED} & named.get(code, set())
+        tests, evidence = ", ".join(sorted(files)), _in_cells(told[name])
         if row is None:
             yield Row(name, None, "", "", "", tests, evidence)
         else:
@@ -154,7 +137,7 @@ def _harmless(table: Mapping[Any, Explanation]) -> list[str]:
 
 def _of_causes(named: Named, told: Counter[str]) -> Iterator[Row]:
     for each in CAUSES:
-        tests = _listed(named.get(each.test or "no test", {}))
+        tests = ", ".join(sorted(named.get(each.test or "no test", ())))
         yield Row(f"cause.{each.name}", each.hazard, each.cause, each.control, "-", tests, _in_cells(told[each.cell]))
 
 
@@ -172,10 +155,6 @@ def _of_kit(named: Named) -> Iterator[Row]:
             tests,
             evidence,
         )
-
-
-def _listed(files: Mapping[str, int]) -> str:
-    return ", ".join(f"{file} ({count})" if count > 1 else file for file, count in sorted(files.items()) if count)
 
 
 def _in_cells(count: int) -> str:

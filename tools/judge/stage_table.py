@@ -1,4 +1,8 @@
-"""The stages of the core in the order in which data flow, and how each is fed: see `stages.py`."""
+"""The core at its entries, each stage as a whole, and how each is fed: see `stages.py`.
+
+A stage owns its parts, and all of their fields are looked at. A part has a row of its own where what its stage lets
+through does not reach its edges.
+"""
 
 import math
 import random
@@ -18,33 +22,22 @@ from firmware_protocol.codec import (
 from judge.stages import Draw, Stage
 from tormagd.config import Config, Motor, Position
 from tormagd.control.aim.aim import Aim
-from tormagd.control.aim.portrait import Portrait, PortraitSearch, ceiling_mm
-from tormagd.control.ask.forecast import Forecast, Skill
+from tormagd.control.aim.portrait import Portrait, PortraitSearch
+from tormagd.control.ask.forecast import Forecast
 from tormagd.control.ask.governor import Governor
-from tormagd.control.ask.path import TIMES_S, nearest_path_mm
-from tormagd.control.ask.way import Way
+from tormagd.control.ask.path import TIMES_S
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import Believe
-from tormagd.control.believe.carriage_lag import CarriageLag
-from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.handle import HandleWatch
-from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.ripple import Ripple
-from tormagd.control.believe.sensor import SensorTrust
-from tormagd.control.believe.sensor_zero import SensorZero
 from tormagd.control.believe.slow_friction import SlowFriction
-from tormagd.control.believe.strength import UNSEEN, Anchor, DeviceFit, adapting_s, observe
+from tormagd.control.believe.strength import UNSEEN, Anchor
 from tormagd.control.core import Planner, Stepper
-from tormagd.control.interpolation import Rising, at_step, interpolated, low_pass
-from tormagd.control.measure import Measure, Sight, is_contradicted, is_outside, leap_between
-from tormagd.control.move.actuator import Reference, target_of
-from tormagd.control.move.carriages import Carriages, follow
+from tormagd.control.interpolation import Rising, at_step, interpolated
+from tormagd.control.measure import Measure
+from tormagd.control.move.carriages import Carriages
 from tormagd.control.move.motor import full_speed_mm_s, margins
-from tormagd.control.move.pid import Pid
-from tormagd.control.move.routines import Homing, Opening
-from tormagd.control.move.watch import Watch
-from tormagd.control.nominal import FieldOfGap, Pressing, Sliding
-from tormagd.control.records import Ask, GapSpeeds, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
+from tormagd.control.nominal import FieldOfGap
+from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import Conditions, SafetyState, command
 from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, named
@@ -53,7 +46,7 @@ from tormagd.element.model.model_file import load_model, model_path
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_statistics import DeviceClock, LinkQuality
-from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.measurement import Measurement
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
 "Periods of a tick and of a plan, and the longest tick of `Stepper`."
@@ -61,13 +54,12 @@ BEGINS_S = 9.9
 CONFIG = Config(scene="coronary")
 BOUNDS = CONFIG.trim
 READY = Conditions(True, True, True, False, False)
-OWN, MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
+OWN, MEASUREMENT, SETPOINT, CODEC, CONFIGURATION = (
     "",
     "Stepper, of measurements",
     "ask/governor, of setpoints",
     "firmware_protocol: codec",
     "config",
-    "Planner, of plans",
 )
 "Checks in front of a stage, beside its own."
 
@@ -192,18 +184,6 @@ def measure(stage: Measure, draw: Draw) -> object:
     return stage.update(draw.last_s, draw.now_s, measurement(draw), False)
 
 
-def sight(stage: Sight, draw: Draw) -> object:
-    stage.update(draw.last_s, draw.now_s, draw(1.0) > 0.0)
-    return stage.is_blind
-
-
-def plausible(_: object, draw: Draw) -> object:
-    one, other = measured(draw), measured(draw)
-    leap = leap_between(one, other, 8.0, draw.now_s, draw.bounded(draw.now_s))
-    is_back = leap is not None and leap.has_come_back(one, 8.0, draw.now_s)
-    return [leap, is_back, is_outside(other, 45.0, 95.0), is_contradicted(other, 0, 45.0, 95.0)]
-
-
 # -- believe -------------------------------------------------------------------------------------------------------
 
 
@@ -214,15 +194,6 @@ def believing(stage: Believe, draw: Draw) -> object:
     return [belief, stage.learned(), stage.memory.open_N()]
 
 
-def strength(stages: list[DeviceFit], draw: Draw) -> object:
-    adapts_in_s = adapting_s(0.5, draw(0.1))
-    stages[0], _ = observe(
-        stages[0], draw(1.1), draw(1.2), draw.positive(PLAN_S), adapts_in_s=adapts_in_s, bounds=BOUNDS
-    )
-    fit = stages[0]
-    return [fit.force_N(1.1), fit.model_N(1.1), fit.deviation_N(1.1), fit.surely_within_N(2.5, BOUNDS)]
-
-
 def slow_friction(stage: SlowFriction, draw: Draw) -> object:
     stage.rescale(draw(1.1), draw(1.1), abs(draw(5.0)))
     if (model_N := draw(1.1)) > 0.1:  # as in `believe`
@@ -230,59 +201,16 @@ def slow_friction(stage: SlowFriction, draw: Draw) -> object:
     return stage.factor_at(abs(draw(1.0)))
 
 
-def sensor_zero(stage: SensorZero, draw: Draw) -> object:
-    stage.update(
-        draw.now_s,
-        1.0 if draw.steps // 4 % 2 else -1.0,
-        draw(1.1),
-        draw(1.1),
-        abs(draw(42.0)),
-        draw.positive(0.2),
-        UNSEEN,
-        learns=True,
-        is_disputed=draw.steps % 2 > 0,
-    )
-    return [stage.sd_N(draw.now_s), stage.way]
-
-
-def freshness(stage: Freshness, draw: Draw) -> object:
-    return list(stage.update(abs(draw(1.0)), draw(1.1), draw(1.1), draw.positive(PLAN_S), learns=True))
-
-
-def sensor(stage: SensorTrust, draw: Draw) -> object:
-    dt_s = draw.positive(PLAN_S)
-    return stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), draw(1.1), abs(draw(0.02)), dt_s, learns=True) or 0.0
-
-
 def anchor(stage: Anchor, draw: Draw) -> object:
     stage.learn(draw(1.1), draw(1.2), draw.positive(PLAN_S))
     return [stage.force_N(1.1), stage.deviation_N(1.1), stage.model_N(2.15)]
-
-
-def ripple(stage: Ripple, draw: Draw) -> object:
-    stage.update(draw(10.0), draw(42.0), 1.1, draw(1.2))
-    return stage.share(draw(10.0))
-
-
-def carriage_lag(stage: CarriageLag, draw: Draw) -> object:
-    stage.update(draw(PLAN_S), draw(80.0), draw(80.1), draw(-5.0), 38.0)
-    return stage.lag_s
 
 
 def handle_watch(stage: HandleWatch, draw: Draw) -> object:
     return [stage.update(measured(draw), draw(1.1)), stage.creep_mm_s, stage.moved_gap_at_rest(1.1)]
 
 
-def memory(stage: ElementMemory, draw: Draw) -> object:
-    stage.update(draw.now_s, measured(draw))
-    return [stage.lag_at_mT(draw(200.0)), stage.force_N(core().element.nominal.only)]
-
-
 # -- ask -----------------------------------------------------------------------------------------------------------
-
-
-def way(stage: Way, draw: Draw) -> object:
-    return stage.update(measured(draw), draw.bounded(0.4), draw.steps % 2 > 0)
 
 
 def governor(stage: Governor, draw: Draw) -> object:
@@ -302,18 +230,6 @@ def forecast(stage: Forecast, draw: Draw) -> object:
     return [stage.trust, *ahead, *np.frombuffer(stage.history).tolist()]
 
 
-def path(speeds: GapSpeeds, draw: Draw) -> object:
-    wanted_mm = [draw(70.0) for _ in TIMES_S]
-    elapsed_s = abs(draw.bounded(PLAN_S))
-    return nearest_path_mm(draw(70.0), elapsed_s, TIMES_S, wanted_mm, [1.0] * len(TIMES_S), speeds, len(TIMES_S))
-
-
-def skill(stages: list[Skill], draw: Draw) -> object:
-    before = stages[0].score
-    stages[0] = stages[0].after(draw(0.01), draw(0.02), 0.2)
-    return [before, stages[0].score]
-
-
 # -- aim -----------------------------------------------------------------------------------------------------------
 
 
@@ -328,15 +244,6 @@ def aiming(stage: list[Any], draw: Draw) -> object:
     begun, remembered, believed = stage
     asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), 1.2)
     return begun.update(draw.now_s, setpoint(usual(draw.now_s)), asked, believed, remembered, measured(draw))
-
-
-def floors(_: object, draw: Draw) -> object:
-    element = core().element
-    assert element.law is not None, "a brake has one"
-    return [
-        ceiling_mm(element.portrait, UNSEEN, draw(2.5), BOUNDS),
-        element.law.held_mT(draw.bounded(200.0), draw(1.2)),
-    ]
 
 
 def portrait(stage: Portrait, draw: Draw) -> object:
@@ -369,17 +276,6 @@ def elapsed_s(draw: Draw) -> float:
     return min(draw.positive(PERIOD_S), LONGEST_S)
 
 
-def pid(stage: Pid, draw: Draw) -> object:
-    stage.rest(draw.bounded(0.1), PERIOD_S)
-    return stage.update(draw(0.1), draw(1.0), draw(0.1), elapsed_s(draw), draw.bounded(0.0) > 0.0)
-
-
-def reference(stages: list[Reference], draw: Draw) -> object:
-    to = target_of(plan(draw), draw.now_s, 2e-3, 45.0, 95.0)
-    stages[0], *_ = follow(1600.0, stages[0], to, elapsed_s(draw), GapSpeeds(38.0, 38.0, 38.0, 40.0), 45.0)
-    return stages[0]
-
-
 def motor(_: object, draw: Draw) -> object:
     """Feed a motor with some configuration keys at an end of what is accepted."""
     if not draw.is_hostile:
@@ -403,31 +299,7 @@ MOTORS = {
 }
 
 
-def homing(stage: Homing, draw: Draw) -> object:
-    mode = DeviceMode.HOMING if draw.steps % 8 else DeviceMode.IDLE
-    stage.update(draw.now_s, measurement(draw).replaced(mode=mode))
-    return [*stage.faults, *stage.went_back_mm]
-
-
-def opening(stage: Opening, draw: Draw) -> object:
-    seen = measurement(draw).replaced(mode=DeviceMode.RETRACTING if draw.steps % 4 else DeviceMode.IDLE)
-    stage.update(seen, draw.steps % 3 > 0, draw.steps % 5 == 0, SafetyState().ask(DeviceRequest.RETRACT))
-    return [*stage.faults, stage.left_late_s, stage.right_late_s, stage.waits_s]
-
-
-def watch(stage: Watch, draw: Draw) -> object:
-    seen, said, seeing = measured(draw), measurement(draw), Sight(PERIOD_S)
-    stage.update(PERIOD_S, seen, Reference(draw(80.0)), draw(0.1), draw(0.1))
-    faults = stage.faults(draw.now_s, SafetyState(), said, seen, seeing, None, draw(0.0))
-    return [*faults, *stage.limits(draw.now_s, said, seen, seeing)]
-
-
 # -- what several stages use ---------------------------------------------------------------------------------------
-
-
-def filtered(values: list[float], draw: Draw) -> object:
-    values[0] = low_pass(values[0], draw(1.0), abs(draw(PERIOD_S)), draw.positive(0.01))
-    return values
 
 
 def tables(_: object, draw: Draw) -> object:
@@ -446,14 +318,6 @@ def tables(_: object, draw: Draw) -> object:
 
 def field(stage: FieldOfGap, draw: Draw) -> object:
     return [stage.field_mT(draw(80.0)), stage.gap_mm(draw(200.0))]
-
-
-def contact(stages: list[Any], draw: Draw) -> object:
-    seen, asked = measured(draw), setpoint(draw)
-    return [
-        [*each.planned(asked.displacement_mm, asked.rate_mm_s, seen), *each.motion_now(seen), each.is_known(seen)]
-        for each in stages
-    ]
 
 
 def curve(_: object, draw: Draw) -> object:
@@ -505,7 +369,7 @@ def safety(stages: list[SafetyState], draw: Draw) -> object:
 
 
 def stages() -> list[Stage]:
-    made, position = core(), CONFIG.position
+    made = core()
     element = made.element
     range_mT, scene = element.nominal.fields_mT, made.scene
     model = load_model(model_path(scene.insert.model, made.models), element=scene.element)
@@ -516,38 +380,18 @@ def stages() -> list[Stage]:
         Stage("Stepper", stepper, step, OWN, PERIOD_S),
         Stage("Planner", planner, planning, OWN, PLAN_S),
         Stage("measure", lambda: Measure(47.5, 0.003, True, 8.0, PERIOD_S), measure, MEASUREMENT, PERIOD_S),
-        Stage("plausible", lambda: None, plausible, MEASUREMENT, PERIOD_S),
-        Stage("sight", lambda: Sight(PERIOD_S), sight, MEASUREMENT, PERIOD_S),
         Stage("believe/believe", lambda: planner().believe, believing, MEASUREMENT, PLAN_S),
-        Stage("believe/strength", lambda: [UNSEEN], strength, MEASUREMENT),
         Stage("believe/slow_friction", partial(SlowFriction, BOUNDS), slow_friction, MEASUREMENT),
-        Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT, PLAN_S),
-        Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
         Stage("believe/anchor", partial(Anchor, UNSEEN), anchor, MEASUREMENT),
-        Stage("believe/ripple", Ripple, ripple, MEASUREMENT),
-        Stage("believe/sensor", partial(SensorTrust, BOUNDS), sensor, MEASUREMENT),
-        Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT, PLAN_S),
-        Stage("believe/memory", lambda: planner().believe.memory, memory, MEASUREMENT, PLAN_S),
-        Stage("ask/way", lambda: Way(-1), way, MEASUREMENT, PLAN_S),
         Stage("ask/governor", lambda: planner().governor, governor, OWN, PLAN_S),
         Stage("ask/forecast", Forecast, forecast, SETPOINT),
-        Stage("ask/path", lambda: made.gap_speeds, path, SETPOINT),
-        Stage("ask/skill", lambda: [Skill(0.0, 0.0)], skill, SETPOINT),
         Stage("aim/aim", aim, aiming, OWN, PLAN_S),
-        Stage("aim/floors", lambda: None, floors),
         Stage("aim/portrait", lambda: made.portrait, portrait),
         Stage("move/carriages", carriages, driving, OWN, PERIOD_S),
-        Stage("move/pid", lambda: Pid(position), pid),
-        Stage("move/reference", lambda: [Reference(80.0)], reference, PLANNED, PERIOD_S),
         Stage("move/motor", lambda: None, motor, CONFIGURATION),
-        Stage("move/routines", lambda: Homing(2.6), homing, MEASUREMENT, PERIOD_S),
-        Stage("move/opening", lambda: Opening(CONFIG, made.scene), opening, MEASUREMENT, PERIOD_S),
-        Stage("move/watch", lambda: Watch(CONFIG, made.scene), watch, MEASUREMENT, PERIOD_S),
-        Stage("filter", lambda: [0.0], filtered, MEASUREMENT),
         Stage("interpolation", lambda: None, tables),
         Stage("field_of_gap", lambda: element.field, field),
-        Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT, PLAN_S),
         Stage("model/force_curve", lambda: None, curve),
         # on few fields: a number travels through one as through a thousand, row by row
         *[

@@ -1,24 +1,21 @@
 """How well a force is followed: the true force of simulated devices less what was asked, in virtual time.
 
 How soon a device is known: `steps`, `creep` and `speeds`, of samples, second plant and draws of the plant card. How
-well signals are followed: the `pulse` of `make run` on all of these, and in full on the `samples` and the second plant,
-at 500 setpoints a second, with a preview of 70 ms and live; and the recorded `signals` of the folder TORMAG_DATA, with
-a preview of 400 ms, as for a file that is played, and live. Beside them are what ideal carriages miss (`tormag-lab
-bound`), and beside `samples` the same core with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the
-second plant only judge. Errors are as they are, without any mean or delay taken out. A step has *arrived* ARRIVES_S
-after the device's ideal carriages would have brought the force.
+well a signal is followed: the `pulse` of `make run` on all of these, at 500 setpoints a second, with a preview of 70 ms
+and live. Draws 40 to 79, samples 2 and 3 and the second plant only judge. Errors are as they are, without any mean or
+delay taken out. A step has *arrived* ARRIVES_S after the device's ideal carriages would have brought the force.
 """
 
 import argparse
 from collections.abc import Iterator
-from itertools import pairwise, product
+from itertools import pairwise
 
 import numpy as np
-from devices import SAMPLES, device, judging
+from devices import device, judging
 
 from judge.following import (
-    FILE_PREVIEW_S,
     PREVIEW_S,
+    PULSE_N,
     RATE_HZ,
     VALID_S,
     Followed,
@@ -28,19 +25,13 @@ from judge.following import (
     asked_at,
     follow,
     played,
+    with_approach,
 )
 from judge.frame import each
 from judge.hands import Legs
-from judge.signals import (
-    TRIM_S,
-    Signal,
-    palpation,
-    pulse_signal,
-    recorded_signals,
-    with_approach,
-)
-from tormag_lab.arrays import Json
-from tormag_lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
+from tormag_lab.arrays import Array, Json
+from tormag_lab.human_pulse import pulse_profile
+from tormag_lab.ideal_carriage import TURNED_MM_S, asked_of, brake_of, drive_of, no_delay_mm
 from tormag_lab.told import lines
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
@@ -65,8 +56,9 @@ SPEEDS_MM_S = (1.0, 300.0, 100.0, 300.0, 42.0, 300.0, 1.0, 100.0, 42.0, 100.0, 1
 SPEED_S, SLID_S = 4.0, 1.0
 SPEEDS_N = (1.0, 2.0)
 START_N, RAMP_S, HOLD_S = 0.6, 1.0, 1.0
-PULSE_S, DRAWN_PULSE_S = 20.0, 15.0
-PALPATION_SEEDS = 1, 2
+PULSE_S = 15.0
+TRIM_S = 10.0
+"The trim learns for this time before the figures of other devices than sample 1 begin."
 
 
 # -- how soon and how well a device is known ------------------------------------------------------------------------
@@ -156,93 +148,23 @@ def speeds(name: str) -> Json:
     return result
 
 
-# -- how well signals are followed ----------------------------------------------------------------------------------
+# -- how well a signal is followed ----------------------------------------------------------------------------------
 
 
-def track(
-    plant: PlantParameters,
-    signal: Signal,
-    scene: str,
-    preview_s: float,
-    *,
-    is_ideal: bool = False,
-) -> Followed:
-    loop = armed(build_core(Config(scene=scene)), plant, SteadyHand(), is_ideal=is_ideal)
-    flat = np.array([0.0, 1.0 / RATE_HZ]), np.full(2, signal.force_N[0])
-    approach_s, approach_N = with_approach(*flat, START_N, RAMP_S, HOLD_S)
-    lead_s = float(approach_s[-1])
-    times = np.concatenate([approach_s[:-1], lead_s + signal.time_s])
-    forces = np.concatenate([approach_N[:-1], signal.force_N])
-    found = played(loop, times, forces, preview_s, lead_s=lead_s)
-    asked = np.interp(found.time_s, signal.time_s, signal.force_N)
-    if not signal.is_known_ahead:  # an event holds until the next
-        asked = signal.force_N[np.searchsorted(signal.time_s, found.time_s, side="right") - 1]
-    return found._replace(asked_N=asked)
-
-
-def ideal(name: str, signal: Signal) -> Bound:
-    return bound(device(name), signal.time_s, signal.force_N, is_held=not signal.is_known_ahead)
-
-
-def compared(found: Followed, best: Bound, start_s: float) -> Json:
-    least = best.figures(start_s)
-    return found.since(start_s)._asdict() | {name: least[name] for name in ("no_delay_rms_N", "foresight_rms_N")}
-
-
-def sample(name: str, preview_s: float) -> Json:
-    signal = pulse_signal(PULSE_S)
-    found, same = (track(device(name), signal, "pulse", preview_s, is_ideal=is_ideal) for is_ideal in (False, True))
-    least = ideal(name, signal)
-    whole, after_trim = (
-        compared(found, least, start_s) | {"same_core_ideal_rms_N": same.since(start_s).rms_N}
-        for start_s in (0.0, TRIM_S)
-    )
-    return {
-        "plant": name,
-        "preview": preview_s > 0.0,
-        "whole": whole,
-        "after_trim": after_trim,
-        "lag_ms": found.shown.lag_s * 1e3,
-        "limits": found.limits,
-    }
-
-
-def samples() -> Json:
-    return {"rows": each(sample, "samples", *zip(*product(judging(0), (PREVIEW_S, 0.0)), strict=True))}
+def track(plant: PlantParameters, times_s: Array, forces_N: Array, preview_s: float) -> Followed:
+    loop = armed(build_core(Config(scene="pulse")), plant, SteadyHand())
+    approached = with_approach(times_s, forces_N, START_N, RAMP_S, HOLD_S)
+    found = played(loop, *approached, preview_s, lead_s=RAMP_S + HOLD_S)
+    return found._replace(asked_N=np.interp(found.time_s, times_s, forces_N))
 
 
 def pulse(name: str) -> Json:
-    signal, previews_s = pulse_signal(DRAWN_PULSE_S), {"with preview": PREVIEW_S, "live": 0.0}
-    runs = {key: track(device(name), signal, "pulse", preview_s) for key, preview_s in previews_s.items()}
+    signal, previews_s = pulse_profile(PULSE_S, *PULSE_N, RATE_HZ), {"with preview": PREVIEW_S, "live": 0.0}
+    runs = {key: track(device(name), *signal, preview_s) for key, preview_s in previews_s.items()}
     return {key: found.since(TRIM_S).rms_N for key, found in runs.items()}
 
 
-def recorded(name: str, signal: Signal, preview_s: float) -> Json:
-    found = track(device(name), signal, "coronary", preview_s)
-    row = {"plant": name, "signal": signal.name, "preview": preview_s > 0.0}
-    return row | compared(found, ideal(name, signal), 0.0) | {"limits": found.limits}
-
-
-def signals() -> Json:
-    found = recorded_signals()
-    if not found:
-        return {"rows": [], "note": "no recorded signals: TORMAG_DATA names no folder of them"}
-    found += [palpation(seed) for seed in PALPATION_SEEDS]
-    cases = [
-        (name, signal, preview_s)
-        for signal in found
-        for preview_s in ((FILE_PREVIEW_S, 0.0) if signal.is_known_ahead else (0.0,))
-        for name in SAMPLES
-    ]
-    return {"rows": each(recorded, "signals", *zip(*cases, strict=True))}
-
-
-# -- all cases -------------------------------------------------------------------------------------------------------
-
-
-OF_DEVICES = {"steps": steps, "creep": creep, "speeds": speeds, "pulse": pulse}
-OF_SIGNALS = {"samples": samples, "signals": signals}
-CASES = (*OF_DEVICES, *OF_SIGNALS)
+CASES = {"steps": steps, "creep": creep, "speeds": speeds, "pulse": pulse}
 
 
 OPTIONS = {"cases": {"nargs": "*", "choices": (*CASES, "all"), "default": "all", "help": "default: all"}}
@@ -253,14 +175,12 @@ def measure(options: argparse.Namespace) -> Json:
 
 
 def of_case(case: str) -> Json:
-    if case in OF_SIGNALS:
-        return OF_SIGNALS[case]()
     names = judging(DRAWS)
-    return dict(zip(names, each(OF_DEVICES[case], case, names), strict=True))
+    return dict(zip(names, each(CASES[case], case, names), strict=True))
 
 
 def shown(figures: Json) -> Iterator[str]:
-    return lines({case: found if case in OF_SIGNALS else worst(found) for case, found in figures.items()})
+    return lines({case: worst(found) for case, found in figures.items()})
 
 
 def worst(devices: dict[str, Json]) -> list[Json]:

@@ -5,7 +5,6 @@ package heartpy ships it as `data.csv`: 100 Hz, 25 s, one person. Shape and rhyt
 """
 
 import importlib.util
-import os
 from pathlib import Path
 
 import numpy as np
@@ -47,9 +46,3 @@ def scaled(values: Array, least: float, most: float) -> Array:
     """Return `values` (n) mapped linearly to `least`..`most`; a smaller `most` mirrors them."""
     found: Array = least + (values - values.min()) / np.ptp(values) * (most - least)
     return found
-
-
-def recorded(folder: str) -> list[Path]:
-    """Return the CSV files of `folder`, sorted by name, in the folder of measured data that TORMAG_DATA names."""
-    data = os.environ.get("TORMAG_DATA")
-    return sorted((Path(data) / folder).glob("*.csv")) if data else []

@@ -273,7 +273,6 @@ def bound(
     time_s: Array,
     force_N: Array,
     *,
-    is_held: bool = False,
     step_s: float = STEP_S,
 ) -> Bound:
     steps = (time_s[-1] - time_s[0]) / step_s
@@ -281,8 +280,6 @@ def bound(
         raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MAX_STEPS} steps of {step_s:g} s")
     axis_s = time_s[0] + step_s * np.arange(math.floor(steps + 1e-6) + 1)
     wanted_N = np.interp(axis_s, time_s, force_N)
-    if is_held:
-        wanted_N = force_N[np.searchsorted(time_s, axis_s + 1e-9, side="right") - 1]
     brake, drive = brake_of(plant), drive_of(plant)
     asked = asked_of(brake, wanted_N, most_N=MAX_N, hand_mm_s=TURNED_MM_S, step_s=step_s)
     greedy_mm = no_delay_mm(drive, brake, asked, step_s)

@@ -38,7 +38,6 @@ class Found(NamedTuple):
 
 COMMANDS = {
     "reproduce-thesis": ("thesis.reproduction", "the thesis's tables and figures beside ours"),
-    "tactile-experiment": ("tactile.experiment", "chapter 4 on a simulated pad: models, the pulse, holds"),
     "optimise-design": ("design.optimisation", "the brake's geometry for a task"),
     "bound": ("ideal_carriage", "what a device's ideal carriages miss of a force"),
     "bench-sweep": ("training.bench_sweep", "training data from the simulated device on a bench"),
@@ -49,7 +48,7 @@ COMMANDS = {
     "twin": ("twin.command", "a plant file of one device from its recordings"),
     "identify-motor": ("motor.command", "a motor and its screw from a log"),
     "tune-position": ("tune_position", "the gains of the position loop for a motor"),
-    "fleet": ("consoles.command", "what the recordings of many consoles say of each"),
+    "fleet": ("fleet", "what the recordings of many consoles say of each"),
 }
 
 

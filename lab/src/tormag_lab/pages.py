@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from tormag_lab.arrays import Array
-
 if TYPE_CHECKING:
     from tormagd.view.drawing import Figure
 
@@ -31,26 +29,6 @@ def subplots(size: tuple[float, float], *grid: int, **options: Any) -> tuple["Fi
 
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(*grid, **options)
-
-
-def draw_beside(
-    time_s: Array,
-    measured: Array,
-    explained: Array,
-    *,
-    labels: tuple[str, str, str],
-    title: str,
-    finer: float = 1.0,
-) -> "Figure":
-    figure, (above, below) = subplots((11.0, 6.0), 2, 1, sharex=True)
-    above.plot(time_s, measured, color="#222222", linewidth=0.8, label="measured")
-    above.plot(time_s, explained, color="#d1495b", linewidth=0.8, label=labels[0])
-    above.legend(frameon=False, ncols=2)
-    above.set_ylabel(labels[1])
-    above.set_title(title, loc="left")
-    below.plot(time_s, finer * (measured - explained), color="#2a6f97", linewidth=0.8)
-    below.set(xlabel="time, s", ylabel=labels[2])
-    return figure
 
 
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
+from scipy.optimize import brentq
 
-from tormag_lab.design.force_law import d_force_d_gap, radial_moment_for_force_Tm
+from tormag_lab.design.force_law import d_force_d_gap
 from tormagd.element.physics.errors import Real, require, require_that
 from tormagd.element.physics.field import FieldLaw, PowerFieldLaw
 from tormagd.element.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
@@ -53,11 +53,8 @@ class Brake:
         """Return |dF/dgap|, the bracket of Eq. 36."""
         return abs(d_force_d_gap(gap_mm, self.field, self.elastomer, self.geometry))
 
-    def gap_mm(self, force_N: Real) -> Real:
+    def gap_mm(self, force_N: float) -> float:
+        """Return the gap that gives the force: the inverse of `force_N`."""
         require("force_N", force_N, self.least_N, self.most_N)
-        moment_Tm = radial_moment_for_force_Tm(force_N, self.elastomer, self.geometry)
-        # the forces of the end positions must not round to gaps beyond them
-        weakest_Tm, strongest_Tm = (self.field.radial_moment_Tm(gap_mm) for gap_mm in (self.open_mm, self.closed_mm))
-        gap_mm = self.field.gap_mm(np.clip(moment_Tm, weakest_Tm, strongest_Tm))
-        found: Real = np.clip(gap_mm, self.closed_mm, self.open_mm)
+        found: float = brentq(lambda gap_mm: self.force_N(gap_mm) - force_N, self.closed_mm, self.open_mm, xtol=1e-10)
         return found

@@ -1,16 +1,16 @@
-"""The force law's stretch, slopes and inverse, for design and for the thesis's numbers; of floats or arrays."""
+"""The force law's stretch and slopes, of floats or arrays, and the elastomer's energy density at the shaft (Eq. 16..18,
+20, 22..24), J/m^3.
 
-import sys
+The shaft is rigid: the hoop stretch is 1 there and the axial one 1 / lambda1. So I1 = I2, and the strain energy asks
+for G0 = 2 (C10 + C01) alone. The field is radial.
+"""
 
-import numpy as np
+from typing import NamedTuple
 
-from tormagd.element.physics.brake_curve import MAX_COMPRESSION, BrakeCurve, functions
+from tormagd.element.physics.brake_curve import BrakeCurve
 from tormagd.element.physics.errors import Real, require
 from tormagd.element.physics.field import FieldLaw
-from tormagd.element.physics.force import Elastomer, Geometry, reduced
-
-_NEWTON_STEPS = 100
-"Enough for bisection alone; Newton's method takes at most about 8."
+from tormagd.element.physics.force import MU0_H_M, Elastomer, Geometry, reduced
 
 
 def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
@@ -34,16 +34,6 @@ def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry:
     return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
 
 
-def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Return the radial moment that gives the force: the inverse of `brake_force_N`."""
-    law = reduced(elastomer, geometry)
-    # so that the force of the largest moment is admitted to the last digit
-    require("force_N", force_N, 0.0, law.force(law.max_moment_Tm))
-    load = law.curve.load(compression_for_force(law.curve, force_N / law.force_scale_N))
-    root: Real = load**0.5
-    return root / law.load_root_per_Tm
-
-
 def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
     """Return d phi / d y, the slope of the reduced force phi over the load y."""
     stretch, w = 1.0 - compression, curve.wall
@@ -52,34 +42,30 @@ def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
     return (elastic + magnetic) * _compression_slope(curve, compression, load) + 4.0 * (1.0 + w) / stretch**3
 
 
-def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
-    """Return the compression eps = 1 - lambda1, 0..0.95, at which the reduced force is `force`."""
-    fn = functions(force)
-    rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)
-    wanted = fn.where(force > 0.0, force, 1.0)
-    low, high = 0.0 * wanted, MAX_COMPRESSION + 0.0 * wanted
-    compression = 0.25 * wanted / (1.0 + (1.0 + curve.wall) / curve.b)
-    compression = fn.where(compression < 0.5, compression, 0.5)
-    for _ in range(_NEWTON_STEPS):
-        load = curve.load(compression)
-        value = curve.force(compression, load)
-        above = value > wanted
-        low, high = fn.where(above, low, compression), fn.where(above, compression, high)
-        per_compression = force_slope(curve, compression, load) / _compression_slope(curve, compression, load)
-        odds = compression / (1.0 - compression)
-        step = -fn.log(value / wanted) * value / (per_compression * compression * (1.0 - compression))
-        # odds * exp(step) to second order, positive and without overflow
-        odds = fn.where(above, odds / (1.0 + abs(step)), odds * (1.0 + abs(step)))
-        trial = odds / (1.0 + odds)
-        settled = abs(trial - compression) <= rounding * compression
-        # a step at rounding level is taken as it is: noise may put it just outside the bracket
-        good = settled | ((trial > low) & (trial < high))
-        compression = fn.where(good, trial, 0.5 * (low + high))
-        if fn.all(settled):
-            break
-    result: Real = fn.where(force > 0.0, compression, 0.0 * wanted)
-    return result
-
-
 def _compression_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
     return (curve.b + curve.a * compression) / (1.0 - curve.a * load + compression)
+
+
+class Invariants(NamedTuple):
+    first: float
+    second: float
+    third: float
+
+
+class Energy(NamedTuple):
+    strain_J_m3: float
+    magnetic_J_m3: float
+
+
+def invariants(radial: float, hoop: float, axial: float) -> Invariants:
+    """Return I1, I2, I3 of the right Cauchy-Green tensor for the principal stretches (Eq. 16..18)."""
+    squares = radial**2, hoop**2, axial**2
+    trace = sum(squares)
+    second = (trace**2 - sum(each**2 for each in squares)) / 2.0
+    return Invariants(trace, second, squares[0] * squares[1] * squares[2])
+
+
+def energy_at_shaft(radial: float, field_T: float, elastomer: Elastomer) -> Energy:
+    """Return both parts of Eq. 22 for the radial stretch and the radial field there."""
+    strain = elastomer.shear_modulus_Pa / 2.0 * (invariants(radial, 1.0, 1.0 / radial).first - 3.0)
+    return Energy(strain, (field_T * radial) ** 2 / (2.0 * MU0_H_M * elastomer.relative_permeability))

@@ -1,9 +1,9 @@
 """Find a brake for a task (Eq. 39-42, table 3.2): outer radius, thickness and open gap, from several starts.
 
 The thesis's cost (Eq. 39) adds the squared distances of the portrait's four corners from the task's. It mixes newtons
-with newtons per second, and punishes a portrait larger than the task. Ours is coverage of the required region, then the
-least volume of elastomer, then the smallest open gap, which may cost `SLACK` of coverage. The elastomer must bear the
-field of the closed gap (lambda1 >= 0.05).
+with newtons per second, and punishes a portrait larger than the task: its minima cover less. Ours is coverage of the
+required region, then the least volume of elastomer, then the smallest open gap, which may cost `SLACK` of coverage. The
+elastomer must bear the field of the closed gap (lambda1 >= 0.05).
 
 The solver is scipy's differential evolution, with the start in its first generation, followed by COBYQA.
 """
@@ -30,8 +30,8 @@ from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import PowerFieldLaw
 from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
-Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
-"Coverage by the trapezoid or the true boundary, or the thesis's cost."
+Measure: TypeAlias = Literal["trapezoid", "true"]
+"Boundary by which coverage counts."
 
 SLACK = 1e-4
 "Coverage that a smaller elastomer may cost."
@@ -103,46 +103,26 @@ def coverage(problem: Problem, design: Design) -> float:
     return portrait.trapezoid_coverage(problem.region)
 
 
-def corner_cost(problem: Problem, design: Design) -> float:
-    """Return Eq. 39: the sum of squared distances of the trapezoid's corners from the region's."""
-    offered, wanted = problem.portrait(design).trapezoid(), problem.region
-    # the lower corners mirror the upper ones
-    return 2.0 * (
-        (offered.least_N - wanted.least_N) ** 2
-        + (offered.least_rate_N_s - wanted.least_rate_N_s) ** 2
-        + (offered.most_N - wanted.most_N) ** 2
-        + (offered.most_rate_N_s - wanted.most_rate_N_s) ** 2
-    )
-
-
 def solve(run: Run) -> Json:
-    """Return the best design. `coverage` is by the true boundary where that was the measure, else by the trapezoid."""
+    """Return the best design, and its coverage by the measure of its problem."""
     began_s = time.thread_time()
     search = _Search(run.problem)
-    first = search.scaled(run.start)
-    if run.problem.measure == "corners":
-        best = search.minimum(search.corner_cost, first, run.seed)
-    else:
-        best = search.smallest(search.minimum(search.miss, first, run.seed), run.seed)
-    design = search.design(best)
+    design = search.design(search.smallest(search.minimum(search.miss, search.scaled(run.start), run.seed), run.seed))
     if run.problem.load_margin(design) < 0.0:
         raise DomainError("shear_modulus_Pa", run.problem.shear_modulus_Pa, "an elastomer that bears the closed gap")
     return {
         "design": design,
         "coverage": coverage(run.problem, design),
-        "corner_cost": corner_cost(run.problem, design),
         "volume_mm3": run.problem.volume_mm3(design),
-        "evaluations": search.evaluations,
         "seconds": time.thread_time() - began_s,  # of this thread's processor time
     }
 
 
 class _Search:
-    """A problem in coordinates from 0 to 1 between the bounds; counts its evaluations."""
+    """A problem in coordinates from 0 to 1 between the bounds."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self.evaluations = 0
         self._low = np.array(msgspec.structs.astuple(problem.lower))
         self._span = np.array(msgspec.structs.astuple(problem.upper)) - self._low
         self._bounds = Bounds(np.zeros(3), np.ones(3), keep_feasible=True)
@@ -156,10 +136,9 @@ class _Search:
         return Design(*(float(value) for value in self._low + self._span * np.clip(x, 0.0, 1.0)))
 
     def miss(self, x: Array) -> float:
-        return 1.0 - self._at(coverage, x, 0.0)
-
-    def corner_cost(self, x: Array) -> float:
-        return self._at(corner_cost, x, math.inf)
+        design = self.design(x)
+        # an elastomer that would not bear the field covers nothing
+        return 1.0 - coverage(self.problem, design) if self.problem.load_margin(design) >= 0.0 else 1.0
 
     def size(self, x: Array) -> float:
         volume = self.problem.volume_mm3(self.design(x)) / self.problem.volume_mm3(self.problem.upper)
@@ -194,12 +173,6 @@ class _Search:
         is_kept = all(limit.lb <= limit.fun(result.x) <= limit.ub for limit in limits)
         return np.asarray(result.x) if is_kept and cost(result.x) < cost(start) else start
 
-    def _at(self, function: Callable[[Problem, Design], float], x: Array, impossible: float) -> float:
-        """Return a function of the design, or `impossible` where the elastomer would not bear the field."""
-        self.evaluations += 1
-        design = self.design(x)
-        return function(self.problem, design) if self.problem.load_margin(design) >= 0.0 else impossible
-
 
 def sweep(runs: Iterable[Run], executor: Executor) -> dict[Run, Json]:
     wanted = list(dict.fromkeys(runs))
@@ -216,7 +189,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar=("MIN_N", "MIN_RATE", "MAX_N", "MAX_RATE"),
         help="required forces, N, and rates, N/s",
     )
-    parser.add_argument("--measure", choices=("true", "trapezoid", "corners"), default="true")
+    parser.add_argument("--measure", choices=("true", "trapezoid"), default="true")
     parser.add_argument(
         "--gap-speed",
         type=GAP_SPEED,
@@ -231,9 +204,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Found:
     with chosen(options) as executor:
         outcomes = sweep(_runs(options), executor)
-    by_cost = options.measure == "corners"
     rows = [msgspec.to_builtins(outcome) for outcome in outcomes.values()]
-    rows.sort(key=lambda row: (row["corner_cost"] if by_cost else -row["coverage"], row["volume_mm3"]))
+    rows.sort(key=lambda row: (-row["coverage"], row["volume_mm3"]))
     return Found({"outcomes": rows})
 
 

@@ -107,9 +107,8 @@ class PhasePortrait:
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:
         """Return which points of a task, force and rate (n each), the true boundary covers."""
-        inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
-        limit = np.full_like(force_N, -1.0)
-        limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
+        falling_N, limit_N_s = self.outline()
+        limit = np.interp(force_N, falling_N[::-1], limit_N_s[::-1], left=-1.0, right=-1.0)
         return np.abs(rate_N_s) <= limit
 
     def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:

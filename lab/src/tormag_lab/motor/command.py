@@ -10,21 +10,17 @@ The first half of the log is fitted and the second half judged; the parameters c
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
-from tormag_lab.motor.fit import THINNED_HZ, Estimate, Gearbox, Windings, fit_gearbox, fit_volts, fit_windings
+from tormag_lab.motor.fit import Estimate, Gearbox, Windings, fit_gearbox, fit_volts, fit_windings
 from tormag_lab.motor.log import Log, read_log
-from tormag_lab.pages import draw_beside
 from tormagd.config import Config, Motor, load_config
 from tormagd.ground.files import new_file
-
-if TYPE_CHECKING:
-    from tormagd.view.drawing import Figure
 
 VAGUE_SHARE = 0.5
 PARAMETERS = ("mass_kg", "viscous_N_s_m", "coulomb_N", "offset_N")
@@ -35,22 +31,15 @@ BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, help="motor log CSV, or DATA_EMPS.mat")
     parser.add_argument("--gain-N-V", type=float, dest="gain", help="force per volt, N/V; replaces a current")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="measured against simulated voltage")
     parser.add_argument("--config", type=Path, help="whose gear ratio and screw lead hold; the defaults otherwise")
     parser.add_argument("--write-config", type=Path, metavar="FILE.toml", help="new file with the identified [motor]")
 
 
 def run(options: argparse.Namespace) -> Found:
-    if options.plot is not None and options.plot.suffix != ".png":
-        raise LabError(f"--plot {options.plot}: allowed is a name that ends with .png")
     log = read_log(options.log)
     result = identify(log, options.gain if options.gain is not None else log.gain_N_V)
     if options.write_config:
         write_config(options.write_config, result, load_config(options.config))
-    if options.plot:
-        from tormagd.view.plot import save_plot
-
-        save_plot(drawn(log, result), options.plot, options.log)
     return Found(result)
 
 
@@ -149,17 +138,3 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
         raise LabError(f"--write-config: {table}: {error}") from error
     except OSError as error:
         raise LabError(f"{path}: {error.strerror}") from error
-
-
-def drawn(log: Log, result: dict[str, Any]) -> "Figure":
-    half = len(log.t_s) // 2
-    fitted = fit_volts(log.part(slice(None, half)))
-    time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))
-    return draw_beside(
-        time_s,
-        measured,
-        predicted,
-        labels=("from the fit of the other half", "input, V", "difference, V"),
-        title=f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {result['holdout_voltage_nrmse']:.1%}; "
-        "gaps where it stands",
-    )

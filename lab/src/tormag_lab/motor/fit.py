@@ -134,18 +134,12 @@ class Volts(NamedTuple):
     relative_residual: float
 
     def voltage(self, log: Log) -> tuple[Array, Array]:
-        _, measured, predicted = self.over_time(log)
-        known = np.isfinite(measured)
-        return measured[known], predicted[known]
-
-    def over_time(self, log: Log) -> tuple[Array, Array, Array]:
-        """Return the thinned times, s, and applied and predicted voltage, V (n each)."""
+        """Return applied and predicted voltage, V (n each), of the thinned rows in motion."""
         seen = motion(log)
         values = np.array([self.mass.value, self.viscous.value, self.coulomb.value, self.offset.value])
         measured, _ = _voltage(log, seen, self.delay.value)
-        stands = np.where(moving(seen, MOSTLY), 0.0, np.nan)
-        time_s = log.t_s[0] + (np.arange(len(measured)) + EDGE) * seen.factor * log.period_s
-        return time_s, measured + stands, _volts_rows(seen) @ values + stands
+        moves = moving(seen, MOSTLY)
+        return measured[moves], (_volts_rows(seen) @ values)[moves]
 
 
 def _volts_rows(seen: Motion) -> Array:

@@ -9,12 +9,11 @@ from collections.abc import Iterable
 from types import MappingProxyType
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tormag_lab.training.dataset import Dataset
-from tormagd.simulation.parameters import PadParameters, Relaxation
+from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import (
     FULL_FIELD_MT,
     FULL_INDENTATION_MM,
@@ -40,28 +39,6 @@ PADS = MappingProxyType(
     }
 )
 "Moduli from section 4.2.3; the breakdown puts the greatest forces near 65, 141 and 186 N, as table 4.1 implies."
-
-
-def drawn_pad(parameters: PadParameters, seed: int) -> PadParameters:
-    """Draw another pad of the same recipe, with each property 3..15 % off."""
-    draw = np.random.default_rng(seed)
-
-    def about(value: float, spread: float) -> float:
-        return value * float(1.0 + spread * draw.uniform(-1.0, 1.0))
-
-    def series(given: Relaxation) -> Relaxation:
-        fractions = tuple(about(fraction, 0.15) for fraction in given.fractions)
-        return Relaxation(fractions, tuple(about(time_s, 0.15) for time_s in given.times_s))
-
-    return msgspec.structs.replace(
-        parameters,
-        modulus_kPa=about(parameters.modulus_kPa, 0.03),
-        full_field_modulus_kPa=about(parameters.full_field_modulus_kPa, 0.03),
-        saturation_mT=about(parameters.saturation_mT, 0.05),
-        rate_gain=about(parameters.rate_gain, 0.15),
-        relaxing=series(parameters.relaxing),
-        field_relaxing=series(parameters.field_relaxing),
-    )
 
 
 class Program(NamedTuple):

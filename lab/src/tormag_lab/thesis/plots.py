@@ -1,53 +1,22 @@
 """The pictures of docs/reproduction.md."""
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from tormag_lab.arrays import Json
-from tormag_lab.design.optimisation import Design, Problem
-from tormag_lab.design.phase_portrait import Region
 from tormag_lab.pages import subplots
-from tormag_lab.thesis.page import best_start
 from tormag_lab.thesis.step_test import StepTest
-from tormag_lab.thesis.values import AS_BUILT, USE_CASES
 from tormagd.view.drawing import Axes, Figure
 
-MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e", "#e9ecf2"
+MEASURED, THESIS, OURS, FREE = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 
 
 def pictures(result: Json, tests: list[StepTest]) -> dict[str, Figure]:
-    drawn: dict[str, tuple[str, Callable[[Json], Figure]]] = {
-        "table_2_4": ("table_2_4", _table_2_4),
-        "figure_2_5": ("figure_2_5", _figure_2_5),
-        "figure_2_7": ("figure_2_7", partial(_figure_2_7, tests=tests)),
-        "figure_3_2": ("table_3_2", _figure_3_2),
-        "figure_3_4": ("table_3_2", _figure_3_4),
-    }
-    return {name: draw(result[part]) for name, (part, draw) in drawn.items() if part in result}
-
-
-def _table_2_4(table: Json) -> Figure:
-    """Draw each insert's force range: measured, the thesis's, and ours in two fits."""
-    figure, axes = subplots((9.5, 4.2))
-    rows = table["rows"]
-    place = np.arange(len(rows))
-    bars = (
-        ("thesis estimate", THESIS, "thesis_N"),
-        ("ours, friction fitted", OURS, "ours_N"),
-        ("ours, exponent free too", FREE, "ours_free_exponent_N"),
-    )
-    for offset, (label, colour, key) in zip((-0.26, 0.0, 0.26), bars, strict=True):
-        axes.bar(place + offset, [row[key] for row in rows], 0.24, color=colour, label=label)
-    for row, x in zip(rows, place, strict=True):
-        named = "measured, with deviation" if x == 0 else None
-        axes.errorbar([x - 0.26, x, x + 0.26], [row["measured_N"]] * 3, row["deviation_N"], color=MEASURED, label=named)
-    axes.set_xticks(place, [row["insert"].removeprefix("MRE-") for row in rows])
-    axes.set(xlabel="insert (matrix-iron %)", ylabel="F(45 mm) - F(95 mm), N")
-    axes.legend(frameon=False)
-    return figure
+    drawn = {"figure_2_5": _figure_2_5(result["figure_2_5"])}
+    if "figure_2_7" in result:
+        drawn["figure_2_7"] = _figure_2_7(result["figure_2_7"], tests)
+    return drawn
 
 
 def _figure_2_5(data: Json) -> Figure:
@@ -95,55 +64,3 @@ def _force_ranges(axes: Axes, rows: list[Json]) -> None:
     axes.plot([], [], "_", color=MEASURED, label="range measured in the thesis")
     axes.set(xlabel="iron, % by volume", ylabel="least to greatest force, N", ylim=(0, None))
     axes.legend(frameon=False, loc="upper left")
-
-
-def _figure_3_2(table: Json) -> Figure:
-    """Draw the portrait of the device as built over both use cases, at both gap speeds."""
-    figure, axes = subplots((9.5, 4.0), 1, 2)
-    speeds = (table["gap_speed_mm_s"]["true_thesis_speed"], table["gap_speed_mm_s"]["true"])
-    for axis, (number, case) in zip(axes, USE_CASES.items(), strict=True):
-        _region(axis, case.region)
-        for speed, colour in zip(speeds, (OURS, FREE), strict=True):
-            _portrait(axis, Problem(case.region, "true", speed), AS_BUILT, colour, f"{speed:.3g} mm/s")
-        _frame(axis, case.region, f"Device as built, use case {number}")
-    return figure
-
-
-def _figure_3_4(table: Json) -> Figure:
-    """Draw our best and the thesis's best portrait for each use case and gap speed."""
-    figure, axes = subplots((9.5, 7.6), 2, 2)
-    for row, (number, case) in zip(axes, USE_CASES.items(), strict=True):
-        for axis, objective in zip(row, ("true_thesis_speed", "true"), strict=True):
-            speed = table["gap_speed_mm_s"][objective]
-            best = best_start(table["starts"], number, objective)
-            thesis = max(case.starts, key=lambda line: line.thesis_percent).thesis
-            _region(axis, case.region)
-            problem = Problem(case.region, "true", speed)
-            _portrait(axis, problem, Design(*best["design"].values()), OURS, f"ours, {best['coverage']:.1%}")
-            reached = problem.portrait(thesis).true_coverage(case.region)
-            _portrait(axis, problem, thesis, THESIS, f"thesis's best, {reached:.1%}")
-            _frame(axis, case.region, f"Use case {number}, gap speed {speed:.3g} mm/s")
-    return figure
-
-
-def _region(axis: Axes, region: Region) -> None:
-    forces = [region.least_N, region.most_N, region.most_N, region.least_N, region.least_N]
-    rates = [region.least_rate_N_s, region.most_rate_N_s, -region.most_rate_N_s, -region.least_rate_N_s]
-    axis.fill(forces, [*rates, region.least_rate_N_s], color=QUIET, label="required")
-
-
-def _portrait(axis: Axes, problem: Problem, design: Design, colour: str, label: str) -> None:
-    portrait = problem.portrait(design)
-    force, rate = portrait.outline()
-    axis.plot([*force, *force[::-1], force[0]], [*rate, *-rate[::-1], rate[0]], color=colour, label=label)
-    ends = portrait.trapezoid()
-    corners = [ends.least_N, ends.most_N], [ends.least_rate_N_s, ends.most_rate_N_s]
-    for sign in (1.0, -1.0):
-        axis.plot(corners[0], sign * np.array(corners[1]), color=colour, linestyle=":", linewidth=1.0)
-
-
-def _frame(axis: Axes, region: Region, title: str) -> None:
-    axis.set_title(title, fontsize=10)
-    axis.set(xlabel="force, N", ylabel="force rate, N/s", xlim=(-0.1, 1.35 * region.most_N))
-    axis.set_ylim(-2.0 * region.most_rate_N_s, 2.0 * region.most_rate_N_s)
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)

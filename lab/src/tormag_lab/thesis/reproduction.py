@@ -13,8 +13,7 @@ import numpy as np
 
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
-from tormag_lab.design.energy import energy_at_shaft
-from tormag_lab.design.force_law import stretch_minus_one
+from tormag_lab.design.force_law import energy_at_shaft, stretch_minus_one
 from tormag_lab.design.optimisation import Design, Problem, Run, coverage, sweep
 from tormag_lab.design.phase_portrait import PhasePortrait
 from tormag_lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
@@ -47,7 +46,7 @@ PULSE_S, PULSE_HZ = 20.0, 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write reproduction.md and its pictures there")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write both pages and their pictures there")
     parser.add_argument("--gap-speed", type=GAP_SPEED, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=WORKERS, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=SEED, default=1)
@@ -72,7 +71,7 @@ def run(options: argparse.Namespace) -> Found:
             result["phase_portrait"] = phase_portrait(GAP_SPEED_MM_S, tests[0].gap_speed_mm_s, options.gap_speed)
             runs = table_3_2_runs(options.gap_speed, options.seed)
             result["table_3_2"] = table_3_2(runs, sweep(runs.values(), pool), options.gap_speed)
-            result |= {name: learned.result()[name] for name in ("table_4_1", "pulse")}
+            result |= learned.result()
         except KeyboardInterrupt:
             pool.shutdown(cancel_futures=True)
     if options.out is not None:
@@ -80,15 +79,17 @@ def run(options: argparse.Namespace) -> Found:
 
         folder = options.out / "reproduction"
         write_page(options.out / "reproduction.md", page.sections(result), folder, pictures(result, tests))
+        if "pulse" in result:
+            from tormag_lab.tactile import report  # loads torch
+
+            write_page(options.out / "learned_inverse.md", report.sections(result), folder, {})
     return Found(result, page.sections(result), 0 if "pulse" in result else 130)
 
 
 def chapter_4() -> Json:
-    from tormag_lab.tactile.experiment import contract
-    from tormag_lab.tactile.models import FULL
+    from tormag_lab.tactile import models, report  # load torch and scikit-learn
 
-    found, *_ = contract(FULL)
-    return found
+    return report.chapter_4(models.FULL)
 
 
 def table_2_3() -> Json:
@@ -312,51 +313,36 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
         "trapezoid": Problem(region, "trapezoid", GAP_SPEED_MM_S),
         "true": Problem(region, "true", gap_speed_mm_s),
         "true_thesis_speed": Problem(region, "true", GAP_SPEED_MM_S),
-        "corners": Problem(region, "corners", GAP_SPEED_MM_S),
     }
 
 
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Json], gap_speed_mm_s: float) -> Json:
-    """Return the optima by each measure and by the thesis's cost, beside the thesis's designs."""
-    rows: list[Json] = [
-        {
-            "use_case": use_case,
-            "start": start,
-            "objective": objective,
-            "design": _design(outcomes[run]["design"]),
-            "volume_cm3": 1e-3 * outcomes[run]["volume_mm3"],
-            **{name: outcomes[run][name] for name in ("coverage", "corner_cost", "seconds")},
-        }
-        for (use_case, start, objective), run in runs.items()
-    ]
-    starts = [row for row in rows if row["objective"] != "corners"]
+    """Return the optima by each measure, beside the thesis's designs."""
     designs = []
     for number, case in USE_CASES.items():
+        problems = _problems(number, gap_speed_mm_s)
         found = [
             (f"thesis, start {index}", each.thesis, each.thesis_percent) for index, each in enumerate(case.starts, 1)
         ]
         for name, design, percent in (("as built", AS_BUILT, case.initial_percent), *found):
-            reached = {
-                objective: coverage(problem, design)
-                for objective, problem in _problems(number, gap_speed_mm_s).items()
-                if objective != "corners"
-            }
+            reached = {objective: coverage(problem, design) for objective, problem in problems.items()}
             designs.append(
                 {"use_case": number, "name": name, "design": _design(design), "thesis": percent / 100, "ours": reached}
             )
-    groups: dict[tuple[int, str], list[float]] = {}
-    for each in starts:
-        groups.setdefault((each["use_case"], each["objective"]), []).append(each["coverage"])
     return {
-        "starts": starts,
-        "corner_cost_starts": [row for row in rows if row["objective"] == "corners"],
-        "thesis_designs": designs,
-        "best": [
-            {"use_case": number, "objective": objective, "coverage": max(values), "spread": max(values) - min(values)}
-            for (number, objective), values in groups.items()
+        "starts": [
+            {
+                "use_case": use_case,
+                "start": start,
+                "objective": objective,
+                "design": _design(outcomes[run]["design"]),
+                "volume_cm3": 1e-3 * outcomes[run]["volume_mm3"],
+                **{name: outcomes[run][name] for name in ("coverage", "seconds")},
+            }
+            for (use_case, start, objective), run in runs.items()
         ],
+        "thesis_designs": designs,
         "gap_speed_mm_s": {"trapezoid": GAP_SPEED_MM_S, "true": gap_speed_mm_s, "true_thesis_speed": GAP_SPEED_MM_S},
-        "max_seconds": max(row["seconds"] for row in starts),
         "note": "R_i 4 mm, bounds of Eq. 40-42, G0 300 kPa, mu_r 3.8, mu_d 0.2, power field law. Use case 1 starts at "
         "(0 N, 0 N/s).",
     }

@@ -10,7 +10,6 @@ import numpy as np
 
 from tormag_lab.arrays import Json
 from tormag_lab.design.brake import CLOSED_MM, Brake
-from tormag_lab.design.force_law import radial_moment_for_force_Tm
 from tormag_lab.thesis.values import TABLE_2_5, ForceTask
 from tormagd.element.physics.inserts import INSERTS
 
@@ -94,18 +93,7 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
         "resolution_mN": 1e3 * resolution_N,
         "served_share": max(high - low, 0.0) / width_N,
         "reasons": reasons,
-        "sufficient_gap_mm": _sufficient_gap_mm(brake, task),
     }
-
-
-def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float | None:
-    """Return the gap, the open one or wider, that gives the task's least force plus its resolution."""
-    tolerated_N = task.least_N + task.resolution_N
-    if tolerated_N >= brake.least_N:
-        return brake.open_mm
-    moment_Tm = radial_moment_for_force_Tm(tolerated_N, brake.elastomer, brake.geometry)
-    is_given = moment_Tm >= brake.field.radial_moment_Tm(brake.field.gap_range_mm[1])
-    return brake.field.gap_mm(moment_Tm) if is_given else None
 
 
 def readings(table: Json) -> list[tuple[str, ...]]:

@@ -13,21 +13,6 @@ TABLE_2_3_MASSES_G = {
 }
 "Grams in 100 cc, by the percentage of iron."
 
-TABLE_2_4_ERRORS = {
-    "MRE-10-10": (0.05, 4.7),
-    "MRE-10-20": (0.06, 4.3),
-    "MRE-10-30": (0.12, 9.2),
-    "MRE-10-40": (0.21, 8.0),
-    "MRE-30-10": (0.16, 12.3),
-    "MRE-30-20": (0.27, 13.2),
-    "MRE-30-30": (0.25, 9.2),
-    "MRE-30-40": (0.39, 10.4),
-    "MRE-50-10": (0.33, 11.9),
-    "MRE-50-20": (0.40, 14.1),
-    "MRE-50-30": (1.23, 14.7),
-    "MRE-50-40": (0.53, 10.0),
-}
-"The two error columns: N and percent."
 TABLE_2_4_MEAN_PERCENT, TABLE_2_4_MAX_PERCENT = 10.2, 14.7
 
 
@@ -102,7 +87,6 @@ USE_CASES = {
 }
 AS_BUILT = Design(11.0, 20.0, 95.0)
 "Table 3.1."
-APPENDIX_B_BOUNDS = (Design(8.0, 10.0, 50.0), Design(15.0, 50.0, 200.0))
 
 
 class FitScore(NamedTuple):

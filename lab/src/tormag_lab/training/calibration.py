@@ -8,7 +8,6 @@ A sweep that teaches nothing, and a fit that is poor, are refused, and nothing i
 import argparse
 import datetime
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,13 @@ from tormag_lab.arrays import Array
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
 from tormag_lab.tables import read_columns
-from tormag_lab.training.dataset import ALLOWED, Dataset, fit_metrics, write_csv
+from tormag_lab.training.dataset import ALLOWED, Dataset, fit_metrics
 from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.element.model.features import FEATURES, FIELD, Element
 from tormagd.element.model.model_file import ForceModel, save_model
 from tormagd.element.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.element.physics.force import TORMAG
 from tormagd.element.physics.inserts import Insert, insert
-from tormagd.ground.files import in_place_of
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 "The handle's travel is at the roller; rate and force are positive in the direction of motion."
@@ -227,7 +225,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sweeps", type=Path, metavar="SWEEPS.csv", help=f"columns {','.join(COLUMNS)}")
     parser.add_argument("--insert", required=True, help="the insert that was swept, such as MRE-50-40")
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL.safetensors")
-    parser.add_argument("--csv", type=Path, metavar="TRAINING.csv", help="write the training data too")
     parser.add_argument("--law", action="store_true", help="fit the law of the brake, without torch")
 
 
@@ -235,10 +232,7 @@ def run(options: argparse.Namespace) -> Found:
     data = training_rows(read_sweeps(options.sweeps), insert(options.insert))
     require_usable(data)
     model = fit(data, options.insert, datetime.date.today(), by_law=options.law)
-    with nullcontext() if options.csv is None else in_place_of(options.csv, options.sweeps) as beside:
-        if beside is not None:
-            write_csv(beside, data)
-        save_model(options.out, model, options.sweeps)
+    save_model(options.out, model, options.sweeps)
     figures = {"model": str(options.out), "insert": options.insert, "rows": len(data), "ranges": data.ranges()}
     metrics = model.metadata.metrics
     told = (

@@ -6,7 +6,7 @@ A model is judged on rows that it did not learn from, drawn at random or in whol
 import csv
 import hashlib
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,18 +150,16 @@ def random_split(rows: int, seed: int, share: float = 0.3) -> Mask:
     return held
 
 
-def leave_one_out(dataset: Dataset, feature: str) -> Iterator[tuple[float, Mask]]:
+def leave_one_out(dataset: Dataset, feature: str) -> list[Mask]:
     column = dataset.features[:, FEATURES.index(feature)]
-    for value in np.unique(column):
-        yield float(value), column == value
+    return [column == value for value in np.unique(column)]
 
 
-def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> Iterator[tuple[int, Mask]]:
-    """Yield the number of each fold, and the mask of the whole cycles that it holds out."""
+def leave_cycles_out(dataset: Dataset, folds: int, seed: int) -> list[Mask]:
+    """Return the mask of the whole cycles that each fold holds out."""
     assert dataset.cycle is not None
     parts = np.array_split(np.random.default_rng(seed).permutation(np.unique(dataset.cycle)), folds)
-    for fold, part in enumerate(parts):
-        yield fold, np.isin(dataset.cycle, part)
+    return [np.isin(dataset.cycle, part) for part in parts]
 
 
 def trained_metrics(model: ForceModel, training: Dataset, validation: Dataset) -> dict[str, float]:

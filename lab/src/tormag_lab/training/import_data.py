@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, median_filter
 
 from tormag_lab.arrays import Array, Mask
 from tormag_lab.errors import LabError
@@ -164,9 +165,7 @@ def _without_duplicates(quantities: Mapping[str, Array]) -> tuple[dict[str, Arra
 
 def _outliers(path: Path, force_N: Array) -> Mask:
     """Return a mask of the forces far from the median of their neighbours in time."""
-    half = NEIGHBOURS // 2
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(force_N, half, mode="edge"), NEIGHBOURS)
-    off_N = np.abs(force_N - np.median(around, axis=1))
+    off_N = np.abs(force_N - median_filter(force_N, NEIGHBOURS, mode="nearest"))
     range_N = np.subtract(*np.percentile(force_N, (98.0, 2.0)))
     most_N = max(OUTLIER_SDS * 1.4826 * float(np.median(off_N)), OUTLIER_OF_RANGE * float(range_N))
     # rows of an unordered table jump everywhere, so neighbours name no outlier there
@@ -216,10 +215,10 @@ def _sign(path: Path, quantities: dict[str, Array], rate: Array) -> tuple[str, A
 def _turns(rate: Array) -> Mask:
     """Return a mask of the rows where the motion rests or turns: the rate's own sign says nothing, the force's does."""
     speed, back = np.abs(rate), np.sign(rate)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(speed, NEIGHBOURS, mode="edge"), 2 * NEIGHBOURS + 1)
+    fastest = maximum_filter1d(speed, 2 * NEIGHBOURS + 1, mode="nearest")
     turned = back[1:] != back[:-1]
     beside = np.concatenate([turned, [False]]) | np.concatenate([[False], turned])
-    turning: Mask = beside | (speed <= QUIET * np.maximum(around.max(axis=1), np.median(speed)))
+    turning: Mask = beside | (speed <= QUIET * np.maximum(fastest, np.median(speed)))
     return turning
 
 

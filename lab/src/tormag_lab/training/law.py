@@ -27,9 +27,10 @@ from tormagd.element.model.displacement import MOBILISED_MM
 from tormagd.element.model.features import FEATURES, FIELD, RATE, Element
 from tormagd.element.model.memory import NO_MEMORY, Memory
 from tormagd.element.model.model_file import ForceModel, ModelMetadata
-from tormagd.element.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
+from tormagd.element.physics.brake_curve import MAX_COMPRESSION
 from tormagd.element.physics.errors import require_that
-from tormagd.element.physics.force import MU0_H_M, TORMAG
+from tormagd.element.physics.field import REFERENCE_PERMEABILITY
+from tormagd.element.physics.force import TORMAG, reduced
 from tormagd.element.physics.inserts import Insert, insert
 
 MIDDLE_MT = 450.0
@@ -82,18 +83,14 @@ class Law(NamedTuple):
 
     def kinetic_N(self, field_mT: Array, fitted: Insert) -> Array:
         """Return K (n) at fields (n)."""
-        nominal, thickness_m = fitted.elastomer, TORMAG.thickness_m
-        inner_m, outer_m = TORMAG.inner_radius_m, TORMAG.outer_radius_m
-        modulus_Pa = nominal.shear_modulus_Pa * np.exp(self.log_modulus)
-        curve = BrakeCurve.of((outer_m - inner_m) / inner_m, thickness_m * (nominal.relative_permeability - 1.0))
+        nominal = fitted.elastomer
+        modulus_Pa = nominal.shear_modulus_Pa * float(np.exp(self.log_modulus))
+        law = reduced(replace(nominal, shear_modulus_Pa=modulus_Pa), TORMAG)
         field_T = 1e-3 * MIDDLE_MT * (field_mT / MIDDLE_MT) ** self.exponent
         field_T = np.tanh(self.saturating_1_T * field_T) / self.saturating_1_T
-        load = field_T**2 * inner_m / (4.0 * MU0_H_M * nominal.relative_permeability * modulus_Pa * outer_m)
-        scale_N = (
-            2.0 * np.pi * thickness_m * inner_m**2 / TORMAG.roller_radius_m * nominal.friction_coefficient * modulus_Pa
-        )
-        compressed = np.minimum(curve.compression(load), MAX_COMPRESSION)
-        kinetic_N: Array = np.exp(self.log_m) * scale_N * curve.force(compressed, load) + self.free_N
+        load = law.load(field_T * TORMAG.inner_radius_m * REFERENCE_PERMEABILITY / nominal.relative_permeability)
+        compressed = np.minimum(law.curve.compression(load), MAX_COMPRESSION)
+        kinetic_N: Array = np.exp(self.log_m) * law.force_scale_N * law.curve.force(compressed, load) + self.free_N
         return kinetic_N
 
 

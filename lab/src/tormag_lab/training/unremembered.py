@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from tormag_lab.arrays import Array
+from tormag_lab.ideal_carriage import Lag
 from tormag_lab.training.dataset import Dataset, records, times_of
 from tormag_lab.training.law import mobilised_N
 from tormagd.element.model.features import CIP, FIELD
@@ -100,16 +101,9 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
 
 def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
     """Return the lag of the element's field behind `field_mT` (n) at each row."""
-    lag_mT = np.zeros_like(field_mT)
-    for record in records(times_of(rows)):
-        now, found = 0.0, []
-        for change in np.diff(field_mT[record], prepend=field_mT[record.start]).tolist():
-            if change != 0.0:
-                side = memory.lag_mT if change > 0.0 else -memory.lag_mT
-                now += (now - side) * float(np.expm1(-abs(change) / memory.turn_mT))
-            found.append(now)
-        lag_mT[record] = found
-    return lag_mT
+    law = Lag(memory.lag_mT, memory.turn_mT)
+    fields_mT = [field_mT[record] for record in records(times_of(rows))]
+    return -np.concatenate([law.along_Tm(each_mT, 0.0, float(each_mT[0])) for each_mT in fields_mT])
 
 
 def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:

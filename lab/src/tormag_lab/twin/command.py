@@ -12,24 +12,19 @@ not explain is the model error. Exit code 1 means that it is too large for the p
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
-from tormag_lab.pages import draw_beside
 from tormag_lab.twin.estimate import keys_of, value_at
 from tormag_lab.twin.excerpt import Excerpt, excerpt_of
-from tormag_lab.twin.fit import EXPLAINED_N, STANDS_FOR, Twin, twin_of
-from tormag_lab.twin.force import EXPONENT, PIVOT_MM, STRENGTH, along, fresh_along
+from tormag_lab.twin.fit import STANDS_FOR, Twin, twin_of
+from tormag_lab.twin.force import EXPONENT, PIVOT_MM, STRENGTH
 from tormagd.ground.files import new_file
 from tormagd.simulation.parameters import Assumed, PlantParameters, load_plant
 
-if TYPE_CHECKING:
-    from tormagd.view.drawing import Figure
-
-MAX_FILES = 10
 BELIEVED = 0.4
 "No device of the plant card is further from sample 1's strength."
 
@@ -68,16 +63,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="recordings of one device, unthinned")
     parser.add_argument("--out", type=Path, metavar="PLANT.toml", help="write the plant, a new file")
     parser.add_argument("--prior", default="sample_1", metavar="PLANT", help="what is believed before (sample_1)")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw measured and explained force")
 
 
 def run(options: argparse.Namespace) -> Found:
     if options.out is not None and options.out.exists():
         raise LabError(f"{options.out} exists; allowed is a new file")
-    if options.plot is not None and options.plot.suffix != ".png":
-        raise LabError(f"--plot {options.plot}: allowed is a name that ends with .png")
-    if len(options.files) > MAX_FILES:
-        raise LabError(f"{len(options.files)} recordings: allowed are {MAX_FILES}")
     prior = load_plant(options.prior)
     ways = [excerpt_of(path) for path in options.files]
     twin = twin_of(prior, ways)
@@ -85,10 +75,6 @@ def run(options: argparse.Namespace) -> Found:
     head = [*figures["says"], f"fitted by tormag-lab twin to {', '.join(way.name for way in ways)}"]
     if options.out is not None:
         write_plant(options.out, twin, head)
-    if options.plot is not None:
-        from tormagd.view.plot import save_plot
-
-        save_plot(drawn(twin, ways[0]), options.plot, *options.files)
     return Found(figures, exit_code=0 if twin.is_explained else 1)
 
 
@@ -124,19 +110,6 @@ def figures_of(twin: Twin, prior: PlantParameters, ways: Sequence[Excerpt]) -> d
             "is_explained": twin.is_explained,
         },
     }
-
-
-def drawn(twin: Twin, way: Excerpt) -> "Figure":
-    zero_N = 1e-3 * (twin.force.zeros[0]["zero_mN"] + twin.force.zeros[0]["drift_mN_min"] * way.minute)
-    explained_N = along(twin.plant, way, twin.force.memory_N, fresh_along(twin.plant, way)) + zero_N
-    return draw_beside(
-        way.time_s,
-        way.force_N,
-        explained_N,
-        labels=("by the plant's laws", "force, N", "difference, mN"),
-        title=f"Model error {1e3 * twin.force.error_N:.1f} mN RMS, allowed {1e3 * EXPLAINED_N:g}",
-        finer=1e3,
-    )
 
 
 def motion_for(key: str) -> str:

@@ -32,26 +32,15 @@ IDLE_A = 0.2
 "About the current of an idling gearbox, about which the laws are linear."
 
 
-class Tick(msgspec.Struct, frozen=True, gc=False):
-    """What is read of a control tick; NaN is unknown."""
-
-    monotonic_s: float = math.nan
-    measurement: float = math.nan
-    left_mm: float = math.nan
-    right_mm: float = math.nan
-    device_handle_mm: float = math.nan
-    device_force_N: float = math.nan
-    device_temperature_C: float = math.nan
-    left_current_A: float = math.nan
-    right_current_A: float = math.nan
-    supply_V: float = math.nan
-    left_duty: float = math.nan
-    right_duty: float = math.nan
-    device_clock_drift: float = math.nan
-    device_mode: str = ""
-
-
-NUMBERS = Tick.__struct_fields__[:-1]
+NUMBERS = (
+    *("monotonic_s", "measurement", "left_mm", "right_mm", "device_handle_mm", "device_force_N"),
+    *("device_temperature_C", "left_current_A", "right_current_A", "supply_V", "left_duty", "right_duty"),
+    "device_clock_drift",
+)
+Tick = msgspec.defstruct(
+    "Tick", [*((name, float, math.nan) for name in NUMBERS), ("device_mode", str, "")], frozen=True, gc=False
+)
+"What is read of a control tick; NaN is unknown."
 
 
 class Moves(NamedTuple):

@@ -47,8 +47,6 @@ class Fitted(NamedTuple):
     estimate: Estimate
     cut_out: list[str]
     zeros: list[dict[str, float]]
-    memory_N: list[float]
-    "Of the first recording, for `along`."
     error_N: float
 
 
@@ -167,7 +165,6 @@ def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[st
     for way, mask, own, residual in zip(ways, kept, each_own.tolist(), each_off, strict=True):
         zeros.append(dict(zip(("zero_mN", "drift_mN_min"), own, strict=True)))
         _require_steady(way, own[0], own[1], 1e3 * found.width_of("drift_N_min"), residual, way.time_s[mask])
-    memory_N = found.values[len(shared) + 2 : len(shared) + 2 + len(branches)].tolist()
     noise_N = rms(
         np.concatenate(
             [
@@ -176,7 +173,7 @@ def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[st
             ]
         )
     )
-    return Fitted(found, cut_out, zeros, memory_N, math.sqrt(max(rms(found.residual) ** 2 - noise_N**2, 0.0)))
+    return Fitted(found, cut_out, zeros, math.sqrt(max(rms(found.residual) ** 2 - noise_N**2, 0.0)))
 
 
 def _believed(prior: PlantParameters, ways: Sequence[Excerpt]) -> tuple[list[Mask], list[str]]:
