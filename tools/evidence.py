@@ -70,7 +70,7 @@ PARTS = {
         judges=False,
     ),
     "envelope": Part(
-        "tools/judge.py envelope --json",
+        "tools/judge.py envelope --json --picture docs/images/envelope.png",
         "{cases} runs on samples and {draws} draws: [bounds and worst](../control.md#the-envelope)",
     ),
     "models": Part(

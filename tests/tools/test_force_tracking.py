@@ -9,6 +9,7 @@ import pytest
 from judge import envelope, models, tracking
 from judge.following import PULSE_N, RATE_HZ, Followed, publisher, tracking as scored
 from judge.frame import parsed, told
+from judge.signals import recorded_signals
 from judge.tracking import (
     ARRIVES_S,
     LATER_S,
@@ -132,6 +133,15 @@ def test_a_publisher_sends_what_follows() -> None:
         pytest.approx(forces[6:16]),
     )
     assert publisher(times, forces, 0.0)(0.1).preview_N == ()
+
+
+def test_recorded_signals_are_in_the_devices_range(recordings, monkeypatch) -> None:
+    monkeypatch.setenv("TORMAG_DATA", str(recordings))
+    found = recorded_signals()
+    assert {signal.split()[0] for signal in found} == {"finger", "arterial", "haptic"}
+    for signal, (time_s, force_N) in found.items():
+        assert np.all(np.diff(time_s) > 0.0)
+        assert 0.55 <= force_N.min() <= force_N.max() <= (2.0 if signal.startswith("haptic") else 1.75)
 
 
 ROOT = Path(__file__).parents[2]

@@ -4,14 +4,15 @@ W is the waiting level: what the open gap, the scene's least force and its stand
 time from when the wall's force at the handle's place reaches W and 0.2 N until the kinetic force does; *short* is the
 share of that force that the run then lacks. *RMS* is the kinetic force less the wall's until the hand turns, then less
 W. *Held* is how long the handle is held back by more than W and 0.1 N while the hand draws it back. Where another force
-or a wall is sent, the bound are the run's own motors, which only open once the hand pulls. A hand notices a force
-that differs by 10 % (Jones 1989).
+or a wall is sent, the bound are the run's own motors, which only open once the hand pulls. The picture's band is
+the just noticeable difference of force, 10 % (Jones 1989).
 """
 
 import argparse
 import math
 from collections.abc import Iterator
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from devices import SAMPLES, SECOND
@@ -32,6 +33,7 @@ from judge.touching import (
     rendered,
 )
 from tormag_lab.arrays import Json, Mask, rms
+from tormag_lab.pages import subplots
 from tormag_lab.told import lines
 
 DEVICES = (*SAMPLES, "draw 100", "draw 103", SECOND)
@@ -45,6 +47,12 @@ EARLY_TICKS = 20
 LATER_MS, WORSE, WORSE_N = 40.0, 1.1, 0.015
 "Bounds for 95 %: onset, unless no hand tells the difference, and RMS, against the bound's."
 SWINGS_MM_S = 5.0
+DRAWN = {
+    "force": "Forces are sent",
+    "way": "Another force is sent for withdrawing",
+    "law": "The wall is sent",
+    "law_standby": "The wall is sent, and the brake waits nearer",
+}
 FORCE_JND = 0.10
 
 
@@ -177,8 +185,34 @@ def spread(values: list[float]) -> Json:
     return {name: float(np.quantile(values or [math.nan], share)) for name, share in shares.items()}
 
 
-def measure(_options: argparse.Namespace) -> Json:
+def draw(picture: Path) -> None:
+    figure, axes = subplots((11.0, 7.0), 2, 2, sharex=True, sharey=True)
+    figure.suptitle("A wall of 0.25 N/mm, pushed at 30 mm/s over 100 ms, sample 2", fontsize=13)
+    for axis, (mode, title) in zip(axes.flat, DRAWN.items(), strict=True):
+        case = Case("sample_2", 0.3, 0.25, 30.0, 100.0, mode)
+        run, bound = rendered(case, core_of(case)), ideal(case)
+        wall_N = case.wall_N_mm * np.maximum(run.depth_mm, 0.0)
+        low_N, high_N = (1.0 - FORCE_JND) * wall_N, (1.0 + FORCE_JND) * wall_N
+        axis.fill_between(run.time_s, low_N, high_N, color="#c9d6df", label="the wall, +- 10 %")
+        axis.plot(bound.time_s, bound.kinetic_N, "--", color="#2a6f97", label="what carriages of this speed could do")
+        axis.plot(run.time_s, run.kinetic_N, color="#d1495b", label="what resists a hand that moves")
+        axis.plot(run.time_s, run.force_N, ":", color="#222222", label="what the hand feels: < 0 holds it back")
+        axis.set_title(title, loc="left", fontsize=10.5)
+        axis.set_ylabel("force, N")
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0, 1].legend(frameon=False, fontsize=8.5)
+    for axis in axes[1]:
+        axis.set_xlabel("time, s")
+    figure.savefig(picture)
+
+
+OPTIONS = {"--picture": {"type": Path, "metavar": "FILE.png"}}
+
+
+def measure(options: argparse.Namespace) -> Json:
     rows = each(judged, "touches", cases())
+    if options.picture:
+        draw(options.picture)
     of_modes = kept(rows)
     is_kept = all(
         (row["late_ms"]["p95"] <= LATER_MS or row["short"]["p95"] <= FORCE_JND)

@@ -10,6 +10,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterable, Iterator
 from itertools import product, starmap
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from judge.frame import each
 from judge.hands import HANDS
 from tormag_lab.arrays import Array, Json, Mask
 from tormag_lab.ideal_carriage import TURNED_MM_S, brake_of
+from tormag_lab.pages import stamp, subplots
 from tormag_lab.told import lines
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Limit
@@ -167,7 +169,7 @@ def low_hold(name: str, asked_N: float) -> tuple[str, ...]:
     return () if is_shown else ("F_MIN was not shown",)
 
 
-def measure(_options: argparse.Namespace) -> Json:
+def measure(options: argparse.Namespace) -> Json:
     asked, holds = list(cases()), list(product(judging(HELD_DRAWS), LOW_N))
     every = list(zip(asked, each(run, "runs", asked), strict=True))
     low = each(low_hold, "low holds", *zip(*holds, strict=True))
@@ -190,6 +192,8 @@ def measure(_options: argparse.Namespace) -> Json:
         "draws": DRAWS,
         "rows": list(starmap(row, every)),
     }
+    if options.picture is not None:
+        picture(options.picture, result, found)
     result["missed"] = missed(result)
     return result | {"passed": not (result["missed"] or result["faults"])}
 
@@ -217,6 +221,25 @@ def missed(result: Json) -> list[str]:
 
 def row(case: Case, of: Json) -> Json:
     return case._asdict() | {name: of[name] for name in ("over_N", "under_N", "peak_N", "limits")}
+
+
+def picture(path: Path, result: Json, found: list[tuple[Case, Json]]) -> None:
+    figure, (own, others) = subplots((11.0, 5.0), 1, 2, sharex=True, sharey=True)
+    for axes, title, is_own in ((own, "sample 1", True), (others, "samples 2, 3 and draws", False)):
+        points = settled([(case, figures) for case, figures in found if (case.device == "sample_1") is is_own])
+        speeds, forces, errors = np.array(points).T
+        jitter = np.random.default_rng(0).uniform(0.94, 1.06, (2, len(points)))
+        shown = axes.scatter(
+            speeds * jitter[0], forces * jitter[1], c=1e3 * errors, cmap="coolwarm", vmin=-100.0, vmax=100.0, s=9
+        )
+        axes.set(xscale="log", xlabel="handle speed, mm/s", title=f"{title}: worst {1e3 * np.abs(errors).max():.0f} mN")
+        axes.grid(alpha=0.3)
+    own.set_ylabel("force asked, N")
+    figure.colorbar(shown, ax=[own, others], label=f"rendered less asked after {SETTLED_S:g} s of sliding, mN")
+    figure.savefig(path, dpi=130, metadata=stamp(result))
+
+
+OPTIONS = {"--picture": {"type": Path, "help": "PNG of the force error over handle speed and asked force"}}
 
 
 def shown(figures: Json) -> Iterator[str]:

@@ -28,6 +28,7 @@ Publisher = Callable[[float], TimedSetpoint | None]
 RATE_HZ = 500
 PULSE_N = (1.4, 1.7)
 PREVIEW_S = 0.07
+FILE_PREVIEW_S = 0.4
 VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2

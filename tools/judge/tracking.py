@@ -1,9 +1,11 @@
 """How well a force is followed: the true force of simulated devices less what was asked, in virtual time.
 
 How soon a device is known: `steps`, `creep` and `speeds`, of samples, second plant and draws of the plant card. How
-well a signal is followed: the `pulse` of `make run` on all of these, at 500 setpoints a second, with a preview of 70 ms
-and live. Draws 40 to 79, samples 2 and 3 and the second plant only judge. Errors are as they are, without any mean or
-delay taken out. A step has *arrived* ARRIVES_S after the device's ideal carriages would have brought the force.
+well a signal is followed, at 500 setpoints a second: the `pulse` of `make run` on all of these, with a preview of 70 ms
+and live; on the samples the recorded `signals` of the folder TORMAG_DATA, with a preview of 400 ms, as for a file that
+is played, and live, beside what ideal carriages miss (`tormag-lab bound`). Draws 40 to 79, samples 2 and 3 and the
+second plant only judge. Errors are as they are, without any mean or delay taken out. A step has *arrived* ARRIVES_S
+after the device's ideal carriages would have brought the force.
 """
 
 import argparse
@@ -11,9 +13,10 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from devices import device, judging
+from devices import SAMPLES, device, judging
 
 from judge.following import (
+    FILE_PREVIEW_S,
     PREVIEW_S,
     PULSE_N,
     RATE_HZ,
@@ -29,9 +32,10 @@ from judge.following import (
 )
 from judge.frame import each
 from judge.hands import Legs
+from judge.signals import recorded_signals
 from tormag_lab.arrays import Array, Json
 from tormag_lab.human_pulse import pulse_profile
-from tormag_lab.ideal_carriage import TURNED_MM_S, asked_of, brake_of, drive_of, no_delay_mm
+from tormag_lab.ideal_carriage import TURNED_MM_S, asked_of, bound, brake_of, drive_of, no_delay_mm
 from tormag_lab.told import lines
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
@@ -151,8 +155,8 @@ def speeds(name: str) -> Json:
 # -- how well a signal is followed ----------------------------------------------------------------------------------
 
 
-def track(plant: PlantParameters, times_s: Array, forces_N: Array, preview_s: float) -> Followed:
-    loop = armed(build_core(Config(scene="pulse")), plant, SteadyHand())
+def track(plant: PlantParameters, times_s: Array, forces_N: Array, preview_s: float, scene: str = "pulse") -> Followed:
+    loop = armed(build_core(Config(scene=scene)), plant, SteadyHand())
     approached = with_approach(times_s, forces_N, START_N, RAMP_S, HOLD_S)
     found = played(loop, *approached, preview_s, lead_s=RAMP_S + HOLD_S)
     return found._replace(asked_N=np.interp(found.time_s, times_s, forces_N))
@@ -164,7 +168,20 @@ def pulse(name: str) -> Json:
     return {key: found.since(TRIM_S).rms_N for key, found in runs.items()}
 
 
-CASES = {"steps": steps, "creep": creep, "speeds": speeds, "pulse": pulse}
+def signals(name: str) -> Json:
+    """Return what the core misses of each recorded signal, beside its bounds; nothing without TORMAG_DATA."""
+    plant = device(name)
+    return {
+        signal: {
+            "with_preview_rms_N": track(plant, *forces, FILE_PREVIEW_S, "coronary").since(0.0).rms_N,
+            "live_rms_N": track(plant, *forces, 0.0, "coronary").since(0.0).rms_N,
+        }
+        | {bounding: bound(plant, *forces).figures()[bounding] for bounding in ("no_delay_rms_N", "foresight_rms_N")}
+        for signal, forces in recorded_signals().items()
+    }
+
+
+CASES = {"steps": steps, "creep": creep, "speeds": speeds, "pulse": pulse, "signals": signals}
 
 
 OPTIONS = {"cases": {"nargs": "*", "choices": (*CASES, "all"), "default": "all", "help": "default: all"}}
@@ -175,7 +192,7 @@ def measure(options: argparse.Namespace) -> Json:
 
 
 def of_case(case: str) -> Json:
-    names = judging(DRAWS)
+    names = SAMPLES if case == "signals" else judging(DRAWS)
     return dict(zip(names, each(CASES[case], case, names), strict=True))
 
 
