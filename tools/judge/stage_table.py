@@ -18,7 +18,7 @@ from firmware_protocol.codec import (
 from judge.stages import Draw, Stage
 from tormagd.config import Config, Motor, Position
 from tormagd.control.aim.aim import Aim
-from tormagd.control.aim.portrait import Portrait, PortraitSearch, ceiling_mm
+from tormagd.control.aim.portrait import Portrait, PortraitSearch
 from tormagd.control.ask.forecast import Forecast, Skill
 from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.path import TIMES_S, nearest_path_mm
@@ -298,7 +298,7 @@ def forecast(stage: Forecast, draw: Draw) -> object:
             stage.update(draw.step(0.01), 1.2 + 0.2 * math.sin(0.6 * place))
     stage.update(draw.step(0.01), draw(1.2))
     stage.foresee(draw(1.0))
-    ahead = [stage.force_at_N(after_s) for after_s in TIMES_S] if stage.trust > 0.0 else []
+    ahead = [stage.force_at_N(after_s, stage.from_N()) for after_s in TIMES_S] if stage.trust > 0.0 else []
     return [stage.trust, *ahead, *np.frombuffer(stage.history).tolist()]
 
 
@@ -334,7 +334,7 @@ def floors(_: object, draw: Draw) -> object:
     element = core().element
     assert element.law is not None, "a brake has one"
     return [
-        ceiling_mm(element.portrait, UNSEEN, draw(2.5), BOUNDS),
+        element.portrait.gap_mm_at(UNSEEN.surely_within_N(draw(2.5), BOUNDS)),
         element.law.held_mT(draw.bounded(200.0), draw(1.2)),
     ]
 

@@ -104,10 +104,8 @@ class TimedSetpoint(Value):
             size += abs(sum(preview_N))
             if not 0.0 < self.preview_dt_s <= _LARGEST:
                 raise DomainError("preview_dt_s", self.preview_dt_s, "above 0 s")
-        if not size <= _LARGEST:
-            self._name_odd()
-
-    def _name_odd(self) -> None:
+        if size <= _LARGEST:
+            return
         fields = [(name, getattr(of, name)) for of in (self, self.wall) if of is not None for name in of.__match_args__]
         for name, field in [*fields, *[("preview_N", force_N) for force_N in self.preview_N]]:
             if isinstance(field, (int, float)):

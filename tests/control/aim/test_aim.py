@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tormagd.config import Config
-from tormagd.control.aim.portrait import CEILING, LAW_SHARE, Portrait, ceiling_mm
+from tormagd.control.aim.portrait import CEILING, LAW_SHARE, Portrait
 from tormagd.control.assembly.build import build_core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.strength import DeviceFit
@@ -183,7 +183,7 @@ def test_the_force_law_stands_around_the_search(core, planned, first, moving, wr
 @pytest.mark.parametrize("scale", [0.7, 1.0, 1.4])
 def test_at_the_ceilings_floor_a_known_device_gives_the_ceiling(core, scale: float) -> None:
     known = DeviceFit(scale, scale_variance=0.0, offset_variance_N2=0.0)
-    floor_mm = ceiling_mm(core.portrait, known, 1.5, CONFIG.trim)
+    floor_mm = core.portrait.gap_mm_at(known.surely_within_N(1.5, CONFIG.trim))
     assert known.force_N(core.portrait.force_N_at(floor_mm)) == pytest.approx(1.5, abs=1e-3)
 
 
@@ -221,7 +221,7 @@ def test_the_most_open_of_the_guards_wins_at_a_speed_that_there_is(
     plan = planner.aim.update(0.1, None, ask, belief, planner.believe.memory, None)
     ceiling_N = CEILING * core.scene.force.most_N
     for guard in (device, unseen):
-        assert guard is None or plan.gap_mm >= ceiling_mm(core.portrait, guard, ceiling_N, CONFIG.trim)
+        assert guard is None or plan.gap_mm >= core.portrait.gap_mm_at(guard.surely_within_N(ceiling_N, CONFIG.trim))
     assert plan.gap_mm >= plan.min_gap_mm
     assert -core.gap_speeds.closing_mm_s <= plan.gap_speed_mm_s <= CONFIG.position.gap_speed_mm_s
 

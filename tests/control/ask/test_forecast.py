@@ -77,7 +77,7 @@ def follow(times_s: Array, forces_N: Array) -> Followed:
         mixture_N = slope_N
         if trust > 0.0:
             mixture_N = slope_N + trust * (
-                np.array([forecast.force_at_N(after_s) for after_s in AHEAD_S.tolist()]) - slope_N
+                np.array([forecast.force_at_N(after_s, forecast.from_N()) for after_s in AHEAD_S.tolist()]) - slope_N
             )
         came_N = np.interp(time_s + AHEAD_S, times_s, forces_N)
         rows.append((time_s, trust, slope_N - came_N, mixture_N - came_N))
@@ -218,7 +218,7 @@ def test_a_stamp_again_counts_once_with_its_newest_force(learned: Forecast) -> N
     history, stamp_s = learned.history, learned.stamp_s
     for back_s in (0.0, 0.003):
         learned.update(stamp_s - back_s, 1.7)
-        assert (learned.history, learned.stamp_s, learned.force_N, learned.force_at_N(0.0)) == (
+        assert (learned.history, learned.stamp_s, learned.force_N, learned.force_at_N(0.0, learned.from_N())) == (
             history,
             stamp_s,
             1.7,

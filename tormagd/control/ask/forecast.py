@@ -155,13 +155,13 @@ class Forecast:
         self.awaited = (*self.awaited[:-1], said)
         return True
 
-    def force_at_N(self, after_s: float) -> float:
+    def from_N(self) -> float:
+        """Return the force at the point the forecast was made from, with which it meets the newest setpoint."""
+        return self.force_N - at_step((self.stamp_s - self.from_s) / GRID_S, self.changes_N)
+
+    def force_at_N(self, after_s: float, from_N: float) -> float:
         """Return the forecast force at `after_s` after the newest setpoint's stamp."""
-        changes = self.changes_N
-        # shifted through the newest setpoint, which may have come after the point the forecast was made from
-        since_s = self.stamp_s - self.from_s
-        base_N = self.force_N - at_step(since_s / GRID_S, changes)
-        return base_N + at_step((since_s + after_s) / GRID_S, changes)
+        return from_N + at_step((self.stamp_s - self.from_s + after_s) / GRID_S, self.changes_N)
 
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
         """Add `count` points to the grid, and judge the guesses for them."""

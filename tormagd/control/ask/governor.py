@@ -226,9 +226,6 @@ class Governor:
         if self.silent_s > setpoint.preview_s + MAX_STEP_S:
             self.slope_N_s = 0.0
         trust = 1.0 if setpoint.preview_N else foreseen
-        if trust == 0.0:
-            last_N = within(setpoint.force_N, self._allowed)
-            return [last_N + self.slope_N_s * min(soon_s + after_s, AHEAD_S) for after_s in PATH_S], trust
         return self.going_on_N(setpoint, soon_s + trust * lag_s, foreseen), trust
 
     def going_on_N(self, setpoint: TimedSetpoint, begins_s: float, foreseen: float) -> list[float]:
@@ -236,6 +233,7 @@ class Governor:
         end_s, forces_N = setpoint.preview_s, [setpoint.force_N, *setpoint.preview_N]
         known_s = end_s + (HORIZON_S if foreseen > 0.0 else 0.0)
         most_s = min(AHEAD_S, end_s) if setpoint.preview_N else AHEAD_S
+        last_N, from_N = within(forces_N[-1], self._allowed), self.forecast.from_N() if foreseen > 0.0 else 0.0
         ahead_N: list[float] = []
         for after_s in TIMES_S:
             at_s = begins_s + after_s
@@ -245,9 +243,9 @@ class Governor:
             if past_s < 0.0:
                 force_N = at_step(at_s / setpoint.preview_dt_s, forces_N)
             else:
-                force_N = within(forces_N[-1], self._allowed) + self.slope_N_s * min(past_s, most_s)
+                force_N = last_N + self.slope_N_s * min(past_s, most_s)
                 if foreseen > 0.0:
-                    force_N += foreseen * (self.forecast.force_at_N(past_s) - force_N)
+                    force_N += foreseen * (self.forecast.force_at_N(past_s, from_N) - force_N)
             ahead_N.append(force_N)
         return ahead_N
 

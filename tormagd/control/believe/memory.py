@@ -52,6 +52,7 @@ class ElementMemory:
         self._least_mm: Final = gap_range_mm[0] - BEYOND_MM
         self._open_mm: Final = gap_range_mm[1]
         self._open_mT: Final = field.field_mT(gap_range_mm[1])
+        self._without_field_N: Final = self._force_N(nominal.only, 0.0)
 
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`."""
@@ -78,7 +79,7 @@ class ElementMemory:
         gap_mm = max(measured.gap_mm, self._least_mm) if measured.is_homed else self._open_mm
         field_mT = self._field.field_mT(gap_mm)
         curve = self._nominal.only if self._slides else self._nominal.now(measured)
-        free_N = self._force_N(curve, 0.0)
+        free_N = self._without_field_N if self._slides else self._force_N(curve, 0.0)
         if self.time_s == math.inf:
             self._begin(curve, gap_mm, free_N, now_s)
         self._follow(curve, free_N, field_mT, now_s)
