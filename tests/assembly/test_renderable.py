@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.assembly.renderable import missed
+from tormagd.control.assembly.build import missed
 
 # 1 N over 50 mm, evenly: at 25 mm/s half a newton a second everywhere
 EVEN = Portrait(np.linspace(95.0, 45.0, 11).tolist(), np.linspace(0.5, 1.5, 11).tolist(), [0.02] * 11)

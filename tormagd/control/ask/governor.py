@@ -26,7 +26,7 @@ from tormagd.control.ask.path import (
     nearest_path_mm,
 )
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.interpolation import at_step, low_pass, require_finite
+from tormagd.control.interpolation import at_step, low_pass
 from tormagd.control.records import AT_REST, Ask, GapSpeeds, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.force_curve import within
@@ -111,7 +111,6 @@ class Governor:
         if setpoint is not None:
             age_s = now_s - setpoint.stamp_s
             setpoint.require_numbers()
-            require_finite("age_s", age_s)
             is_new = self.last is None or setpoint.stamp_s != self.last.stamp_s
             self.silent_s = 0.0 if is_new else self.silent_s + dt_s
             if age_s <= setpoint.valid_for_s:

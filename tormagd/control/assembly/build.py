@@ -17,7 +17,6 @@ from msgspec import UNSET
 from tormagd.config import Config
 from tormagd.control.aim.aim import Element
 from tormagd.control.aim.portrait import CEILING, LawOfField, Portrait, PortraitSearch, portrait
-from tormagd.control.assembly.renderable import Missed, missed
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.move.motor import Margins, gap_speeds, margins, most_closing_mm_s, pull_V
 from tormagd.control.nominal import PRESSED, ElementContact, FieldOfGap, Nominal, Pressing, Sliding
@@ -59,6 +58,14 @@ BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most e
 
 ROUNDED_UP = 1.005
 "A number times this, to three digits, is not below the number."
+
+
+class Missed(NamedTuple):
+    """What ideal carriages, which only their top speed bounds, miss of a signal."""
+
+    rms_N: float
+    share: float
+    "Of the time in which the signal is faster than the gap."
 
 
 class Core(NamedTuple):
@@ -301,6 +308,19 @@ def _missed(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Miss
     rate_hz = max(LOOKED_AT_HZ, math.ceil(LOOKS * bandwidth_hz))
     times_s, forces_N = asked(scene.signal, beside, (min(low_N, most_N), most_N), LOOKED_AT_S, rate_hz)
     return missed(reach, times_s.tolist(), forces_N.tolist(), config.position.gap_speed_mm_s)
+
+
+def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_speed_mm_s: float) -> Missed:
+    """Return what ideal carriages without preview miss of forces at rising times."""
+    at_N, squares, faster = forces_N[0], 0.0, 0
+    for index in range(1, len(forces_N)):
+        step_s, force_N = times_s[index] - times_s[index - 1], forces_N[index]
+        most_N = shown.force_rate_N_s(at_N, gap_speed_mm_s) * step_s
+        at_N += min(max(force_N - at_N, -most_N), most_N)
+        squares += (force_N - at_N) ** 2
+        faster += abs(force_N - forces_N[index - 1]) / step_s > shown.force_rate_N_s(force_N, gap_speed_mm_s)
+    count = len(forces_N) - 1
+    return Missed(math.sqrt(squares / count), faster / count)
 
 
 def _too_fast(config: Config, scene: Scene, miss: Missed | None) -> Iterator[str]:
