@@ -112,17 +112,8 @@ class TimedSetpoint(Value):
                 require_number(name, field)
 
     @property
-    def is_told(self) -> bool:
-        """Whether the publisher says what comes."""
-        return self.wall is not None or self.preview_N != ()
-
-    @property
     def preview_s(self) -> float:
         return self.preview_dt_s * len(self.preview_N)
-
-    @property
-    def preview_slope_N_s(self) -> float:
-        return (self.preview_N[-1] - self.force_N) / self.preview_s
 
 
 @final

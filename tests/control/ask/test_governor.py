@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.forecast import HORIZON_S, Forecast
+from tormagd.control.ask.forecast import GRID_S, HORIZON, Forecast
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
@@ -449,7 +449,7 @@ def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> No
             decide(following, now_s, setpoint)
             if now_s > 6.0:
                 wanted_N = following.going_on_N(setpoint, 0.0, following.forecast.trust)
-                known_s = 0.04 + HORIZON_S * is_foreseen
+                known_s = 0.04 + HORIZON * GRID_S * is_foreseen
                 assert len(wanted_N) == max(MIN_TIMES, sum(after_s < known_s for after_s in TIMES_S))
                 found.append(wanted_N[MIN_TIMES - 1] - beats_N(now_s + TIMES_S[MIN_TIMES - 1]))
     assert np.std(missed[True]) < 0.5 * np.std(missed[False])

@@ -56,7 +56,6 @@ STRIDE: Final = 3
 "Every third stretch of the history is compared."
 HORIZON: Final = 8
 "A plan looks 30 ms ahead, and further by the carriages' lag."
-HORIZON_S: Final = HORIZON * GRID_S
 EVERY: Final = 2
 "A forecast takes several times as long as a plan."
 JUDGED: Final = 4
@@ -118,8 +117,8 @@ class Forecast:
     @property
     def trust(self) -> float:
         """Return how far the forecast takes the place of the slope, 0..1."""
-        unit = 0.0, 1.0
-        return within(self.long.score, unit) * within(1.0 + self.short.score, unit) if self.changes_N else 0.0
+        earned, kept = self.long.score, 1.0 + self.short.score
+        return within(earned, (0.0, 1.0)) * within(kept, (0.0, 1.0)) if self.changes_N else 0.0
 
     def forget(self, stamp_s: float = -math.inf, force_N: float = 0.0, history: bytes = b"") -> None:
         """Begin with one setpoint, or with none."""

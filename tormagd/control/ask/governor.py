@@ -16,7 +16,7 @@ import math
 from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
+from tormagd.control.ask.forecast import GRID_S, HORIZON, MAX_STEP_S, Forecast
 from tormagd.control.ask.path import (
     FLATTEST_N_MM,
     LASTS_S,
@@ -151,7 +151,8 @@ class Governor:
         if trust > 0.0:
             path_mm = self._path_mm(setpoint.wall, travel, wanted_N, device, lag_s, dt_s, blend_N, bounds)
             path_N = self._behind_N(path_mm, wanted_N, trust, device, lag_s, dt_s, bounds)
-            governed_N = within(self.expected_N, bounds) if setpoint.is_told else force_N
+            if setpoint.wall is not None or setpoint.preview_N:
+                governed_N = within(self.expected_N, bounds)
         else:
             self._stand_at(path_N[0], device)
         is_late = blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N
@@ -202,12 +203,12 @@ class Governor:
             most = -self._speeds.opening_mm_s * per_mm_s, self._speeds.sure_mm_s * per_mm_s
             risen_N = within(setpoint.force_N, self._allowed) - within(last.force_N, self._allowed)
             self.slope_N_s = low_pass(self.slope_N_s, within(risen_N / spacing_s, most), spacing_s, SLOPE_FILTER_S)
-        end_N = setpoint.force_N
         if setpoint.preview_N:
-            end_N, self.slope_N_s = setpoint.preview_N[-1], setpoint.preview_slope_N_s
+            self.slope_N_s = (setpoint.preview_N[-1] - setpoint.force_N) / setpoint.preview_s
         if setpoint.preview_s >= TIMES_S[-1]:
             self.forecast.forget()
         elif self._has_forecast:
+            end_N = setpoint.preview_N[-1] if setpoint.preview_N else setpoint.force_N
             self.forecast.update(setpoint.stamp_s + setpoint.preview_s, within(end_N, self._allowed))
 
     def _ahead_N(
@@ -230,7 +231,7 @@ class Governor:
     def going_on_N(self, setpoint: TimedSetpoint, begins_s: float, foreseen: float) -> list[float]:
         """Return the forces at TIMES_S from `begins_s` after the stamp: of the preview, and of what comes after it."""
         end_s, forces_N = setpoint.preview_s, [setpoint.force_N, *setpoint.preview_N]
-        known_s = end_s + (HORIZON_S if foreseen > 0.0 else 0.0)
+        known_s = end_s + (HORIZON * GRID_S if foreseen > 0.0 else 0.0)
         most_s = min(AHEAD_S, end_s) if setpoint.preview_N else AHEAD_S
         last_N, from_N = within(forces_N[-1], self._allowed), self.forecast.from_N() if foreseen > 0.0 else 0.0
         ahead_N: list[float] = []
