@@ -9,7 +9,7 @@ from tormagd.config import Config
 from tormagd.control.measure import BLIND_S, LEAP_MM
 from tormagd.control.move.watch import STARTING_S
 from tormagd.control.safety.codes import Fault, Limit
-from tormagd.control.safety.operating_state import CLEARING_S, OperatingState
+from tormagd.control.safety.operating_state import CLEARING_S
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.measurement import DeviceRequest
 
@@ -24,11 +24,6 @@ def test_enabling_is_bumpless(running) -> None:
     running.command("enable")
     assert [running.step().left_duty for _ in range(20)] == pytest.approx([0.0] * 20, abs=1e-9)
     assert running.move.left.integral == pytest.approx(0.0, abs=1e-12)
-
-
-def test_enabling_wants_a_measurement(bench) -> None:
-    refused = bench.refused("enable").code
-    assert (refused, bench.stepper.safety.operating_state) == ("not_fresh", OperatingState.DISABLED)
 
 
 @pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
@@ -145,14 +140,6 @@ def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> Non
     bench.command("clear-fault", device_latched=True)
     assert (bench.step(**broken).request, bench.faults) == (DeviceRequest.CLEAR, ())
     assert bench.run_into(Fault.DEVICE_OVERCURRENT, **broken) * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
-
-
-def test_a_latched_fault_asks_once_and_stays(running) -> None:
-    running.run_into(Fault.DEVICE_SKEW, faults=DeviceFault.SKEW, mode=DeviceMode.RETRACTING)
-    number = running.output.request_number
-    assert running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100).request_number == number
-    running.step(count=100)
-    assert running.opened_for == (Fault.DEVICE_SKEW,)
 
 
 @pytest.fixture

@@ -131,9 +131,3 @@ def test_what_a_pad_cannot_serve_is_refused(tmp_path: Path, changes: dict[str, s
     with pytest.raises(ConfigError) as caught:
         build_core(Config(scene=str(tmp_path / "scene.toml")))
     assert said in str(caught.value)
-
-
-def test_a_brake_knows_of_no_finger(tmp_path: Path) -> None:
-    (tmp_path / "scene.toml").write_text(Path(scene_path("coronary")).read_text() + "\n[finger]\ndepth_mm = 2.0\n")
-    with pytest.raises(ConfigError, match=r"\[finger\]"):
-        load_scene(str(tmp_path / "scene.toml"))

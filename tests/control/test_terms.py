@@ -75,12 +75,6 @@ def test_without_the_rate_one_table_answers_and_no_network_is_asked(after) -> No
     assert Limit.F_MIN in core.planner().plan(PERIOD_S, TimedSetpoint(0.1, PERIOD_S, 0.1), None).limits
 
 
-def test_a_search_that_is_named_runs_all_the_same() -> None:
-    scene = load_scene("pulse")
-    core = build_core(Config(scene="pulse"), msgspec.structs.replace(scene, terms=EVERY_TERM.without("rate")))
-    assert core.solver.solver == scene.solver.name == "nearest"
-
-
 def test_scale_and_offset_are_learned_each_on_its_own(after) -> None:
     fits = {names: after(core_without(*names), 100).believe.device for names in ((), ("scale",), ("offset",))}
     assert fits[()].scale != 1.0
@@ -171,7 +165,3 @@ def test_dry_friction_counts_both_ways_and_the_magnets_pull_where_it_opens(dutie
         assert all(abs(duty) < abs(whole) for duty, whole in zip(smooth, full, strict=True))
         assert all((whole > duty) is is_opening for duty, whole in zip(free, full, strict=True))
         assert is_opening or free == full
-
-
-def test_learning_can_be_stopped_for_a_measurement() -> None:
-    assert [core_without(learning=learns).planner().believe.learns for learns in (True, False)] == [True, False]

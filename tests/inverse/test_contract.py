@@ -16,7 +16,7 @@ from hypothesis import example, given, strategies as st
 from scipy.optimize import brentq
 
 from tormagd.config import Config
-from tormagd.control.assembly.build import build_core, choose_solver
+from tormagd.control.assembly.build import build_core
 from tormagd.ctl.scene_check import measured_as
 from tormagd.element.inverse import choice, ordered
 from tormagd.element.inverse.choice import RUNTIME_SOLVERS, build, mean_error_N, named
@@ -27,7 +27,7 @@ from tormagd.element.model.features import UNITS, Element, Scaling
 from tormagd.element.model.force_curve import ForceCurve, Known, Network
 from tormagd.element.model.model_file import ForceModel, ModelMetadata
 from tormagd.element.physics.errors import DomainError
-from tormagd.scenes.scene import Solver, load_scene, shipped_scenes
+from tormagd.scenes.scene import load_scene, shipped_scenes
 
 torch.set_num_threads(1)  # a second thread costs more than it saves at this size
 
@@ -283,12 +283,6 @@ def test_the_thesis_search_stops_at_the_first_row_within_epsilon_or_has_the_near
     assert row_by_row(1.25).solve(curve, below, None).reach is Reach.BELOW
 
 
-def test_the_grid_has_both_ends_and_no_wider_step() -> None:
-    grid = field_grid((100.0, 800.0), 3.0)
-    assert (grid[0], grid[-1]) == (100.0, 800.0)
-    assert 2.9 < np.diff(grid).max() <= 3.0
-
-
 KNOWN = Known(((0.0, 1.0), (0.0, 60.0), RANGE_MT, (CIP, CIP)), 6.0)
 
 Steps = list[tuple[float, float, float]]
@@ -454,9 +448,3 @@ def test_no_other_search_without_torch_is_worth_its_price() -> None:
     assert statistics.median(errors) > 0.9
     assert statistics.median(shares) > 1.05
     assert min(shares) > 0.9
-
-
-def test_a_scene_may_name_its_search() -> None:
-    scene = load_scene(shipped_scenes()[0])
-    choice = choose_solver(msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2)))
-    assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)

@@ -62,10 +62,6 @@ def test_a_handle_that_rests_does_not_close_the_gap(first, moving, rate_mm_s: fl
     assert first(force_N).gap_mm == pytest.approx(gap_mm, abs=1.5)
 
 
-def test_a_creeping_handle_is_planned_for_with_its_static_friction(first, moving) -> None:
-    assert first(1.5, moving(handle=Handle(MOBILISED_MM, 0.5, TURN, 0.5))).gap_mm > first(1.5, moving()).gap_mm + 2.0
-
-
 def test_the_portrait_rises_and_agrees_with_its_slope(core) -> None:
     portrait = core.portrait
     assert np.all(np.diff(portrait.force_N) > 0.0)
@@ -178,13 +174,6 @@ def test_the_force_law_stands_around_the_search(core, planned, first, moving, wr
     assert wrong.field_mT == pytest.approx(first(1.0, moving()).field_mT, rel=LAW_SHARE + 0.01)
     assert wrong.outside == (Outside("field_mT", wrong_mT, wrong.field_mT),)
     assert Limit.MODEL_RANGE in wrong.limits
-
-
-@pytest.mark.parametrize("scale", [0.7, 1.0, 1.4])
-def test_at_the_ceilings_floor_a_known_device_gives_the_ceiling(core, scale: float) -> None:
-    known = DeviceFit(scale, scale_variance=0.0, offset_variance_N2=0.0)
-    floor_mm = core.portrait.gap_mm_at(known.surely_within_N(1.5, CONFIG.trim))
-    assert known.force_N(core.portrait.force_N_at(floor_mm)) == pytest.approx(1.5, abs=1e-3)
 
 
 TURNING = {"is_homed": False, "handle": Handle(MOBILISED_MM / 2.0, 42.0, TURN, 42.0)}

@@ -109,15 +109,6 @@ def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least(preview_
     assert ask.force_N == 0.4
 
 
-def test_a_setpoint_that_goes_stale_on_a_slope_is_let_go_from_where_the_force_is() -> None:
-    following, ask = stream_of([1.0 + 0.02 * number for number in range(20)])
-    for tick in range(1, 400):
-        last_N = ask.path_N[0]
-        ask = decide(following, 0.2 + tick * 1e-3, TimedSetpoint(1.38, 0.2, VALID_S))
-        assert last_N - ask.path_N[0] <= SCENE.release_N_s * 1e-3 + 1e-8
-    assert ask.path_N[0] < 1.0
-
-
 @pytest.mark.parametrize("ahead_N", [(), (1.0,) * 40])
 @pytest.mark.parametrize(("before_N", "after_N"), [(1.6, 0.8), (0.8, 1.6)])
 def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(
@@ -305,10 +296,6 @@ def test_what_is_too_fast_is_missed_before_and_after() -> None:
     assert told(step_N, 0.88, ahead_s=0.05).force_N == pytest.approx(1.2)
 
 
-def test_late_carriages_set_out_sooner() -> None:
-    assert told(step_N, 0.75, lag_s=0.03).force_N > told(step_N, 0.75).force_N + 1e-3
-
-
 @given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=60), st.floats(1e-4, 1.0), st.floats(0.0, 0.03))
 def test_no_path_is_faster_than_the_gap_or_beyond_what_was_asked(
     ahead_N: list[float], spacing_s: float, lag_s: float
@@ -322,11 +309,6 @@ def test_no_path_is_faster_than_the_gap_or_beyond_what_was_asked(
         assert abs(ask.path_N[0] - before_N) <= STEEPEST_N_S * 0.004 + 1e-9
         assert np.all(np.abs(np.diff(path_N(ask))) <= STEEPEST_N_S * 0.005 + 1e-9)
         assert np.all((path_N(ask) >= PORTRAIT.min_N) & (path_N(ask) <= SCENE.most_N))
-
-
-@pytest.mark.parametrize(("asked_N", "held_N"), [(3.0, SCENE.most_N), (0.0, PORTRAIT.min_N)])
-def test_a_preview_beyond_the_range_is_held_at_its_ends(asked_N: float, held_N: float) -> None:
-    assert path_N(told(lambda time_s: asked_N, 1.5)) == pytest.approx(held_N)
 
 
 def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
@@ -431,11 +413,6 @@ def test_a_silent_stream_is_not_believed_to_go_on(learned: Governor) -> None:
     assert np.all(path_N(late) == path_N(decide(learned, 10.2, last)))
     leapt, _ = stream_of([1.0, 1.5], 0.05)
     assert path_N(decide(leapt, 0.201, TimedSetpoint(1.5, 0.1, 60.0))) == pytest.approx(1.5)
-
-
-def test_what_a_long_preview_says_is_not_foreseen(learned: Governor) -> None:
-    decide(learned, 10.002, TimedSetpoint(1.4, 10.002, VALID_S, preview_N=(1.4,) * 200, preview_dt_s=2e-3))
-    assert plain(learned.forecast) == plain(Forecast())
 
 
 def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> None:
