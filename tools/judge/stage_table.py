@@ -36,7 +36,7 @@ from tormagd.control.believe.slow_friction import SlowFriction
 from tormagd.control.believe.strength import UNSEEN, Anchor, DeviceFit, adapting_s, observe
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.interpolation import Rising, at_step, interpolated, low_pass
-from tormagd.control.measure import Measure, Sight, is_contradicted, is_outside, leap_between
+from tormagd.control.measure import Measure, Sight, can_come, is_contradicted, is_outside
 from tormagd.control.move.actuator import Reference, target_of
 from tormagd.control.move.carriages import Carriages, follow
 from tormagd.control.move.motor import full_speed_mm_s, margins
@@ -199,9 +199,8 @@ def sight(stage: Sight, draw: Draw) -> object:
 
 def plausible(_: object, draw: Draw) -> object:
     one, other = measured(draw), measured(draw)
-    leap = leap_between(one, other, 8.0, draw.now_s, draw.bounded(draw.now_s))
-    is_back = leap is not None and leap.has_come_back(one, 8.0, draw.now_s)
-    return [leap, is_back, is_outside(other, 45.0, 95.0), is_contradicted(other, 0, 45.0, 95.0)]
+    can = can_come(one, other, 8.0, draw.bounded(draw.now_s))
+    return [can, is_outside(other, 45.0, 95.0), is_contradicted(other, 0, 45.0, 95.0)]
 
 
 # -- believe -------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from tormagd.hardware.backend import Received, Sent
 from tormagd.hardware.measurement import DeviceRequest
 from tormagd.scenes.scene import Scene
 
-FORMAT = 23
+FORMAT = 24
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),

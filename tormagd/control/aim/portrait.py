@@ -95,8 +95,7 @@ def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, fl
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))
     slopes: list[float] = np.abs(np.gradient(forces_N, gaps)).tolist()
-    force_N: list[float] = forces_N.tolist()
-    return Portrait(gap_mm, force_N, slopes)
+    return Portrait(gap_mm, forces_N.tolist(), slopes)
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Trim) -> float:

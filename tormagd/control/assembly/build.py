@@ -134,10 +134,9 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     """Return the scene's element and the choice of the search for its field."""
-    terms = scene.terms
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
     require("insert.name, cip_percent", cip_percent, *model.feature_ranges[FEATURES.index("cip_percent")])
-    nominal = Nominal(model, contact, cip_percent, terms.rate)
+    nominal = Nominal(model, contact, cip_percent, scene.terms.rate)
     fields_mT, rises = _known_fields_mT(scene, model, contact, field)
     reach = portrait(nominal.only, field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
     choice = choose_solver(scene, rises=rises)
@@ -145,7 +144,7 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
         choice = choice._replace(reason=f"{choice.reason}; epsilon {mean_error_N(model):.4f} N, its model's mean error")
     search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, model, rises=rises)
     law = _law(scene, reach, field) if contact.slides else None
-    memory = model.metadata.memory if terms.memory else NO_MEMORY
+    memory = model.metadata.memory if scene.terms.memory else NO_MEMORY
     return Element(nominal, memory, field, reach, search, law, choice.solver in BESIDE_PLANS), choice
 
 
