@@ -147,8 +147,7 @@ class Forecast:
         said: Guess | None = None
         if self.changes_N:
             since = (self.stamp_s - self.time_s) / GRID_S
-            risen_N = self.changes_N[JUDGED] - self.changes_N[1] * since
-            said = self.force_N + risen_N, self.force_N + slope_N_s * GRID_S * (JUDGED - since)
+            said = self.from_N() + self.changes_N[JUDGED], self.force_N + slope_N_s * GRID_S * (JUDGED - since)
         else:
             self.short = LOST
         self.awaited = (*self.awaited[:-1], said)
