@@ -9,7 +9,7 @@ from tormagd.config import Config
 from tormagd.control.measure import BLIND_S, LEAP_MM
 from tormagd.control.move.watch import STARTING_S
 from tormagd.control.safety.codes import Fault, Limit
-from tormagd.control.safety.operating_state import CLEARING_S
+from tormagd.control.safety.operating_state import CLEARING_S, OperatingState
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.measurement import DeviceRequest
 
@@ -24,6 +24,11 @@ def test_enabling_is_bumpless(running) -> None:
     running.command("enable")
     assert [running.step().left_duty for _ in range(20)] == pytest.approx([0.0] * 20, abs=1e-9)
     assert running.move.left.integral == pytest.approx(0.0, abs=1e-12)
+
+
+def test_enabling_wants_a_measurement(bench) -> None:
+    refused = bench.refused("enable").code
+    assert (refused, bench.stepper.safety.operating_state) == ("not_fresh", OperatingState.DISABLED)
 
 
 @pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
@@ -115,15 +120,6 @@ def test_a_lost_link_is_a_fault_while_driven(running, names: list[str], is_betwe
     assert running.opened_for == (Fault.LINK_LOST,)
 
 
-def test_a_lost_link_is_no_fault_while_disabled(bench) -> None:
-    bench.step()
-    output = bench.silent(None, count=5)
-    assert bench.is_off
-    assert (output.request, output.request_number, output.limits) == (DeviceRequest.NONE, 0, ())
-    bench.stepper.lose_link()
-    assert (bench.faults, bench.stepper.measured) == ((), None)
-
-
 def test_a_number_that_is_not_finite(running) -> None:
     running.step(math.nan)
     assert running.opened_for == (Fault.NOT_FINITE,)
@@ -140,6 +136,14 @@ def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> Non
     bench.command("clear-fault", device_latched=True)
     assert (bench.step(**broken).request, bench.faults) == (DeviceRequest.CLEAR, ())
     assert bench.run_into(Fault.DEVICE_OVERCURRENT, **broken) * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
+
+
+def test_a_latched_fault_asks_once_and_stays(running) -> None:
+    running.run_into(Fault.DEVICE_SKEW, faults=DeviceFault.SKEW, mode=DeviceMode.RETRACTING)
+    number = running.output.request_number
+    assert running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100).request_number == number
+    running.step(count=100)
+    assert running.opened_for == (Fault.DEVICE_SKEW,)
 
 
 @pytest.fixture
@@ -200,18 +204,6 @@ def test_the_answer_to_it_is_gone_on_from_without_a_kick(make_moving, came_mm: f
     assert abs(output.left_duty) < 0.6
     assert moving.move.left.integral == pytest.approx(integral, abs=0.02)
     assert Limit.HOST_STALL in output.limits
-
-
-def test_without_an_answer_in_time_the_measurement_is_stale(running) -> None:
-    newest = running.measure(running.ticks)
-    running.ticks += round(CONFIG.device.measurement_timeout_ms) - 2
-    begun = running.ticks
-    while not running.faults:
-        running.silent(newest)
-        assert running.driven[1:] == (0.0, 0.0)
-        assert running.ticks - begun < 100
-    assert running.opened_for == (Fault.MEASUREMENT_STALE,)
-    assert running.ticks - begun == pytest.approx(2.0 * BLIND_S / PERIOD_S, abs=2)
 
 
 def test_a_slow_loop_takes_no_period_of_its_own_for_a_stall(make_bench) -> None:

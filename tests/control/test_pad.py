@@ -13,7 +13,6 @@ from tormagd.control.nominal import PRESSED, Pressing
 from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import Turn
-from tormagd.ground.plain_values import plain
 from tormagd.scenes.scene import EVERY_TERM, load_scene, scene_path
 from tormagd_client.endpoints import ConfigError
 
@@ -82,22 +81,6 @@ def test_without_the_term_nothing_is_remembered() -> None:
         0.0,
         pytest.approx(held(without, PERIOD_S).planned.field_mT, abs=0.01),
     )
-
-
-def test_a_finger_that_stands_while_the_force_rises_has_not_lost_its_encoder(pad_core: Core) -> None:
-    planner = pad_core.planner()
-    for tick in range(1, 200):
-        now_s, gap_mm = 0.01 * tick, 95.0 - 0.2 * tick
-        measured = pressed(DEPTH_MM, gap_mm=gap_mm, number=tick, sensed_s=now_s, force_N=3.3 + 0.005 * tick)
-        planner.plan(now_s, TimedSetpoint(3.8, now_s, 0.1), measured)
-    assert not planner.believe.handle.is_lost
-
-
-def test_planning_that_begins_anew_has_not_forgotten(pad_core: Core) -> None:
-    planner = held(pad_core, 5.0)
-    remembered = plain(planner.believe.memory)
-    planner.afresh(5.1)
-    assert plain(planner.believe.memory) == remembered
 
 
 def test_a_force_out_of_the_pads_reach_says_so(pad_core: Core) -> None:

@@ -345,13 +345,6 @@ def test_out_of_reach_costs_one_evaluation_while_it_lasts(rising: ForceModel, en
     assert solved(rising.curve(0.5, 10.0, CIP), force, end).iterations == 1
 
 
-def test_from_the_answer_it_does_not_move(rising: ForceModel) -> None:
-    curve = rising.curve(0.5, 10.0, CIP)
-    first = solved(curve, 2.5, 300.0)
-    again = solved(curve, first.predicted_force_N, first.field_mT)
-    assert (again.field_mT, again.iterations) == (first.field_mT, 1)
-
-
 def test_a_force_that_moves_is_followed_with_few_evaluations(rising: ForceModel) -> None:
     counts, last = [], 450.0
     for field in (450.0 + 50.0 * np.sin(np.arange(800) * 2 * np.pi * 5 / 200)).tolist():

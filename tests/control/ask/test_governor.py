@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.forecast import GRID_S, HORIZON, Forecast
+from tormagd.control.ask.forecast import GRID_S, HORIZON
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
@@ -145,13 +145,6 @@ def test_a_takeover_turns_where_the_new_holder_does_and_ends_a_step_from_its_for
     assert ask.force_N == to_N
 
 
-def test_another_holders_forces_teach_no_slope_and_no_period() -> None:
-    following, _ = stream_of([1.0, 1.1, 1.2])
-    assert following.slope_N_s != 0.0
-    decide(following, 0.04, TimedSetpoint(1.0, 0.04, VALID_S, holder=1))
-    assert (following.slope_N_s, np.frombuffer(following.forecast.history).tolist()) == (0.0, [1.0])
-
-
 @given(
     st.lists(
         st.tuples(st.integers(0, 3), st.sampled_from([0.0, 0.02, 0.2, 2.0]), st.floats(1e-4, 0.01)),
@@ -170,6 +163,13 @@ def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
         if following.is_passing or Limit.STALE in ask.limits:
             assert before_N - following.asked_N <= SCENE.release_N_s * elapsed_s + 1e-9
         assert following.asked_N == ask.path_N[0]
+
+
+def test_another_holders_forces_teach_no_slope_and_no_period() -> None:
+    following, _ = stream_of([1.0, 1.1, 1.2])
+    assert following.slope_N_s != 0.0
+    decide(following, 0.04, TimedSetpoint(1.0, 0.04, VALID_S, holder=1))
+    assert (following.slope_N_s, np.frombuffer(following.forecast.history).tolist()) == (0.0, [1.0])
 
 
 @pytest.mark.parametrize("holder", [0, 1])
@@ -379,29 +379,6 @@ def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> 
         worst_N = max(worst_N, float(np.abs(path_N(ask) - wanted_N).max()))
         extrapolated_N = max(extrapolated_N, float(np.abs(path_N(extrapolated) - wanted_N).max()))
     assert worst_N < share * extrapolated_N
-
-
-def test_what_is_foreseen_is_asked_for_as_fast_as_the_gap_goes() -> None:
-    following, steepest_N_s = governor(), []
-    fastest_N_s = GAP_SPEED_MM_S * (PORTRAIT.max_N - PORTRAIT.min_N) / (95.0 - 45.0)
-    for tick in range(1, 3_000):
-        now_s = tick / 500
-        asked = decide(following, now_s, at(lambda time_s: 3.0 * beats_N(time_s) - 2.8, now_s))
-        following.foresee()
-        steepest_N_s.append(np.max(np.abs(np.diff(path_N(asked))) / np.diff(PATH_S)))
-    assert np.median(steepest_N_s[2_000:]) < 1.1 * fastest_N_s
-
-
-def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> None:
-    for tick in range(1, 1_000):
-        now_s = 10.0 + tick * 1e-3
-        ask = decide(learned, now_s, at(beats_N, 10.0))
-        if now_s - 10.0 <= VALID_S:
-            continue
-        assert (ask.limits, ask.foresight) == ((Limit.STALE,), 0.0)
-        assert np.all(path_N(ask) == ask.force_N)
-        assert plain(learned.forecast) == plain(Forecast())
-    assert learned.asked_N == PORTRAIT.min_N
 
 
 def test_a_silent_stream_is_not_believed_to_go_on(learned: Governor) -> None:

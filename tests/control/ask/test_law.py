@@ -111,13 +111,6 @@ def test_a_wall_that_goes_with_the_handle_asks_for_what_it_says(following: Follo
         assert ask.force_N <= 1.2 + PORTRAIT.min_N + EARLY_N + 0.036
 
 
-def test_a_wall_that_is_met_again_is_there_at_once(following: Following) -> None:
-    following.ask(Travel(14.0, 5.0), wall=WALL, withdraw_N=0.5)
-    following.ask(Travel(14.0, -5.0, is_pushing=False), wall=WALL, withdraw_N=0.5)
-    following.ask(Travel(14.0, 0.0), wall=WALL, withdraw_N=0.5)
-    assert following.governor.target_N == WALL.force_N(14.0)
-
-
 @pytest.mark.parametrize(
     ("law", "asked_N"),
     [({"withdraw_N": 0.5}, 0.5), ({"withdraw_N": 0.5, "wall": WALL}, 0.5), ({"wall": WALL}, 0.6), ({}, 1.5)],
@@ -126,15 +119,6 @@ def test_a_handle_that_withdraws_is_asked_for_its_own_force(following: Following
     following.ask(Travel(14.0, 5.0), 1.5, **law)
     ask = following.ask(Travel(14.0, -5.0, is_pushing=False), 1.5, **law)
     assert (ask.asked_N, ask.path_N) == (asked_N, [asked_N] * 7)
-
-
-def test_a_force_that_repeats_is_remembered_over_a_withdrawal(following: Following) -> None:
-    for number in range(3000):
-        is_pushing = number % 1000 < 900
-        force_N = 1.2 + 0.2 * math.sin(math.tau * 1.1 * following.now_s)
-        following.ask(Travel(0.0, 5.0, is_pushing), force_N, withdraw_N=0.4)
-        following.governor.foresee()
-    assert following.governor.forecast.trust > 0.5
 
 
 @pytest.mark.parametrize(
@@ -201,10 +185,6 @@ def test_a_tremor_of_a_held_handle_changes_no_way(pushed: Pushed) -> None:
     for time_s in np.arange(0.0, 2.0, 0.001):
         swing = math.sin(math.tau * 8.0 * time_s)
         assert pushed.at(5.0 + 0.1 * swing, 1.0 + 0.5 * swing).is_pushing
-
-
-def test_a_silent_device_keeps_its_place_and_way(pushed: Pushed) -> None:
-    assert pushed._way.update(None, 0.0, is_sensor_believed=True) == Travel(5.0, 0.0)
 
 
 @pytest.mark.parametrize("breakthrough", ["off", "decay"])

@@ -85,15 +85,6 @@ def test_nothing_winds_up_against_a_switch(
         assert -position.duty_limit <= stage.integral <= max(integral, 0.0)
 
 
-def test_a_carriage_at_its_switch_closes_as_any_other() -> None:
-    blocked, free = begun(), begun()
-    assert (blocked.update(-0.1, -5.0, -0.2, DT_S, True), blocked.integral, blocked.is_saturated) == (
-        updated(free, -0.1, -5.0, -0.2),
-        free.integral,
-        free.is_saturated,
-    )
-
-
 @given(position=positions, back_calculation_s=st.floats(0.01, 0.2), error=st.floats(15.0, 50.0))
 def test_back_calculation_balances_growth(position: Position, back_calculation_s: float, error: float) -> None:
     stage = Pid(msgspec.structs.replace(position, back_calculation_s=back_calculation_s))
