@@ -75,7 +75,6 @@ LOPSIDED = of_field([40.0, -4.0], 4.0, [1.5, 1.5], -2.0)
 "The force rises steeply to its greatest value near 450 mT and falls gently."
 PLATEAU = of_field([500.0], 0.0, [1.0], 0.0)
 "The force climbs steeply at 450 mT and is flat to the last bit on both sides."
-CREEPING = of_field([500.0, 1.0], 0.0, [1.0, 1e-14], -0.9)
 
 
 REACHED_MT = (100.0, 750.0)
@@ -255,18 +254,6 @@ def test_neighbours_decide_where_the_force_falls(neighbours: int, keeps: bool) -
         strayed |= solution.field_mT > 450.0
         last = solution.field_mT
     assert strayed is not keeps
-
-
-def test_on_a_plateau_the_field_moves_as_little_as_possible() -> None:
-    solver = nearest(neighbours=701)
-    creep = CREEPING.curve(0.5, 10, CIP)
-    assert 0 < creep.force_N(800.0) - creep.force_N(500.0) < 1e-14
-    for curve in (PLATEAU.curve(0.5, 10, CIP), creep):
-        above = solver.solve(curve, curve.force_N(800.0) + 1, 600.0)
-        assert (above.reach, above.field_mT) == (Reach.ABOVE, pytest.approx(600, abs=0.5))
-    assert solver.solve(PLATEAU.curve(0.5, 10, CIP), PLATEAU.predict_one(0.5, 10, 800.0, CIP), 700.0).field_mT == (
-        pytest.approx(700, abs=0.5)
-    )
 
 
 def test_the_thesis_search_stops_at_the_first_row_within_epsilon_or_has_the_nearest_of_all(rising: ForceModel) -> None:

@@ -8,7 +8,6 @@ from tormagd.control.safety.codes import FAULTS, LIMITS, Fault, Limit, Position,
 from tormagd.control.safety.operating_state import (
     CLEARING_S,
     COMMANDS,
-    LOST_POSITION,
     ROWS,
     TRANSITIONS,
     Conditions,
@@ -163,12 +162,6 @@ def test_an_encoder_fault_takes_homing_away_until_the_device_has_homed_again(fau
     assert refusal(asked, "enable").code == "not_homed"
     homing = homed_again(asked, is_homed=False)
     assert command(homed_again(homing, is_homed=True), "enable", 2.0, READY).operating_state is ENABLED
-
-
-def test_other_faults_leave_homing_to_the_device() -> None:
-    others = tuple(fault for fault in Fault if fault not in LOST_POSITION)
-    cleared = command(latch(SafetyState(), others), "clear-fault", 2.0, READY)
-    assert command(cleared, "enable", 2.0, READY).operating_state is ENABLED
 
 
 def test_faults_are_kept_in_the_order_they_came() -> None:

@@ -33,17 +33,6 @@ def first(core, planned):
     return plan
 
 
-def test_starts_with_the_gap_open(core) -> None:
-    plan = core.planner(3.0).planned
-    assert (plan.gap_mm, plan.gap_speed_mm_s, plan.time_s, plan.governed_N, plan.limits) == (
-        95.0,
-        0.0,
-        3.0,
-        core.portrait.min_N,
-        (Limit.NO_SETPOINT,),
-    )
-
-
 @pytest.mark.parametrize("is_there", [False, True], ids=["no device", "at rest"])
 def test_without_a_setpoint_the_gap_stays_open(planner, moving, is_there: bool) -> None:
     for tick in range(1, 20):
@@ -101,12 +90,6 @@ def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(planner
 def test_the_trim_is_the_devices_force_over_the_models_where_the_plan_leads(planner, planned) -> None:
     planner.believe.teach(Learned(DeviceFit(1.25, 0.2)))
     assert planned(planner, 1.2).trim == pytest.approx(1.2 / 0.8)
-
-
-def test_the_gap_moves_ahead_along_the_setpoints_slope(core, planner, planned, moving) -> None:
-    for _ in range(40):
-        plan = planned(planner, 1.0 + 0.5 * planner.planned.time_s, moving())
-    assert plan.gap_speed_mm_s == pytest.approx(-0.5 / core.portrait.slope_at_N_mm(plan.governed_N), rel=0.1)
 
 
 def test_a_plan_is_reached_from_the_one_before_though_its_preview_comes_and_goes(core, planner, planned) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.forecast import GRID_S, HORIZON
+from tormagd.control.ask.forecast import GRID_S, HORIZON, Forecast
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
@@ -379,6 +379,12 @@ def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> 
         worst_N = max(worst_N, float(np.abs(path_N(ask) - wanted_N).max()))
         extrapolated_N = max(extrapolated_N, float(np.abs(path_N(extrapolated) - wanted_N).max()))
     assert worst_N < share * extrapolated_N
+
+
+@pytest.mark.parametrize(("age_s", "ahead_s"), [(0.2, 0.0), (0.002, 0.4)], ids=["stale", "a long preview"])
+def test_what_is_over_or_told_at_length_is_not_foreseen(learned: Governor, age_s: float, ahead_s: float) -> None:
+    decide(learned, 10.002 + age_s, at(beats_N, 10.002, ahead_s))
+    assert plain(learned.forecast) == plain(Forecast())
 
 
 def test_a_silent_stream_is_not_believed_to_go_on(learned: Governor) -> None:

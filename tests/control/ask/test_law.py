@@ -187,6 +187,10 @@ def test_a_tremor_of_a_held_handle_changes_no_way(pushed: Pushed) -> None:
         assert pushed.at(5.0 + 0.1 * swing, 1.0 + 0.5 * swing).is_pushing
 
 
+def test_a_silent_device_keeps_its_place_and_way(pushed: Pushed) -> None:
+    assert pushed._way.update(None, 0.0, is_sensor_believed=True) == Travel(5.0, 0.0)
+
+
 @pytest.mark.parametrize("breakthrough", ["off", "decay"])
 def test_a_force_that_gives_way_is_let_go_at_once_or_along_the_ramp_and_comes_back_at_once(breakthrough: str) -> None:
     following = Following(msgspec.structs.replace(SCENE, breakthrough=breakthrough))
