@@ -6,6 +6,7 @@ import msgspec
 import pytest
 
 from tormagd.config import Config
+from tormagd.control.ask.forecast import Forecast
 from tormagd.control.assembly.build import Core, build_core
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.strength import UNSEEN
@@ -13,6 +14,7 @@ from tormagd.control.core import Planner
 from tormagd.control.records import Handle, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
+from tormagd.ground.plain_values import plain
 from tormagd.scenes.scene import EVERY_TERM, Scene, load_scene
 
 pytestmark = pytest.mark.usefixtures("forgetful")
@@ -100,6 +102,11 @@ def test_without_the_forecast_a_force_is_held_until_the_next(told) -> None:
     assert slope_N_s == pytest.approx(0.5, rel=0.05)
     assert speed_mm_s < -5.0
     assert motion(core_without("forecast")) == (0.0, 0.0)
+
+
+def test_without_the_forecast_nothing_is_remembered(after) -> None:
+    full, without = (plain(after(core_without(*names), 20).governor.forecast) for names in ((), ("forecast",)))
+    assert full != plain(Forecast()) == without
 
 
 @pytest.mark.parametrize("names", [(), ("motor",)])
