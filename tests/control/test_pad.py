@@ -13,6 +13,7 @@ from tormagd.control.nominal import PRESSED, Pressing
 from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import Turn
+from tormagd.ground.plain_values import plain
 from tormagd.scenes.scene import EVERY_TERM, load_scene, scene_path
 from tormagd_client.endpoints import ConfigError
 
@@ -81,6 +82,13 @@ def test_without_the_term_nothing_is_remembered() -> None:
         0.0,
         pytest.approx(held(without, PERIOD_S).planned.field_mT, abs=0.01),
     )
+
+
+def test_planning_that_begins_anew_has_not_forgotten(pad_core: Core) -> None:
+    planner = held(pad_core, 5.0)
+    remembered = plain(planner.believe.memory)
+    planner.afresh(5.1)
+    assert plain(planner.believe.memory) == remembered
 
 
 def test_a_force_out_of_the_pads_reach_says_so(pad_core: Core) -> None:

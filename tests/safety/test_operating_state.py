@@ -45,7 +45,6 @@ FIGURES = {
     "clock": "10.1%: allowed is 10%",
     "not_fresh": "no fresh measurement from the device: no Sense yet",
 }
-"What a refusal says beside its code."
 
 
 @pytest.mark.parametrize(
@@ -308,4 +307,4 @@ def test_codes_are_their_names_and_each_is_explained_in_the_order_of_its_table()
     assert all(row.cause and row.remedy and row.shows and row.safe_ms > 0.0 for row in rows)
     assert len({row.cause for row in rows}) == len(rows), "an explanation of its own"
     latched = [row for fault, row in FAULTS.items() if fault.startswith("DEVICE_")]
-    assert {row.position for row in latched} == {Position.LOST_THERE}, "what has latched does not call itself homed"
+    assert {row.position for row in latched} == {Position.LOST_THERE}

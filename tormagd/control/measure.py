@@ -109,6 +109,14 @@ def can_come(before: Measured, after: Measured, full_speed_mm_s: float, within_s
     return abs(after.left_mm - before.left_mm) <= max_mm and abs(after.right_mm - before.right_mm) <= max_mm
 
 
+def leap_between(
+    last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
+) -> Leap | None:
+    within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
+    is_possible = can_come(last, measured, full_speed_mm_s, within_s)
+    return None if is_possible else Leap(now_s, within_s, last, measured)
+
+
 def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     return not (min_mm <= measured.left_mm <= max_mm and min_mm <= measured.right_mm <= max_mm)
@@ -165,9 +173,7 @@ class Measure:
             if is_over or can_come(self.leap.before, measured, self._full_speed_mm_s, since_s):
                 self.leap = None
         elif is_new and last is not None and last.is_homed and measurement.is_homed:
-            within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
-            if not can_come(last, measured, self._full_speed_mm_s, within_s):
-                self.leap = Leap(now_s, within_s, last, measured)
+            self.leap = leap_between(last, measured, self._full_speed_mm_s, now_s, seen_s)
         return measured
 
     def without_position(self, measured: Measured) -> Measured:

@@ -104,12 +104,19 @@ class TimedSetpoint(Value):
             size += abs(sum(preview_N))
             if not 0.0 < self.preview_dt_s <= _LARGEST:
                 raise DomainError("preview_dt_s", self.preview_dt_s, "above 0 s")
-        if size <= _LARGEST:
-            return
+        if not size <= _LARGEST:
+            self._name_odd()
+
+    def _name_odd(self) -> None:
         fields = [(name, getattr(of, name)) for of in (self, self.wall) if of is not None for name in of.__match_args__]
         for name, field in [*fields, *[("preview_N", force_N) for force_N in self.preview_N]]:
             if isinstance(field, (int, float)):
                 require_number(name, field)
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the publisher says what comes."""
+        return self.wall is not None or self.preview_N != ()
 
     @property
     def preview_s(self) -> float:

@@ -256,9 +256,9 @@ def test_a_guess_is_judged_over_a_long_time_and_a_short_one(learned: Forecast) -
     learned.update(learned.stamp_s, 1.5)
     if learned.awaited[0] is None:
         learned.update(learned.time_s + 1.1 * GRID_S, 1.5)
-    errors_N = [guessed_N - 1.5 for guessed_N in learned.awaited[0]]
+    error_N, slope_error_N = (guessed_N - 1.5 for guessed_N in learned.awaited[0])
     long, short = learned.long, learned.short
     learned.update(learned.time_s + 1.1 * GRID_S, 1.5)
     for found, before, time_s in ((learned.long, long, LONG_S), (learned.short, short, SHORT_S)):
-        after = before.after(*errors_N, time_s)
+        after = before.after(error_N, slope_error_N, time_s)
         assert (found.gained, found.apart) == pytest.approx((after.gained, after.apart))

@@ -154,7 +154,7 @@ class Forecast:
         return True
 
     def from_N(self) -> float:
-        """Return the force at the point the forecast was made from, with which it meets the newest setpoint."""
+        """Return the force that the forecast was made from, so that it meets the newest setpoint."""
         return self.force_N - at_step((self.stamp_s - self.from_s) / GRID_S, self.changes_N)
 
     def force_at_N(self, after_s: float, from_N: float) -> float:

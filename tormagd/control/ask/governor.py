@@ -151,8 +151,7 @@ class Governor:
         if trust > 0.0:
             path_mm = self._path_mm(setpoint.wall, travel, wanted_N, device, lag_s, dt_s, blend_N, bounds)
             path_N = self._behind_N(path_mm, wanted_N, trust, device, lag_s, dt_s, bounds)
-            if setpoint.wall is not None or setpoint.preview_N:
-                governed_N = within(self.expected_N, bounds)
+            governed_N = within(self.expected_N, bounds) if setpoint.is_told else force_N
         else:
             self._stand_at(path_N[0], device)
         is_late = blend_N != 0.0 or abs(governed_N - force_N) > OUTRUN_N
@@ -203,12 +202,13 @@ class Governor:
             most = -self._speeds.opening_mm_s * per_mm_s, self._speeds.sure_mm_s * per_mm_s
             risen_N = within(setpoint.force_N, self._allowed) - within(last.force_N, self._allowed)
             self.slope_N_s = low_pass(self.slope_N_s, within(risen_N / spacing_s, most), spacing_s, SLOPE_FILTER_S)
+        end_N = setpoint.force_N
         if setpoint.preview_N:
-            self.slope_N_s = (setpoint.preview_N[-1] - setpoint.force_N) / setpoint.preview_s
+            end_N = setpoint.preview_N[-1]
+            self.slope_N_s = (end_N - setpoint.force_N) / setpoint.preview_s
         if setpoint.preview_s >= TIMES_S[-1]:
             self.forecast.forget()
         elif self._has_forecast:
-            end_N = setpoint.preview_N[-1] if setpoint.preview_N else setpoint.force_N
             self.forecast.update(setpoint.stamp_s + setpoint.preview_s, within(end_N, self._allowed))
 
     def _ahead_N(

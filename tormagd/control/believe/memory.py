@@ -21,7 +21,7 @@ BEYOND_MM: Final = 2.0
 "The model is asked no further beyond the closed end, where a carriage may overrun."
 
 LEAST_MT: Final = 1e-9
-"Against a division by 0 where nothing lags."
+"Against a division by 0."
 
 
 @final
@@ -70,7 +70,7 @@ class ElementMemory:
 
     def open_N(self) -> float:
         """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed."""
-        # linear up to where the field lags by all it can, within 0.3 mN: one question less to the network
+        # within 0.3 mN, and no question to the network
         return self._open_N - self._open_N_mT * self.lag_at_mT(self._open_mT)
 
     def force_N(self, curve: ForceCurve) -> float:
