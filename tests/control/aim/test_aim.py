@@ -33,6 +33,17 @@ def first(core, planned):
     return plan
 
 
+def test_starts_with_the_gap_open(core) -> None:
+    plan = core.planner(3.0).planned
+    assert (plan.gap_mm, plan.gap_speed_mm_s, plan.time_s, plan.governed_N, plan.limits) == (
+        95.0,
+        0.0,
+        3.0,
+        core.portrait.min_N,
+        (Limit.NO_SETPOINT,),
+    )
+
+
 @pytest.mark.parametrize("is_there", [False, True], ids=["no device", "at rest"])
 def test_without_a_setpoint_the_gap_stays_open(planner, moving, is_there: bool) -> None:
     for tick in range(1, 20):
