@@ -102,6 +102,19 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
     assert (reference.speed_mm_s, is_limited) == (pytest.approx(speed, abs=1e-3), False)
 
 
+@given(start=gaps, target=gaps, dt_s=periods)
+@example(start=95.0, target=45.0, dt_s=1e-5)
+@example(start=95.0, target=45.0, dt_s=0.1)
+def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: float) -> None:
+    # one period of full braking covers a dt^2 / 2: a slow loop cannot stop more exactly than a part of that
+    grain = HALF_COUNT_MM + 0.2 * LIMITS.gap_acceleration_mm_s2 * dt_s**2
+    for reference in followed(start, [Reference(target)] * 400, dt_s):
+        assert math.isfinite(reference.gap_mm + reference.speed_mm_s + reference.acceleration_mm_s2)
+        assert min(start, target) - grain <= reference.gap_mm <= max(start, target) + grain
+    if dt_s * 400 > 4.0:
+        assert reference.gap_mm == pytest.approx(target, abs=0.01)
+
+
 def test_a_target_that_turns_is_met_where_it_turns() -> None:
     rate, excess_mm = 2.0 * math.pi * 3.0, []
     for is_known in (True, False):

@@ -139,6 +139,15 @@ def test_a_gap_that_does_not_follow(make_bench) -> None:
     )
 
 
+def test_following_again_in_time_is_no_fault(running) -> None:
+    away_mm = [80.0 - 3.5 * part / 16.0 for part in range(1, 17)]
+    for _ in range(3):
+        for gap_mm in (*away_mm, *[away_mm[-1]] * 20, *reversed(away_mm)):
+            running.step(**running.gap(gap_mm))
+        running.step(count=20)
+    assert not running.faults
+
+
 def test_a_carriage_that_is_driven_and_does_not_move(running) -> None:
     assert running.run_into(Fault.NO_MOTION, 60.0) * PERIOD_S < 0.25
 

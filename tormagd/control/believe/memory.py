@@ -20,9 +20,6 @@ from tormagd.element.physics.relaxation import PronyState
 BEYOND_MM: Final = 2.0
 "The model is asked no further beyond the closed end, where a carriage may overrun."
 
-LEAST_MT: Final = 1e-9
-"Against a division by 0."
-
 
 @final
 class ElementMemory:
@@ -58,7 +55,7 @@ class ElementMemory:
         self._without_field_N: Final = self._force_N(nominal.only, 0.0)
         self._open_N: Final = self._force_N(nominal.only, self._open_mT)
         lagging_N = self._force_N(nominal.only, self._open_mT + memory.lag_mT)
-        self._open_N_mT: Final = (lagging_N - self._open_N) / max(memory.lag_mT, LEAST_MT)
+        self._open_N_mT: Final = (lagging_N - self._open_N) / max(memory.lag_mT, 1e-9)
 
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`."""
