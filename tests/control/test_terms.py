@@ -70,6 +70,12 @@ def test_without_the_rate_one_table_answers_and_no_network_is_asked(after) -> No
     assert Limit.F_MIN in core.planner().plan(PERIOD_S, TimedSetpoint(0.1, PERIOD_S, 0.1), None).limits
 
 
+def test_a_search_that_is_named_runs_all_the_same() -> None:
+    scene = load_scene("pulse")
+    core = build_core(Config(scene="pulse"), msgspec.structs.replace(scene, terms=EVERY_TERM.without("rate")))
+    assert core.solver.solver == scene.solver.name == "nearest"
+
+
 def test_scale_and_offset_are_learned_each_on_its_own(after) -> None:
     fits = {names: after(core_without(*names), 100).believe.device for names in ((), ("scale",), ("offset",))}
     assert fits[()].scale != 1.0

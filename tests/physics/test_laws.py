@@ -34,6 +34,10 @@ def test_eq_7_gives_the_published_flux_density_at_the_shaft() -> None:
     assert law.d_radial_moment_d_gap(95.0) == 0.0, "it is flat at its own end"
 
 
+def test_flux_density_over_the_radial_moment() -> None:
+    assert flux_density_T(3.1e-3, 3.2, 0.004) == pytest.approx(3.1e-3 * 0.8 / 0.004)
+
+
 STIFF = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
 
 
