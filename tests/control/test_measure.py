@@ -95,11 +95,6 @@ def test_a_handle_that_nobody_hears_of_has_not_stopped(look: Look, measure, miss
     assert (handle.rate_mm_s, handle.sliding_mm_s) == pytest.approx((42.0, 42.0), rel=0.01)
 
 
-def test_one_encoder_count_is_filtered(look: Look, measure) -> None:
-    after = look(measure(0), measure(1, left_mm=-7.5 + COUNT_MM))
-    assert (after.left_mm_s, after.right_mm_s) == (pytest.approx(COUNT_MM / 1e-3 / 4.0), 0.0)
-
-
 FORTH_MM = [0.1 * k for k in range(51)]
 
 

@@ -84,15 +84,6 @@ def test_without_the_term_nothing_is_remembered() -> None:
     )
 
 
-def test_a_finger_that_stands_while_the_force_rises_has_not_lost_its_encoder(pad_core: Core) -> None:
-    planner = pad_core.planner()
-    for tick in range(1, 200):
-        now_s, gap_mm = 0.01 * tick, 95.0 - 0.2 * tick
-        measured = pressed(DEPTH_MM, gap_mm=gap_mm, number=tick, sensed_s=now_s, force_N=3.3 + 0.005 * tick)
-        planner.plan(now_s, TimedSetpoint(3.8, now_s, 0.1), measured)
-    assert not planner.believe.handle.is_lost
-
-
 def test_planning_that_begins_anew_has_not_forgotten(pad_core: Core) -> None:
     planner = held(pad_core, 5.0)
     remembered = plain(planner.believe.memory)
@@ -131,9 +122,3 @@ def test_what_a_pad_cannot_serve_is_refused(tmp_path: Path, changes: dict[str, s
     with pytest.raises(ConfigError) as caught:
         build_core(Config(scene=str(tmp_path / "scene.toml")))
     assert said in str(caught.value)
-
-
-def test_a_brake_knows_of_no_finger(tmp_path: Path) -> None:
-    (tmp_path / "scene.toml").write_text(Path(scene_path("coronary")).read_text() + "\n[finger]\ndepth_mm = 2.0\n")
-    with pytest.raises(ConfigError, match=r"\[finger\]"):
-        load_scene(str(tmp_path / "scene.toml"))

@@ -15,7 +15,7 @@ from tormagd.control.records import Handle, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import MOBILISED_MM, Turn
 from tormagd.ground.plain_values import plain
-from tormagd.scenes.scene import EVERY_TERM, TERMS, Scene, Terms, load_scene
+from tormagd.scenes.scene import EVERY_TERM, Scene, load_scene
 
 pytestmark = pytest.mark.usefixtures("forgetful")
 
@@ -53,11 +53,6 @@ def after(told):
         return planner
 
     return run
-
-
-def test_all_terms_are_in_unless_a_scene_says_so() -> None:
-    assert EVERY_TERM.left_out == ()
-    assert Terms(**dict.fromkeys(TERMS, False)).left_out == TERMS
 
 
 def test_without_the_rate_one_table_answers_and_no_network_is_asked(after) -> None:
@@ -171,7 +166,3 @@ def test_dry_friction_counts_both_ways_and_the_magnets_pull_where_it_opens(dutie
         assert all(abs(duty) < abs(whole) for duty, whole in zip(smooth, full, strict=True))
         assert all((whole > duty) is is_opening for duty, whole in zip(free, full, strict=True))
         assert is_opening or free == full
-
-
-def test_learning_can_be_stopped_for_a_measurement() -> None:
-    assert [core_without(learning=learns).planner().believe.learns for learns in (True, False)] == [True, False]

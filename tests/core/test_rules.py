@@ -4,11 +4,9 @@ import importlib.util
 from pathlib import Path
 from types import ModuleType
 
-import msgspec
 import pytest
 
 from tormagd.control.assembly.build import Core
-from tormagd.control.safety.operating_state import Event, OperatingState
 
 
 class Unseen:
@@ -28,18 +26,3 @@ def histories() -> ModuleType:
 
 def test_no_hostile_history_breaks_a_rule(core: Core, histories: ModuleType) -> None:
     histories.hostile(core, Unseen(), episodes=270)
-
-
-def test_a_broken_rule_is_seen(core: Core, histories: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    weak = msgspec.structs.replace(core.config.position, duty_limit=0.36)
-    with monkeypatch.context() as patch:
-        patch.setattr(histories, "CONFIG", msgspec.structs.replace(core.config, position=weak))
-        with pytest.raises(AssertionError, match="duties = "):
-            histories.hostile(core, Unseen())
-    with monkeypatch.context() as patch:
-        patch.setattr(histories, "DRIVEN", (OperatingState.PAUSED,))
-        with pytest.raises(AssertionError, match=r"mode=.* in "):
-            histories.hostile(core, Unseen())
-    monkeypatch.delitem(histories.WAYS, (Event.ENABLE, OperatingState.DISABLED))
-    with pytest.raises(AssertionError, match="enable was taken in DISABLED"):
-        histories.hostile(core, Unseen())

@@ -231,7 +231,6 @@ def test_weights_that_are_not_finite_are_refused(saved: Path, value: float) -> N
 
 
 def test_a_model_for_something_else_is_refused(saved: Path) -> None:
-    refused(saved, "trained on the torque element, but the tactile element is in use", element=Element.TACTILE)
     refused(saved, "trained on insert MRE-50-40, but MRE-10-30 is in use", insert="MRE-10-30")
     refused(model_path("tactile_mre_c", Path()), "trained on the tactile element, but the torque element is in use")
 

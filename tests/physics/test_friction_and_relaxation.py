@@ -107,16 +107,6 @@ def test_a_ramp_follows_the_closed_form(dt_s: float) -> None:
     assert force == pytest.approx(0.87 * time_s + branches, rel=1e-12)
 
 
-@given(forces, forces, st.floats(1e-6, 10.0), st.integers(2, 50))
-def test_splitting_a_step_changes_nothing(start_N: float, end_N: float, dt_s: float, parts: int) -> None:
-    jumped = SERIES.discretise(0.0).advance(SERIES.relaxed(0.0), start_N)[1]
-    whole_N, whole = SERIES.discretise(dt_s).advance(jumped, end_N)
-    update, state, force_N = SERIES.discretise(dt_s / parts), jumped, math.nan
-    for index in range(1, parts + 1):
-        force_N, state = update.advance(state, start_N + (end_N - start_N) * index / parts)
-    assert (force_N, *state) == pytest.approx((whole_N, *whole), abs=1e-12)
-
-
 def test_a_rested_element_carries_the_equilibrium_share_and_may_undershoot() -> None:
     update, state = SERIES.discretise(1e-3), SERIES.relaxed(5.0)
     assert update.advance(state, 5.0)[0] == pytest.approx(0.87 * 5.0)

@@ -1,6 +1,5 @@
 """Scenes: the shipped ones give a working core, contradictions and misfits are refused."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -210,13 +209,10 @@ def test_an_insert_whose_iron_the_model_does_not_know_is_refused(write, monkeypa
     refused(write(), "cip_percent = 35.0 is not allowed: a number from 40 to 40", load=of_path)
 
 
-def test_a_force_that_is_too_fast_for_the_gap_is_refused_with_the_failing_points(write) -> None:
+def test_a_force_that_is_too_fast_for_the_gap_is_refused(write) -> None:
     build_core(Config(scene=write(signal__bandwidth_hz="0.2")))
-    with pytest.raises(ConfigError, match=r"at least 0\.[0-9]+: gaps .*% of the time it is faster") as caught:
+    with pytest.raises(ConfigError, match=r"at least 0\.[0-9]+: gaps .* and [0-9]+% of the time it is faster"):
         build_core(Config(scene=write(signal__bandwidth_hz="1.0")))
-    points = re.findall(r"([0-9.]+) N/s at ([0-9.]+) N \(the device: ([0-9.]+)\)", str(caught.value))
-    assert len(points) == 3
-    assert all(float(asked) > float(given) and 0.65 <= float(force) <= 2.0 for asked, force, given in points)
 
 
 def test_the_scenes_own_gap_speed_counts_where_it_is_the_lower_one(write) -> None:

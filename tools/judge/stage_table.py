@@ -226,7 +226,7 @@ def forecast(stage: Forecast, draw: Draw) -> object:
             stage.update(draw.step(0.01), 1.2 + 0.2 * math.sin(0.6 * place))
     stage.update(draw.step(0.01), draw(1.2))
     stage.foresee(draw(1.0))
-    ahead = [stage.force_at_N(after_s) for after_s in TIMES_S] if stage.trust > 0.0 else []
+    ahead = [stage.force_at_N(after_s, stage.from_N()) for after_s in TIMES_S] if stage.trust > 0.0 else []
     return [stage.trust, *ahead, *np.frombuffer(stage.history).tolist()]
 
 

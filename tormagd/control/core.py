@@ -35,7 +35,6 @@ from tormagd.scenes.scene import Scene
 PLAN_ERRORS: Final = (ValueError, ArithmeticError, RuntimeError)
 "What a plan may raise: DomainError and the errors of NumPy."
 _ENABLED: Final = OperatingState.ENABLED
-_PAUSED: Final = OperatingState.PAUSED
 
 
 @final
@@ -44,8 +43,9 @@ class Planner:
 
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begin at `now_s` with the gap open and nothing known of the device."""
-        gap_range_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
-        memory = ElementMemory(element.memory, element.nominal, element.field, gap_range_mm)
+        memory = ElementMemory(
+            element.memory, element.nominal, element.field, (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
+        )
         self.believe = Believe(config, scene, element.nominal, memory)
         self._portrait: Final = element.portrait
         self.way = Way(config.handle.push_sign)
@@ -190,7 +190,7 @@ class Stepper:
         return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
 
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
-        followed = None if self.safety.operating_state is _PAUSED else plan
+        followed = plan if self.is_followed else None
         try:
             drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
         except DomainError:

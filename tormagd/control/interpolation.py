@@ -3,23 +3,13 @@
 from itertools import accumulate
 from typing import Final, final
 
-from tormagd.element.model.features import LARGEST, require_number
+from tormagd.element.model.features import require_number
 from tormagd.element.physics.errors import DomainError
 
 
 def low_pass(value: float, towards: float, dt_s: float, time_s: float) -> float:
     """Return `value` after `dt_s` on its way to `towards` with the time constant `time_s` (implicit Euler)."""
     return value + dt_s / (time_s + dt_s) * (towards - value)
-
-
-# compiled, a constant of this module is a plain float
-_LARGEST: Final[float] = LARGEST
-
-
-def require_finite(name: str, value: float) -> None:
-    """Raise DomainError unless `value` is a number within LARGEST."""
-    if not -_LARGEST <= value <= _LARGEST:
-        require_number(name, value)
 
 
 STRETCHES: Final = 1024

@@ -92,43 +92,29 @@ def unsensed_s(period_s: float) -> float:
 class Leap(Value):
     """A step of the encoders that no carriage can make."""
 
-    def __init__(
-        self,
-        seen_s: float,
-        left_mm: float,
-        right_mm: float,
-        within_s: float,
-        left_from_mm: float,
-        right_from_mm: float,
-    ) -> None:
+    def __init__(self, seen_s: float, within_s: float, before: Measured, after: Measured) -> None:
         self.seen_s: Final = seen_s
-        self.left_mm: Final = left_mm
-        self.right_mm: Final = right_mm
         self.within_s: Final = within_s
-        self.left_from_mm: Final = left_from_mm
-        self.right_from_mm: Final = right_from_mm
-
-    def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
-        """Tell whether both carriages can have come to where they read from before the step."""
-        max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
-        return (
-            abs(measured.left_mm - self.left_from_mm) <= max_mm
-            and abs(measured.right_mm - self.right_from_mm) <= max_mm
-        )
+        self.before: Final = before
+        self.after: Final = after
 
     def __str__(self) -> str:
-        return f"left {self.left_mm:+.2f} mm, right {self.right_mm:+.2f} mm within {self.within_s * 1e3:.1f} ms"
+        left_mm, right_mm = self.after.left_mm - self.before.left_mm, self.after.right_mm - self.before.right_mm
+        return f"left {left_mm:+.2f} mm, right {right_mm:+.2f} mm within {self.within_s * 1e3:.1f} ms"
+
+
+def can_come(before: Measured, after: Measured, full_speed_mm_s: float, within_s: float) -> bool:
+    """Tell whether both carriages can come from where one record has them to where the other has them."""
+    max_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
+    return abs(after.left_mm - before.left_mm) <= max_mm and abs(after.right_mm - before.right_mm) <= max_mm
 
 
 def leap_between(
     last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
 ) -> Leap | None:
-    left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
-    max_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
-    if -max_mm <= left_mm <= max_mm and -max_mm <= right_mm <= max_mm:
-        return None
-    return Leap(now_s, left_mm, right_mm, within_s, last.left_mm, last.right_mm)
+    is_possible = can_come(last, measured, full_speed_mm_s, within_s)
+    return None if is_possible else Leap(now_s, within_s, last, measured)
 
 
 def is_outside(measured: Measured, closed_mm: float, open_mm: float) -> bool:
@@ -183,8 +169,8 @@ class Measure:
         measured = self.measured = self._measured(last, measurement)
         if self.leap is not None:
             # a device that was reset says so itself; after a burst of noise on the line the counts are right again
-            is_over = needs_homing or not measurement.is_homed
-            if is_over or self.leap.has_come_back(measured, self._full_speed_mm_s, now_s):
+            is_over, since_s = needs_homing or not measurement.is_homed, self.leap.within_s + now_s - self.leap.seen_s
+            if is_over or can_come(self.leap.before, measured, self._full_speed_mm_s, since_s):
                 self.leap = None
         elif is_new and last is not None and last.is_homed and measurement.is_homed:
             self.leap = leap_between(last, measured, self._full_speed_mm_s, now_s, seen_s)

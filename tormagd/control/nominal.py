@@ -87,9 +87,8 @@ class FieldOfGap:
         self._inverse: Final = 1.0 / law.exponent
         self._per_moment_T: Final = flux_density_T(1.0, relative_permeability, inner_radius_m)
         self._range_mm: Final = law.gap_range_mm
-        nearest_mm, farthest_mm = law.gap_range_mm
-        self._strongest_mT: Final = self.field_mT(nearest_mm)
-        self._weakest_mT: Final = self.field_mT(farthest_mm)
+        self._strongest_mT: Final = self.field_mT(law.gap_range_mm[0])
+        self._weakest_mT: Final = self.field_mT(law.gap_range_mm[1])
 
     def field_mT(self, gap_mm: float) -> float:
         if not self._range_mm[0] <= gap_mm <= self._range_mm[1]:

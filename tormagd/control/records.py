@@ -17,6 +17,8 @@ from tormagd.hardware.measurement import DeviceRequest
 
 # compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST
+_LEAST_STEP_S: Final[float] = 1e-4
+"Of a preview: no loop runs faster, and a closer one has a slope without measure."
 
 
 @final
@@ -102,8 +104,8 @@ class TimedSetpoint(Value):
             size += abs(wall.place_sd_mm) + abs(wall.stiffness_share)
         if preview_N:
             size += abs(sum(preview_N))
-            if not 0.0 < self.preview_dt_s <= _LARGEST:
-                raise DomainError("preview_dt_s", self.preview_dt_s, "above 0 s")
+            if not _LEAST_STEP_S <= self.preview_dt_s <= _LARGEST:
+                raise DomainError("preview_dt_s", self.preview_dt_s, f"at least {_LEAST_STEP_S:g} s")
         if not size <= _LARGEST:
             self._name_odd()
 
@@ -121,10 +123,6 @@ class TimedSetpoint(Value):
     @property
     def preview_s(self) -> float:
         return self.preview_dt_s * len(self.preview_N)
-
-    @property
-    def preview_slope_N_s(self) -> float:
-        return (self.preview_N[-1] - self.force_N) / self.preview_s
 
 
 @final

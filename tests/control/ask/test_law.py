@@ -55,14 +55,6 @@ def test_a_handle_feels_the_wall_where_it_is_and_at_most_a_little_before(followi
     assert (Limit.RATE in ask.limits) is not is_slow
 
 
-def test_the_gap_passes_the_place_of_a_stiff_wall_at_speed(following: Following) -> None:
-    wall, at_once_s = Wall(10.0, 1.0, 0.6), 0.2 / (38.0 * 0.036)
-    places_mm = np.arange(-20.0, 20.0, 30.0 * PERIOD_S).tolist()
-    gap_N = [following.ask(Travel(place_mm, 30.0), wall=wall).path_N[0] for place_mm in places_mm]
-    felt_mm = next(place for place, each_N in zip(places_mm, gap_N, strict=True) if each_N > 0.8 + EARLY_N)
-    assert (felt_mm - wall.place_mm) / 30.0 == pytest.approx(at_once_s, abs=0.01)
-
-
 def test_the_less_sure_a_wall_is_the_sooner_the_gap_sets_out_to_it() -> None:
     places_mm = [*np.arange(-20.0, 12.0, 30.0 * PERIOD_S).tolist(), *[12.0] * 500]
     at_wall, before_N = places_mm.index(min(places_mm, key=lambda place: abs(place - 10.0))) - PASSES, []
@@ -119,13 +111,6 @@ def test_a_wall_that_goes_with_the_handle_asks_for_what_it_says(following: Follo
         assert ask.force_N <= 1.2 + PORTRAIT.min_N + EARLY_N + 0.036
 
 
-def test_a_wall_that_is_met_again_is_there_at_once(following: Following) -> None:
-    following.ask(Travel(14.0, 5.0), wall=WALL, withdraw_N=0.5)
-    following.ask(Travel(14.0, -5.0, is_pushing=False), wall=WALL, withdraw_N=0.5)
-    following.ask(Travel(14.0, 0.0), wall=WALL, withdraw_N=0.5)
-    assert following.governor.target_N == WALL.force_N(14.0)
-
-
 @pytest.mark.parametrize(
     ("law", "asked_N"),
     [({"withdraw_N": 0.5}, 0.5), ({"withdraw_N": 0.5, "wall": WALL}, 0.5), ({"wall": WALL}, 0.6), ({}, 1.5)],
@@ -134,15 +119,6 @@ def test_a_handle_that_withdraws_is_asked_for_its_own_force(following: Following
     following.ask(Travel(14.0, 5.0), 1.5, **law)
     ask = following.ask(Travel(14.0, -5.0, is_pushing=False), 1.5, **law)
     assert (ask.asked_N, ask.path_N) == (asked_N, [asked_N] * 7)
-
-
-def test_a_force_that_repeats_is_remembered_over_a_withdrawal(following: Following) -> None:
-    for number in range(3000):
-        is_pushing = number % 1000 < 900
-        force_N = 1.2 + 0.2 * math.sin(math.tau * 1.1 * following.now_s)
-        following.ask(Travel(0.0, 5.0, is_pushing), force_N, withdraw_N=0.4)
-        following.governor.foresee()
-    assert following.governor.forecast.trust > 0.5
 
 
 @pytest.mark.parametrize(
@@ -193,11 +169,6 @@ def test_a_held_handle_withdraws_once_the_hand_pulls(push_sign: int) -> None:
 def test_a_sensor_that_is_not_believed_shows_no_way_but_a_handle_that_comes_back_does(pushed: Pushed) -> None:
     assert pushed.at(4.8, -0.5, is_sensor_believed=False).is_pushing
     assert not pushed.at(5.0 - 1.01 * SLID_MM, -0.5, is_sensor_believed=False).is_pushing
-
-
-def test_a_hand_that_pulls_where_the_encoder_shows_nothing_is_let_go(pushed: Pushed) -> None:
-    are_pushing = [pushed.at(5.0, hand_N).is_pushing for hand_N in (-0.09, -0.11, 0.09, 0.11)]
-    assert are_pushing == [True, False, False, True]
 
 
 @pytest.mark.parametrize("push_sign", [1, -1])

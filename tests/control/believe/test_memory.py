@@ -66,7 +66,7 @@ def test_the_open_gap_gives_more_on_the_way_back(follow, element: Element) -> No
     open_mm, curve = max(GAPS_MM), element.nominal.only
     rested, closed = follow(found(open_mm)), follow(found(open_mm), found(NEAR_MM))
     opened = follow(found(open_mm), found(NEAR_MM), found(open_mm))
-    assert closed.open_N() == pytest.approx(opened.force_N(curve) + opened.relaxed_N)
+    assert closed.open_N() == pytest.approx(opened.force_N(curve) + opened.relaxed_N, abs=3e-4)
     assert closed.open_N() > rested.open_N() + 0.01
 
 

@@ -13,9 +13,7 @@ from tormagd.control.assembly.build import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_
 from tormagd.control.move.motor import (
     MAX_MARGIN_DB,
     delay_margin_s,
-    full_speed_mm_s,
     margins,
-    mechanical_time_s,
     pull_V,
     zero_order_hold,
 )
@@ -56,25 +54,6 @@ def test_the_step_response_is_that_of_the_held_continuous_motor(motor: Motor, pe
     _, expected, _ = dlsim(exact, duty)
     response = lfilter(ours.numerator, ours.denominator, duty)
     np.testing.assert_allclose(response, expected.ravel(), rtol=1e-6, atol=1e-9 * np.abs(expected).max())
-
-
-@given(motor=motors)
-def test_full_speed_is_what_full_duty_comes_to(motor: Motor) -> None:
-    slowest_s = max(mechanical_time_s(motor), 2e-3 * motor.inductance_mH / motor.resistance_ohm)
-    period_s = 0.05 * slowest_s
-    plant = zero_order_hold(motor, period_s)
-    position = lfilter(plant.numerator, plant.denominator, np.ones(600))
-    assert (position[-1] - position[-2]) / period_s == pytest.approx(full_speed_mm_s(motor), rel=1e-4)
-
-
-@pytest.mark.parametrize("resistance_ohm", [1.0, 2.2, 8.0])
-def test_the_mechanical_time_constant_is_where_the_speed_has_come_to_63_percent(resistance_ohm: float) -> None:
-    motor = Motor(resistance_ohm=resistance_ohm, inductance_mH=0.01)
-    period_s = mechanical_time_s(motor) / 50.0
-    plant = zero_order_hold(motor, period_s)
-    position = lfilter(plant.numerator, plant.denominator, np.ones(60))
-    speed = (position[51] - position[49]) / (2.0 * period_s)
-    assert speed / full_speed_mm_s(motor) == pytest.approx(1.0 - math.exp(-1.0), abs=0.002)
 
 
 def open_loop(motor: Motor, position: Position, frequency_Hz: float) -> complex:
@@ -169,12 +148,6 @@ def test_gains_at_their_bounds_are_unstable_only_where_the_margins_say_so(positi
     found = margins(motor, position, PERIOD_S)
     if found.phase_margin_deg >= MIN_PHASE_MARGIN_DEG and found.gain_margin_dB >= MIN_GAIN_MARGIN_DB:
         assert closed_loop_radius(motor, position) < 1.0
-
-
-def test_the_round_trip_that_is_refused_is_within_what_the_loop_bears(core) -> None:
-    bears_s = delay_margin_s(core.config.motor, core.config.position, PERIOD_S)
-    assert 0.005 < bears_s < 0.05
-    assert bears_s == pytest.approx(core.margins.phase_margin_deg / 360.0 / core.margins.crossover_Hz)
 
 
 OSCILLATES = r"phase margin of .* gain margin of .* allowed is at least"

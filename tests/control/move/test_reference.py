@@ -102,14 +102,6 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
     assert (reference.speed_mm_s, is_limited) == (pytest.approx(speed, abs=1e-3), False)
 
 
-def test_being_held_back_is_said() -> None:
-    reference = next(followed(95.0, [Reference(45.0)]))
-    far, here = Reference(45.0), Reference(reference.gap_mm)
-    targets = far, here, here.replaced(speed_mm_s=2.0 * LIMITS.gap_speed_mm_s)
-    are_limited = [follow(MAX_MM_S2, reference, target, DT_S, SPEEDS)[1] for target in targets]
-    assert are_limited == [True, False, True]
-
-
 @given(start=gaps, target=gaps, dt_s=periods)
 @example(start=95.0, target=45.0, dt_s=1e-5)
 @example(start=95.0, target=45.0, dt_s=0.1)
@@ -121,13 +113,6 @@ def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: 
         assert min(start, target) - grain <= reference.gap_mm <= max(start, target) + grain
     if dt_s * 400 > 4.0:
         assert reference.gap_mm == pytest.approx(target, abs=0.01)
-
-
-def test_either_way_has_its_own_limit() -> None:
-    slow = SPEEDS.replaced(opening_mm_s=30.0)
-    for target, most in ((95.0, 30.0), (45.0, LIMITS.gap_speed_mm_s)):
-        way = followed(70.0, [Reference(target)] * 500, speeds=slow)
-        assert max(abs(reference.speed_mm_s) for reference in way) == pytest.approx(most, rel=1e-3)
 
 
 def test_a_target_that_turns_is_met_where_it_turns() -> None:

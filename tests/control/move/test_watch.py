@@ -45,13 +45,22 @@ def test_a_device_may_take_a_moment_to_start(bench) -> None:
     assert bench.run_into(Fault.DEVICE_NOT_RUNNING, mode=DeviceMode.IDLE) <= 3
 
 
-def test_a_sense_that_stops_is_a_limit_and_then_a_fault_where_the_scene_needs_it(running) -> None:
+@pytest.mark.parametrize(
+    ("stream", "fault", "longest_s", "limits"),
+    [
+        ("sensed_s", Fault.SENSE_STALE, SENSE_FAULT_S, (Limit.SENSE_STALE,)),
+        ("reported_s", Fault.STATUS_STALE, STATUS_FAULT_S, ()),
+    ],
+)
+def test_a_stream_that_stops_is_a_fault_and_a_sense_first_a_limit(
+    running, stream: str, fault: Fault, longest_s: float, limits: tuple[Limit, ...]
+) -> None:
     running.step(count=200)
     last_s = running.now_s
-    assert Limit.SENSE_STALE not in running.step(count=round(UNSENSED_S / PERIOD_S), sensed_s=last_s).limits
-    assert running.step(count=2, sensed_s=last_s).limits == (Limit.SENSE_STALE,)
-    running.run_into(Fault.SENSE_STALE, sensed_s=last_s)
-    assert running.now_s - last_s == pytest.approx(SENSE_FAULT_S, abs=0.5 * PERIOD_S)
+    assert running.step(count=round(UNSENSED_S / PERIOD_S), **{stream: last_s}).limits == ()
+    assert running.step(count=2, **{stream: last_s}).limits == limits
+    running.run_into(fault, **{stream: last_s})
+    assert running.now_s - last_s == pytest.approx(longest_s, abs=0.5 * PERIOD_S)
 
 
 def test_a_scene_that_does_without_the_sensor_does_without_its_messages(core, make_bench) -> None:
@@ -61,26 +70,14 @@ def test_a_scene_that_does_without_the_sensor_does_without_its_messages(core, ma
     assert (bench.step(count=500, sensed_s=bench.now_s).limits, bench.faults) == ((Limit.SENSE_STALE,), ())
 
 
-def test_a_status_that_stops_is_a_fault(running) -> None:
-    running.step(count=200)
-    last_s = running.now_s
-    running.step(count=round(STATUS_FAULT_S / PERIOD_S) - 1, reported_s=last_s)
-    assert not running.faults
-    assert running.run_into(Fault.STATUS_STALE, reported_s=last_s) == 1
-
-
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_skew(running, side: float) -> None:
     def apart(skew_mm: float) -> dict[str, float]:
         return {"left_mm": -7.5 + side * skew_mm / 2.0, "right_mm": -7.5 - side * skew_mm / 2.0}
 
     allowed_mm = CONFIG.limits.skew_fault_mm
-    for part in range(1, 41):
+    for part in (*range(1, 41), *[40] * 20, 39.7, 39.3, 39.0, *[38.7] * 20):
         running.step(**apart(0.98 * allowed_mm * part / 40.0))
-    running.step(count=20, **apart(0.98 * allowed_mm))
-    for back_mm in (0.008, 0.016, 0.024, 0.032):
-        running.step(**apart(0.98 * allowed_mm - back_mm))
-    running.step(count=20, **apart(0.98 * allowed_mm - back_mm))
     assert not running.faults
     assert running.run_into(Fault.SKEW, **apart(1.02 * allowed_mm)) == 1
 
@@ -89,23 +86,18 @@ def test_skew(running, side: float) -> None:
 def test_carriages_that_are_too_far_apart_are_not_enabled(bench, side: float) -> None:
     half_mm = side * CONFIG.limits.skew_fault_mm / 2.0
     bench.step(left_mm=-7.5 + 1.01 * half_mm, right_mm=-7.5 - 1.01 * half_mm)
-    refusal = bench.refused("enable")
-    assert (refusal.code, refusal.hint) == ("skewed", "tormagctl home")
-    assert "1.01 mm apart: allowed is at most 1 mm" in str(refusal)
+    assert "1.01 mm apart: allowed is at most 1 mm" in str(bench.refused("enable"))
     bench.step(left_mm=-7.5 + 0.99 * half_mm, right_mm=-7.5 - 0.99 * half_mm)
     bench.command("enable")
-    assert not bench.faults
 
 
 @pytest.mark.parametrize("gap_mm", [-64.0, -40.0, -5.0, 0.0, 30.0, 100.5, 140.0])
 def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench, gap_mm: float) -> None:
+    bench.step(count=20, switches=Switches.HOMED | Switches.LEFT_OPEN | Switches.RIGHT_OPEN, **bench.gap(99.5))
+    assert not bench.faults, "an open switch may be overrun by a little"
+    bench.stepper.lose_link()
     assert bench.run_into(Fault.OUT_OF_STROKE, **bench.gap(gap_mm)) == 1
     assert bench.stepper.safety.needs_homing
-
-
-def test_carriages_that_overran_their_open_switches_by_a_little_are_no_fault(bench) -> None:
-    bench.step(count=20, switches=Switches.HOMED | Switches.LEFT_OPEN | Switches.RIGHT_OPEN, **bench.gap(99.5))
-    assert not bench.faults
 
 
 @pytest.mark.parametrize("side", ["LEFT", "RIGHT"])

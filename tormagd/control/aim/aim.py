@@ -193,8 +193,8 @@ class Aim:
         # along the portrait: a difference of two solutions would amplify the solver's grain
         start_mm = self._portrait.gap_for_mm(path_N[0], device)
         speed, acceleration = 0.0, 0.0
-        for place, force_N in enumerate(path_N):
-            away_mm = self._portrait.gap_for_mm(force_N, device) - start_mm
+        for place in range(1, len(path_N)):
+            away_mm = self._portrait.gap_for_mm(path_N[place], device) - start_mm
             speed += _TO_SPEED[place] * away_mm
             acceleration += _TO_ACCELERATION[place] * away_mm
         most, hardest = self._speeds, self._max_mm_s2

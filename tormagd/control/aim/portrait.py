@@ -95,18 +95,12 @@ def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, fl
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))
     slopes: list[float] = np.abs(np.gradient(forces_N, gaps)).tolist()
-    force_N: list[float] = forces_N.tolist()
-    return Portrait(gap_mm, force_N, slopes)
+    return Portrait(gap_mm, forces_N.tolist(), slopes)
 
 
 def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Trim) -> float:
     """Return the least gap allowed for the believed device, and for an unseen one where there is one."""
-    known_mm = max(ceiling_mm(portrait, belief.device, ceiling_N, bounds), portrait.gap_mm_at(belief.anchor_N))
-    if belief.unseen is None:
-        return known_mm
-    return max(known_mm, ceiling_mm(portrait, belief.unseen, ceiling_N, bounds))
-
-
-def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: Trim) -> float:
-    """Return the least gap at which the device surely gives no more than `ceiling_N`."""
-    return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
+    model_N = min(belief.device.surely_within_N(ceiling_N, bounds), belief.anchor_N)
+    if belief.unseen is not None:
+        model_N = min(model_N, belief.unseen.surely_within_N(ceiling_N, bounds))
+    return portrait.gap_mm_at(model_N)

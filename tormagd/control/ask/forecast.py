@@ -56,7 +56,6 @@ STRIDE: Final = 3
 "Every third stretch of the history is compared."
 HORIZON: Final = 8
 "A plan looks 30 ms ahead, and further by the carriages' lag."
-HORIZON_S: Final = HORIZON * GRID_S
 EVERY: Final = 2
 "A forecast takes several times as long as a plan."
 JUDGED: Final = 4
@@ -118,8 +117,8 @@ class Forecast:
     @property
     def trust(self) -> float:
         """Return how far the forecast takes the place of the slope, 0..1."""
-        unit = 0.0, 1.0
-        return within(self.long.score, unit) * within(1.0 + self.short.score, unit) if self.changes_N else 0.0
+        earned, kept = self.long.score, 1.0 + self.short.score
+        return within(earned, (0.0, 1.0)) * within(kept, (0.0, 1.0)) if self.changes_N else 0.0
 
     def forget(self, stamp_s: float = -math.inf, force_N: float = 0.0, history: bytes = b"") -> None:
         """Begin with one setpoint, or with none."""
@@ -148,20 +147,19 @@ class Forecast:
         said: Guess | None = None
         if self.changes_N:
             since = (self.stamp_s - self.time_s) / GRID_S
-            risen_N = self.changes_N[JUDGED] - self.changes_N[1] * since
-            said = self.force_N + risen_N, self.force_N + slope_N_s * GRID_S * (JUDGED - since)
+            said = self.from_N() + self.changes_N[JUDGED], self.force_N + slope_N_s * GRID_S * (JUDGED - since)
         else:
             self.short = LOST
         self.awaited = (*self.awaited[:-1], said)
         return True
 
-    def force_at_N(self, after_s: float) -> float:
+    def from_N(self) -> float:
+        """Return the force that the forecast was made from, so that it meets the newest setpoint."""
+        return self.force_N - at_step((self.stamp_s - self.from_s) / GRID_S, self.changes_N)
+
+    def force_at_N(self, after_s: float, from_N: float) -> float:
         """Return the forecast force at `after_s` after the newest setpoint's stamp."""
-        changes = self.changes_N
-        # shifted through the newest setpoint, which may have come after the point the forecast was made from
-        since_s = self.stamp_s - self.from_s
-        base_N = self.force_N - at_step(since_s / GRID_S, changes)
-        return base_N + at_step((since_s + after_s) / GRID_S, changes)
+        return from_N + at_step((self.stamp_s - self.from_s + after_s) / GRID_S, self.changes_N)
 
     def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
         """Add `count` points to the grid, and judge the guesses for them."""

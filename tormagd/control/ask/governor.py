@@ -16,7 +16,7 @@ import math
 from typing import Final, final
 
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
+from tormagd.control.ask.forecast import GRID_S, HORIZON, MAX_STEP_S, Forecast
 from tormagd.control.ask.path import (
     FLATTEST_N_MM,
     LASTS_S,
@@ -26,7 +26,7 @@ from tormagd.control.ask.path import (
     nearest_path_mm,
 )
 from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.interpolation import at_step, low_pass, require_finite
+from tormagd.control.interpolation import at_step, low_pass
 from tormagd.control.records import AT_REST, Ask, GapSpeeds, TimedSetpoint, Travel, Wall
 from tormagd.control.safety.codes import Limit
 from tormagd.element.model.force_curve import within
@@ -111,7 +111,6 @@ class Governor:
         if setpoint is not None:
             age_s = now_s - setpoint.stamp_s
             setpoint.require_numbers()
-            require_finite("age_s", age_s)
             is_new = self.last is None or setpoint.stamp_s != self.last.stamp_s
             self.silent_s = 0.0 if is_new else self.silent_s + dt_s
             if age_s <= setpoint.valid_for_s:
@@ -205,7 +204,8 @@ class Governor:
             self.slope_N_s = low_pass(self.slope_N_s, within(risen_N / spacing_s, most), spacing_s, SLOPE_FILTER_S)
         end_N = setpoint.force_N
         if setpoint.preview_N:
-            end_N, self.slope_N_s = setpoint.preview_N[-1], setpoint.preview_slope_N_s
+            end_N = setpoint.preview_N[-1]
+            self.slope_N_s = (end_N - setpoint.force_N) / setpoint.preview_s
         if setpoint.preview_s >= TIMES_S[-1]:
             self.forecast.forget()
         elif self._has_forecast:
@@ -226,16 +226,14 @@ class Governor:
         if self.silent_s > setpoint.preview_s + MAX_STEP_S:
             self.slope_N_s = 0.0
         trust = 1.0 if setpoint.preview_N else foreseen
-        if trust == 0.0:
-            last_N = within(setpoint.force_N, self._allowed)
-            return [last_N + self.slope_N_s * min(soon_s + after_s, AHEAD_S) for after_s in PATH_S], trust
         return self.going_on_N(setpoint, soon_s + trust * lag_s, foreseen), trust
 
     def going_on_N(self, setpoint: TimedSetpoint, begins_s: float, foreseen: float) -> list[float]:
         """Return the forces at TIMES_S from `begins_s` after the stamp: of the preview, and of what comes after it."""
         end_s, forces_N = setpoint.preview_s, [setpoint.force_N, *setpoint.preview_N]
-        known_s = end_s + (HORIZON_S if foreseen > 0.0 else 0.0)
+        known_s = end_s + (HORIZON * GRID_S if foreseen > 0.0 else 0.0)
         most_s = min(AHEAD_S, end_s) if setpoint.preview_N else AHEAD_S
+        last_N, from_N = within(forces_N[-1], self._allowed), self.forecast.from_N() if foreseen > 0.0 else 0.0
         ahead_N: list[float] = []
         for after_s in TIMES_S:
             at_s = begins_s + after_s
@@ -245,9 +243,9 @@ class Governor:
             if past_s < 0.0:
                 force_N = at_step(at_s / setpoint.preview_dt_s, forces_N)
             else:
-                force_N = within(forces_N[-1], self._allowed) + self.slope_N_s * min(past_s, most_s)
+                force_N = last_N + self.slope_N_s * min(past_s, most_s)
                 if foreseen > 0.0:
-                    force_N += foreseen * (self.forecast.force_at_N(past_s) - force_N)
+                    force_N += foreseen * (self.forecast.force_at_N(past_s, from_N) - force_N)
             ahead_N.append(force_N)
         return ahead_N
 

@@ -111,15 +111,10 @@ def margins(motor: Motor, position: Position, period_s: float) -> Margins:
     phase_deg += 360.0 * np.round((-180.0 - phase_deg[0]) / 360.0)
     below = np.flatnonzero((magnitude[:-1] >= 1.0) & (magnitude[1:] < 1.0))
     crossing = int(below[-1]) if below.size else 0
-    turning = np.flatnonzero((phase_deg[:-1] >= -180.0) & (phase_deg[1:] < -180.0))
-    after = turning[turning > crossing] if below.size else turning
-    gain_margin = -20.0 * math.log10(float(magnitude[after[0]])) if after.size else MAX_MARGIN_DB
-    # with a short integral time the phase comes from below -180 degrees: there less gain loses the loop
-    rising = np.flatnonzero((phase_deg[:-1] < -180.0) & (phase_deg[1:] >= -180.0))
-    rising = rising[rising < crossing]
-    if rising.size:
-        gain_margin = min(gain_margin, 20.0 * math.log10(float(magnitude[rising].min())))
-    if phase_deg[crossing] < -180.0:  # the loop swings: the margin is how much less gain would end that, if any does
-        before = turning[turning <= crossing]
-        gain_margin = -20.0 * abs(math.log10(float(magnitude[before[-1]]))) if before.size else -MAX_MARGIN_DB
+    turning = np.flatnonzero(np.diff(phase_deg < -180.0))
+    # more gain makes the loop swing where the phase turns beyond the crossover, and less gain where it turns before
+    gains_dB = 20.0 * np.log10(magnitude[turning])
+    gain_margin = float(np.where(turning > crossing, -gains_dB, gains_dB).min(initial=MAX_MARGIN_DB))
+    if phase_deg[crossing] < -180.0:  # the loop swings
+        gain_margin = -abs(gain_margin)
     return Margins(gain_margin, 180.0 + float(phase_deg[crossing]), float(frequency[crossing]))

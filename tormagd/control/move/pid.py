@@ -7,10 +7,11 @@ The speed error carries the derivative action: the expected speed, less the filt
 position.
 """
 
+import math
 from typing import Final, final
 
 from tormagd.config import Position
-from tormagd.control.interpolation import require_finite
+from tormagd.element.model.features import require_number
 
 ON_TARGET_MM: Final = 0.001
 "Just over half an encoder count: a carriage cannot be told to stand nearer."
@@ -40,7 +41,8 @@ class Pid:
         proportional = self._proportional_per_mm * error_mm
         derivative = self._proportional_per_mm * self._derivative_time_s * error_mm_s
         asked = proportional + self.integral + derivative + feed_forward
-        require_finite("duty", asked)
+        if not -math.inf < asked < math.inf:
+            require_number("duty", asked)
         within = min(max(asked, -self._limit), self._limit)
         duty = min(within, 0.0) if is_blocked else within
         growth = proportional / self._integral_time_s + (duty - asked) / self._back_calculation_s
