@@ -15,6 +15,7 @@ from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.records import Ask, GapSpeeds, TimedSetpoint, Travel
 from tormagd.control.safety.codes import Limit
+from tormagd.element.physics.errors import DomainError
 from tormagd.ground.plain_values import plain, restore
 from tormagd.record.journal import KNOWN
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
@@ -294,6 +295,12 @@ def test_what_is_too_fast_is_missed_before_and_after() -> None:
     assert (path_N(long_after), long_after.limits) == (pytest.approx(1.8, abs=2e-3), ())
     # what is not known cannot be prepared for
     assert told(step_N, 0.88, ahead_s=0.05).force_N == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize("spacing_s", [0.0, 5e-324, 9e-5, math.nan])
+def test_a_preview_without_a_measure_of_its_slope_is_refused(spacing_s: float) -> None:
+    with pytest.raises(DomainError, match="^preview_dt_s = .* is not allowed: at least 0.0001 s$"):
+        TimedSetpoint(1.0, 1.0, VALID_S, preview_N=(1.6,), preview_dt_s=spacing_s).require_numbers()
 
 
 @given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=60), st.floats(1e-4, 1.0), st.floats(0.0, 0.03))
