@@ -200,8 +200,20 @@ class Bench:
         self.carriages.positions_mm = [CLOSED_MM + 1.0, CLOSED_MM + 1.0]
         self.drive(-1.0, -1.0, count=150)
 
+    def open_stuck(self, current_A: float, drift_mm_s: float, ticks: int, tick_s: float) -> None:
+        self.settle()
+        self.home()
+        self.drive(-1.0, -1.0, count=50)
+        self.carriages.held, self.carriages.current_A, self.carriages.drift_mm_s = True, current_A, drift_mm_s
+        self.command(Retract)
+        self.tick(ticks, tick_s)
+
     def stop_encoder(self) -> None:
         self.carriages.blind = self.sensors.left_counts
+
+
+STUCK = ((0.01, 0.0, 700, TICK_S), (0.025, 0.0, 830, 10.0 * TICK_S), (3.5, 0.18, 700, TICK_S))
+"""A motor without current, at once; a travelling one only after 8 s; not a creeping one: 0.05 mm in 0.3 s is enough."""
 
 
 def life(bench: Bench, generator: random.Random) -> Iterator[str]:
@@ -237,6 +249,8 @@ def life(bench: Bench, generator: random.Random) -> Iterator[str]:
         "blind": lambda: [bench.settle(), bench.stop_encoder(), bench.home()],
         "askew": lambda: [bench.settle(), bench.home(), bench.drive(0.0, -1.0, count=300)],
         "closed end": bench.reach_the_end,
+        "stuck": lambda: bench.open_stuck(*generator.choice(STUCK)),
+        "backwards": lambda: [bench.settle(), setattr(carriages, "drift_mm_s", -30.0), bench.home()],
     }
     while True:
         name = generator.choice(list(happenings))
@@ -307,7 +321,7 @@ def test_twins_agree_on_sensors_that_no_device_could_have(steps: list[tuple[str,
 @pytest.fixture(scope="module")
 def told() -> Twins:
     bench = Bench()
-    list(islice(life(bench, random.Random(3)), 100))
+    list(islice(life(bench, random.Random(4)), 150))
     return bench.twins
 
 
