@@ -194,9 +194,6 @@ class Rogue:
         self.count[Status] += status is not None
         return status and self.shows(time_s, status)
 
-    def status(self, sensors: Sensors) -> Status:
-        return self.real.status(self.senses(sensors))
-
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
         time_s += self.up_s
         return self.measures(time_s, self.real.measurement(time_s, self.senses(sensors)))
@@ -316,12 +313,6 @@ def times_out_opening(device: Rogue) -> bool:
     return device.real.mode is DeviceMode.RETRACTING and DeviceFault.COMMAND_TIMEOUT in device.real.faults
 
 
-def does_not_latch(device: Rogue, time_s: float) -> None:
-    if is_latched(device):
-        device.real.faults = DeviceFault(0)
-        device.real._rest(time_s, DeviceMode.IDLE)
-
-
 def homed_before_zero(device: Rogue, time_s: float, measured: Measured) -> Measured:
     if device.real.homed and device.zeroed_s < 0.0:
         device.zeroed_s = time_s + 0.04
@@ -351,11 +342,6 @@ def stops_after(seconds: float) -> Callable[[Rogue, float], None]:
             device.real._rest(time_s, DeviceMode.IDLE)
 
     return ticked
-
-
-def clears_itself(device: Rogue, time_s: float) -> None:
-    if is_over(device, time_s, 1.0, DeviceMode.LATCHED):
-        does_not_latch(device, time_s)
 
 
 def blind_while(blind: Callable[[Rogue, float], bool]) -> Callable[[Rogue, float], None]:
@@ -460,12 +446,6 @@ def with_duties(left: Callable[..., float], right: Callable[..., float]) -> Call
 def shows_late(device: Rogue, time_s: float, status: Status) -> Status:
     device.ends = [*device.ends, status.switches & ~Switches.HOMED][-4:]
     return status.replaced(switches=device.ends[0] | status.switches & Switches.HOMED)
-
-
-def every_997th(device: Rogue, time_s: float, measured: Measured) -> Measured:
-    device.since_s += 1
-    old = place_old(device, time_s, measured)
-    return old if device.since_s % 997 == 0 else measured
 
 
 def handle_of_10_ms(device: Any, time_s: float, measured: Measured) -> Measured:
@@ -749,7 +729,7 @@ PLANTED = (
         "run_silence",
         before=lambda device, time_s, message: extends(device, time_s) if isinstance(message, Drive) else None,
     ),
-    rogue("does not latch", "run_silence", ticked=does_not_latch),
+    rogue("does not latch", "run_silence", ticked=rests(is_latched)),
     rogue(
         "latched does not measure",
         "every_drive_answered",
@@ -774,7 +754,6 @@ PLANTED = (
         up=lambda wire, data: data[1:] if round(wire.time_s * 1e3) % 50 == 0 else data,
     ),
     # errors that an earlier kit did not see
-    rogue("latch clears itself", "latched_stays", ticked=clears_itself),
     rogue(
         "runs without a Hello",
         "warm_reset",
@@ -965,7 +944,14 @@ PLANTED = (
         "every_drive_answered",
         measures=lambda _, time_s, measured: (measured[0].replaced(device_time_s=time_s % 0.65), measured[1]),
     ),
-    rogue("every 997th position old", "positions_run_on", "skew_opens", "end_stop_opens", measures=every_997th),
+    rogue(
+        "every 256th position off",
+        "positions_run_on",
+        *MOTIONS,
+        measures=placed(
+            lambda state: {"left_position_mm": state.left_position_mm - 0.01 * (state.counter == 99)}, DeviceMode.RUN
+        ),
+    ),
     rogue(
         "duties of 5 bits",
         "duties_make_currents",
