@@ -1,7 +1,6 @@
 """The schema in tormag.dbc. Only the generators read it; everything that runs uses `layouts.py`. Needs cantools.
 
-Signals are little-endian integers of 8, 16 or 32 bits in a row; enumerations count from 0, flags are the bits from 0.
-What keeps to none of that fails the golden vectors, which cantools packs from the same file.
+A DBC beyond the layout's rules fails the golden vectors, which cantools packs from it.
 """
 
 import hashlib

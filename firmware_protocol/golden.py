@@ -23,7 +23,7 @@ Json = dict[str, Any]
 
 
 def bitwise_crc(data: bytes, bits: int, polynomial: int) -> int:
-    """Return a CRC straight from its definition; the initial value and the final XOR are all ones."""
+    """Return a CRC straight from its definition."""
     register = ones = (1 << bits) - 1
     for byte in data:
         register ^= byte << bits - 8

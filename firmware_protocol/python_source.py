@@ -49,7 +49,7 @@ def _enumerations(schema: Schema) -> dict[str, SignalSource]:
 
 
 def _import(module: str, names: list[str]) -> str:
-    """Return an import, a name a line, which `ruff format` leaves so."""
+    """Return an import as `ruff format` leaves it."""
     return f"from firmware_protocol.{module} import (\n{''.join(f'    {name},{chr(10)}' for name in names)})\n"
 
 
@@ -110,7 +110,7 @@ def _message(message: MessageSource) -> str:
 
 
 def _call(before: str, arguments: list[str], after: str = "") -> str:
-    """Return a call, an argument a line, which `ruff format` leaves so."""
+    """Return a call as `ruff format` leaves it."""
     return f"{before}(\n{''.join(f'        {argument},{chr(10)}' for argument in arguments)}    ){after}"
 
 

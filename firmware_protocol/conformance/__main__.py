@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import json
-import math
 import shlex
 import signal
 import subprocess
@@ -39,10 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Examine the device on a line, once the user has agreed that its motors move, and print the results."""
     command = parser()
     options = command.parse_args(arguments)
-    if not (0.0 < options.opening_mm_s < math.inf and 0.0 < options.stroke_mm < math.inf):
-        command.error(
-            f"--opening-mm-s {options.opening_mm_s:g}, --stroke-mm {options.stroke_mm:g}: allowed are numbers over 0"
-        )
     if not (options.yes or _is_agreed(options.line)):
         command.exit(USAGE, f"{command.prog}: nothing was sent; say yes, or --yes where nobody can be asked\n")
     try:

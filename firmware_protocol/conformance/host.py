@@ -43,14 +43,13 @@ ANSWER_S, SEEN_S, ACKNOWLEDGED_S = 0.02, 0.065, 0.5
 """An immediate answer has arrived by ANSWER_S, on any carrier that the position loop can use. Three Status come in
 SEEN_S: one of them shows the present state, even where one is lost."""
 OPENED_S, HOMED_S, HOMES_S, MOVED_S = 10.0, 12.0, 0.75, 2.0
-"""HOMED_S is what the daemon allows a homing, none ends before HOMES_S; a motion may take MOVED_S in addition to its
-time at TRAVEL_MM_S."""
+"HOMED_S is what the daemon allows a homing, none ends before HOMES_S; a motion may take MOVED_S more."
 HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
 BRAKED, LEAP_C, LATE_DRIVES, AHEAD = 3, 10.0, 100, 3
-"BRAKED Status come in 50 ms of braking and after; States may be AHEAD of a Status."
+"BRAKED Status come in 50 ms of braking; States may be AHEAD of a Status."
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
 OPEN, CLOSED = ENDS[0] | ENDS[1], ENDS[2] | ENDS[3]
 NO_FAULT: Final = DeviceFault(0)
@@ -120,7 +119,7 @@ class Host:
         self._asked = deque[tuple[float, ...]](maxlen=999)
         self.counters = deque[int](maxlen=LATE_DRIVES)
         self.nonces: list[int] = []
-        """The nonce that Status showed last, and those sent since."""
+        """The one Status showed last, and those sent since."""
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
         self.drives = self.states = self.senses = 0
@@ -280,7 +279,7 @@ class Host:
         return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
 
     def _listen(self, period_s: float) -> None:
-        """Take what comes in the next `period_s`, and note how late this process is."""
+        """Take what comes in a period, and note this process's lateness."""
         self._next_s += period_s
         for time_s, function, payload in self.line.receive(self._next_s):
             try:
@@ -321,7 +320,7 @@ class Host:
         self.newest[type(message)] = heard
 
     def _compare(self, before: Any, after: Status) -> None:
-        """Count what in a Status cannot follow the one before it, or the messages that were sent."""
+        """Count what in a Status cannot follow the one before."""
         self._opens = (self._opens + 1) * is_open(after)
         is_same, recent = before.mode is after.mode, [*self.counters][-len(self._asked) - AHEAD :]
         found = {

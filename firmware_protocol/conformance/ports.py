@@ -92,7 +92,7 @@ class CanPort(RealPort):
             ValueError,
             OSError,
             NotImplementedError,
-        ) as error:  # the last where nothing can wait for it
+        ) as error:
             raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
 
     def write(self, identifier: int, data: bytes) -> None:
@@ -109,7 +109,7 @@ class CanPort(RealPort):
         """Return the classical data frame with an 11-bit identifier that is there, or none."""
         try:
             frame = self._bus.recv(0)
-        except (can.CanError, OSError, ValueError, IndexError) as error:  # the last two are slcan's, of a damaged line
+        except (can.CanError, OSError, ValueError, IndexError) as error:
             raise OSError(str(error)) from error
         if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
             return []

@@ -61,8 +61,9 @@ DUTY: Final = -0.4
 STEPS: Final = round(DUTY * 10_000)
 MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
 "A homing that goes in further than it backs off obeys another message."
-BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM = 0.1, 0.2, 0.8, 0.05, 0.6
+BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S = 0.1, 0.2, 0.8, 0.05
 "A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
+COASTED_MM: Final = {DeviceMode.RUN: 0.6, DeviceMode.HOMING: 0.6}
 WITHIN_S: Final = {DeviceMode.HOMING: HOMES_S, DeviceMode.RETRACTING: 0.6}
 TWO_STATUS_S: Final = 2.2 * STATUS_S
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
@@ -178,7 +179,7 @@ def _stays(host: Host, place: Place, period_s: float) -> int:
     unless(before.mode is not place.mode, f"where it begins: {shown(before)}")
     first = len(host.rows)
     sources = [taken(host, place), refused(host, 1 if period_s == PERIOD_S else 7)]
-    if (place.mode in RESTING) is (period_s == PERIOD_S):  # a motion has no time for all
+    if (place.mode in RESTING) is (period_s == PERIOD_S):
         sources.insert(1, damaged(host))
     for one in chain(*sources):
         before = _changes_nothing(host, place, period_s, one, before, start)
@@ -211,7 +212,7 @@ def _changes_nothing(
 
 
 def _changes(host: Host, one: Sent, before: Status, since_s: float) -> dict[str, bool]:
-    """Return what may not change in Status from a time on, and whether it did."""
+    """Return what may not change in Status, and whether it did."""
     after = [each for time_s, each in host.all_of(Status) if time_s > since_s] or [host.status]
     identities = len(host.all_of(Identity))
     return {
@@ -258,9 +259,7 @@ def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
         first = len(host.rows)
         host.pass_time(WITHIN_S.get(place.mode, 0.0) * (host.random.random() + (period_s > PERIOD_S)) / 2.0, beat)
     faults = (NO_FAULT if name == "Clear" else host.status.faults) | CAUSES.get(name, NO_FAULT)
-    seen = _begun(
-        host, place, name, beat, period_s, COASTED_MM if is_far or place.mode is DeviceMode.HOMING else MOVED_MM
-    )
+    seen = _begun(host, place, name, beat, period_s)
     if is_far or place.mode is DeviceMode.RETRACTING:
         return opens_fully(host, faults, first, beat)
     host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, beat)
@@ -304,7 +303,7 @@ def _say(host: Host, place: Place, name: str, beat: Beat) -> None:
         _fall_silent(host, place)
 
 
-def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coasted_mm: float) -> str:
+def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float) -> str:
     """Send a message, and compare what follows at once with what must be."""
     start, to = places(host.last(State)), ACTS[name][place.mode].partition(",")[0]
     host.heard.clear()
@@ -313,7 +312,7 @@ def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coa
     way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_wrong = to != DeviceMode.HOMING.name and min(way_mm) < -coasted_mm
+    is_wrong = to != DeviceMode.HOMING.name and min(way_mm) < -COASTED_MM.get(place.mode, MOVED_MM)
     is_wrong |= place.mode is DeviceMode.RUN and min(way_mm[-2:]) < BEGUN_MM
     is_wrong |= name != SILENT and len(host.all_of(Identity)) != (name == MISFITS)
     return unless(is_wrong or modes[:1] != [to] * (to in MODES), seen)
@@ -322,7 +321,7 @@ def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coa
 def opens_fully(
     host: Host, fault: DeviceFault, first: int, beat: Beat = DriveMode.OFF, *, has_zero: bool = True
 ) -> str:
-    """Watch a device open, and judge each carriage's speed on the device's clock, from this value of `host.rows` on."""
+    """Watch a device open, and judge each carriage's speed from this value of `host.rows` on."""
     host.until(host.is_resting, OPENED_S, beat)
     rows = columns(host, first)
     leasts, mosts = zip(*(_opened(rows, side) for side in SIDES), strict=True)

@@ -4,6 +4,7 @@ Those of all reports read every State and Sense since the start, by mode.
 """
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from itertools import chain, pairwise
 from typing import Final
@@ -49,11 +50,10 @@ MAX_ANSWER_S, PAUSE_S = 3e-3, 0.1
 TIME_SPAN_S, HANDLE_SPAN_MM = period(State, "device_time_s"), period(Sense, "handle_position_mm")
 STEP_MM, HANDLE_STEP_MM = period(State, "left_position_mm") / 2**16, HANDLE_SPAN_MM / 2**16
 TURN_MM, TURNED_S, LEAP_MM = 40.0 * math.pi, 20.0, 0.25
-"A hand changes the way from State to State by a few um; one of swapped bytes leaps by 2 mm a step."
+"Swapped bytes leap by 2 mm a step."
 SUCCESSIVE_S, TICK_S, FORCE_S, AT_REST_A, USUAL_N = 3e-3, 1e-5, 0.03, 0.02, 5.0
 STEPS, ENDS, BESIDE_S, FRESH_S, FORCE_STEPS, LONE, UNMOVED = 3.0, -1.0, 5e-3, 2e-3, 50, 0.2, 999
-"""A place that is old, or of another time, lies STEPS off its way; the motion itself makes one. LONE is a share of the
-whole range."""
+"A place that is old lies STEPS off its way; LONE is a share of a mode's range."
 SIDES, MOVES_MM_S, STANDS_MM_S, MOVING = (
     ("left", "right"),
     0.5,
@@ -68,7 +68,7 @@ SLIDES_MM_S, NEAR_MM, GROWS, AS_MUCH, DEPTHS_MM = 10.0, 0.7, 1.15, 1.25, (0.0, 1
 
 
 def columns(host: Host, first: int = 0) -> dict[str, Array]:
-    """Return what came from this value of `host.rows` on, unwrapped, and speeds."""
+    """Return what came from a value of `host.rows` on, unwrapped, and speeds."""
     rows = np.array(host.rows[first:]).reshape(-1, len(COLUMNS))
     unless(len(rows) < 2, "no Sense")
     table = dict(zip(COLUMNS, rows.T, strict=True))
@@ -84,7 +84,7 @@ def columns(host: Host, first: int = 0) -> dict[str, Array]:
 
 
 def all_columns(host: Host) -> dict[str, Array]:
-    """Return all that came, with the mode that both Status around a row show, else ENDS less the first."""
+    """Return all that came, with the mode of both Status around, else ENDS less the first."""
     unless(len(host.marks) < 4, "no Status")
     table, (at, modes) = columns(host), np.array(host.marks).reshape(-1, 2).T
     table["mode"] = np.full(len(table["counter"]), math.nan)
@@ -95,20 +95,20 @@ def all_columns(host: Host) -> dict[str, Array]:
 
 
 def successive(rows: dict[str, Array]) -> npt.NDArray[np.bool_]:
-    """Return whether a State follows the one before it at once, but where a homing ends and the origin leaps."""
+    """Return whether a State follows at once, but where a homing moves the origin."""
     is_old = rows["mode"] == ENDS - DeviceMode.HOMING
     return np.asarray((np.diff(rows["device_s"]) < SUCCESSIVE_S) & ~is_old[1:] & ~is_old[:-1])
 
 
 def least_step(rows: dict[str, Array], name: str, step: float) -> int:
-    """Return a value's least step from State to State, in the mode where that is greatest."""
+    """Return a value's least step, in the mode where that is greatest."""
     ways = np.rint(np.abs(np.diff(rows[name])) / step).astype(np.int_) * successive(rows)
     parts = [ways[(ways > 0) & (rows["mode"][1:] == mode)] for mode in DeviceMode]
     return max((int(part.min()) for part in parts if part.size > BLOCK), default=UNMOVED)
 
 
 def off_way(rows: dict[str, Array], name: str) -> Array:
-    """Return how far each of a motion's places but those at its ends lies beside the way between its neighbours."""
+    """Return how far each place but the ends lies beside the way between its neighbours."""
     steps_s, ways, near = np.diff(rows["device_s"]), np.diff(rows[name]), successive(rows)
     off = ways[1:-1] - steps_s[1:-1] * (ways[:-2] + ways[2:]) / np.maximum(steps_s[:-2] + steps_s[2:], TICK_S)
     return np.abs(off) * (near[:-2] & near[1:-1] & near[2:])
@@ -172,10 +172,7 @@ def every_counter(host: Host) -> str:
 
 
 def drawn_A(rows: dict[str, Array], side: str) -> dict[str, float]:
-    """Return by mode the current that a motor draws for an acceleration.
-
-    Both are means over a window, with the weights that make a second difference of places.
-    """
+    """Return by mode the current for an acceleration, both with the weights of a second difference."""
     clock_s = np.arange(rows["device_s"][0], rows["device_s"][-1], PERIOD_S)
     row = np.searchsorted(rows["device_s"], clock_s, side="right") - 1
     at_mm, at_A = (np.interp(clock_s, rows["device_s"], rows[f"{side}_{unit}"]) for unit in ("mm", "A"))
@@ -198,7 +195,7 @@ def drawn_A(rows: dict[str, Array], side: str) -> dict[str, float]:
 
 
 def _standing_A(rows: dict[str, Array]) -> float:
-    """Return what a motor usually draws while it stands in a motion: at all, or beside the other one's."""
+    """Return what a standing motor usually draws in a motion."""
     found_A = [0.0]
     for side, other in (SIDES, SIDES[::-1]):
         stands = (np.abs(rows[f"{side}_mm_s"]) < STANDS_MM_S) & np.isin(rows["mode"], MOVING[1:])
@@ -208,7 +205,7 @@ def _standing_A(rows: dict[str, Array]) -> float:
 
 
 def _alike(rows: dict[str, Array]) -> list[str]:
-    """Return the modes in which both sides always report the same place, or current, but not the same of the other."""
+    """Return the modes in which both sides always report one value alike, but not the other."""
     is_both, found = np.minimum(*(np.abs(rows[f"{side}_mm_s"]) for side in SIDES)) > MOVES_MM_S, []
     for mode in MOVING:
         part = is_both & (rows["mode"] == mode)
@@ -386,8 +383,14 @@ def _usual_N(rows: dict[str, Array], part: npt.NDArray[np.bool_]) -> float:
     return float(np.median(np.abs(rows["force_N"][part]))) if np.sum(part) > BLOCK / 4 else math.nan
 
 
+def _times(rows: dict[str, Array], depths: Sequence[npt.NDArray[np.bool_]]) -> float:
+    """Return the greatest quotient of the forces of two modes."""
+    modes_N = [[_usual_N(rows, depth & (rows["mode"] == mode)) for mode in DeviceMode] for depth in depths]
+    return max((np.nanmax(by_N) / np.nanmin(by_N) for by_N in modes_N if not np.isnan(by_N).all()), default=1.0)
+
+
 def alone(rows: dict[str, Array], name: str) -> int:
-    """Return how many values lie far beside both neighbours, as shares of what is usual in their mode."""
+    """Return how many values lie far beside both neighbours."""
     ways, near = np.diff(rows[name]), successive(rows)
     least = np.minimum(ways[:-1] * -np.sign(ways[1:]), np.abs(ways[1:]))  # over 0 if it turns back
     near = near[:-1] & near[1:]
@@ -410,14 +413,15 @@ def force_follows_gap(host: Host) -> str:
     least, old_s = least_step(rows, "force_N", 1e-3), oldest_s(rows, "force_N", slides)
     depths = [slides & (np.abs(inside_mm - mm) < NEAR_MM) for mm in DEPTHS_MM]
     forces_N = [_usual_N(rows, depth) for depth in depths]
-    modes_N = [[_usual_N(rows, depth & (rows["mode"] == mode)) for mode in DeviceMode] for depth in depths]
-    most = max((np.nanmax(by_N) / np.nanmin(by_N) for by_N in modes_N if not np.isnan(by_N).all()), default=1.0)
+    most = _times(rows, depths)
     seen = (
         f"{against_N} N against it, {old_s * 1e3:.0f} ms old, in steps of {least}; "
         f"{', '.join(f'{force_N:.2f}' for force_N in forces_N)} N, {most:.2f} times as much in one mode as in another"
     )
-    is_wrong = min(against_N, default=1.0) <= 0.0 or FORCE_STEPS < least < UNMOVED
-    unless(is_wrong or old_s > FORCE_S / 2.0 or most > AS_MUCH, seen)
+    unless(
+        min(against_N, default=1.0) <= 0.0 or FORCE_STEPS < least < UNMOVED or old_s > FORCE_S / 2.0 or most > AS_MUCH,
+        seen,
+    )
     if np.isnan(forces_N).any():
         raise Untested(f"{seen} at {DEPTHS_MM} mm: run all checks, and turn the handle meanwhile")
     return unless(any(after < GROWS * before for before, after in pairwise(forces_N[1:])), seen)

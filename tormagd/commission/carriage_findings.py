@@ -49,7 +49,7 @@ REMEDIES = {RESISTANCE: PLUG, BACK_EMF: SCALE, INERTIA: COUPLED, FRICTION: GREAS
 
 
 Driven = dict[str, tuple[float, float]]
-"""What one carriage's motor shows, by the name in [motor], each value with the half width of its interval."""
+"""What a carriage's motor shows, each value with the half width of its interval."""
 
 
 def nominals(motor: Motor) -> dict[str, float]:

@@ -163,7 +163,7 @@ def given(
     force_N: float | None = None,
     late: tuple[str, str, str] | None = None,
 ) -> Course[Columns]:
-    """Give `command` once, wait until the newest tick `is_done`, and return all ticks; `late` is the error else."""
+    """Give `command` once, wait until the newest tick `is_done`, and return all ticks."""
     begun_s, fresh = yield Asked(force_N, command)
     rows = list(fresh)
     while not (rows and is_done(rows[-1])):
