@@ -63,7 +63,11 @@ MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
 "A homing that goes in further than it backs off obeys another message."
 BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S = 0.1, 0.2, 0.8, 0.05
 "A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
-COASTED_MM: Final = {DeviceMode.RUN: 0.6, DeviceMode.HOMING: 0.6}
+COASTED_MM: Final = {
+    (DeviceMode.RUN, PERIOD_S): 0.6,
+    (DeviceMode.HOMING, PERIOD_S): 0.6,
+    (DeviceMode.HOMING, SPARSE_S): 0.6,
+}
 WITHIN_S: Final = {DeviceMode.HOMING: HOMES_S, DeviceMode.RETRACTING: 0.6}
 TWO_STATUS_S: Final = 2.2 * STATUS_S
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
@@ -312,7 +316,7 @@ def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float) -> 
     way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_wrong = to != DeviceMode.HOMING.name and min(way_mm) < -COASTED_MM.get(place.mode, MOVED_MM)
+    is_wrong = to != DeviceMode.HOMING.name and min(way_mm) < -COASTED_MM.get((place.mode, period_s), MOVED_MM)
     is_wrong |= place.mode is DeviceMode.RUN and min(way_mm[-2:]) < BEGUN_MM
     is_wrong |= name != SILENT and len(host.all_of(Identity)) != (name == MISFITS)
     return unless(is_wrong or modes[:1] != [to] * (to in MODES), seen)
