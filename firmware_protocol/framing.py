@@ -173,9 +173,9 @@ class FrameDecoder:
         """Count the bytes between two delimiters, and return their frame, unless it is corrupt or repeated."""
         statistics = self.statistics
         frame = _parse(encoded)
-        if frame is None:
+        if isinstance(frame, str):
             statistics.corrupt += 1
-            statistics.refused["frame"] = _why_refused(encoded)
+            statistics.refused["frame"] = frame
             self._synchronised = False
             return None
         if not self._synchronised:
@@ -192,20 +192,15 @@ class FrameDecoder:
         return frame
 
 
-def _why_refused(encoded: bytes) -> str:
-    """Return in a few words which check a corrupt frame failed."""
+def _parse(encoded: bytes) -> Frame | str:
+    """Return the frame between two delimiters, or in a few words which check it failed."""
     if len(encoded) > MAX_ENCODED:
         return f"over {MAX_ENCODED} bytes"
     body = cobs_decode(encoded)
     if body is None:
         return "COBS"
-    return "too short" if len(body) < HEADER_LENGTH + CRC_LENGTH else "CRC-16"
-
-
-def _parse(encoded: bytes) -> Frame | None:
-    if len(encoded) > MAX_ENCODED:
-        return None
-    body = cobs_decode(encoded)
-    if body is None or len(body) < HEADER_LENGTH + CRC_LENGTH or crc_hqx(body, CRC_INITIAL) != CRC_RESIDUE:
-        return None
+    if len(body) < HEADER_LENGTH + CRC_LENGTH:
+        return "too short"
+    if crc_hqx(body, CRC_INITIAL) != CRC_RESIDUE:
+        return "CRC-16"
     return Frame(body[0], body[1], body[HEADER_LENGTH:-CRC_LENGTH])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from firmware_protocol.c.source import c_files
-from firmware_protocol.dbc import DBC, Schema, SchemaError, SignalSource, read_schema
+from firmware_protocol.dbc import DBC, Schema, SignalSource, read_schema
 from firmware_protocol.golden import vector_files
 from firmware_protocol.python_source import python_files
 
@@ -55,10 +55,8 @@ def generated_files(room: Path) -> dict[Path, str]:
     """Return the text that each generated file of a folder should have, by its path."""
     schema = read_schema(room / DBC.name)
     readme = (room / "README.md").read_text(encoding="utf-8")
-    before, begin, rest = readme.partition(TABLE_BEGIN)
-    _, end, after = rest.partition(TABLE_END)
-    if not (begin and end):
-        raise SchemaError(f"README.md: the markers {TABLE_BEGIN!r} and {TABLE_END!r} are missing")
+    before, rest = readme.split(TABLE_BEGIN)
+    after = rest.split(TABLE_END)[1]
     files = {room / name: text for name, text in python_files(schema).items()}
     files |= {room / "README.md": before + markdown_tables(schema) + after}
     files |= {room / "c" / name: text for name, text in c_files(schema, room / DBC.name).items()}

@@ -7,6 +7,7 @@ and the `cobs` package stuffs the frames. What a receiver must make of a damaged
 import json
 import random
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,24 +22,20 @@ RANDOM_SEED: Final = 20240229
 Json = dict[str, Any]
 
 
-def bitwise_crc8(data: bytes) -> int:
-    """Return the CRC-8/SAE-J1850, straight from its definition."""
-    register = 0xFF
+def bitwise_crc(data: bytes, bits: int, polynomial: int) -> int:
+    """Return a CRC straight from its definition."""
+    register = ones = (1 << bits) - 1
     for byte in data:
-        register ^= byte
+        register ^= byte << bits - 8
         for _ in range(8):
-            register = (register << 1) ^ (0x11D if register & 0x80 else 0)
-    return register ^ 0xFF
+            register = (register << 1) ^ (polynomial | ones + 1 if register & (ones + 1) >> 1 else 0)
+    return register ^ ones
 
 
-def bitwise_crc16(data: bytes) -> int:
-    """Return the CRC-16/GENIBUS, straight from its definition."""
-    register = 0xFFFF
-    for byte in data:
-        register ^= byte << 8
-        for _ in range(8):
-            register = (register << 1) ^ (0x11021 if register & 0x8000 else 0)
-    return register ^ 0xFFFF
+bitwise_crc8 = partial(bitwise_crc, bits=8, polynomial=0x1D)
+"CRC-8/SAE-J1850."
+bitwise_crc16 = partial(bitwise_crc, bits=16, polynomial=0x1021)
+"CRC-16/GENIBUS."
 
 
 def vector_files(schema: Schema, dbc: Path) -> dict[str, str]:

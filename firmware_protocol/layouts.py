@@ -2,7 +2,12 @@
 
 from typing import Final, final
 
-from firmware_protocol.enumerations import DeviceFault, DeviceMode, DriveMode, Switches
+from firmware_protocol.enumerations import (
+    DeviceFault,
+    DeviceMode,
+    DriveMode,
+    Switches,
+)
 from firmware_protocol.schema import Layout, Signal
 from firmware_protocol.value import Value
 
@@ -14,7 +19,10 @@ SCHEMA_HASH: Final = 0x4B3A3191
 class Retract(Value):
     """Host -> Device. Open the gap at the device's bounded rate, then switch the drives off."""
 
-    def __init__(self, nonce: int) -> None:
+    def __init__(
+        self,
+        nonce: int,
+    ) -> None:
         # New for every command, equal in its repetitions: the device acts on a nonce once.
         self.nonce: Final = nonce
 
@@ -23,7 +31,13 @@ class Retract(Value):
 class Drive(Value):
     """Host -> Device. Motor duties. Every 1 ms."""
 
-    def __init__(self, left_duty: float, right_duty: float, mode: DriveMode, counter: int) -> None:
+    def __init__(
+        self,
+        left_duty: float,
+        right_duty: float,
+        mode: DriveMode,
+        counter: int,
+    ) -> None:
         # Share of the supply voltage at the left motor; positive opens.
         self.left_duty: Final = left_duty
         # As left_duty, at the right motor.
@@ -38,7 +52,13 @@ class Drive(Value):
 class State(Value):
     """Device -> Host. Where the carriages are. Sent for each accepted Drive."""
 
-    def __init__(self, left_position_mm: float, right_position_mm: float, device_time_s: float, counter: int) -> None:
+    def __init__(
+        self,
+        left_position_mm: float,
+        right_position_mm: float,
+        device_time_s: float,
+        counter: int,
+    ) -> None:
         # Left screw relative to home (8 mm lead, 4480 counts a turn): 0 at the open end, negative towards closed.
         self.left_position_mm: Final = left_position_mm
         # Right screw relative to home, as the left.
@@ -54,7 +74,11 @@ class Sense(Value):
     """Device -> Host. Currents, force and handle, sampled with the State it follows. Sent for each accepted Drive."""
 
     def __init__(
-        self, left_current_A: float, right_current_A: float, force_N: float, handle_position_mm: float
+        self,
+        left_current_A: float,
+        right_current_A: float,
+        force_N: float,
+        handle_position_mm: float,
     ) -> None:
         # Left motor current; positive drives towards open.
         self.left_current_A: Final = left_current_A
@@ -70,7 +94,10 @@ class Sense(Value):
 class Clear(Value):
     """Host -> Device. Clear latched faults whose cause is gone."""
 
-    def __init__(self, nonce: int) -> None:
+    def __init__(
+        self,
+        nonce: int,
+    ) -> None:
         # As in Retract.
         self.nonce: Final = nonce
 
@@ -79,7 +106,10 @@ class Clear(Value):
 class Home(Value):
     """Host -> Device. Find the open end and zero the encoders there."""
 
-    def __init__(self, nonce: int) -> None:
+    def __init__(
+        self,
+        nonce: int,
+    ) -> None:
         # As in Retract.
         self.nonce: Final = nonce
 
@@ -118,7 +148,12 @@ class Status(Value):
 class Hello(Value):
     """Host -> Device. First message of a host; answered by Identity."""
 
-    def __init__(self, schema_hash: int, protocol_version: int, nonce: int) -> None:
+    def __init__(
+        self,
+        schema_hash: int,
+        protocol_version: int,
+        nonce: int,
+    ) -> None:
         # Beginning of the SHA-256 of the canonical layout, as the host knows it.
         self.schema_hash: Final = schema_hash
         # Version of the rules around the messages: framing, timing, meaning.
@@ -131,7 +166,13 @@ class Hello(Value):
 class Identity(Value):
     """Device -> Host. Answer to Hello."""
 
-    def __init__(self, schema_hash: int, firmware_major: int, firmware_minor: int, serial_number: int) -> None:
+    def __init__(
+        self,
+        schema_hash: int,
+        firmware_major: int,
+        firmware_minor: int,
+        serial_number: int,
+    ) -> None:
         # As in Hello, as the device knows it.
         self.schema_hash: Final = schema_hash
         # Firmware version, major.

@@ -20,10 +20,11 @@ _WIRE_HEAD: Final = '''\
 Whatever does not fit is None here, or an error of Python's where it is not even a number. `codec` says what was wrong.
 """
 
+from collections.abc import Callable
 from functools import cache
 from operator import index
 from struct import Struct
-from typing import Final
+from typing import Any, Final
 
 from firmware_protocol.checksum import CRC8_RESIDUE, crc8
 '''
@@ -48,9 +49,7 @@ def _enumerations(schema: Schema) -> dict[str, SignalSource]:
 
 
 def _import(module: str, names: list[str]) -> str:
-    line = f"from firmware_protocol.{module} import {', '.join(names)}\n"
-    if len(line) <= LINE_WIDTH + 1:
-        return line
+    """Return an import as `ruff format` leaves it."""
     return f"from firmware_protocol.{module} import (\n{''.join(f'    {name},{chr(10)}' for name in names)})\n"
 
 
@@ -111,13 +110,8 @@ def _message(message: MessageSource) -> str:
 
 
 def _call(before: str, arguments: list[str], after: str = "") -> str:
-    whole = f"{before}({', '.join(arguments)}){after}"
-    if len(whole) <= LINE_WIDTH - 4:
-        return whole
-    inner = f"        {', '.join(arguments)}\n"
-    if len(inner) > LINE_WIDTH + 1:
-        inner = "".join(f"        {argument},\n" for argument in arguments)
-    return f"{before}(\n{inner}    ){after}"
+    """Return a call as `ruff format` leaves it."""
+    return f"{before}(\n{''.join(f'        {argument},{chr(10)}' for argument in arguments)}    ){after}"
 
 
 def _layout(message: MessageSource) -> str:
@@ -211,10 +205,11 @@ def _pack(message: MessageSource) -> str:
             tests.append(f"not {float(lowest)!r} <= {name} <= {float(highest)!r}")
             steps.append(f"int({name})")
         else:
+            step = f"message.{name}" if s.python_type == "int" and not _is_wide(s) else name
             value = f"index(message.{name})" if _is_wide(s) else f"message.{name}"
-            lines.append(f"{name}: int = {value}")
-            tests.append(f"not {lowest} <= {name} <= {highest}")
-            steps.append(name)
+            lines += [f"{name}: int = {value}"] if step == name else []
+            tests.append(f"not {lowest} <= {step} <= {highest}")
+            steps.append(step)
     lines += _none_where(*tests)
     packer = f"_PACK_{_constant(message.name)}"
     if message.protected:
@@ -225,47 +220,53 @@ def _pack(message: MessageSource) -> str:
     return head + "".join(f"    {line}\n" for line in lines)
 
 
+def _raw(signal: SignalSource) -> str:
+    """Return a signal's step, out of the bytes of `data`."""
+    first, count = signal.start // 8, signal.length // 8
+    raw = " | ".join(f"data[{first + k}]" + (f" << {8 * k}" if k else "") for k in range(count))
+    half = _mask(1 << signal.length - 1)
+    if signal.signed:
+        return f"(({raw}) ^ {half}) - {half}" if count > 1 else f"({raw} ^ {half}) - {half}"
+    return raw
+
+
 def _unpack(message: MessageSource) -> str:
-    lines = _none_where(f"len(data) != {message.length}")
+    damaged = [f"len(data) != {message.length}"]
     if message.protected:
-        lines += _none_where(f"{_crc(message, 'data')} != CRC8_RESIDUE")
-    values, tests = [], []
+        damaged.append(f"{_crc(message, 'data')} != CRC8_RESIDUE")
+    lines, values, tests = _none_where(*damaged), [], []
     for s in message.fields:
-        first, count = s.start // 8, s.length // 8
-        raw = " | ".join(f"data[{first + k}]" + (f" << {8 * k}" if k else "") for k in range(count))
-        if s.signed:
-            half = _mask(1 << s.length - 1)
-            raw = f"(({raw}) ^ {half}) - {half}" if count > 1 else f"({raw} ^ {half}) - {half}"
-        lines.append(f"{s.name} = {raw}")
-        lowest, highest = s.steps
-        held = steps_held(s.length, s.signed)
+        (lowest, highest), held = s.steps, steps_held(s.length, s.signed)
+        step = f"({_raw(s)})" if s.signed or s.length > 8 else _raw(s)
         if s.steps != held:
+            lines.append(f"{s.name} = {_raw(s)}")
             tests.append(f"not {lowest} <= {s.name} <= {highest}" if lowest > held[0] else f"{s.name} > {highest}")
+            step = s.name
         if s.python_type == "float":
-            values.append(f"{s.name} * {s.scale!r}")
+            values.append(f"{step} * {s.scale!r}")
         elif s.kind == "Enumeration":
-            values.append(f"_{_constant(s.type_name)}[{s.name}]")
+            values.append(f"_{_constant(s.type_name)}[{step}]")
         elif s.kind == "Flags":
-            values.append(f"_{_constant(s.type_name)}({s.name})")
+            values.append(f"_{_constant(s.type_name)}({step})")
         else:
-            values.append(s.name)
+            values.append(step.strip("()"))
     lines += [*_none_where(*tests), _call(f"return {message.name}", values)]
     head = f"def unpack_{message.name.lower()}(data: bytes) -> {message.name} | None:\n"
     return head + "".join(f"    {line}\n" for line in lines)
 
 
 def _dispatch(schema: Schema) -> str:
-    packs = "".join(
-        f"        case {m.name}():\n            return pack_{m.name.lower()}(message)\n" for m in schema.messages
-    )
-    unpacks = "".join(
-        f"        case {m.function}:\n            return unpack_{m.name.lower()}(data)\n" for m in schema.messages
-    )
+    packs = "".join(f"    {m.name}: pack_{m.name.lower()},\n" for m in schema.messages)
+    unpacks = "".join(f"    {m.function}: unpack_{m.name.lower()},\n" for m in schema.messages)
     return (
+        f"_PACKERS: Final[dict[type[object], Callable[[Any], bytes | None]]] = {{\n{packs}}}\n"
+        f"_UNPACKERS: Final[dict[int, Callable[[bytes], Message | None]]] = {{\n{unpacks}}}\n\n\n"
         "def pack(message: Message) -> bytes | None:\n"
         '    """The payload of a message; None where a value does not fit."""\n'
-        f"    match message:\n{packs}    return None\n\n\n"
+        "    packer = _PACKERS.get(type(message))\n"
+        "    return None if packer is None else packer(message)\n\n\n"
         "def unpack(function: int, data: bytes) -> Message | None:\n"
         '    """The message in a payload; None for bytes that are none."""\n'
-        f"    match function:\n{unpacks}    return None\n"
+        "    unpacker = _UNPACKERS.get(function)\n"
+        "    return None if unpacker is None else unpacker(data)\n"
     )

@@ -3,14 +3,31 @@
 Whatever does not fit is None here, or an error of Python's where it is not even a number. `codec` says what was wrong.
 """
 
+from collections.abc import Callable
 from functools import cache
 from operator import index
 from struct import Struct
-from typing import Final
+from typing import Any, Final
 
 from firmware_protocol.checksum import CRC8_RESIDUE, crc8
-from firmware_protocol.enumerations import DeviceFault, DeviceMode, DriveMode, Switches
-from firmware_protocol.layouts import Clear, Drive, Hello, Home, Identity, Message, Retract, Sense, State, Status
+from firmware_protocol.enumerations import (
+    DeviceFault,
+    DeviceMode,
+    DriveMode,
+    Switches,
+)
+from firmware_protocol.layouts import (
+    Clear,
+    Drive,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Retract,
+    Sense,
+    State,
+    Status,
+)
 
 _BYTES: Final = tuple([bytes((byte,)) for byte in range(256)])
 _HALVES: Final = 1.5 * 2.0**52
@@ -36,47 +53,55 @@ _PACK_IDENTITY: Final = Struct("<IBBH").pack
 
 
 def pack_retract(message: Retract) -> bytes | None:
-    nonce: int = message.nonce
-    if not 0 <= nonce <= 255:
+    if not 0 <= message.nonce <= 255:
         return None
-    return _PACK_RETRACT(nonce)
+    return _PACK_RETRACT(
+        message.nonce,
+    )
 
 
 def unpack_retract(data: bytes) -> Retract | None:
     if len(data) != 1:
         return None
-    nonce = data[0]
-    return Retract(nonce)
+    return Retract(
+        data[0],
+    )
 
 
 def pack_drive(message: Drive) -> bytes | None:
     left_duty = float(message.left_duty / 0.0001) + _HALVES - _HALVES
     right_duty = float(message.right_duty / 0.0001) + _HALVES - _HALVES
     mode: int = message.mode
-    counter: int = message.counter
     if (
         not -10000.0 <= left_duty <= 10000.0
         or not -10000.0 <= right_duty <= 10000.0
         or not 0 <= mode <= 1
-        or not 0 <= counter <= 255
+        or not 0 <= message.counter <= 255
     ):
         return None
-    body = _PACK_DRIVE(int(left_duty), int(right_duty), mode, counter)
+    body = _PACK_DRIVE(
+        int(left_duty),
+        int(right_duty),
+        mode,
+        message.counter,
+    )
     return body + _BYTES[crc8(body, 0xFE)]
 
 
 def unpack_drive(data: bytes) -> Drive | None:
-    if len(data) != 7:
-        return None
-    if crc8(data, 0xFE) != CRC8_RESIDUE:
+    if len(data) != 7 or crc8(data, 0xFE) != CRC8_RESIDUE:
         return None
     left_duty = ((data[0] | data[1] << 8) ^ 0x8000) - 0x8000
     right_duty = ((data[2] | data[3] << 8) ^ 0x8000) - 0x8000
     mode = data[4]
-    counter = data[5]
     if not -10000 <= left_duty <= 10000 or not -10000 <= right_duty <= 10000 or mode > 1:
         return None
-    return Drive(left_duty * 0.0001, right_duty * 0.0001, _DRIVE_MODE[mode], counter)
+    return Drive(
+        left_duty * 0.0001,
+        right_duty * 0.0001,
+        _DRIVE_MODE[mode],
+        data[5],
+    )
 
 
 def pack_state(message: State) -> bytes | None:
@@ -89,32 +114,25 @@ def pack_state(message: State) -> bytes | None:
     device_time_s = float(message.device_time_s / 1e-05)
     if not -_WHOLE < device_time_s < _WHOLE:
         device_time_s %= 65536.0
-    counter: int = message.counter
-    if not 0 <= counter <= 255:
+    if not 0 <= message.counter <= 255:
         return None
     body = _PACK_STATE(
         int(left_position_mm + _HALVES - _HALVES) & 0xFFFF,
         int(right_position_mm + _HALVES - _HALVES) & 0xFFFF,
         int(device_time_s + _HALVES - _HALVES) & 0xFFFF,
-        counter,
+        message.counter,
     )
     return body + _BYTES[crc8(body, 0xE3)]
 
 
 def unpack_state(data: bytes) -> State | None:
-    if len(data) != 8:
+    if len(data) != 8 or crc8(data, 0xE3) != CRC8_RESIDUE:
         return None
-    if crc8(data, 0xE3) != CRC8_RESIDUE:
-        return None
-    left_position_mm = ((data[0] | data[1] << 8) ^ 0x8000) - 0x8000
-    right_position_mm = ((data[2] | data[3] << 8) ^ 0x8000) - 0x8000
-    device_time_s = data[4] | data[5] << 8
-    counter = data[6]
     return State(
-        left_position_mm * 0.0017857142857142857,
-        right_position_mm * 0.0017857142857142857,
-        device_time_s * 1e-05,
-        counter,
+        (((data[0] | data[1] << 8) ^ 0x8000) - 0x8000) * 0.0017857142857142857,
+        (((data[2] | data[3] << 8) ^ 0x8000) - 0x8000) * 0.0017857142857142857,
+        (data[4] | data[5] << 8) * 1e-05,
+        data[6],
     )
 
 
@@ -132,48 +150,54 @@ def pack_sense(message: Sense) -> bytes | None:
     ):
         return None
     return _PACK_SENSE(
-        int(left_current_A), int(right_current_A), int(force_N), int(handle_position_mm + _HALVES - _HALVES) & 0xFFFF
+        int(left_current_A),
+        int(right_current_A),
+        int(force_N),
+        int(handle_position_mm + _HALVES - _HALVES) & 0xFFFF,
     )
 
 
 def unpack_sense(data: bytes) -> Sense | None:
     if len(data) != 8:
         return None
-    left_current_A = ((data[0] | data[1] << 8) ^ 0x8000) - 0x8000
-    right_current_A = ((data[2] | data[3] << 8) ^ 0x8000) - 0x8000
-    force_N = ((data[4] | data[5] << 8) ^ 0x8000) - 0x8000
-    handle_position_mm = data[6] | data[7] << 8
     return Sense(
-        left_current_A * 0.001, right_current_A * 0.001, force_N * 0.001, handle_position_mm * 0.007669903939428206
+        (((data[0] | data[1] << 8) ^ 0x8000) - 0x8000) * 0.001,
+        (((data[2] | data[3] << 8) ^ 0x8000) - 0x8000) * 0.001,
+        (((data[4] | data[5] << 8) ^ 0x8000) - 0x8000) * 0.001,
+        (data[6] | data[7] << 8) * 0.007669903939428206,
     )
 
 
 def pack_clear(message: Clear) -> bytes | None:
-    nonce: int = message.nonce
-    if not 0 <= nonce <= 255:
+    if not 0 <= message.nonce <= 255:
         return None
-    return _PACK_CLEAR(nonce)
+    return _PACK_CLEAR(
+        message.nonce,
+    )
 
 
 def unpack_clear(data: bytes) -> Clear | None:
     if len(data) != 1:
         return None
-    nonce = data[0]
-    return Clear(nonce)
+    return Clear(
+        data[0],
+    )
 
 
 def pack_home(message: Home) -> bytes | None:
-    nonce: int = message.nonce
-    if not 0 <= nonce <= 255:
+    if not 0 <= message.nonce <= 255:
         return None
-    return _PACK_HOME(nonce)
+    return _PACK_HOME(
+        message.nonce,
+    )
 
 
 def unpack_home(data: bytes) -> Home | None:
     if len(data) != 1:
         return None
-    nonce = data[0]
-    return Home(nonce)
+    return Home(
+        data[0],
+    )
 
 
 def pack_status(message: Status) -> bytes | None:
@@ -182,19 +206,25 @@ def pack_status(message: Status) -> bytes | None:
     faults: int = index(message.faults)
     temperature_C = float(message.temperature_C / 1.0) + _HALVES - _HALVES
     supply_V = float(message.supply_V / 0.1) + _HALVES - _HALVES
-    drive_counter: int = message.drive_counter
-    command_nonce: int = message.command_nonce
     if (
         not 0 <= mode <= 4
         or not 0 <= switches <= 31
         or not 0 <= faults <= 1023
         or not -128.0 <= temperature_C <= 127.0
         or not 0.0 <= supply_V <= 255.0
-        or not 0 <= drive_counter <= 255
-        or not 0 <= command_nonce <= 255
+        or not 0 <= message.drive_counter <= 255
+        or not 0 <= message.command_nonce <= 255
     ):
         return None
-    return _PACK_STATUS(mode, switches, faults, int(temperature_C), int(supply_V), drive_counter, command_nonce)
+    return _PACK_STATUS(
+        mode,
+        switches,
+        faults,
+        int(temperature_C),
+        int(supply_V),
+        message.drive_counter,
+        message.command_nonce,
+    )
 
 
 def unpack_status(data: bytes) -> Status | None:
@@ -203,109 +233,100 @@ def unpack_status(data: bytes) -> Status | None:
     mode = data[0]
     switches = data[1]
     faults = data[2] | data[3] << 8
-    temperature_C = (data[4] ^ 0x80) - 0x80
-    supply_V = data[5]
-    drive_counter = data[6]
-    command_nonce = data[7]
     if mode > 4 or switches > 31 or faults > 1023:
         return None
     return Status(
         _DEVICE_MODE[mode],
         _SWITCHES(switches),
         _DEVICE_FAULT(faults),
-        temperature_C * 1.0,
-        supply_V * 0.1,
-        drive_counter,
-        command_nonce,
+        ((data[4] ^ 0x80) - 0x80) * 1.0,
+        data[5] * 0.1,
+        data[6],
+        data[7],
     )
 
 
 def pack_hello(message: Hello) -> bytes | None:
     schema_hash: int = index(message.schema_hash)
-    protocol_version: int = message.protocol_version
-    nonce: int = message.nonce
-    if not 0 <= schema_hash <= 4294967295 or not 0 <= protocol_version <= 255 or not 0 <= nonce <= 255:
+    if not 0 <= schema_hash <= 4294967295 or not 0 <= message.protocol_version <= 255 or not 0 <= message.nonce <= 255:
         return None
-    return _PACK_HELLO(schema_hash, protocol_version, nonce)
+    return _PACK_HELLO(
+        schema_hash,
+        message.protocol_version,
+        message.nonce,
+    )
 
 
 def unpack_hello(data: bytes) -> Hello | None:
     if len(data) != 6:
         return None
-    schema_hash = data[0] | data[1] << 8 | data[2] << 16 | data[3] << 24
-    protocol_version = data[4]
-    nonce = data[5]
-    return Hello(schema_hash, protocol_version, nonce)
+    return Hello(
+        data[0] | data[1] << 8 | data[2] << 16 | data[3] << 24,
+        data[4],
+        data[5],
+    )
 
 
 def pack_identity(message: Identity) -> bytes | None:
     schema_hash: int = index(message.schema_hash)
-    firmware_major: int = message.firmware_major
-    firmware_minor: int = message.firmware_minor
     serial_number: int = index(message.serial_number)
     if (
         not 0 <= schema_hash <= 4294967295
-        or not 0 <= firmware_major <= 255
-        or not 0 <= firmware_minor <= 255
+        or not 0 <= message.firmware_major <= 255
+        or not 0 <= message.firmware_minor <= 255
         or not 0 <= serial_number <= 65535
     ):
         return None
-    return _PACK_IDENTITY(schema_hash, firmware_major, firmware_minor, serial_number)
+    return _PACK_IDENTITY(
+        schema_hash,
+        message.firmware_major,
+        message.firmware_minor,
+        serial_number,
+    )
 
 
 def unpack_identity(data: bytes) -> Identity | None:
     if len(data) != 8:
         return None
-    schema_hash = data[0] | data[1] << 8 | data[2] << 16 | data[3] << 24
-    firmware_major = data[4]
-    firmware_minor = data[5]
-    serial_number = data[6] | data[7] << 8
-    return Identity(schema_hash, firmware_major, firmware_minor, serial_number)
+    return Identity(
+        data[0] | data[1] << 8 | data[2] << 16 | data[3] << 24,
+        data[4],
+        data[5],
+        data[6] | data[7] << 8,
+    )
+
+
+_PACKERS: Final[dict[type[object], Callable[[Any], bytes | None]]] = {
+    Retract: pack_retract,
+    Drive: pack_drive,
+    State: pack_state,
+    Sense: pack_sense,
+    Clear: pack_clear,
+    Home: pack_home,
+    Status: pack_status,
+    Hello: pack_hello,
+    Identity: pack_identity,
+}
+_UNPACKERS: Final[dict[int, Callable[[bytes], Message | None]]] = {
+    1: unpack_retract,
+    2: unpack_drive,
+    3: unpack_state,
+    4: unpack_sense,
+    5: unpack_clear,
+    6: unpack_home,
+    7: unpack_status,
+    8: unpack_hello,
+    9: unpack_identity,
+}
 
 
 def pack(message: Message) -> bytes | None:
     """The payload of a message; None where a value does not fit."""
-    match message:
-        case Retract():
-            return pack_retract(message)
-        case Drive():
-            return pack_drive(message)
-        case State():
-            return pack_state(message)
-        case Sense():
-            return pack_sense(message)
-        case Clear():
-            return pack_clear(message)
-        case Home():
-            return pack_home(message)
-        case Status():
-            return pack_status(message)
-        case Hello():
-            return pack_hello(message)
-        case Identity():
-            return pack_identity(message)
-    return None
+    packer = _PACKERS.get(type(message))
+    return None if packer is None else packer(message)
 
 
 def unpack(function: int, data: bytes) -> Message | None:
     """The message in a payload; None for bytes that are none."""
-    match function:
-        case 1:
-            return unpack_retract(data)
-        case 2:
-            return unpack_drive(data)
-        case 3:
-            return unpack_state(data)
-        case 4:
-            return unpack_sense(data)
-        case 5:
-            return unpack_clear(data)
-        case 6:
-            return unpack_home(data)
-        case 7:
-            return unpack_status(data)
-        case 8:
-            return unpack_hello(data)
-        case 9:
-            return unpack_identity(data)
-    return None
+    unpacker = _UNPACKERS.get(function)
+    return None if unpacker is None else unpacker(data)

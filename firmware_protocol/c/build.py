@@ -1,7 +1,6 @@
 """Builds the C sources on this machine, for the simulated device and for tests.
 
-`python -m firmware_protocol.c.build` builds the shared library, if that has not been done yet, and prints its path. The
-library is kept in the user's cache, under a name made from the sources, the compiler and its flags.
+What is built is kept in the user's cache, under a name made from the sources, the compiler and its flags.
 """
 
 import ctypes
@@ -9,7 +8,6 @@ import hashlib
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 from enum import Enum
 from functools import cache
@@ -119,16 +117,3 @@ def _compile(command: list[str]) -> None:
         raise BuildError(f"{command[0]} did not finish in {TIME_LIMIT_S} s") from error
     if result.returncode != 0:
         raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
-
-
-def main() -> int:
-    try:
-        print(build(Target.LIBRARY))
-    except BuildError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

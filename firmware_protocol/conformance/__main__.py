@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import json
-import math
 import shlex
 import signal
 import subprocess
@@ -22,7 +21,6 @@ from firmware_protocol.conformance.rules import RULES
 
 PASSED, FAILED, USAGE = 0, 1, 2
 RESET_S: Final = 30.0
-WAYS: Final = {"warm": "by its reset pin", "cold": "by its supply, off and on"}
 PAGE: Final = "firmware_protocol/README.md"
 LISTED: Final = "\n".join(
     (
@@ -40,10 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Examine the device on a line, once the user has agreed that its motors move, and print the results."""
     command = parser()
     options = command.parse_args(arguments)
-    if not (0.0 < options.opening_mm_s < math.inf and 0.0 < options.stroke_mm < math.inf):
-        command.error(
-            f"--opening-mm-s {options.opening_mm_s:g}, --stroke-mm {options.stroke_mm:g}: allowed are numbers over 0"
-        )
     if not (options.yes or _is_agreed(options.line)):
         command.exit(USAGE, f"{command.prog}: nothing was sent; say yes, or --yes where nobody can be asked\n")
     try:
@@ -89,12 +83,11 @@ def told(result: Result) -> str:
 def _examined(line: Line, checks: Sequence[Check], options: argparse.Namespace) -> bool:
     """Run the checks, print the results, and return whether none failed."""
     out = sys.stderr if options.json else sys.stdout
-    can_reset = options.reset or (not options.yes and sys.stdin.isatty())
     host = Host(
         line,
         opening_mm_s=options.opening_mm_s,
         stroke_mm=options.stroke_mm,
-        reset=partial(_reset, options.reset) if can_reset else None,
+        reset=partial(_reset, options.reset) if options.reset else None,
         ask=lambda what: _say(f"please {what}", sys.stderr),
     )
 
@@ -121,18 +114,15 @@ def _examined(line: Line, checks: Sequence[Check], options: argparse.Namespace) 
 
 def _summary(host: Host, results: Sequence[Result]) -> str:
     passed, failed, untested = (sum(result.passed is each for result in results) for each in (True, False, None))
-    known = host.all_of(Identity)
-    names = [f"device {it.serial_number}, firmware {it.firmware_major}.{it.firmware_minor}" for _, it in known]
-    besides = f", {untested} not tested" if untested else ""
-    return f"{(names or ['nobody'])[-1]}: {passed} of {passed + failed} checks passed{besides}"
+    names = [
+        f"device {it.serial_number}, firmware {it.firmware_major}.{it.firmware_minor}"
+        for _, it in host.all_of(Identity)
+    ]
+    return f"{(names or ['nobody'])[-1]}: {passed} of {passed + failed} checks passed, {untested} not tested"
 
 
-def _reset(command: str | None, how: str) -> None:
-    """Reset the device by the command of `--reset`, or by a person at the terminal."""
-    if command is None:
-        print(f"Reset the device {WAYS[how]}, then press Enter: ", end="", file=sys.stderr, flush=True)
-        sys.stdin.readline()
-        return
+def _reset(command: str, how: str) -> None:
+    """Reset the device by the command of `--reset`."""
     try:
         subprocess.run([*shlex.split(command), how], check=True, timeout=RESET_S, stdin=subprocess.DEVNULL)
     except subprocess.SubprocessError as error:

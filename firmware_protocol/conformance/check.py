@@ -56,8 +56,7 @@ def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = la
     for one in checks:
         seen = f"not tried, because {closed_by} failed"
         result = Result(one, passed=False, seen=seen) if one.moves and closed_by else _performed(host, one)
-        if one.is_gate and result.passed is False:
-            closed_by = closed_by or one.name
+        closed_by = closed_by or (one.name if one.is_gate and result.passed is False else "")
         results.append(result)
         tell(result)
     return results

@@ -32,15 +32,17 @@ def _is_new(host: Host, how: str) -> str:
     host.running(FAR_INSIDE_MM, ASKEW_MM)
     host.reset(how)
     host.begin()
-    is_new = host.until(lambda: host.status.command_nonce == 0, BOOT_S, None)
-    unless(not is_new, f"no reset, or one that keeps the nonce: {shown(host.status)}")
+    unless(
+        not host.until(lambda: host.status.command_nonce == 0, BOOT_S, None),
+        f"no reset, or one that keeps the nonce: {shown(host.status)}",
+    )
     host.counter = (host.counter - 1) % 256 if how == "warm" else 255
     seen = [moving.keeps_still(host, "after the reset")]
     host.send(Home(0))
     host.shows(DeviceMode.IDLE, None, homed=False, fault=NO_FAULT, besides="after a Home with nonce 0")
     if how == "warm":
         host.obeyed(Retract)
-        seen.append(taking.opens_fully(host, NO_FAULT, has_zero=False))
+        seen.append(taking.opens_fully(host, NO_FAULT, len(host.rows), has_zero=False))
     host.home(None)
     seen.append(moving.keeps_still(host, "homed without a Hello,"))
     host.hello()

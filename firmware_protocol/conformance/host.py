@@ -9,6 +9,7 @@ from array import array
 from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
+from itertools import dropwhile
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 from firmware_protocol.codec import (
@@ -42,13 +43,13 @@ ANSWER_S, SEEN_S, ACKNOWLEDGED_S = 0.02, 0.065, 0.5
 """An immediate answer has arrived by ANSWER_S, on any carrier that the position loop can use. Three Status come in
 SEEN_S: one of them shows the present state, even where one is lost."""
 OPENED_S, HOMED_S, HOMES_S, MOVED_S = 10.0, 12.0, 0.75, 2.0
-"HOMED_S is what the daemon allows a homing; a motion may take MOVED_S in addition to its time at TRAVEL_MM_S."
+"HOMED_S is what the daemon allows a homing, none ends before HOMES_S; a motion may take MOVED_S more."
 HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
-BRAKED, LEAP_C, LATE_DRIVES = 3, 10.0, 100
-"BRAKED Status come in 50 ms of braking and after."
+BRAKED, LEAP_C, LATE_DRIVES, AHEAD = 3, 10.0, 100, 3
+"BRAKED Status come in 50 ms of braking; States may be AHEAD of a Status."
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
 OPEN, CLOSED = ENDS[0] | ENDS[1], ENDS[2] | ENDS[3]
 NO_FAULT: Final = DeviceFault(0)
@@ -117,11 +118,12 @@ class Host:
         """For each Status the rows before it, and its mode."""
         self._asked = deque[tuple[float, ...]](maxlen=999)
         self.counters = deque[int](maxlen=LATE_DRIVES)
+        self.nonces: list[int] = []
+        """The one Status showed last, and those sent since."""
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
         self._opens = 0
         self.drives = self.states = self.senses = 0
         """How many Drives that must be answered were sent, and how many State came."""
-        self.home_s = HOMES_S
         self.drive_s = self._next_s = line.port.now_s()
         self.counter = 0
         self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
@@ -135,6 +137,7 @@ class Host:
     # -- what is sent ------------------------------------------------------------------------------------------------
 
     def send(self, message: Message) -> None:
+        self.nonces += [message.nonce] if isinstance(message, Retract | Clear | Home | Hello) else []
         self.line.send(FUNCTION[type(message)], encode(message))
 
     def drive(self, mode: DriveMode, left: float = 0.0, right: float = 0.0) -> None:
@@ -187,8 +190,10 @@ class Host:
     def obeyed(self, kind: Command, beat: Beat = DriveMode.OFF, nonce: int = 0, duty: float = 0.0) -> None:
         before, is_shown = len(self.all_of(Status)), self.command(kind, beat, REPEAT_S, nonce, duty)
         unless(not is_shown, f"{kind.__name__} not acknowledged before its repetition: {shown(self.status)}")
-        came = [each for _, each in self.all_of(Status)[before:] if each.command_nonce == self.status.command_nonce]
-        unless(came[0].mode is not LEADS_TO[kind], f"{kind.__name__} acknowledged with {shown(came[0])}")
+        to, nonce = LEADS_TO[kind], self.status.command_nonce
+        came = next(each for _, each in self.all_of(Status)[before:] if each.command_nonce == nonce or each.mode is to)
+        is_wrong = came.mode is not to or came.command_nonce != nonce
+        unless(is_wrong, f"{kind.__name__} acknowledged with {shown(came)}")
 
     def beat(
         self,
@@ -274,16 +279,16 @@ class Host:
         return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
 
     def _listen(self, period_s: float) -> None:
-        """Take what comes in the next `period_s`, and note how late this process is."""
+        """Take what comes in a period, and note this process's lateness."""
         self._next_s += period_s
-        for arrival in self.line.receive(self._next_s):
+        for time_s, function, payload in self.line.receive(self._next_s):
             try:
-                message = decode(arrival.function, arrival.payload)
+                message = decode(function, payload)
             except DecodeError as error:
-                self.refused[f"{error.name or f'function {arrival.function}'}: {error.check}"] += 1
+                self.refused[f"{error.name or f'function {function}'}: {error.check}"] += 1
                 continue
             if isinstance(message, State | Sense | Status | Identity):
-                self._take(Heard(arrival.time_s, message))
+                self._take(Heard(time_s, message))
             else:
                 self.refused[f"{type(message).__name__}: a host's message"] += 1
         late_s = self.now_s - self._next_s
@@ -308,25 +313,31 @@ class Host:
         if isinstance(message, Identity):
             self.contradictions["another Identity"] += message != self.newest.get(Identity, heard).message
         if isinstance(message, Status):
-            before: Any = self.newest.get(Status, heard).message
-            self._opens = (self._opens + 1) * is_open(message)
-            is_unbraked = before.mode is DeviceMode.RETRACTING is not message.mode and 0 < self._opens < BRAKED
-            self.contradictions["at rest without braking"] += is_unbraked
-            self.contradictions["drive_counter of none of the last Drives"] += (
-                len(self.counters) == LATE_DRIVES and message.drive_counter not in self.counters
-            )
-            self.contradictions["nonce 0 again: a reset"] += before.command_nonce > message.command_nonce == 0
-            self.contradictions[f"{before.mode.name} then {message.mode.name}"] += (
-                message.mode.name in NEVER_FOLLOWS.get(before.mode.name, ())
-            )
-            flickers = (is_homed(before) is not is_homed(message)) | bool(before.faults & ~message.faults)
-            self.contradictions[f"HOMED, a fault or the temperature leaps in {message.mode.name}"] += (
-                flickers & (before.mode is message.mode)
-            ) | (abs(message.temperature_C - before.temperature_C) > LEAP_C)
+            self._compare(self.newest.get(Status, heard).message, message)
             self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
             self.marks.extend((len(self.rows) / len(COLUMNS), message.mode))
         self.heard.append(heard)
         self.newest[type(message)] = heard
+
+    def _compare(self, before: Any, after: Status) -> None:
+        """Count what in a Status cannot follow the one before."""
+        self._opens = (self._opens + 1) * is_open(after)
+        is_same, recent = before.mode is after.mode, [*self.counters][-len(self._asked) - AHEAD :]
+        found = {
+            "at rest without braking": before.mode is DeviceMode.RETRACTING
+            and not is_same
+            and 0 < self._opens < BRAKED,
+            "drive_counter not of the last Drive": len(self.counters) == LATE_DRIVES
+            and after.drive_counter not in recent,
+            "nonce 0 again: a reset": before.command_nonce > after.command_nonce == 0,
+            "a nonce not sent since the one before": Status in self.newest and after.command_nonce not in self.nonces,
+            f"{before.mode.name} then {after.mode.name}": after.mode.name in NEVER_FOLLOWS.get(before.mode.name, ()),
+            f"HOMED leaps in {after.mode.name}": is_same and is_homed(before) is not is_homed(after),
+            f"a fault ends in {after.mode.name}": is_same and before.faults & ~after.faults,
+            "the temperature leaps": abs(after.temperature_C - before.temperature_C) > LEAP_C,
+        }
+        self.contradictions.update(what for what, is_so in found.items() if is_so)
+        self.nonces = [*dropwhile(lambda nonce: nonce != after.command_nonce, self.nonces)] or [after.command_nonce]
 
     def _misplaced(self, time_s: float, status: Status) -> list[str]:
         """Return the end switches in a Status that do not fit the State just before it."""
@@ -373,7 +384,6 @@ class Host:
         self.obeyed(Home, beat)
         self.until(lambda: self.status.mode is not DeviceMode.HOMING, HOMED_S, beat)
         seconds = self._next_s - start_s
-        self.home_s = min(self.home_s, seconds)
         self.pass_time(SEEN_S, beat)
         return seconds
 

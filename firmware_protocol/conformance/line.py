@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from itertools import product
-from typing import Any, Final, NamedTuple, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 from firmware_protocol.codec import can_identifier
 from firmware_protocol.framing import (
@@ -24,10 +24,8 @@ TOO_MANY: Final = (1, 2, 5, 8, 12, 13, 14, 15, 16, 32, 64, 128, 243, 256)
 "Bytes too many, where a buffer's end may cut them off."
 
 
-class Arrival(NamedTuple):
-    time_s: float
-    function: int
-    payload: bytes
+Arrival: TypeAlias = tuple[float, int, bytes]
+"""When a frame came, its function, and its payload."""
 
 
 class Port(Protocol):
@@ -109,7 +107,7 @@ class SerialLine:
     def receive(self, until_s: float) -> list[Arrival]:
         """Wait until `until_s`, and return the whole frames that came."""
         arrivals = [
-            Arrival(time_s, frame.function, frame.payload)
+            (time_s, frame.function, frame.payload)
             for time_s, data in self.port.read(until_s)
             for frame in self._decoder.feed(data)
         ]
@@ -139,7 +137,6 @@ class CanLine:
     """One conversation with a node on a CAN bus."""
 
     def __init__(self, port: Port, node: int) -> None:
-        can_identifier(1, node)
         self.port, self._node = port, node
         self._others: set[int] = set()
         self.frame_errors: dict[str, int] = {}
@@ -162,7 +159,7 @@ class CanLine:
         arrivals = []
         for time_s, identifier, data in self.port.read(until_s):
             if identifier & 0xF == self._node:
-                arrivals.append(Arrival(time_s, identifier >> 4, data))
+                arrivals.append((time_s, identifier >> 4, data))
             else:
                 self._others.add(identifier & 0xF)
         return arrivals

@@ -7,13 +7,11 @@ import select
 import termios
 import time
 from abc import ABC, abstractmethod
-from pathlib import Path
 from typing import Any, Final, final
 
 import can
 import serial
 from can.interfaces import BACKENDS
-from can.interfaces.slcan import slcanBus
 
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 
@@ -89,9 +87,12 @@ class CanPort(RealPort):
                 interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **known.get(interface, {})
             )
             self._fd = self._bus.fileno()
-        except NotImplementedError as error:
-            raise OSError(f"{interface}: this driver cannot be waited for; use the kernel's, socketcan") from error
-        except (can.CanError, ValueError, OSError) as error:
+        except (
+            can.CanError,
+            ValueError,
+            OSError,
+            NotImplementedError,
+        ) as error:
             raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
 
     def write(self, identifier: int, data: bytes) -> None:
@@ -108,13 +109,8 @@ class CanPort(RealPort):
         """Return the classical data frame with an 11-bit identifier that is there, or none."""
         try:
             frame = self._bus.recv(0)
-        except (can.CanError, OSError) as error:
-            if isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError):
-                self._bus.flush()  # python-can would keep a line that is not text for ever
-                return []
+        except (can.CanError, OSError, ValueError, IndexError) as error:
             raise OSError(str(error)) from error
-        except (ValueError, IndexError):  # slcan's answer to a damaged line from the adapter
-            return []
         if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
             return []
         return [(frame.arbitration_id, bytes(frame.data))]
@@ -125,7 +121,4 @@ def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:
     interface, colon, channel = name.partition(":")
     if colon and interface in BACKENDS:
         return CanLine(CanPort(interface, channel, bitrate, baud), node)
-    if colon and not Path(name).exists():
-        known = ", ".join(sorted(BACKENDS))
-        raise OSError(f"{name}: no such port, and {interface!r} is no python-can interface: installed are {known}")
     return SerialLine(SerialPort(name, baud))

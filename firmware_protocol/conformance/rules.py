@@ -116,6 +116,7 @@ RULES: Final = {
     "When the positions were latched, on the device's clock.": "clock_runs_on",
     "sampled with the State it follows.": "- a handle's constant lag, or one of all device times, nothing tells",
     "to 0.3 mm.": "- a zero that is less than that from its switch, as one for both of an even gap",
+    "Share of the supply voltage at the left motor": "- its scale only a voltmeter tells",
     "Left motor current; positive": "- its scale only an ammeter tells",
     "positive drives towards open.": "duties_make_currents run_drive_off",
     "A motor at rest reads under 0.02 A, a force is at most 30 ms old.": "plausible_in_each_mode handle_runs_on",

@@ -26,7 +26,6 @@ from firmware_protocol.codec import (
     Identity,
     Message,
     Retract,
-    Sense,
     State,
     Status,
     crc8,
@@ -34,9 +33,10 @@ from firmware_protocol.codec import (
 )
 from firmware_protocol.conformance.check import Check, Hazard
 from firmware_protocol.conformance.host import (
-    ANSWER_S,
+    FRESH_S,
     HELLO_NONCE,
     HOMED_S,
+    HOMES_S,
     INSIDE_MM,
     NO_FAULT,
     OPENED_S,
@@ -52,7 +52,7 @@ from firmware_protocol.conformance.host import (
     ways_mm,
 )
 from firmware_protocol.conformance.rules import MODES, REFUSED_COMMANDS, REFUSED_DRIVES, TAKES
-from firmware_protocol.conformance.telling import Array, columns
+from firmware_protocol.conformance.telling import SIDES, Array, columns
 
 PAGE: Final = "What each mode takes"
 SPARSE_S: Final = 0.025
@@ -61,8 +61,14 @@ DUTY: Final = -0.4
 STEPS: Final = round(DUTY * 10_000)
 MOVED_MM, RESTING_A, DEEP_MM, FAR_MM, HOMING_MM = 0.1, 0.2, 20.0, 4.0, 3.0
 "A homing that goes in further than it backs off obeys another message."
-BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S, COASTED_MM, WITHIN_S, LATEST = 0.1, 0.2, 0.8, 0.05, 0.6, 0.6, 0.8
+BEGUN_MM, BEGUN_S, OPEN_S, SILENCE_S = 0.1, 0.2, 0.8, 0.05
 "A carriage INSIDE_MM in has begun to open after BEGUN_S, and is open after OPEN_S."
+COASTED_MM: Final = {
+    (DeviceMode.RUN, PERIOD_S): 0.6,
+    (DeviceMode.HOMING, PERIOD_S): 0.6,
+    (DeviceMode.HOMING, SPARSE_S): 0.6,
+}
+WITHIN_S: Final = {DeviceMode.HOMING: HOMES_S, DeviceMode.RETRACTING: 0.6}
 TWO_STATUS_S: Final = 2.2 * STATUS_S
 RESTING: Final = (DeviceMode.IDLE, DeviceMode.RUN, DeviceMode.LATCHED)
 ENDS_IN: Final = {False: DeviceMode.IDLE, True: DeviceMode.LATCHED}
@@ -70,9 +76,9 @@ COMMANDS: Final[dict[str, type[Retract | Home | Clear]]] = {"Retract": Retract, 
 FITS, MISFITS, OFF, SILENT = "Hello that fits", "Hello that does not", "Drive OFF", "silence"
 ACTS: Final = TAKES | {SILENT: ("", "RETRACTING, LATCHED with COMMAND_TIMEOUT", "", "", "")}
 CAUSES: Final = {MISFITS: DeviceFault.SCHEMA_MISMATCH, SILENT: DeviceFault.COMMAND_TIMEOUT}
-MIN_SHARE, UNHOMED_SHARE, MAX_SHARE, ENDS_MM, WINDOW = 0.6, 0.5, 1.15, 3.0, 50
+MIN_SHARE, UNHOMED_SHARE, MAX_SHARE, ENDS_MM, WINDOW_S = 0.6, 0.5, 1.15, 3.0, 0.02
 """Bounds of a carriage's speed as shares of the device's opening speed: its least without the ends, and without a zero,
-and its most, over WINDOW States."""
+and its most, over WINDOW_S."""
 MISFITTING: Final = (
     *(Hello(SCHEMA_HASH ^ 1 << bit, PROTOCOL_VERSION, HELLO_NONCE) for bit in (0, 7, 8, 15, 16, 23, 24, 31)),
     *(Hello(SCHEMA_HASH, version, HELLO_NONCE) for version in (0, 2, 129, 255)),
@@ -168,27 +174,22 @@ def taken(host: Host, place: Place) -> Iterator[Sent]:
 
 def stays(place: Place, host: Host) -> str:
     """Send all that changes nothing in this place, at both rates of Drives."""
-    sent = [_stays(host, place, period_s) for period_s in (PERIOD_S, SPARSE_S)]
-    return f"{sent[0]} and {sent[1]} messages changed nothing"
+    return f"{_stays(host, place, PERIOD_S)} and {_stays(host, place, SPARSE_S)} messages changed nothing"
 
 
 def _stays(host: Host, place: Place, period_s: float) -> int:
     place.enter(host)
     before, start, sent = host.next_status(place.beat), places(host.last(State)), 0
     unless(before.mode is not place.mode, f"where it begins: {shown(before)}")
-    host.pass_time(ANSWER_S)
-    unanswered, first = host.drives - host.states, len(host.rows)
+    first = len(host.rows)
     sources = [taken(host, place), refused(host, 1 if period_s == PERIOD_S else 7)]
-    if place.name in ("IDLE", "RUN") and period_s == PERIOD_S:
-        sources.append(damaged(host))
+    if (place.mode in RESTING) is (period_s == PERIOD_S):
+        sources.insert(1, damaged(host))
     for one in chain(*sources):
         before = _changes_nothing(host, place, period_s, one, before, start)
         if host.status.mode is not place.mode:
             break
         sent += 1
-    host.pass_time(ANSWER_S)
-    extra = unanswered - (host.drives - host.states)
-    unless(extra, f"{extra:+d} State besides one for each Drive")
     if place.mode not in RESTING:
         _ends(host, place, first, before.faults)
     return sent
@@ -199,12 +200,13 @@ def _changes_nothing(
 ) -> Status:
     """Send a message, compare Status with the one before, unless a motion has ended, and return what it must be."""
     host.heard.clear()
-    is_still = place.mode in RESTING
+    is_still, since_s = place.mode in RESTING, host.now_s + FRESH_S
     host.beat(place.beat, place.duty, place.duty, period_s, one.send)
     seen_s = TWO_STATUS_S if is_still or one.nonce is not None else 0.5 * STATUS_S
     host.pass_time(seen_s, place.beat, period_s, place.duty)
     after = before.replaced(command_nonce=before.command_nonce if one.nonce is None else one.nonce)
-    found = _changes(host, one, after) | (_stirs(host, start) if is_still else {})
+    moved_mm = max(map(abs, ways_mm(host.last(State), start)))
+    found = _changes(host, one, after, since_s) | {f"moved by {moved_mm:.2f} mm": is_still and moved_mm > MOVED_MM}
     wrong = ", ".join(what for what, is_so in found.items() if is_so)
     unless(
         wrong and (is_still or not host.is_resting()),
@@ -213,75 +215,67 @@ def _changes_nothing(
     return after
 
 
-def _changes(host: Host, one: Sent, before: Status) -> dict[str, bool]:
+def _changes(host: Host, one: Sent, before: Status, since_s: float) -> dict[str, bool]:
     """Return what may not change in Status, and whether it did."""
-    after, identities = host.status, len(host.all_of(Identity))
+    after = [each for time_s, each in host.all_of(Status) if time_s > since_s] or [host.status]
+    identities = len(host.all_of(Identity))
     return {
-        "another mode": after.mode is not before.mode,
-        "other faults": after.faults != before.faults,
-        "another HOMED": is_homed(after) is not is_homed(before),
-        f"nonce not {before.command_nonce}": after.command_nonce != before.command_nonce,
+        "another mode": any(each.mode is not before.mode for each in after),
+        "other faults": any(each.faults != before.faults for each in after),
+        "another HOMED": any(is_homed(each) is not is_homed(before) for each in after),
+        f"nonce not {before.command_nonce}": any(each.command_nonce != before.command_nonce for each in after),
         f"{identities} Identity": identities != one.identities,
-        "drive_counter of no Drive": any(each.drive_counter not in host.counters for _, each in host.all_of(Status)),
+        "drive_counter of no Drive": any(each.drive_counter not in host.counters for each in after),
     }
-
-
-def _stirs(host: Host, start: tuple[float, float]) -> dict[str, bool]:
-    """Return how far a device at rest moved, and what it drew, and whether that is too much."""
-    moved_mm = max(map(abs, ways_mm(host.last(State), start)))
-    most_A = max(
-        (abs(A) for _, sense in host.all_of(Sense) for A in (sense.left_current_A, sense.right_current_A)), default=0.0
-    )
-    return {f"moved by {moved_mm:.2f} mm": moved_mm > MOVED_MM, f"{most_A:.2f} A": most_A > RESTING_A}
 
 
 def _ends(host: Host, place: Place, first: int, faults: DeviceFault) -> None:
     """Let a motion end, which the messages must not have changed."""
+    if place.mode is DeviceMode.RETRACTING:
+        opens_fully(host, faults, first, place.beat)
+        return
     host.until(host.is_resting, HOMED_S, place.beat)
-    rows = columns(host, first)
-    deepest_mm = min(rows["left_mm"].min(), rows["right_mm"].min())
+    deepest_mm = min(columns(host, first)[f"{side}_mm"].min() for side in SIDES)
     host.shows(
-        ENDS_IN[bool(faults)],
+        DeviceMode.IDLE,
         place.beat,
-        homed=not faults,
+        homed=True,
         opened=True,
-        fault=faults,
+        fault=NO_FAULT,
         besides=f"{deepest_mm:+.2f} mm at the innermost",
-        wrong=deepest_mm < (-HOMING_MM if place.mode is DeviceMode.HOMING else -DEEP_MM - HOMING_MM),
+        wrong=deepest_mm < -HOMING_MM,
     )
 
 
 def acts(place: Place, name: str, host: Host) -> str:
     """Send a message that this mode acts on, at both rates of Drives, and compare what it leads to."""
-    first = _closing if place.mode is DeviceMode.RUN else _acts
-    return "; ".join([first(host, place, name, PERIOD_S), _acts(host, place, name, SPARSE_S)])
-
-
-def _closing(host: Host, place: Place, name: str, period_s: float) -> str:
-    """Send what ends RUN, far inside, at full duty."""
-    host.running(host.stroke_mm - FAR_MM)
-    host.pass_time(BEGUN_S / 4.0, DriveMode.RUN, duty=-1.0)
-    beat = DriveMode.OFF if name == OFF else DriveMode.RUN
-    _begun(host, place, name, beat, period_s, COASTED_MM)
-    return opens_fully(host, CAUSES.get(name, NO_FAULT), beat)
+    return "; ".join(_acts(host, place, name, period_s) for period_s in (PERIOD_S, SPARSE_S))
 
 
 def _acts(host: Host, place: Place, name: str, period_s: float) -> str:
-    place.enter(host)
-    within_s = {DeviceMode.HOMING: LATEST * host.home_s, DeviceMode.RETRACTING: WITHIN_S}.get(place.mode, 0.0)
-    host.pass_time(within_s * (host.random.random() + (period_s > PERIOD_S)) / 2.0, place.beat)
+    is_far, beat = place.mode is DeviceMode.RUN and period_s == PERIOD_S, place.beat
+    if is_far:  # far inside, at full duty
+        host.running(host.stroke_mm - FAR_MM)
+        host.pass_time(BEGUN_S / 4.0, DriveMode.RUN, duty=-1.0)
+        beat, first = DriveMode.OFF if name == OFF else DriveMode.RUN, len(host.rows)
+    else:
+        place.enter(host)
+        first = len(host.rows)
+        host.pass_time(WITHIN_S.get(place.mode, 0.0) * (host.random.random() + (period_s > PERIOD_S)) / 2.0, beat)
     faults = (NO_FAULT if name == "Clear" else host.status.faults) | CAUSES.get(name, NO_FAULT)
-    seen = _begun(host, place, name, place.beat, period_s, MOVED_MM)
-    host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, place.beat)
+    seen = _begun(host, place, name, beat, period_s)
+    if is_far or place.mode is DeviceMode.RETRACTING:
+        return opens_fully(host, faults, first, beat)
+    host.until(host.is_resting, OPEN_S - BEGUN_S if place.mode is DeviceMode.RUN else HOMED_S, beat)
     return host.shows(
         # one Drive OFF lets go
         DeviceMode.RUN if name == OFF else ENDS_IN[bool(faults)],
-        place.beat,
+        beat,
         homed=not any((faults, "not homed" in ACTS[name][place.mode], place.mode is DeviceMode.LATCHED)),
         opened=True,
         fault=faults,
         besides=seen,
-        wrong=name == MISFITS and host.command(Clear, place.beat, SEEN_S),
+        wrong=name == MISFITS and host.command(Clear, beat, SEEN_S),
     )
 
 
@@ -313,7 +307,7 @@ def _say(host: Host, place: Place, name: str, beat: Beat) -> None:
         _fall_silent(host, place)
 
 
-def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coasted_mm: float) -> str:
+def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float) -> str:
     """Send a message, and compare what follows at once with what must be."""
     start, to = places(host.last(State)), ACTS[name][place.mode].partition(",")[0]
     host.heard.clear()
@@ -322,18 +316,20 @@ def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float, coa
     way_mm = [way for _, state in host.all_of(State) for way in ways_mm(state, start)]
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
-    is_wrong = place.mode is DeviceMode.RUN and (min(way_mm) < -coasted_mm or min(way_mm[-2:]) < BEGUN_MM)
+    is_wrong = to != DeviceMode.HOMING.name and min(way_mm) < -COASTED_MM.get((place.mode, period_s), MOVED_MM)
+    is_wrong |= place.mode is DeviceMode.RUN and min(way_mm[-2:]) < BEGUN_MM
     is_wrong |= name != SILENT and len(host.all_of(Identity)) != (name == MISFITS)
     return unless(is_wrong or modes[:1] != [to] * (to in MODES), seen)
 
 
-def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF, *, has_zero: bool = True) -> str:
-    """Watch a device open, and judge each carriage's speed on the device's clock."""
-    first = len(host.rows)
+def opens_fully(
+    host: Host, fault: DeviceFault, first: int, beat: Beat = DriveMode.OFF, *, has_zero: bool = True
+) -> str:
+    """Watch a device open, and judge each carriage's speed from this value of `host.rows` on."""
     host.until(host.is_resting, OPENED_S, beat)
     rows = columns(host, first)
-    leasts, mosts, drawn_A = zip(*(_opened(rows, side) for side in ("left", "right")), strict=True)
-    seen = f"{min(leasts):.1f} mm/s on the way, {max(mosts):.1f} at most, {min(drawn_A):+.2f} A as a rule"
+    leasts, mosts = zip(*(_opened(rows, side) for side in SIDES), strict=True)
+    seen = f"{min(leasts):.1f} mm/s on the way, {max(mosts):.1f} at most"
     return host.shows(
         ENDS_IN[bool(fault)],
         beat,
@@ -342,34 +338,32 @@ def opens_fully(host: Host, fault: DeviceFault, beat: Beat = DriveMode.OFF, *, h
         fault=fault,
         besides=seen,
         wrong=min(leasts) < MIN_SHARE * (1.0 if has_zero else UNHOMED_SHARE) * host.opening_mm_s
-        or max(mosts) > MAX_SHARE * host.opening_mm_s
-        or min(drawn_A) <= 0.0,
+        or max(mosts) > MAX_SHARE * host.opening_mm_s,
     )
 
 
-def _opened(rows: dict[str, Array], side: str) -> tuple[float, float, float]:
-    """Return a carriage's least speed without ENDS_MM, its most, and its usual current."""
-    times_s, at_mm, drawn_A = rows["device_s"], rows[f"{side}_mm"], float(np.median(rows[f"{side}_A"]))
-    mm_s = (at_mm[WINDOW:] - at_mm[:-WINDOW]) / (times_s[WINDOW:] - times_s[:-WINDOW])
-    is_way = (at_mm[:-WINDOW] > at_mm[0] + ENDS_MM) & (at_mm[WINDOW:] < at_mm[-1] - ENDS_MM)
-    return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0)), drawn_A
+def _opened(rows: dict[str, Array], side: str) -> tuple[float, float]:
+    """Return a carriage's least speed without ENDS_MM, and its most."""
+    times_s, at_mm = rows["device_s"], rows[f"{side}_mm"]
+    later = np.searchsorted(times_s, times_s + WINDOW_S)
+    earlier, later = np.flatnonzero(later < len(times_s)), later[later < len(times_s)]
+    mm_s = (at_mm[later] - at_mm[earlier]) / (times_s[later] - times_s[earlier])
+    is_way = (at_mm[earlier] > at_mm[0] + ENDS_MM) & (at_mm[later] < at_mm[-1] - ENDS_MM)
+    return float(np.min(mm_s[is_way])) if is_way.any() else 0.0, float(np.max(mm_s, initial=0.0))
 
 
 def misfits(host: Host) -> str:
     """Send an idle device each Hello that does not fit, and mend it."""
-    fault = DeviceFault.SCHEMA_MISMATCH
     for hello in MISFITTING:
         host.idle()
         host.heard.clear()
         host.hello(hello.schema_hash, hello.protocol_version)
         count, seen = len(host.all_of(Identity)), f"schema {hello.schema_hash:08X}, version {hello.protocol_version}"
-        host.shows(DeviceMode.LATCHED, homed=False, fault=fault, besides=seen, wrong=count != 1)
+        host.shows(DeviceMode.LATCHED, homed=False, fault=CAUSES[MISFITS], besides=seen, wrong=count != 1)
         unless(
             host.status.command_nonce != HELLO_NONCE or host.command(Clear, DriveMode.OFF, SEEN_S),
             f"{seen}: its nonce is not shown, or Clear's is, {shown(host.status)}",
         )
-        host.hello()
-        host.shows(DeviceMode.LATCHED, fault=fault, besides=f"{seen}, then a Hello that fits")
     return f"{len(MISFITTING)} latched, and were mended"
 
 

@@ -4,8 +4,9 @@ Those of all reports read every State and Sense since the start, by mode.
 """
 
 import math
+from collections.abc import Sequence
 from functools import partial
-from itertools import chain, pairwise, product
+from itertools import chain, pairwise
 from typing import Final
 
 import numpy as np
@@ -48,20 +49,26 @@ MAX_ANSWER_S, PAUSE_S = 3e-3, 0.1
 "The device's own millisecond, and the way there and back by any adapter."
 TIME_SPAN_S, HANDLE_SPAN_MM = period(State, "device_time_s"), period(Sense, "handle_position_mm")
 STEP_MM, HANDLE_STEP_MM = period(State, "left_position_mm") / 2**16, HANDLE_SPAN_MM / 2**16
-TURN_MM, TURNED_S, LEAP_MM = 40.0 * math.pi, 20.0, 1.0
-"A handle at 0.3 m/s moves a third of LEAP_MM in 1 ms; one of swapped bytes leaps by 2 mm a step."
-SUCCESSIVE_S, FORCE_S, AT_REST_A, USUAL_N = 3e-3, 0.03, 0.02, 5.0
-STEPS, FARTHEST_MM, ENDS, BESIDE_S, FRESH_S, FORCE_STEPS, LONE, UNMOVED = 4.5, 0.2, -1.0, 5e-3, 2e-3, 50, 0.2, 999
-"STEPS in one period tell a place that is not between its neighbours; LONE is a share of the whole range."
-SIDES, MOVES_MM_S, STANDS_MM_S = ("left", "right"), 0.5, 0.1
+TURN_MM, TURNED_S, LEAP_MM = 40.0 * math.pi, 20.0, 0.25
+"Swapped bytes leap by 2 mm a step."
+SUCCESSIVE_S, TICK_S, FORCE_S, AT_REST_A, USUAL_N = 3e-3, 1e-5, 0.03, 0.02, 5.0
+STEPS, ENDS, BESIDE_S, FRESH_S, FORCE_STEPS, LONE, UNMOVED = 3.0, -1.0, 5e-3, 2e-3, 50, 0.2, 999
+"A place that is old lies STEPS off its way; LONE is a share of a mode's range."
+SIDES, MOVES_MM_S, STANDS_MM_S, MOVING = (
+    ("left", "right"),
+    0.5,
+    0.1,
+    (DeviceMode.RUN, DeviceMode.HOMING, DeviceMode.RETRACTING),
+)
+HALF, ALIKE, SAME, LEAST, MANY = 20, 0.15, 0.99, 0.05, 2000
 NONCES: Final = (1, 129, 1, 65, 1, 33, 1, 17, 1, 9, 1, 5, 1, 3, 2, 254, 253, 128, 127, 126, 6)
 """Each bit changes alone, up and down by any distance."""
-SLIDES_MM_S, NEAR_MM, GROWS, DEPTHS_MM = 10.0, 0.7, 1.15, (12.0, 16.0, 20.0, 24.0)
+SLIDES_MM_S, NEAR_MM, GROWS, AS_MUCH, DEPTHS_MM = 10.0, 0.7, 1.15, 1.25, (0.0, 12.0, 16.0, 20.0, 24.0)
 "From one of the depths to the next a force grows GROWS times, at least."
 
 
 def columns(host: Host, first: int = 0) -> dict[str, Array]:
-    """Return what came from this value of `host.rows` on, unwrapped, and speeds."""
+    """Return what came from a value of `host.rows` on, unwrapped, and speeds."""
     rows = np.array(host.rows[first:]).reshape(-1, len(COLUMNS))
     unless(len(rows) < 2, "no Sense")
     table = dict(zip(COLUMNS, rows.T, strict=True))
@@ -69,17 +76,15 @@ def columns(host: Host, first: int = 0) -> dict[str, Array]:
     middle_s = 0.5 * (table["asked_s"] + table["arrived_s"])
     table["device_s"] = middle_s - np.unwrap(middle_s - table["device_time_s"], period=TIME_SPAN_S)
     table["handle_mm"] = np.unwrap(table["handle_mm"], period=HANDLE_SPAN_MM)
-    for side in (*SIDES, "handle"):
-        before_mm, after_mm = (
-            np.interp(table["device_s"] + beside_s, table["device_s"], table[f"{side}_mm"])
-            for beside_s in (-BESIDE_S, BESIDE_S)
-        )
-        table[f"{side}_mm_s"] = (after_mm - before_mm) / (2.0 * BESIDE_S)
+    at_s = table["device_s"]
+    for name in ("left_mm", "right_mm", "handle_mm"):
+        ways_mm = [way * np.interp(at_s + way * BESIDE_S, at_s, table[name]) for way in (1.0, -1.0)]
+        table[f"{name}_s"] = sum(ways_mm) / (2.0 * BESIDE_S)
     return table
 
 
 def all_columns(host: Host) -> dict[str, Array]:
-    """Return all that came, with the mode that both Status around a row show, else ENDS less the first."""
+    """Return all that came, with the mode of both Status around, else ENDS less the first."""
     unless(len(host.marks) < 4, "no Status")
     table, (at, modes) = columns(host), np.array(host.marks).reshape(-1, 2).T
     table["mode"] = np.full(len(table["counter"]), math.nan)
@@ -89,12 +94,24 @@ def all_columns(host: Host) -> dict[str, Array]:
     return table
 
 
-def steps(rows: dict[str, Array], name: str, step: float) -> npt.NDArray[np.int_]:
-    """Return a value's steps from State to State, but where a homing ends."""
+def successive(rows: dict[str, Array]) -> npt.NDArray[np.bool_]:
+    """Return whether a State follows at once, but where a homing moves the origin."""
     is_old = rows["mode"] == ENDS - DeviceMode.HOMING
-    is_next = (np.diff(rows["device_s"]) < SUCCESSIVE_S) & ~is_old[1:] & ~is_old[:-1]
-    ways = np.rint(np.abs(np.diff(rows[name])[is_next]) / step).astype(np.int_)
-    return np.asarray(ways[ways > 0], dtype=np.int_)
+    return np.asarray((np.diff(rows["device_s"]) < SUCCESSIVE_S) & ~is_old[1:] & ~is_old[:-1])
+
+
+def least_step(rows: dict[str, Array], name: str, step: float) -> int:
+    """Return a value's least step, in the mode where that is greatest."""
+    ways = np.rint(np.abs(np.diff(rows[name])) / step).astype(np.int_) * successive(rows)
+    parts = [ways[(ways > 0) & (rows["mode"][1:] == mode)] for mode in DeviceMode]
+    return max((int(part.min()) for part in parts if part.size > BLOCK), default=UNMOVED)
+
+
+def off_way(rows: dict[str, Array], name: str) -> Array:
+    """Return how far each place but the ends lies beside the way between its neighbours."""
+    steps_s, ways, near = np.diff(rows["device_s"]), np.diff(rows[name]), successive(rows)
+    off = ways[1:-1] - steps_s[1:-1] * (ways[:-2] + ways[2:]) / np.maximum(steps_s[:-2] + steps_s[2:], TICK_S)
+    return np.abs(off) * (near[:-2] & near[1:-1] & near[2:])
 
 
 def oldest_s(rows: dict[str, Array], name: str, moves: npt.NDArray[np.bool_]) -> float:
@@ -110,9 +127,8 @@ def identity_answers_hello(host: Host) -> str:
     host.counter = host.next_status(None).drive_counter  # so that the first Drive counts
     for _ in range(3):
         host.hello()
-    theirs = {identity.schema_hash for _, identity in host.all_of(Identity)}
-    count, seen = len(host.all_of(Identity)), ", ".join([*(f"{schema:08X}" for schema in theirs), *host.refused])
-    return unless(count != 3 or theirs != {SCHEMA_HASH}, f"{count} Identity for 3 Hellos, schema {seen}")
+    theirs = [f"{identity.schema_hash:08X}" for _, identity in host.all_of(Identity)]
+    return unless(theirs != 3 * [f"{SCHEMA_HASH:08X}"], f"for 3 Hellos {theirs} {[*host.refused]}")
 
 
 @check(
@@ -155,38 +171,71 @@ def every_counter(host: Host) -> str:
     return "255 changes accepted"
 
 
-def drawn_A(rows: dict[str, Array], mode: DeviceMode, own: str, other: str) -> tuple[float, ...]:
-    """Return a motor's usual current going out, in, and standing beside the other."""
-    own_mm_s, other_mm_s, is_whole = rows[f"{own}_mm_s"], rows[f"{other}_mm_s"], rows["mode"] == mode
-    parts = (
-        own_mm_s > MOVES_MM_S,
-        own_mm_s < -MOVES_MM_S,
-        (np.abs(own_mm_s) < STANDS_MM_S) & (np.abs(other_mm_s) > MOVES_MM_S),
-    )
-    currents_A = (rows[f"{own}_A"][is_whole & part] for part in parts)
-    return tuple(float(np.median(part_A)) if part_A.size else math.nan for part_A in currents_A)
+def drawn_A(rows: dict[str, Array], side: str) -> dict[str, float]:
+    """Return by mode the current for an acceleration, both with the weights of a second difference."""
+    clock_s = np.arange(rows["device_s"][0], rows["device_s"][-1], PERIOD_S)
+    row = np.searchsorted(rows["device_s"], clock_s, side="right") - 1
+    at_mm, at_A = (np.interp(clock_s, rows["device_s"], rows[f"{side}_{unit}"]) for unit in ("mm", "A"))
+    before, middle, after = slice(-2 * HALF), slice(HALF, -HALF), slice(2 * HALF, None)
+    mm_s2 = (at_mm[before] - 2.0 * at_mm[middle] + at_mm[after]) / (HALF * PERIOD_S) ** 2
+    mm_s = (at_mm[after] - at_mm[before]) / (2.0 * HALF * PERIOD_S)
+    mean_A = np.convolve(at_A, np.bartlett(2 * HALF + 1) / HALF, "valid")
+    makes = np.column_stack([mm_s2, mm_s, np.sign(mm_s), np.ones(len(mm_s))])
+    is_dense = (row[after] - row[before] > HALF) & (np.abs(mm_s) > MOVES_MM_S)
+    modes = rows["mode"][row]
+    parts = {
+        mode.name: is_dense & (modes[before] == mode) & (modes[middle] == mode) & (modes[after] == mode)
+        for mode in MOVING
+    }
+    return {
+        name: float(np.linalg.lstsq(makes[part], mean_A[part], rcond=None)[0][0])
+        for name, part in parts.items()
+        if np.sum(part) > MANY
+    }
+
+
+def _standing_A(rows: dict[str, Array]) -> float:
+    """Return what a standing motor usually draws in a motion."""
+    found_A = [0.0]
+    for side, other in (SIDES, SIDES[::-1]):
+        stands = (np.abs(rows[f"{side}_mm_s"]) < STANDS_MM_S) & np.isin(rows["mode"], MOVING[1:])
+        beside = stands & (np.abs(rows[f"{other}_mm_s"]) > MOVES_MM_S)
+        found_A += [float(np.median(np.abs(rows[f"{side}_A"][part]))) for part in (stands, beside) if part.any()]
+    return max(found_A)
+
+
+def _alike(rows: dict[str, Array]) -> list[str]:
+    """Return the modes in which both sides always report one value alike, but not the other."""
+    is_both, found = np.minimum(*(np.abs(rows[f"{side}_mm_s"]) for side in SIDES)) > MOVES_MM_S, []
+    for mode in MOVING:
+        part = is_both & (rows["mode"] == mode)
+        sames = [rows[f"left_{of}"][part] == rows[f"right_{of}"][part] for of in ("mm", "A")]
+        is_one = np.sum(part) > MANY and any(map(np.all, sames)) and min(map(np.mean, sames)) < SAME
+        found += [mode.name] if is_one else []
+    return found
 
 
 @check(
     Hazard.MISLED,
     WHO + "3",
     ALL,
-    f"with the drives off currents under {AT_REST_A:g} A; while HOMING and RETRACTING each motor's that of its own "
-    f"carriage's motion, which HOMING has out and in; a force under {USUAL_N:g} N, as a rule, none far beside both "
-    "its neighbours",
+    f"a motor at rest under {AT_REST_A:g} A, also where it is braked; in each mode the same current for an "
+    f"acceleration, to {ALIKE:.0%}; nowhere both sides always alike; a force under {USUAL_N:g} N, as a rule; no value "
+    "far beside both its neighbours",
 )
 def plausible_in_each_mode(host: Host) -> str:
     rows = all_columns(host)
     is_off = np.isin(rows["mode"], (DeviceMode.IDLE, DeviceMode.LATCHED))
-    most_A = max(np.abs(rows[name][is_off]).max(initial=0.0) for name in ("left_A", "right_A"))
-    force_N, lone = np.median(np.abs(rows["force_N"])), alone(rows, "force_N")
-    seen = f"{most_A:.3f} A at rest at most, {force_N:.2f} N as a rule, {lone} of them alone"
-    is_wrong = most_A > AT_REST_A or force_N > USUAL_N or lone > 0
-    for mode, (own, other) in product((DeviceMode.HOMING, DeviceMode.RETRACTING), (SIDES, SIDES[::-1])):
-        out_A, in_A, still_A = drawn_A(rows, mode, own, other)
-        seen += f"; {mode.name} {own} {out_A:+.2f} A out, {in_A:+.2f} A in, {still_A:+.2f} A standing"
-        is_wrong |= (
-            out_A < AT_REST_A or abs(still_A) > out_A / 2.0 or (mode is DeviceMode.HOMING and not in_A < -AT_REST_A)
+    most_A = max([_standing_A(rows), *(float(np.abs(rows[f"{side}_A"][is_off]).max(initial=0.0)) for side in SIDES)])
+    force_N = float(np.median(np.abs(rows["force_N"])))
+    lone = sum(alone(rows, name) for name in ("force_N", "left_A", "right_A"))
+    seen = f"{most_A:.3f} A at rest, alike in {_alike(rows)}, {force_N:.2f} N as a rule, {lone} values alone"
+    is_wrong = most_A > AT_REST_A or _alike(rows) or force_N > USUAL_N or lone > 0
+    for side in SIDES:
+        drawn = drawn_A(rows, side)
+        seen += "".join(f"; {side} {mode} {1e3 * value:+.2f} mA s2/mm" for mode, value in drawn.items())
+        is_wrong = is_wrong or not all(
+            abs(value / np.mean([*drawn.values()]) - 1.0) < ALIKE for value in drawn.values()
         )
     return unless(is_wrong, seen)
 
@@ -234,6 +283,7 @@ def frames_as_they_come(host: Host) -> str:
     counts = []
     for many, parts in host.line.unusual(FUNCTION[Hello], encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, HELLO_NONCE))):
         host.heard.clear()
+        host.nonces += [HELLO_NONCE ^ 1, HELLO_NONCE]
         for part in parts:
             host.beat(None, period_s=PAUSE_S, besides=partial(host.line.port.write, part))
         host.pass_time(ANSWER_S)
@@ -270,44 +320,33 @@ def none_of(counts: dict[str, int], seen: str) -> str:
     "device_time_s in steps of 10 us, 1 s in a second to 1 %, without leaps",
 )
 def clock_runs_on(host: Host) -> str:
-    rows = columns(host)
-    delays_s = rows["arrived_s"] - rows["asked_s"]
-    rate, _ = np.polyfit(rows["asked_s"], rows["device_s"], 1, w=1.0 / (PERIOD_S + delays_s))
+    rows = all_columns(host)
+    rate, _ = np.polyfit(rows["asked_s"], rows["device_s"], 1, w=1.0 / (PERIOD_S + rows["arrived_s"] - rows["asked_s"]))
     starts = np.arange(0, max(len(rows["device_s"]) - BLOCK, 1), BLOCK)
     least_s = np.maximum.reduceat(rows["device_s"] - rate * rows["arrived_s"], starts)
     most_s = np.minimum.reduceat(rows["device_s"] - rate * rows["asked_s"], starts)
     drift, leap_s = rate - 1.0, np.maximum(least_s[1:] - most_s[:-1], least_s[:-1] - most_s[1:]).max(initial=0.0)
-    times = len(set(np.round(rows["device_time_s"] * 1e5) % 100))
+    ticks = np.round(rows["device_time_s"] * 1e5) % 100
+    times = min(len(set(part)) for mode in DeviceMode if len(part := ticks[rows["mode"] == mode]) > BLOCK)
     seen = f"{drift:+.2%}, {leap_s * 1e3:.2f} ms of leap at most, {times} different times of 100 within a millisecond"
     return unless(abs(drift) > MAX_DRIFT or leap_s > MAX_LEAP_S or times < 20, seen)
-
-
-def astray(device_s: Array, at_mm: Array, step_mm: float) -> int:
-    """Return how many places lie off the way of a motion: old, or of another time."""
-    steps_s, ways_mm = np.diff(device_s), np.diff(at_mm)
-    near = np.logical_and.reduce([steps_s[at : len(steps_s) - 3 + at] < SUCCESSIVE_S for at in range(4)])
-    off_mm = ways_mm[1:-2] - steps_s[1:-2] * (ways_mm[1:-2] + ways_mm[2:-1]) / (steps_s[1:-2] + steps_s[2:-1])
-    least_mm = np.minimum(ways_mm[:-3] * np.sign(ways_mm[3:]), np.abs(ways_mm[3:]))  # over 0 if both go the same way
-    return int(np.sum(near & (least_mm > STEPS * step_mm) & (np.abs(off_mm) > 0.6 * least_mm)))
 
 
 @check(
     Hazard.MISLED,
     "State",
     ALL,
-    f"in each motion, and each mode, a new position, between those before and after it; in steps of 1, no leap over "
-    f"{FARTHEST_MM:g} mm",
+    f"in each mode a position, to {STEPS * STEP_MM * 1e3:.0f} um on the way between those before and after it; in "
+    "steps of 1",
 )
 def positions_run_on(host: Host) -> str:
     rows, seen = all_columns(host), []
     for side in SIDES:
-        off, ways = astray(rows["device_s"], rows[f"{side}_mm"], STEP_MM), steps(rows, f"{side}_mm", STEP_MM)
-        if np.sum(ways > STEPS) < BLOCK:
+        off, least = off_way(rows, f"{side}_mm"), least_step(rows, f"{side}_mm", STEP_MM)
+        if least == UNMOVED:
             raise Untested("nothing moved; run all checks")
-        least, most_mm = ways.min(), ways.max() * STEP_MM
-        old_s = oldest_s(rows, f"{side}_mm", np.abs(rows[f"{side}_mm_s"]) > SLIDES_MM_S)
-        text = f"{side}: {off} astray, {old_s * 1e3:.1f} ms old, in steps of {least}, {most_mm:.3f} mm at most"
-        seen.append(unless(off or least > 1 or most_mm > FARTHEST_MM or old_s > FRESH_S, text))
+        is_wrong = off.max() > STEPS * STEP_MM or least > 1
+        seen.append(unless(is_wrong, f"{side}: {off.max() * 1e3:.1f} um off the way, in steps of {least}"))
     return "; ".join(seen)
 
 
@@ -325,10 +364,9 @@ def handle_runs_on(host: Host) -> str:
         rows = all_columns(host)
         way_mm = float(np.ptp(rows["handle_mm"]))
         has_turned = way_mm > 1.05 * TURN_MM and len(_along_N(rows)) == 2
-    ways = steps(rows, "handle_mm", HANDLE_STEP_MM)
-    least, most_mm = ways.min(initial=UNMOVED), ways.max(initial=0) * HANDLE_STEP_MM
+    least, most_mm = least_step(rows, "handle_mm", HANDLE_STEP_MM), off_way(rows, "handle_mm").max()
     old_s = oldest_s(rows, "handle_mm", np.abs(rows["handle_mm_s"]) > SLIDES_MM_S)
-    seen = f"turned by {way_mm:.0f} mm, in steps of {least}, {most_mm:.3f} mm at most, {old_s * 1e3:.1f} ms old"
+    seen = f"turned by {way_mm:.0f} mm, in steps of {least}, {most_mm:.3f} mm off its way, {old_s * 1e3:.1f} ms old"
     unless((has_turned and 1 < least < UNMOVED) or most_mm > LEAP_MM or old_s > FRESH_S, seen)
     if not has_turned:
         raise Untested(f"{seen}; turn the handle by over a turn and back meanwhile, --only handle_runs_on")
@@ -341,11 +379,23 @@ def _along_N(rows: dict[str, Array], mode: DeviceMode | None = None) -> list[flo
     return [round(float(np.median(way_N)), 2) for way_N in ways_N if way_N.size > BLOCK]
 
 
+def _usual_N(rows: dict[str, Array], part: npt.NDArray[np.bool_]) -> float:
+    return float(np.median(np.abs(rows["force_N"][part]))) if np.sum(part) > BLOCK / 4 else math.nan
+
+
+def _times(rows: dict[str, Array], depths: Sequence[npt.NDArray[np.bool_]]) -> float:
+    """Return the greatest quotient of the forces of two modes."""
+    modes_N = [[_usual_N(rows, depth & (rows["mode"] == mode)) for mode in DeviceMode] for depth in depths]
+    return max((np.nanmax(by_N) / np.nanmin(by_N) for by_N in modes_N if not np.isnan(by_N).all()), default=1.0)
+
+
 def alone(rows: dict[str, Array], name: str) -> int:
     """Return how many values lie far beside both neighbours."""
-    ways, near = np.diff(rows[name]), np.diff(rows["device_s"]) < SUCCESSIVE_S
+    ways, near = np.diff(rows[name]), successive(rows)
     least = np.minimum(ways[:-1] * -np.sign(ways[1:]), np.abs(ways[1:]))  # over 0 if it turns back
-    return int(np.sum(near[:-1] & near[1:] & (least > LONE * np.ptp(rows[name]))))
+    near = near[:-1] & near[1:]
+    parts = [part for mode in DeviceMode if (part := rows["mode"] == mode).any()]
+    return sum(int(np.sum(near & part[1:-1] & (least > max(LONE * np.ptp(rows[name][part]), LEAST)))) for part in parts)
 
 
 @check(
@@ -360,17 +410,21 @@ def force_follows_gap(host: Host) -> str:
     rows = all_columns(host)
     inside_mm, slides = -0.5 * (rows["left_mm"] + rows["right_mm"]), np.abs(rows["handle_mm_s"]) > SLIDES_MM_S
     against_N = [*chain.from_iterable(_along_N(rows, mode) for mode in DeviceMode)]
-    least, old_s = steps(rows, "force_N", 1e-3).min(initial=UNMOVED), oldest_s(rows, "force_N", slides)
-    seen = f"{against_N} N against it, {old_s * 1e3:.0f} ms old, in steps of {least}"
-    unless(min(against_N, default=1.0) <= 0.0 or FORCE_STEPS < least < UNMOVED or old_s > FORCE_S / 2.0, seen)
-    forces_N = [
-        np.median(part_N) if part_N.size else math.nan
-        for part_N in (np.abs(rows["force_N"][slides & (np.abs(inside_mm - mm) < NEAR_MM)]) for mm in DEPTHS_MM)
-    ]
-    seen += f"; {', '.join(f'{force_N:.2f}' for force_N in forces_N)} N"
+    least, old_s = least_step(rows, "force_N", 1e-3), oldest_s(rows, "force_N", slides)
+    depths = [slides & (np.abs(inside_mm - mm) < NEAR_MM) for mm in DEPTHS_MM]
+    forces_N = [_usual_N(rows, depth) for depth in depths]
+    most = _times(rows, depths)
+    seen = (
+        f"{against_N} N against it, {old_s * 1e3:.0f} ms old, in steps of {least}; "
+        f"{', '.join(f'{force_N:.2f}' for force_N in forces_N)} N, {most:.2f} times as much in one mode as in another"
+    )
+    unless(
+        min(against_N, default=1.0) <= 0.0 or FORCE_STEPS < least < UNMOVED or old_s > FORCE_S / 2.0 or most > AS_MUCH,
+        seen,
+    )
     if np.isnan(forces_N).any():
         raise Untested(f"{seen} at {DEPTHS_MM} mm: run all checks, and turn the handle meanwhile")
-    return unless(any(after < GROWS * before for before, after in pairwise(forces_N)), seen)
+    return unless(any(after < GROWS * before for before, after in pairwise(forces_N[1:])), seen)
 
 
 STREAMS: Final = (

@@ -100,18 +100,6 @@ def second_order(hz):
     return passes
 
 
-def read_at(hz):
-    value, next_s = 0.0, 0.0
-
-    def reads(now_s, force_N):
-        nonlocal value, next_s
-        if now_s >= next_s:
-            value, next_s = force_N, now_s + 1.0 / hz
-        return value
-
-    return reads
-
-
 def with_play(width_N):
     value = 0.0
 
@@ -140,9 +128,6 @@ def through(sensor):
     )
 
 
-NOISE = random.Random(1)
-
-
 @pytest.mark.parametrize(
     ("steps", "device", "expected"),
     [
@@ -152,11 +137,11 @@ NOISE = random.Random(1)
         ((), {"plant": with_part("electronics", supply_V=10.0)}, "supply"),
         ((), {"stall_ticks": 2}, "periods kept"),
         (("sensor",), {"alters": through(lambda _now_s, force_N: force_N + 0.2)}, "sensor's zero"),
-        (("sensor",), {"alters": through(lambda _now_s, force_N: force_N + NOISE.gauss(0.0, 0.06))}, "sensor's noise"),
+        (("sensor",), {"plant": with_part("force_sensor", noise_mN=60.0)}, "sensor's noise"),
         (("sensor",), {"alters": through(lambda _now_s, force_N: 0.05 * round(force_N / 0.05))}, "sensor's resolution"),
         (("sensor",), {"alters": through(second_order(4.0))}, "sensor's rise after the handle's turn"),
         (("sensor",), {"alters": through(second_order(5.0))}, "sensor's rise after the handle's turn"),
-        (("steps",), {"alters": through(read_at(12.0))}, "sensor's readings apart"),
+        (("steps",), {"plant": with_part("force_sensor", rate_Hz=12.0)}, "sensor's readings apart"),
         (("force over gap",), {"alters": through(with_play(0.06))}, "force of a closing gap over an opening one's"),
         (("force over gap",), {"alters": through(bent(-0.1))}, "force's curve, of sensor or magnets"),
         (("carriages",), {"plant": with_part("screw", friction_coefficient=0.7)}, "left friction over the configured"),
@@ -179,22 +164,18 @@ def test_the_row_of_what_a_fault_changes_turns_red(bench, steps, device, expecte
 
 
 @pytest.mark.parametrize(
-    ("sensor", "steps"),
+    ("device", "steps"),
     [
-        (through(read_at(50.0)), ("sensor", "force over gap", "steps")),
-        (through(second_order(15.0)), ("sensor",)),
-        (through(with_play(0.03)), ("force over gap",)),
-        (with_cross_talk, ("sensor", "force over gap", "steps")),
+        ({"plant": with_part("force_sensor", rate_Hz=50.0)}, ("sensor", "force over gap", "steps")),
+        ({"alters": through(second_order(15.0))}, ("sensor",)),
+        ({"alters": through(with_play(0.03))}, ("force over gap",)),
+        ({"alters": with_cross_talk}, ("sensor", "force over gap", "steps")),
+        ({"hand": ReversingHand(6.0)}, ("carriages",)),
     ],
-    ids=["50/s", "15 Hz", "30 mN", "cross-talk"],
+    ids=["50/s", "15 Hz", "30 mN", "cross-talk", "a handle that turns seldom"],
 )
-def test_a_fair_sensor_is_taken(bench, sensor, steps):
-    found, stopped = bench(SAMPLE, alters=sensor).commission(chosen(*steps))
-    assert (red(found), stopped) == ([], None)
-
-
-def test_a_handle_that_turns_seldom_makes_no_screw_rub(bench):
-    found, stopped = bench(SAMPLE, hand=ReversingHand(6.0)).commission(chosen("carriages"))
+def test_a_fair_device_is_taken(bench, device, steps):
+    found, stopped = bench(**{"plant": SAMPLE} | device).commission(chosen(*steps))
     assert (red(found), stopped) == ([], None)
 
 

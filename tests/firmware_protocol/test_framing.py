@@ -2,12 +2,11 @@
 
 import contextlib
 import pickle
-import random
 from itertools import pairwise
 
 import pytest
 from cobs import cobs  # type: ignore[import-untyped]
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import assume, given, strategies as st
 
 from firmware_protocol.codec import EncodeError
 from firmware_protocol.framing import (
@@ -146,26 +145,6 @@ def test_a_second_gap_does_not_forget_the_first_and_a_late_repetition_fills_none
     decoder = FrameDecoder()
     decoder.feed(b"".join(wire(sent[number]) for number in (0, 2, 4, 1, 3, 0, 6)))
     assert decoder.statistics.lost == 1
-
-
-@pytest.mark.long
-@settings(max_examples=100, deadline=None)
-@given(seed=st.integers(0, 10_000), lossy=st.booleans())
-def test_a_line_that_reorders_loses_what_it_lost(seed: int, lossy: bool) -> None:
-    rng = random.Random(seed)
-    sent = numbered(2_000, rng.randrange(256))
-    kept = [
-        frame for number, frame in enumerate(sent) if number in (0, len(sent) - 1) or not lossy or rng.random() > 0.03
-    ]
-    arriving, place = list(kept), 1
-    while place < len(arriving) - 2:
-        if rng.random() < 0.2:
-            arriving[place], arriving[place + 1] = arriving[place + 1], arriving[place]
-            place += 1
-        place += 1
-    decoder = FrameDecoder()
-    assert decoder.feed(b"".join(wire(frame) for frame in arriving)) == arriving
-    assert (decoder.statistics.lost, decoder.statistics.corrupt) == (len(sent) - len(kept), 0)
 
 
 @pytest.mark.parametrize(

@@ -48,12 +48,8 @@ ALLOWED = {RESISTANCE: (0.75, 1.25), BACK_EMF: (0.88, 1.12), INERTIA: (0.6, 2.2)
 REMEDIES = {RESISTANCE: PLUG, BACK_EMF: SCALE, INERTIA: COUPLED, FRICTION: GREASE}
 
 
-class Driven(NamedTuple):
-    """What one carriage's motor shows, each value with the half width of its interval."""
-
-    resistance_ohm: tuple[float, float]
-    back_emf_V_s: tuple[float, float]
-    inertia_kg_m2: tuple[float, float]
+Driven = dict[str, tuple[float, float]]
+"""What a carriage's motor shows, each value with the half width of its interval."""
 
 
 def nominals(motor: Motor) -> dict[str, float]:
@@ -146,11 +142,11 @@ def _driven(known: Known, ticks: Columns, side: str) -> Driven:
     (mass, *_), (mass_width, *_) = fitted(mechanical, current_A[kept], blocks)
     advance_m_rad = motor.screw_lead_mm * 1e-3 / (math.tau * motor.gear_ratio)
     inertia = emf * advance_m_rad**2
-    return Driven(
-        (float(ohm), float(ohm_width)),
-        (float(emf * advance_m_rad), float(emf_width * advance_m_rad)),
-        (float(mass * inertia), float(mass_width * inertia)),
-    )
+    return {
+        "resistance_ohm": (float(ohm), float(ohm_width)),
+        "back_emf_V_s": (float(emf * advance_m_rad), float(emf_width * advance_m_rad)),
+        "inertia_kg_m2": (float(mass * inertia), float(mass_width * inertia)),
+    }
 
 
 class Smoothed(NamedTuple):
@@ -182,8 +178,8 @@ def smooth(values: Array, window: int) -> Array:
 
 
 def _motor_findings(known: Known, slow: Columns, side: str, driven: Driven) -> list[Finding]:
-    torque_Nm = _friction_A(known.period_s, slow, side) * driven.back_emf_V_s[0]
-    seen = zip(nominals(known.config.motor).items(), (*driven, (torque_Nm, 0.0)), strict=True)
+    torque_Nm = _friction_A(known.period_s, slow, side) * driven["back_emf_V_s"][0]
+    seen = zip(nominals(known.config.motor).items(), (*driven.values(), (torque_Nm, 0.0)), strict=True)
     return [
         finding(f"{side} {name}", value / nominal, "", ALLOWED[name], REMEDIES[name], half_width=width / nominal)
         for (name, nominal), (value, width) in seen
@@ -204,5 +200,5 @@ def _friction_A(period_s: float, ticks: Columns, side: str) -> float:
 
 def identified(motor: Motor, driven: Sequence[Driven]) -> Motor:
     """Return `motor` with the means of what its carriages show."""
-    means = {name: float(np.mean([getattr(each, name)[0] for each in driven])) for name in Driven._fields}
+    means = {name: float(np.mean([each[name][0] for each in driven])) for name in driven[0]}
     return msgspec.structs.replace(motor, **{name: value for name, value in means.items() if math.isfinite(value)})

@@ -54,6 +54,11 @@ PREVIEW_STEP_S, PREVIEW_STEPS = 0.02, 15
 "Spacing and number of the forces that are told ahead."
 MOVING_MM_S = 5.0
 HANDLE_PATIENCE_S = 30.0
+STILL = (
+    "handle_still",
+    f"the handle stood still for {HANDLE_PATIENCE_S:g} s",
+    f"turn it to and fro, at {MOVING_MM_S:g} mm/s or more at the roller, while it runs",
+)
 CLEAR_N = 0.1
 "At the open end the firmware holds back a duty that would push on, and a device's least force varies."
 
@@ -151,7 +156,13 @@ def watch(
     return columns_of(rows)
 
 
-def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: float | None = None) -> Course[Columns]:
+def given(
+    command: str,
+    is_done: Callable[[Row], bool],
+    most_s: float,
+    force_N: float | None = None,
+    late: tuple[str, str, str] | None = None,
+) -> Course[Columns]:
     """Give `command` once, wait until the newest tick `is_done`, and return all ticks."""
     begun_s, fresh = yield Asked(force_N, command)
     rows = list(fresh)
@@ -161,21 +172,16 @@ def given(command: str, is_done: Callable[[Row], bool], most_s: float, force_N: 
         rows += fresh
         if now_s - begun_s > most_s:
             what = command or "what was waited for"
-            raise StoppedError("not_done", f"{what} was not done within {most_s:g} s", "tormagctl status")
+            raise StoppedError(*(late or ("not_done", f"{what} was not done within {most_s:g} s", "tormagctl status")))
     return columns_of(rows)
 
 
 def handle_moved(force_N: float) -> Course[None]:
-    begun_s, fresh = yield Asked(force_N)
-    while not any(abs(row[PLACES["handle_rate_mm_s"]] or 0.0) >= MOVING_MM_S for row in fresh):
-        now_s, fresh = yield Asked(force_N)
-        _require_state(fresh, ("ENABLED",))
-        if now_s - begun_s > HANDLE_PATIENCE_S:
-            raise StoppedError(
-                "handle_still",
-                f"the handle stood still for {HANDLE_PATIENCE_S:g} s",
-                f"turn it to and fro, at {MOVING_MM_S:g} mm/s or more at the roller, while it runs",
-            )
+    yield from given("", _moves, HANDLE_PATIENCE_S, force_N, STILL)
+
+
+def _moves(row: Row) -> bool:
+    return bool(abs(row[PLACES["handle_rate_mm_s"]] or 0.0) >= MOVING_MM_S)
 
 
 def _require_state(fresh: Sequence[Row], states: Sequence[str], before: Sequence[Row] = ()) -> None:
