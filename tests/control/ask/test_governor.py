@@ -299,7 +299,7 @@ def test_what_is_too_fast_is_missed_before_and_after() -> None:
 
 @pytest.mark.parametrize("spacing_s", [0.0, 5e-324, 9e-5, math.nan])
 def test_a_preview_without_a_measure_of_its_slope_is_refused(spacing_s: float) -> None:
-    with pytest.raises(DomainError, match="^preview_dt_s = .* is not allowed: at least 0.0001 s$"):
+    with pytest.raises(DomainError, match=r"^preview_dt_s = .* is not allowed: at least 0\.0001 s$"):
         TimedSetpoint(1.0, 1.0, VALID_S, preview_N=(1.6,), preview_dt_s=spacing_s).require_numbers()
 
 
