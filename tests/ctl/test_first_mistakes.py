@@ -137,7 +137,12 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl scene check pulse --share 1 --tolerance 1", 2, "tormagctl scene check NAME with one of", {}),
     ("tormagctl scene check pulse --share 0.5 --out a.toml", 2, "allowed is a new file", {"a.toml": ""}),
     ("tormagctl scene new vein.toml", 2, "nobody to ask", {}),
-    ("tormagctl scene check fast.toml", 1, "N/s at", {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")}),
+    (
+        "tormagctl scene check fast.toml",
+        1,
+        "of the time it is faster",
+        {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")},
+    ),
     (
         "tormagctl scene check poor.toml",
         1,

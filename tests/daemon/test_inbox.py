@@ -26,10 +26,11 @@ class Publishing:
     def __init__(self, sources: Sources = Sources()) -> None:  # noqa: B008 it is immutable
         self.inbox = SetpointInbox(sources)
         self.now_s = 0.0
+        self.step_s = 0.0
 
     @property
     def realtime_ns(self) -> int:
-        return START_NS + round(self.now_s * 1e9)
+        return START_NS + round((self.now_s + self.step_s) * 1e9)
 
     def send(
         self,
@@ -229,6 +230,23 @@ def test_why_it_is_stale_is_said(publishing: Publishing) -> None:
 
 
 # -- clocks --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step_s", [-3_600.0, -0.5, 0.5, 3_600.0])
+def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publishing, step_s: float) -> None:
+    publishing.send(1, 1.0, "a", 0.01)
+    publishing.step_s = step_s
+    for tick in range(2, 5):
+        publishing.now_s += 0.002
+        assert publishing.send(tick, float(tick), "a", 0.001)
+        assert (publishing.force_N, publishing.age_s) == (tick, pytest.approx(0.001, abs=1e-5))
+
+
+def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publishing) -> None:
+    for tick in range(100):
+        publishing.send(tick, 1.0, "a", 0.5 * (tick >= 50), at_s=tick * 0.002)
+        assert publishing.age_s == pytest.approx(0.0, abs=1e-3)
+    assert publishing.counters() == (100, 0, 0)
 
 
 @pytest.mark.parametrize(

@@ -159,15 +159,6 @@ def test_a_calibration_is_learned_anew_at_once_and_then_upward_only(
     assert anchor.force_N(MODEL_N) - MODEL_N == pytest.approx(learned_N, abs=6e-3)
 
 
-def test_where_the_fit_has_fallen_a_new_force_is_learned_downward_to_half_only(core, known, hear, moving) -> None:
-    hear(known, 2.0, moving(force_N=0.96 * MODEL_N))
-    known.believe.handle = HandleWatch()
-    here_N = core.portrait.force_N_at(60.0)
-    sensor = hear(known, 4.0, moving(force_N=0.9 * here_N, **{**CLOSER, "gap_mm": 60.0})).believe.sensor
-    assert KNOWN_N < sensor.anchor.deviation_N(here_N) <= 2.0 * KNOWN_N
-    assert sensor.fallen == pytest.approx(0.96, abs=5e-3)
-
-
 @pytest.mark.parametrize(("seconds", "is_known"), [(4.0, True), (0.3, False)])
 def test_at_a_new_force_the_device_may_be_another(core, known, hear, moving, seconds: float, is_known: bool) -> None:
     known.believe.handle = HandleWatch()  # the handle has gone on

@@ -131,11 +131,9 @@ class SensorTrust:
         is_prior: bool,
     ) -> None:
         """Teach the anchor, which gives `force_N` there, a force at which it is not known; else learn `fallen`."""
-        # where it is half known, a reading that is less is of a sensor that fades, or of a device
-        half_N = 2.0 * KNOWN_N if self.off_N <= 0.0 else KNOWN_N
-        if deviation_N <= (half_N if is_prior else KNOWN_N):
+        # where a calibration half knows it, a reading that is less is of a sensor that fades, or of a device
+        if deviation_N <= (2.0 * KNOWN_N if is_prior and self.off_N <= 0.0 else KNOWN_N):
             self.fallen = within(believed, (self._trim.least, 1.0))
-        if deviation_N <= (half_N if is_prior or self.fallen < 1.0 else KNOWN_N):
             return
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
         if self.has_slid:
