@@ -159,13 +159,12 @@ def test_the_measured_force_holds_alone(arm, core: Core, sample: str) -> None:
 # -- a profile is a prior for tracking only
 
 
-RESTS_S, GOES_MM_S = 3.0, (0.0, 1.0, 42.0)
-SCALES, OFFSETS_N = (0.1, 2.0), (-1.0, 1.0)
+RESTS_S = 3.0
 
 
-@pytest.mark.parametrize("goes_mm_s", GOES_MM_S)
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("offset_N", OFFSETS_N)
+@pytest.mark.parametrize("goes_mm_s", [0.0, 1.0, 42.0])
+@pytest.mark.parametrize("scale", [0.1, 2.0])
+@pytest.mark.parametrize("offset_N", [-1.0, 1.0])
 def test_a_profile_that_lies_never_presses_over_the_ceiling(
     arm, render, goes_mm_s: float, scale: float, offset_N: float
 ) -> None:
@@ -175,5 +174,5 @@ def test_a_profile_that_lies_never_presses_over_the_ceiling(
     fit = DeviceFit(scale, offset_N, draw.choice((1e-6, 1e-2)), 0.0, 1e-4)
     loop.planner.believe.teach(Learned(fit, draw.uniform(0.7, 1.2), 1.0, draw.uniform(-0.3, 0.3)))
     samples = render(loop, MAX_N, 4.0)
-    assert max(abs(sample.truth.force_N) for sample in samples) < 1.25 * MAX_N + 0.1
+    assert worst_N(samples) < CEILING_N
     assert set(samples[-1].safety.faults) <= {Fault.SENSOR}

@@ -22,13 +22,12 @@ pytestmark = pytest.mark.usefixtures("forgetful")
 PERIOD_S = 0.004
 
 
-def scene_without(*names: str, learning: bool = True) -> Scene:
-    terms = msgspec.structs.replace(EVERY_TERM.without(*names), learning=learning)
-    return msgspec.structs.replace(load_scene("coronary"), terms=terms)
+def scene_without(*names: str) -> Scene:
+    return msgspec.structs.replace(load_scene("coronary"), terms=EVERY_TERM.without(*names))
 
 
-def core_without(*names: str, learning: bool = True) -> Core:
-    return build_core(Config(), scene_without(*names, learning=learning))
+def core_without(*names: str) -> Core:
+    return build_core(Config(), scene_without(*names))
 
 
 @pytest.fixture(scope="session")
