@@ -45,18 +45,6 @@ See = Callable[[object], None]
 WAYS = {(row.event, row.source): row.target for row in ROWS if isinstance(row, Transition)}
 
 
-class Digest:
-    def __init__(self) -> None:
-        self._hash = hashlib.sha256()
-
-    def see(self, thing: object) -> None:
-        self._hash.update(packed(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing)))
-
-    @property
-    def text(self) -> str:
-        return self._hash.hexdigest()
-
-
 def hostile(core: Core, see: See, episodes: int = EPISODES) -> None:
     """Random measurements, setpoints and commands; a tenth of all numbers is none that a device gives."""
     rng = random.Random(12)
@@ -188,9 +176,13 @@ def _attempted(see: See, attempt: Callable[..., object], *arguments: object) -> 
 
 
 def main() -> None:
-    seen = Digest()
-    hostile(build_core(CONFIG), seen.see)
-    print(json.dumps({"is_compiled": BUILD.is_compiled, "digest": seen.text}))
+    digest = hashlib.sha256()
+
+    def see(thing: object) -> None:
+        digest.update(packed(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing)))
+
+    hostile(build_core(CONFIG), see)
+    print(json.dumps({"is_compiled": BUILD.is_compiled, "digest": digest.hexdigest()}))
 
 
 if __name__ == "__main__":
