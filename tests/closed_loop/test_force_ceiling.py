@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from lying import Lie, LyingSensor
 
-from tormagd.config import Config
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import Governor
 from tormagd.control.assembly.build import Core
@@ -18,7 +17,6 @@ from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.hand import RecordedHand, ReversingHand
 
-CONFIG = Config(scene="coronary")
 ASKED_N, MAX_N = 1.5, 2.0
 NAMED = {Limit.SENSOR, Limit.DEVICE_OR_SENSOR}
 CEILING_N = 1.25 * MAX_N + 0.1

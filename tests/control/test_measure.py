@@ -11,7 +11,6 @@ from tormagd.control.records import Measured
 from tormagd.element.model.displacement import MOBILISED_MM, TURN_MM
 from tormagd.hardware.measurement import Measurement
 
-COUNT_MM = 8.0 / 4480.0
 HANDLE_COUNT_MM = 2.0 * math.pi * 20.0 / 16384.0
 
 
