@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from lying import Lie, LyingSensor
 
-from tormagd.config import Config
 from tormagd.control.aim.portrait import Portrait
 from tormagd.control.ask.governor import Governor
 from tormagd.control.assembly.build import Core
@@ -18,7 +17,6 @@ from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.closed_loop import ClosedLoop, Sample
 from tormagd.simulation.hand import RecordedHand, ReversingHand
 
-CONFIG = Config(scene="coronary")
 ASKED_N, MAX_N = 1.5, 2.0
 NAMED = {Limit.SENSOR, Limit.DEVICE_OR_SENSOR}
 CEILING_N = 1.25 * MAX_N + 0.1
@@ -159,13 +157,12 @@ def test_the_measured_force_holds_alone(arm, core: Core, sample: str) -> None:
 # -- a profile is a prior for tracking only
 
 
-RESTS_S, GOES_MM_S = 3.0, (0.0, 1.0, 42.0)
-SCALES, OFFSETS_N = (0.1, 2.0), (-1.0, 1.0)
+RESTS_S = 3.0
 
 
-@pytest.mark.parametrize("goes_mm_s", GOES_MM_S)
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("offset_N", OFFSETS_N)
+@pytest.mark.parametrize("goes_mm_s", [0.0, 1.0, 42.0])
+@pytest.mark.parametrize("scale", [0.1, 2.0])
+@pytest.mark.parametrize("offset_N", [-1.0, 1.0])
 def test_a_profile_that_lies_never_presses_over_the_ceiling(
     arm, render, goes_mm_s: float, scale: float, offset_N: float
 ) -> None:
@@ -175,5 +172,5 @@ def test_a_profile_that_lies_never_presses_over_the_ceiling(
     fit = DeviceFit(scale, offset_N, draw.choice((1e-6, 1e-2)), 0.0, 1e-4)
     loop.planner.believe.teach(Learned(fit, draw.uniform(0.7, 1.2), 1.0, draw.uniform(-0.3, 0.3)))
     samples = render(loop, MAX_N, 4.0)
-    assert max(abs(sample.truth.force_N) for sample in samples) < 1.25 * MAX_N + 0.1
+    assert worst_N(samples) < CEILING_N
     assert set(samples[-1].safety.faults) <= {Fault.SENSOR}

@@ -26,11 +26,6 @@ PERIOD_S, PLAN_PERIOD_S = 1e-3, 4e-3
 READY = Conditions(connected=True, fresh=True, homed=True, busy=False, device_latched=False)
 
 
-@pytest.fixture(scope="session")
-def config() -> Config:
-    return Config()
-
-
 LOADED = "tormagd.control.assembly.build.load_model"
 
 
@@ -46,10 +41,10 @@ def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def core(config: Config) -> Core:
+def core() -> Core:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(LOADED, load_forgetful)
-        return build_core(config)
+        return build_core(Config())
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import math
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
-from tormagd.config import Config
 from tormagd.control.measure import BLIND_S, LEAP_MM
 from tormagd.control.move.watch import STARTING_S
 from tormagd.control.safety.codes import Fault, Limit
@@ -14,7 +13,6 @@ from tormagd.ground.plain_values import plain
 from tormagd.hardware.measurement import DeviceRequest
 
 PERIOD_S = 1e-3
-CONFIG = Config()
 
 
 def test_enabling_is_bumpless(running) -> None:

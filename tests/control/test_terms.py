@@ -22,13 +22,12 @@ pytestmark = pytest.mark.usefixtures("forgetful")
 PERIOD_S = 0.004
 
 
-def scene_without(*names: str, learning: bool = True) -> Scene:
-    terms = msgspec.structs.replace(EVERY_TERM.without(*names), learning=learning)
-    return msgspec.structs.replace(load_scene("coronary"), terms=terms)
+def scene_without(*names: str) -> Scene:
+    return msgspec.structs.replace(load_scene("coronary"), terms=EVERY_TERM.without(*names))
 
 
-def core_without(*names: str, learning: bool = True) -> Core:
-    return build_core(Config(), scene_without(*names, learning=learning))
+def core_without(*names: str) -> Core:
+    return build_core(Config(), scene_without(*names))
 
 
 @pytest.fixture(scope="session")
@@ -97,22 +96,18 @@ def test_without_the_creep_term_nothing_slow_is_learned(after) -> None:
     assert (slow.factor, slow.learned) == (1.0, 0.0)
 
 
-def test_without_the_forecast_a_force_is_held_until_the_next(told) -> None:
-    def motion(core: Core) -> tuple[float, float]:
+def test_without_the_forecast_a_force_is_held_until_the_next_and_nothing_is_remembered(told) -> None:
+    def motion(core: Core) -> tuple[float, float, object]:
         planner = core.planner()
         for number in range(50):
             plan = told(planner, 1.0 + 0.002 * number)
-        return planner.governor.slope_N_s, plan.gap_speed_mm_s
+        return planner.governor.slope_N_s, plan.gap_speed_mm_s, plain(planner.governor.forecast)
 
-    slope_N_s, speed_mm_s = motion(core_without())
+    slope_N_s, speed_mm_s, remembered = motion(core_without())
     assert slope_N_s == pytest.approx(0.5, rel=0.05)
     assert speed_mm_s < -5.0
-    assert motion(core_without("forecast")) == (0.0, 0.0)
-
-
-def test_without_the_forecast_nothing_is_remembered(after) -> None:
-    full, without = (plain(after(core_without(*names), 20).governor.forecast) for names in ((), ("forecast",)))
-    assert full != plain(Forecast()) == without
+    assert remembered != plain(Forecast())
+    assert motion(core_without("forecast")) == (0.0, 0.0, plain(Forecast()))
 
 
 @pytest.mark.parametrize("names", [(), ("motor",)])

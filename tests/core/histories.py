@@ -40,22 +40,12 @@ EPISODES, TICKS = 40, 150
 COMMANDS = ["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"]
 NEXT = {OperatingState.DISABLED: "enable", OperatingState.FAULT: "clear-fault"}
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
+See = Callable[[object], None]
+"Takes what came out."
 WAYS = {(row.event, row.source): row.target for row in ROWS if isinstance(row, Transition)}
 
 
-class Digest:
-    def __init__(self) -> None:
-        self._hash = hashlib.sha256()
-
-    def see(self, thing: object) -> None:
-        self._hash.update(packed(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing)))
-
-    @property
-    def text(self) -> str:
-        return self._hash.hexdigest()
-
-
-def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
+def hostile(core: Core, see: See, episodes: int = EPISODES) -> None:
     """Random measurements, setpoints and commands; a tenth of all numbers is none that a device gives."""
     rng = random.Random(12)
     for _ in range(episodes):
@@ -79,24 +69,24 @@ def hostile(core: Core, seen: Digest, episodes: int = EPISODES) -> None:
                 plan = Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
             before = stepper.safety
             output = stepper.step(now_s, measured, plan)
-            seen.see([output, stepper])
+            see([output, stepper])
             check_step(output, before, stepper.safety)
             if rng.random() < 0.3:
                 setpoint = None if rng.random() < 0.1 else setpoint_at(rng, now_s)
                 try:
                     planner.plan(now_s, setpoint, stepper.measured, rng.random() < 0.8)
-                    seen.see(planner)
+                    see(planner)
                     planner.governor.foresee()
                 except (ValueError, OverflowError) as error:
-                    seen.see(error)
-                    seen.see(planner)
+                    see(error)
+                    see(planner)
                     planner = core.planner(now_s)
             if rng.random() < 0.1:
                 name = NEXT.get(stepper.safety.operating_state, "resume")
                 if rng.random() < 0.2:
                     name = rng.choice(COMMANDS)
                 before = stepper.safety
-                _attempted(seen, stepper.command, name, now_s, conditions(rng))
+                _attempted(see, stepper.command, name, now_s, conditions(rng))
                 if stepper.safety is not before:
                     check_way(Event(name), before, stepper.safety)
             if rng.random() < 0.003:
@@ -178,17 +168,21 @@ def conditions(rng: random.Random) -> Conditions:
     )
 
 
-def _attempted(seen: Digest, attempt: Callable[..., object], *arguments: object) -> None:
+def _attempted(see: See, attempt: Callable[..., object], *arguments: object) -> None:
     try:
-        seen.see(attempt(*arguments))
+        see(attempt(*arguments))
     except RefusedError as error:
-        seen.see(error)
+        see(error)
 
 
 def main() -> None:
-    seen = Digest()
-    hostile(build_core(CONFIG), seen)
-    print(json.dumps({"is_compiled": BUILD.is_compiled, "digest": seen.text}))
+    digest = hashlib.sha256()
+
+    def see(thing: object) -> None:
+        digest.update(packed(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing)))
+
+    hostile(build_core(CONFIG), see)
+    print(json.dumps({"is_compiled": BUILD.is_compiled, "digest": digest.hexdigest()}))
 
 
 if __name__ == "__main__":

@@ -209,20 +209,16 @@ def test_the_most_open_of_the_guards_wins_at_a_speed_that_there_is(
     assert -core.gap_speeds.closing_mm_s <= plan.gap_speed_mm_s <= CONFIG.position.gap_speed_mm_s
 
 
-GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)
-
-
-def drawn_portrait(least_N: float, gains_N: list[float]) -> Portrait:
-    """A portrait whose forces rise by these gains, from steep to flat as they come."""
+@given(
+    least_N=st.floats(0.1, 1.0),
+    gains_N=st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60),
+    share=st.floats(-0.5, 1.5),
+    place=st.integers(0),
+)
+def test_a_force_is_found_as_bisection_finds_it(least_N: float, gains_N: list[float], share: float, place: int) -> None:
     forces_N = list(accumulate(gains_N, initial=least_N))
     gaps_mm = np.linspace(40.0, 15.0, len(forces_N)).tolist()
-    return Portrait(gaps_mm, forces_N, [*gains_N, 2.0 * gains_N[-1]])
-
-
-@given(least_N=st.floats(0.1, 1.0), gains_N=GAINS_N, share=st.floats(-0.5, 1.5), place=st.integers(0))
-def test_a_force_is_found_as_bisection_finds_it(least_N: float, gains_N: list[float], share: float, place: int) -> None:
-    shown = drawn_portrait(least_N, gains_N)
-    forces_N = shown.force_N
+    shown = Portrait(gaps_mm, forces_N, [*gains_N, 2.0 * gains_N[-1]])
     at_a_point = forces_N[place % len(forces_N)]
     for force_N in (
         shown.min_N + share * (shown.max_N - shown.min_N),

@@ -114,8 +114,9 @@ RELAXED = 0.13
 "Share that the shipped model's element has relaxed after a long rest."
 
 
-def test_a_device_that_is_found_homed_has_rested_there(follow, element: Element) -> None:
-    remembered = follow(found(95.0), memory=element.memory)
+@pytest.mark.parametrize("before", [[], [found(900.0, is_homed=False)]], ids=["nothing", "a gap that no device has"])
+def test_a_device_that_is_found_homed_has_rested_there(follow, element: Element, before: list[Measured]) -> None:
+    remembered = follow(*before, found(95.0), memory=element.memory)
     assert (remembered.relaxed_N, remembered.lag_mT) == (pytest.approx(RELAXED * 0.62, rel=0.1), 0.0)
 
 
@@ -127,11 +128,6 @@ def test_one_that_has_to_be_homed_has_rested_where_it_was_switched_on(
     remembered = follow(*on_its_way, found(95.0), memory=element.memory)
     assert remembered.relaxed_N == pytest.approx(follow(found(rested_mm), memory=element.memory).relaxed_N, rel=0.02)
     assert remembered.lag_mT < 0.0
-
-
-def test_a_gap_that_no_device_has_is_not_believed_to_have_been_one(follow, element: Element) -> None:
-    remembered = follow(found(900.0, is_homed=False), found(95.0), memory=element.memory)
-    assert remembered.relaxed_N == pytest.approx(RELAXED * 0.62, rel=0.1)
 
 
 def test_a_brake_that_loses_its_position_remembers_what_it_knew(follow, element: Element) -> None:

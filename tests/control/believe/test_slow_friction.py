@@ -18,7 +18,6 @@ PERIOD_S = 0.003
 BOUNDS = Config().trim
 MIN_FACTOR, MAX_FACTOR = factor_bounds(BOUNDS)
 MIN_SHARE = BOUNDS.least * (1.0 - MAX_RELAXED)
-KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
 
 
 def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit = UNSEEN) -> SlowFriction:
@@ -45,10 +44,6 @@ def test_what_a_creep_shows_is_learned_and_not_believed_at_speed() -> None:
 
 def test_it_is_learned_within_the_time_that_a_person_takes_to_notice() -> None:
     assert crept(1.2, 0.5).factor_at(1.0) > 1.12
-
-
-def test_of_a_known_device_a_creep_shows_its_static_friction_and_no_more() -> None:
-    assert [crept(share, 10.0, fit=KNOWN).factor for share in (0.6, 5.0)] == [MIN_STATIC, MAX_STATIC]
 
 
 def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:

@@ -71,11 +71,6 @@ def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
     assert (is_held, held.scale, held.offset_N) == (True, BOUNDS.most, BOUNDS.most_offset_N)
 
 
-def test_force_and_model_are_each_others_inverse() -> None:
-    fit = DeviceFit(1.3, -0.2)
-    assert fit.model_N(fit.force_N(1.7)) == pytest.approx(1.7)
-
-
 STRONGEST = 1.53
 "Friction, modulus and field are all at the ends of the plant card."
 

@@ -95,12 +95,6 @@ def test_back_calculation_balances_growth(position: Position, back_calculation_s
     assert stage.integral == pytest.approx(min(max(balance, -limit), limit), abs=1e-3)
 
 
-def test_a_jump_of_the_reference_is_no_derivative_kick() -> None:
-    assert updated(begun(), 0.1) == pytest.approx(SHIPPED.proportional_per_mm * 0.1)
-    # a carriage that moves exactly as its reference asks for no derivative action
-    assert updated(begun(), 0.0, ahead=0.3) == pytest.approx(0.3)
-
-
 @given(integral=st.floats(-1.0, 1.0), error_mm=st.floats(-0.01, 0.01))
 def test_a_carriage_at_rest_on_target_forgets_within_its_integral_time(integral: float, error_mm: float) -> None:
     stage = begun(integral=integral)
