@@ -198,11 +198,11 @@ class FakeDaemon(threading.Thread):
         self.is_over = threading.Event()
 
     def says(self, **changes: Any) -> None:
-        self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | changes)}
+        self.says_in_turn(changes)
 
-    def in_turn(self, command: str, *results: dict[str, Any]) -> None:
-        each = chain(results, repeat(results[-1]))
-        self.answers[command] = lambda: {"ok": True, "result": next(each)}
+    def says_in_turn(self, *looks: dict[str, Any]) -> None:
+        each = chain(looks, repeat(looks[-1]))
+        self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | next(each))}
 
     def taken(self) -> dict[str, Any]:
         counts = Counter(setpoint.source for setpoint in self.setpoints)

@@ -137,7 +137,12 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl scene check pulse --share 1 --tolerance 1", 2, "tormagctl scene check NAME with one of", {}),
     ("tormagctl scene check pulse --share 0.5 --out a.toml", 2, "allowed is a new file", {"a.toml": ""}),
     ("tormagctl scene new vein.toml", 2, "nobody to ask", {}),
-    ("tormagctl scene check fast.toml", 1, "N/s at", {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")}),
+    (
+        "tormagctl scene check fast.toml",
+        1,
+        "of the time it is faster",
+        {"fast.toml": CORONARY.replace("step_N = 0.1\n", "")},
+    ),
     (
         "tormagctl scene check poor.toml",
         1,
@@ -149,6 +154,12 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
         1,
         "tormagctl scene measure other.toml",
         {"other.toml": CORONARY.replace("most_N = 2.0", "most_N = 1.9")},
+    ),
+    (
+        "tormagctl scene measure silent.toml",
+        2,
+        "signal is missing",
+        {"silent.toml": SCENE.replace("cut.safetensors", "torque_mre_50_40")},
     ),
     ("tormagctl --config unfit.toml doctor --measure", 1, "nowhere", {"unfit.toml": 'scene = "nowhere"\n'}),
     ("tormagd --chek", 2, "unrecognized arguments: --chek; did you mean `--check`?", {}),
