@@ -405,10 +405,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
 
 @pytest.fixture
 def shown(status_with: Any) -> Any:
-    def text(**changes: Any) -> str:
-        return f"\n{status_text(msgspec.convert(status_with(**changes), Status), Colour(sys.stdout))}\n"
-
-    return text
+    return lambda **changes: f"\n{status_text(msgspec.convert(status_with(**changes), Status), Colour(sys.stdout))}\n"
 
 
 @pytest.mark.parametrize(("changes", "blocks", "absent"), STATUS_TEXTS.values(), ids=STATUS_TEXTS)

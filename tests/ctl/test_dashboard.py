@@ -10,8 +10,6 @@ import math
 import re
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -235,22 +233,17 @@ def test_lateness_falls_into_the_bar_that_names_it() -> None:
 
 @pytest.mark.parametrize(("options", "sent"), [((), []), (("--operate",), ["operate", "stop", "pause"])])
 async def test_the_command_says_where_it_serves_and_ends_in_order(
-    fake_daemon: Any, options: tuple[str, ...], sent: list[str]
+    fake_daemon: Any, started: Any, options: tuple[str, ...], sent: list[str]
 ) -> None:
     fake_daemon.answers["stop"] = lambda: {"ok": True, "result": {"operating_state": "FAULT", "is_connected": True}}
     fake_daemon.refuse("pause", "not_enabled")
-    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "20", "--json"]
-    command += ["dashboard", "--port", "0", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            link = next(found for line in process.stderr if (found := re.search(r"(http://127\S+)/#?(\S*)", line)))
-            async with ClientSession(headers={"Origin": link[1], "Tormag-Secret": link[2]}) as session:
-                given = [await session.post(f"{link[1]}/command", json={"command": each}) for each in sent[1:]]
-                answers = [(each.status, (await each.text()).split(";")[0]) for each in given]
-            process.send_signal(signal.SIGINT)
-            said, more = process.communicate(timeout=60.0)
-        finally:
-            process.kill()
+    with started("--json", "dashboard", "--port", "0", *options) as process:
+        link = next(found for line in process.stderr if (found := re.search(r"(http://127\S+)/#?(\S*)", line)))
+        async with ClientSession(headers={"Origin": link[1], "Tormag-Secret": link[2]}) as session:
+            given = [await session.post(f"{link[1]}/command", json={"command": each}) for each in sent[1:]]
+            answers = [(each.status, (await each.text()).split(";")[0]) for each in given]
+        process.send_signal(signal.SIGINT)
+        said, more = process.communicate(timeout=60.0)
     assert (process.returncode, json.loads(said)["ok"], len(link[2])) == (0, True, 43 if options else 0)
     assert answers == [(200, "stopped and latched"), (409, "pause: cannot pause")][: len(answers)]
     assert not options or link[2] not in said + more

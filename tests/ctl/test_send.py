@@ -273,19 +273,10 @@ def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon,
 
 
 def test_setpoints_that_nobody_took_are_no_success(fake_daemon, sent):
-    fake_daemon.taken_by_source = False
+    fake_daemon.taken_share = 0.0
     assert sent().ended(1).error["code"] == "not_heard"
     # another publisher of the same name, or a loss
-    fake_daemon.taken_by_source = True
-    taken = fake_daemon.taken
-    fake_daemon.taken = lambda: (
-        taken()
-        | {
-            "by_source": {
-                name: each | {"accepted": each["accepted"] // 2} for name, each in taken()["by_source"].items()
-            }
-        }
-    )
+    fake_daemon.taken_share = 0.5
     fake_daemon.setpoints.clear()
     assert sent().ended(1).error["code"] == "not_taken"
 

@@ -136,6 +136,14 @@ def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, ctl, status_with, so
     assert (known["link"] if command == "status" else known)["port"].endswith(EVIL)
 
 
+def test_a_refusal_is_one_printable_line_and_a_hint(fake_daemon, ctl):
+    error = {"code": EVIL, "message": "no" + EVIL, "hint": "next" + EVIL}
+    fake_daemon.answers["pause"] = lambda: {"ok": False, "error": error}
+    said = ctl(*fake_daemon.at, "pause").ended(1).err
+    assert is_harmless(said)
+    assert len(said.splitlines()) == 2
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [

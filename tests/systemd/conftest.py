@@ -82,12 +82,14 @@ class Machine:
         self._boot()
 
     def run(self, *command: str, check: bool = True) -> str:
-        inner = self._inner()
-        if inner is None:
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
+        # there until the process is waited for
+        first = children.read_text().split()[:1] if children.exists() else []
+        if not first:
             assert self._process.poll() is None, self.log.read_text()
             return ""
         done = subprocess.run(
-            ["nsenter", "--target", inner, "--all", *command],
+            ["nsenter", "--target", *first, "--all", *command],
             capture_output=True,
             text=True,
             check=False,
@@ -118,12 +120,6 @@ class Machine:
                 for folder, _, _ in os.walk(self._group, topdown=False):
                     with contextlib.suppress(OSError):
                         Path(folder).rmdir()
-
-    def _inner(self) -> str | None:
-        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
-        with contextlib.suppress(OSError):
-            return next(iter(children.read_text().split()), None)
-        return None
 
     def _enter_group(self) -> None:
         ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
