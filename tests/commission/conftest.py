@@ -8,7 +8,7 @@ import pytest
 
 from firmware_protocol.codec import Message
 from tormagd.commission.finding import Finding
-from tormagd.commission.procedure import COLUMNS, PREVIEW_STEP_S, Asked, Course, Found, Heard, Known, drive
+from tormagd.commission.procedure import COLUMNS, PREVIEW_STEP_S, Asked, Heard, Known, drive
 from tormagd.commission.sequence import STEPS, Step, Stopped, due, sequence
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import build_core
@@ -86,9 +86,6 @@ class Bench:
             rows.append([row[place] for place in PLACES])
         return Heard(self.loop.now_s, rows)
 
-    def follow(self, course: Course[Found]) -> Found:
-        return drive(course, self)
-
     def commission(
         self, steps: Sequence[Step] = STEPS, weight_N: float | None = None
     ) -> tuple[dict[str, list[Finding]], Stopped | None]:
@@ -97,7 +94,7 @@ class Bench:
         course = sequence(
             due(steps, known, {}), known, lambda step: None, lambda step, each: found.update({step.name: list(each)})
         )
-        return found, self.follow(course)
+        return found, drive(course, self)
 
 
 @pytest.fixture(scope="session")

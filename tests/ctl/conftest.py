@@ -6,6 +6,8 @@ import io
 import json
 import math
 import os
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -188,7 +190,7 @@ class FakeDaemon(threading.Thread):
             "status": lambda: {"ok": True, "result": status(setpoints=self.taken())},
             "describe": lambda: {"ok": True, "result": DESCRIPTION},
         }
-        self.taken_by_source = True
+        self.taken_share = 1.0
         self.is_silent = False
         self.commands: list[str] = []
         self.requests: list[dict[str, Any]] = []
@@ -198,16 +200,16 @@ class FakeDaemon(threading.Thread):
         self.is_over = threading.Event()
 
     def says(self, **changes: Any) -> None:
-        self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | changes)}
+        self.says_in_turn(changes)
 
-    def in_turn(self, command: str, *results: dict[str, Any]) -> None:
-        each = chain(results, repeat(results[-1]))
-        self.answers[command] = lambda: {"ok": True, "result": next(each)}
+    def says_in_turn(self, *looks: dict[str, Any]) -> None:
+        each = chain(looks, repeat(looks[-1]))
+        self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | next(each))}
 
     def taken(self) -> dict[str, Any]:
         counts = Counter(setpoint.source for setpoint in self.setpoints)
-        by_source = {name: SOURCE | {"accepted": count} for name, count in counts.items()}
-        return {"by_source": by_source if self.taken_by_source else {}}
+        by_source = {name: SOURCE | {"accepted": int(self.taken_share * count)} for name, count in counts.items()}
+        return {"by_source": by_source if self.taken_share else {}}
 
     def arrived(self, count: int) -> list[Setpoint]:
         until_s = time.monotonic() + PATIENCE_S
@@ -364,6 +366,22 @@ def source_with() -> Callable[..., dict[str, Any]]:
 def run_dir() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="tormag") as directory:
         yield Path(directory)
+
+
+@pytest.fixture
+def started(fake_daemon: FakeDaemon) -> Callable[..., contextlib.AbstractContextManager["subprocess.Popen[str]"]]:
+    """`tormagctl` as a process of its own, which does not outlive its block."""
+
+    @contextlib.contextmanager
+    def start(*arguments: str) -> Iterator["subprocess.Popen[str]"]:
+        command = [sys.executable, "-m", "tormagd.ctl.main", *fake_daemon.at, *arguments]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
+
+    return start
 
 
 @pytest.fixture

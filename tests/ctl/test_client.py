@@ -129,7 +129,7 @@ UNDER_WAY = {"given": ["home"], "is_over": False, "error": None}
 
 def test_arming_tells_each_command_and_ends_when_the_daemon_has(client, fake_daemon):
     done = {"given": ["home", "enable"], "is_over": True, "error": None}
-    fake_daemon.in_turn("status", *({"arm": report} for report in (UNDER_WAY, UNDER_WAY, done)))
+    fake_daemon.says_in_turn(*({"arm": report} for report in (UNDER_WAY, UNDER_WAY, done)))
     told: list[str] = []
     assert client.arm(told=told.append) == ("home", "enable")
     assert (told, fake_daemon.commands) == (["home", "enable"], ["arm", *["status"] * 3])
@@ -144,14 +144,14 @@ def test_arming_tells_each_command_and_ends_when_the_daemon_has(client, fake_dae
     ],
 )
 def test_an_arming_that_the_daemon_ended_says_why(client, fake_daemon, report, kind, words):
-    fake_daemon.in_turn("status", {"arm": report})
+    fake_daemon.says(arm=report)
     with pytest.raises(kind, match=words):
         client.arm()
     assert fake_daemon.commands == ["arm", "status"]
 
 
 def test_who_stops_waiting_for_an_arming_takes_the_word_back(client, fake_daemon):
-    fake_daemon.in_turn("status", {"arm": UNDER_WAY})
+    fake_daemon.says(arm=UNDER_WAY)
     with pytest.raises(RefusedError, match=r"not armed within 0\.1 s"):
         client.arm(0.1)
     assert fake_daemon.commands[-1] == "disable"

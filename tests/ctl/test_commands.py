@@ -31,6 +31,7 @@ NOT_UNDERSTOOD: list[Row] = [
 ]
 ARMED = {"given": ["home", "enable"], "is_over": True, "error": None}
 A_FAULT = {"code": "fault", "cause": "it came back", "remedy": "tormagctl status"}
+LINK_KEYS = [f'"{each.name}":' for each in msgspec.structs.fields(LinkReport) if each.required]
 ANSWERS: dict[str, list[Row]] = {
     "status": [
         ({"operating_state": "ENABLED"}, {}, 0, ["state     ENABLED, homed"]),
@@ -41,8 +42,16 @@ ANSWERS: dict[str, list[Row]] = {
         ({"core_share": 0.1}, {}, 0, ['"core_share":0.1', '"measured_jp":[35.0,35.0]', '"frames":55096']),
         *NOT_UNDERSTOOD,
     ],
-    "--json firmware": NOT_UNDERSTOOD,
+    "--json firmware": [
+        # a newer daemon's too
+        ({"link": {"newer": 1}}, {}, 0, ['"newer":1', '"port":"/dev/tormag"', '"frames":55096', *LINK_KEYS]),
+        *NOT_UNDERSTOOD,
+    ],
+    "firmware": [({}, {}, 0, ["RUNNING"])],
     "top": [({}, {}, 2, ["next: tormagctl status"])],  # there is no terminal
+    "--json scene list": [({}, {}, 0, [f'"name":"{scene}"' for scene in ("coronary", "pulse", "brain")])],
+    "--json scene show pulse": [({}, {}, 0, ['"name":"pulse"', '"gap_open_mm":95.0'])],
+    "--json scene show": [({}, {}, 0, ['"name":"coronary"'])],  # the configuration's
     "record /nowhere/a.mcap": [({}, {}, 2, ["/nowhere/a.mcap: No such file"])],
     "stop": [
         ({"is_open": True}, {"operating_state": "FAULT", "is_connected": True}, 0, ["latched; the gap is open"]),
@@ -169,15 +178,6 @@ def test_guides_are_listed_and_printed_as_they_are(ctl):
         assert ctl("guide", name).ended(0).out == page.read_text(encoding="utf-8").rstrip() + "\n"
 
 
-def test_scenes_are_listed_and_shown(ctl):
-    listed = ctl("--json", "scene", "list").result["scenes"]
-    assert {"coronary", "pulse", "brain"} <= {scene["name"] for scene in listed}
-    shown = ctl("--json", "scene", "show", "pulse").result
-    assert (shown["name"], shown["insert"]["gap_open_mm"]) == ("pulse", 95.0)
-    # without a name: the configuration's
-    assert ctl("--json", "scene", "show").result["name"] == "coronary"
-
-
 def test_a_scene_without_a_signal_is_shown_as_toml(tmp_path, ctl):
     scene = tmp_path / "scene.toml"
     text = 'name = "x"\ndescription = ""\n[force]\nleast_N = 0.0\nmost_N = 2.0\nresolution_N = 0.1\n'
@@ -272,51 +272,31 @@ def test_of_ways_that_are_alike_the_cheaper_is_taken(fast, ctl, monkeypatch):
     assert "--share = 0.05: allowed is at least 0.1 of a processor" in refused["message"]
 
 
-def test_a_scene_that_was_not_measured_as_it_is_now_says_how(fast, ctl):
-    fast.write_text(fast.read_text(encoding="utf-8").replace("most_N = 1.9", "most_N = 1.8"), encoding="utf-8")
-    error = ctl("--json", "scene", "explain", str(fast)).ended(1).error
-    assert (error["code"], f"tormagctl scene measure {fast}" in error["hint"]) == ("not_measured", True)
-
-
-@pytest.fixture
-def states(fake_daemon: Any, status_with: Any) -> Any:
-    def told(*pairs: tuple[bool, bool]) -> None:
-        shown = [
-            {"is_homed": is_homed, "is_busy": is_busy, "operating_state": "DISABLED"} for is_homed, is_busy in pairs
-        ]
-        fake_daemon.in_turn("status", *(status_with(**each) for each in shown))
-
-    return told
+AWAY, GOING, HOMED = (
+    {"is_homed": is_homed, "is_busy": is_busy, "operating_state": "DISABLED"}
+    for is_homed, is_busy in ((False, False), (False, True), (True, False))
+)
 
 
 @pytest.mark.parametrize(
-    "sequence",
+    ("looks", "refused"),
     [
-        [(False, False), (False, False), (False, True), (False, True), (True, False)],
-        [(True, False), (True, False), (False, True), (True, False)],  # homed before: the old state is no answer
-        [(False, False), (True, False)],  # over between two looks
+        ([AWAY, AWAY, GOING, GOING, HOMED], None),
+        ([HOMED, HOMED, GOING, HOMED], None),  # homed before: the old state is no answer
+        ([AWAY, HOMED], None),  # over between two looks
+        ([AWAY, GOING, AWAY], "not_homed"),
+        ([AWAY, GOING], "timeout"),
+        ([HOMED], "not_begun"),
     ],
 )
-def test_home_waits_until_the_device_is_homed(fake_daemon, ctl, states, sequence):
-    states(*sequence)
-    assert "seconds" in ctl(*fake_daemon.at, "--json", "home").ended(0).result
-    assert fake_daemon.commands == ["status", "home", *["status"] * (len(sequence) - 1)]
-
-
-@pytest.mark.parametrize(
-    ("sequence", "expected"),
-    [
-        ([(False, False), (False, True), (False, False)], "not_homed"),
-        ([(False, False), (False, True)], "timeout"),
-        ([(True, False)], "not_begun"),
-    ],
-)
-def test_home_that_does_not_succeed_says_how(fake_daemon, ctl, monkeypatch, states, sequence, expected):
-    monkeypatch.setattr("tormagd.ctl.operate.BEGIN_S", 0.2)
-    monkeypatch.setattr("tormagd.ctl.operate.HOMES_S", 1.0)
-    states(*sequence)
-    ended = ctl(*fake_daemon.at, "--json", "home")
-    assert (ended.code, ended.error["code"]) == (1, expected)
+def test_home_waits_until_the_device_is_homed_or_says_why_it_is_not(fake_daemon, ctl, monkeypatch, looks, refused):
+    if refused:
+        monkeypatch.setattr("tormagd.ctl.operate.BEGIN_S", 0.2)
+        monkeypatch.setattr("tormagd.ctl.operate.HOMES_S", 1.0)
+    fake_daemon.says_in_turn(*looks)
+    said = ctl(*fake_daemon.at, "--json", "home").ended(1 if refused else 0).said
+    assert said["error"]["code"] == refused if refused else "seconds" in said["result"]
+    assert refused or fake_daemon.commands == ["status", "home", *["status"] * (len(looks) - 1)]
 
 
 NO_PORT = {"cause": "there is no such port", "remedy": "plug the device in"}
@@ -425,10 +405,7 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
 
 @pytest.fixture
 def shown(status_with: Any) -> Any:
-    def text(**changes: Any) -> str:
-        return f"\n{status_text(msgspec.convert(status_with(**changes), Status), Colour(sys.stdout))}\n"
-
-    return text
+    return lambda **changes: f"\n{status_text(msgspec.convert(status_with(**changes), Status), Colour(sys.stdout))}\n"
 
 
 @pytest.mark.parametrize(("changes", "blocks", "absent"), STATUS_TEXTS.values(), ids=STATUS_TEXTS)
@@ -482,11 +459,11 @@ def test_a_command_loads_only_what_it_needs(command, run_dir):
     assert ran.stderr.splitlines()[-1] == "[]"
 
 
-def test_a_black_box_is_waited_for_until_it_is_written_or_cannot_be(fake_daemon, status_with, ctl):
+def test_a_black_box_is_waited_for_until_it_is_written_or_cannot_be(fake_daemon, ctl):
     fetch = (*fake_daemon.at, "--json", "blackbox")
     fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/boxes/new.mcap"}}
     boxes = [{"folder": "/boxes", "newest": newest} for newest in ("an older one", "new.mcap")]
-    fake_daemon.in_turn("status", *(status_with(black_box=each) for each in boxes))
+    fake_daemon.says_in_turn(*({"black_box": each} for each in boxes))
     assert ctl(*fetch).ended(0).result == {"file": "/boxes/new.mcap"}
     fake_daemon.says(black_box={"folder": "/boxes", "refusal": "/boxes/new.mcap: No space left on device"})
     error = ctl(*fetch).ended(1).error
@@ -535,13 +512,6 @@ def test_nothing_known_is_no_error(text: Any) -> None:
     shown = text(**dict.fromkeys(nullable))
     assert "not known yet" in shown
     assert "None" not in shown
-
-
-def test_the_keys_of_json_are_the_links(fake_daemon: Any, status_with: Any, ctl: Any) -> None:
-    newer = {"of a newer daemon": 1}
-    fake_daemon.says(link=newer)
-    assert ctl(*fake_daemon.at, "--json", "firmware").ended(0).result == status_with(link=newer)["link"]
-    assert "RUNNING" in ctl(*fake_daemon.at, "firmware").ended(0).out
 
 
 # -- scene new ---------------------------------------------------------------------------------------------------------

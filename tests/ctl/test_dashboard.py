@@ -10,9 +10,7 @@ import math
 import re
 import shutil
 import signal
-import subprocess
-import sys
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -234,34 +232,22 @@ def test_lateness_falls_into_the_bar_that_names_it() -> None:
 
 
 @pytest.mark.parametrize(("options", "sent"), [((), []), (("--operate",), ["operate", "stop", "pause"])])
-def test_the_command_says_where_it_serves_and_ends_in_order(
-    fake_daemon: Any, options: tuple[str, ...], sent: list[str]
+async def test_the_command_says_where_it_serves_and_ends_in_order(
+    fake_daemon: Any, started: Any, options: tuple[str, ...], sent: list[str]
 ) -> None:
     fake_daemon.answers["stop"] = lambda: {"ok": True, "result": {"operating_state": "FAULT", "is_connected": True}}
     fake_daemon.refuse("pause", "not_enabled")
-    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "20", "--json"]
-    command += ["dashboard", "--port", "0", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            link = next(found for line in process.stderr if (found := re.search(r"(http://127\S+)/#?(\S*)", line)))
-            answers = asyncio.run(given_by(link[1], link[2], sent[1:]))
-            process.send_signal(signal.SIGINT)
-            said, more = process.communicate(timeout=60.0)
-        finally:
-            process.kill()
+    with started("--json", "dashboard", "--port", "0", *options) as process:
+        link = next(found for line in process.stderr if (found := re.search(r"(http://127\S+)/#?(\S*)", line)))
+        async with ClientSession(headers={"Origin": link[1], "Tormag-Secret": link[2]}) as session:
+            given = [await session.post(f"{link[1]}/command", json={"command": each}) for each in sent[1:]]
+            answers = [(each.status, (await each.text()).split(";")[0]) for each in given]
+        process.send_signal(signal.SIGINT)
+        said, more = process.communicate(timeout=60.0)
     assert (process.returncode, json.loads(said)["ok"], len(link[2])) == (0, True, 43 if options else 0)
     assert answers == [(200, "stopped and latched"), (409, "pause: cannot pause")][: len(answers)]
     assert not options or link[2] not in said + more
     assert [each for each in fake_daemon.commands if each not in ("status", "describe")] == sent
-
-
-async def given_by(address: str, secret: str, commands: Sequence[str]) -> list[tuple[int, str]]:
-    found = []
-    async with ClientSession(headers={"Origin": address, "Tormag-Secret": secret}) as session:
-        for command in commands:
-            async with session.post(f"{address}/command", json={"command": command}) as answer:
-                found.append((answer.status, (await answer.text()).split(";")[0]))
-    return found
 
 
 def test_a_key_that_may_only_look_starts_no_page_that_operates(fake_daemon: Any, ctl: Any, tmp_path: Path) -> None:

@@ -155,6 +155,12 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
         "tormagctl scene measure other.toml",
         {"other.toml": CORONARY.replace("most_N = 2.0", "most_N = 1.9")},
     ),
+    (
+        "tormagctl scene measure silent.toml",
+        2,
+        "signal is missing",
+        {"silent.toml": SCENE.replace("cut.safetensors", "torque_mre_50_40")},
+    ),
     ("tormagctl --config unfit.toml doctor --measure", 1, "nowhere", {"unfit.toml": 'scene = "nowhere"\n'}),
     ("tormagd --chek", 2, "unrecognized arguments: --chek; did you mean `--check`?", {}),
     (

@@ -246,17 +246,13 @@ async def heard(address: str) -> dict[str, list[tuple[int, dict[str, Any]]]]:
     return told
 
 
-def test_foxglove_hears_force_gap_and_limits(fake_daemon: Any, ctl: Any) -> None:
-    command = [sys.executable, "-m", "tormagd.ctl.main", *fake_daemon.at, "foxglove", "--port", "0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            port = next(found[1] for line in process.stderr if (found := re.search(r"ws://127.0.0.1:(\d+)", line)))
-            told = asyncio.run(heard(f"ws://127.0.0.1:{port}"))
-            assert "give another --port" in ctl(*fake_daemon.at, "foxglove", "--port", port).ended(2).err
-            process.send_signal(signal.SIGINT)
-            assert process.wait(LONGEST_S) == 0
-        finally:
-            process.kill()
+def test_foxglove_hears_force_gap_and_limits(fake_daemon: Any, started: Any, ctl: Any) -> None:
+    with started("foxglove", "--port", "0") as process:
+        port = next(found[1] for line in process.stderr if (found := re.search(r"ws://127.0.0.1:(\d+)", line)))
+        told = asyncio.run(heard(f"ws://127.0.0.1:{port}"))
+        assert "give another --port" in ctl(*fake_daemon.at, "foxglove", "--port", port).ended(2).err
+        process.send_signal(signal.SIGINT)
+        assert process.wait(LONGEST_S) == 0
     for values in told.values():
         assert {then[0] - now[0] for now, then in itertools.pairwise(values)} == {20_000_000}
     assert {(each["setpoint_cf"], each["gap_mm"], *each["limits"]) for _, each in told["/telemetry"]} == {(1.5, 70.0)}

@@ -193,16 +193,12 @@ def test_a_folder_that_is_moved_away_is_told_and_not_taken_for_a_full_disk(fake_
     assert error["hint"].startswith(f"see that {folder} stays in place and takes files; what is in the file")
 
 
-def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, ctl, file):
-    command = [sys.executable, "-m", "tormagd.ctl.main", *fake_daemon.at, "--wait", "20", "--json"]
-    recorder = subprocess.Popen([*command, "record", str(file)], stdout=subprocess.PIPE, text=True)
-    try:
+def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, started, ctl, file):
+    with started("--json", "record", str(file)) as recorder:
         while recorder.poll() is None and not file.exists():
             ctl(*fake_daemon.at, "status")
         recorder.send_signal(signal.SIGINT)
         printed, _ = recorder.communicate(timeout=20)
-    finally:
-        recorder.kill()
     assert recorder.returncode == 0
     recording = RecordingFile(file)
     assert recording.is_complete

@@ -132,13 +132,6 @@ def test_searches_compete_at_rates_about_those_that_a_scene_states(
     assert (str(ways[0]), len(ways)) == (first, count)
 
 
-def test_a_scene_without_a_signal_cannot_be_measured(mine: Path, ctl: Any, checked_here: None) -> None:
-    text = mine.read_text(encoding="utf-8")
-    start = text.index("[signal]")
-    mine.write_text(text[:start] + text[text.index("[", start + 1) :], encoding="utf-8")
-    assert "signal is missing" in ctl("--json", "scene", "measure", str(mine)).ended(2).error["message"]
-
-
 @pytest.mark.live
 def test_a_daemon_is_measured_live_beside_a_simulated_device(tmp_path: Path) -> None:
     found, machine_us = scene_measure.served("coronary", load_scene("coronary"), SLOW, 2, RANGE_N, tmp_path)

@@ -1,4 +1,4 @@
-from itertools import chain, pairwise, repeat
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -261,38 +261,22 @@ def test_what_is_not_rendered_is_no_success(fake_daemon, sent, changes, expected
     assert (done.result, done.error["code"], bool(fake_daemon.setpoints)) == (None, code, expected == 1)
 
 
-def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, sent, status_with):
-
-    def states(*names: str) -> Any:
-        each = chain(names, repeat(names[-1]))
-        return lambda: {
-            "ok": True,
-            "result": status_with(operating_state=next(each), setpoints=fake_daemon.taken()),
-        }
-
-    fake_daemon.answers["status"] = states("DISABLED", "DISABLED", "ENABLED")
+def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, sent):
+    disabled, enabled, paused = ({"operating_state": state} for state in ("DISABLED", "ENABLED", "PAUSED"))
+    fake_daemon.says_in_turn(disabled, disabled, enabled)
     done = sent().ended(0)
     assert 0.0 < done.result["rendered_share"] < 1.0
     assert done.err.count("not rendered: the device is DISABLED") == 1
     fake_daemon.setpoints.clear()
-    fake_daemon.answers["status"] = states("ENABLED", "ENABLED", "PAUSED", "ENABLED")
+    fake_daemon.says_in_turn(enabled, enabled, paused, enabled)
     assert sent().ended(1).error["code"] == "paused"
 
 
 def test_setpoints_that_nobody_took_are_no_success(fake_daemon, sent):
-    fake_daemon.taken_by_source = False
+    fake_daemon.taken_share = 0.0
     assert sent().ended(1).error["code"] == "not_heard"
     # another publisher of the same name, or a loss
-    fake_daemon.taken_by_source = True
-    taken = fake_daemon.taken
-    fake_daemon.taken = lambda: (
-        taken()
-        | {
-            "by_source": {
-                name: each | {"accepted": each["accepted"] // 2} for name, each in taken()["by_source"].items()
-            }
-        }
-    )
+    fake_daemon.taken_share = 0.5
     fake_daemon.setpoints.clear()
     assert sent().ended(1).error["code"] == "not_taken"
 

@@ -183,10 +183,11 @@ LIST = (*CTL, "scene", "list")
 LOST = "tormagctl scene: the answer could not be written: No space left on device"
 
 
-def run(redirected: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
+def run(redirected: str, *arguments: str, stdout: int = subprocess.PIPE) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         ["sh", "-c", f'"$@" {redirected}', "sh", sys.executable, "-m", *arguments],
-        capture_output=True,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
         text=True,
         check=False,
         timeout=60,
@@ -229,20 +230,10 @@ def test_a_refusal_without_stderr_leaves_the_object_alone_on_stdout(tmp_path: Pa
 def test_a_reader_that_has_gone_makes_no_traceback(arguments, code, said):
     reading, writing = os.pipe()
     os.close(reading)
-    try:
-        ran = subprocess.run(
-            [sys.executable, "-m", *arguments],
-            stdout=writing,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-            timeout=60,
-        )
-    finally:
-        os.close(writing)
-    assert ran.returncode == code
+    ran = run("", *arguments, stdout=writing)
+    os.close(writing)
+    assert (ran.returncode, len(ran.stderr.splitlines())) == (code, bool(said))
     assert said in ran.stderr
-    assert len(ran.stderr.splitlines()) == bool(said)
 
 
 # -- top ---------------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from tormagd.scenes.measured import (
     measured,
     served_like,
 )
-from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Signal, Terms, load_scene, shipped_scenes
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Signal, Terms, load_scene, shipped_scenes
 from tormagd.scenes.signal import asked
 from tormagd_client.endpoints import ConfigError
 
@@ -82,11 +82,6 @@ def test_a_shipped_scene_gives_a_core_that_can_render_it(name: str) -> None:
     assert core.portrait.min_N < core.scene.force.most_N <= core.portrait.max_N
     assert core.margins.phase_margin_deg >= 45.0
     assert core.margins.gain_margin_dB >= 6.0
-
-
-def test_a_scene_survives_its_own_listing() -> None:
-    scene = load_scene("pulse")
-    assert msgspec.convert(msgspec.to_builtins(scene), Scene) == scene
 
 
 def test_a_name_of_no_file_lists_the_shipped_ones_or_says_why_it_is_none() -> None:
@@ -334,10 +329,16 @@ def test_a_daemon_runs_at_the_rates_that_measuring_chose_if_they_are_higher(writ
 
 @pytest.mark.parametrize(
     "damage",
-    [{"machine_us": 0.0}, {"judged": []}, {"served": []}, {"served": [msgspec.to_builtins(USUAL) | {"rms_N": {}}]}],
+    [
+        {"machine_us": 0.0},
+        {"judged": []},
+        {"served": []},
+        {"served": [msgspec.to_builtins(USUAL) | {"rms_N": {}}]},
+        {"fingerprint": "of another scene"},
+    ],
     ids=str,
 )
-def test_damaged_figures_are_as_none(write: Write, damage: dict[str, object]) -> None:
+def test_damaged_figures_and_those_of_another_scene_are_as_none(write: Write, damage: dict[str, object]) -> None:
     path = Path(write())
     scene = load_scene(str(path))
     found = msgspec.to_builtins(MeasuredScene(scene.fingerprint, 0.05, 100.0, (USUAL, BOTH), (USUAL,)))

@@ -11,6 +11,7 @@ import sysconfig
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
@@ -19,12 +20,12 @@ BOOT = Path(__file__).with_name("boot.sh")
 NAMESPACES = ("--pid", "--fork", "--mount", "--mount-proc", "--cgroup", "--uts", "--ipc", "--net", "--kill-child")
 VERSION = f"{sys.version_info[0]}.{sys.version_info[1]}"
 PYTHON = f"env LD_LIBRARY_PATH=/opt/base/lib /opt/base/bin/python{VERSION}"
-LIBRARY = "/opt/checkout:/opt/checkout/client/src:/opt/packages"
-"Where the machine finds this interpreter, and what it imports."
+"How the machine finds this interpreter."
 TRIAL = """mount -t tmpfs tmpfs /mnt && mkdir /mnt/upper /mnt/work /mnt/root /mnt/group
 mount -t overlay overlay -o lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work /mnt/root
 mount -t cgroup2 cgroup2 /mnt/group"""
 GROUPS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
+GROUP = next((group for group in GROUPS if (group / "cgroup.procs").exists()), None)
 DEATH_SIGNAL = 1
 "PR_SET_PDEATHSIG: a test that is killed leaves no machine behind."
 PATIENCE_S = 60.0
@@ -33,25 +34,22 @@ PATIENCE_S = 60.0
 
 def missing() -> str:
     """Return why no such machine can be made here."""
-    if os.geteuid() != 0:
-        return "not root"
     for program in ("unshare", "nsenter", "pivot_root", "systemctl"):
         if shutil.which(program) is None:
             return f"{program} is not installed"
     if not Path("/usr/lib/systemd/systemd").exists():
         return "systemd is not installed"
-    if "overlay" not in Path("/proc/filesystems").read_text():
-        return "the kernel has no overlayfs"
     # a container may allow the namespaces, and neither a view of its files nor a control group
     tried = subprocess.run(["unshare", *NAMESPACES, "sh", "-ec", TRIAL], capture_output=True, text=True, check=False)
     if tried.returncode:
         return f"namespaces or mounts are not allowed: {tried.stderr.strip()}"
-    group = next((group for group in GROUPS if (group / "cgroup.procs").exists()), None)
-    return f"{group} may not be written" if group is not None and not os.access(group, os.W_OK) else ""
+    return f"{GROUP} may not be written" if GROUP is not None and not os.access(GROUP, os.W_OK) else ""
 
 
 class Machine:
     """A booted machine, which has `shared` as /opt/shared."""
+
+    imports: ClassVar = {"python": PYTHON, "library": "/opt/checkout:/opt/checkout/client/src:/opt/packages"}
 
     def __init__(self, folder: Path, shared: Path) -> None:
         self._folder, self._shared = folder, shared
@@ -62,7 +60,9 @@ class Machine:
         place.mkdir(exist_ok=True)
         packages = sysconfig.get_path("purelib")
         # the new process 1 is the root of its own control group, and sees nothing of this machine's
-        self._group = _own_group(f"tormag-test-{os.getpid()}")
+        self._group = None if GROUP is None else GROUP / f"tormag-test-{os.getpid()}"
+        if self._group is not None:
+            self._group.mkdir(exist_ok=True)
         self.log = self._folder / "console.log"
         command = ["unshare", *NAMESPACES, "sh", str(BOOT)]
         command += [str(place), str(self._shared), str(CHECKOUT), sys.base_prefix, packages]
@@ -82,12 +82,14 @@ class Machine:
         self._boot()
 
     def run(self, *command: str, check: bool = True) -> str:
-        inner = self._inner()
-        if inner is None:
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
+        # there until the process is waited for
+        first = children.read_text().split()[:1] if children.exists() else []
+        if not first:
             assert self._process.poll() is None, self.log.read_text()
             return ""
         done = subprocess.run(
-            ["nsenter", "--target", inner, "--all", *command],
+            ["nsenter", "--target", *first, "--all", *command],
             capture_output=True,
             text=True,
             check=False,
@@ -119,25 +121,10 @@ class Machine:
                     with contextlib.suppress(OSError):
                         Path(folder).rmdir()
 
-    def _inner(self) -> str | None:
-        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
-        with contextlib.suppress(OSError):
-            return next(iter(children.read_text().split()), None)
-        return None
-
     def _enter_group(self) -> None:
         ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
         if self._group is not None:
             (self._group / "cgroup.procs").write_text("0")
-
-
-def _own_group(name: str) -> Path | None:
-    for mounted in GROUPS:
-        if (mounted / "cgroup.procs").exists():
-            group = mounted / name
-            group.mkdir(exist_ok=True)
-            return group
-    return None
 
 
 @pytest.fixture
@@ -180,8 +167,3 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
         pytest.skip(f"no machine of its own: {why_not}")
     with contextlib.closing(Machine(tmp_path, tmp_path)) as made:
         yield made
-
-
-@pytest.fixture
-def imports() -> dict[str, str]:
-    return {"python": PYTHON, "library": LIBRARY}

@@ -76,10 +76,10 @@ def shown(section: str) -> str:
     return textwrap.dedent(re.findall(r"(?:^    [\[\w].*\n)+", text, re.MULTILINE)[0])
 
 
-def test_the_service_from_its_installation_to_its_removal(package, machine, imports):
+def test_the_service_from_its_installation_to_its_removal(package, machine):
     console, left = Console(machine, "tormagd"), Console(machine, "tormagd@left")
     assert files(machine) == set()
-    installed(machine, package, imports)
+    installed(machine, package)
     it_is_up_with_a_device_only(console)
     real_time_is_granted_to_the_daemon_alone(console)
     an_upgrade_lets_it_run(console, package)
@@ -96,10 +96,10 @@ def unpack(machine, package) -> None:
     machine.run("dpkg", *options, "--install", f"/opt/shared/package/{package.name}")
 
 
-def installed(machine, package, imports) -> None:
+def installed(machine, package) -> None:
     unpack(machine, package)
     assert {"/usr/bin/tormagd", "/usr/lib/systemd/system/tormagd@.service", "/etc/tormag"} < files(machine)
-    put(machine, "/etc/systemd/system/simulator@.service", SIMULATOR.format(**imports))
+    put(machine, "/etc/systemd/system/simulator@.service", SIMULATOR.format(**machine.imports))
     seen = SEEN if machine.run("sh", "-c", RAISES) else SEEN + IN_ITS_PLACE
     put(machine, f"{DROP_INS.format(unit='tormagd')}/test.conf", seen)
     machine.run("systemctl", "enable", "tormag.target", "tormagd", "tormagd@left", "tormag-record@left")

@@ -161,16 +161,11 @@ def test_bash_completes_commands_options_and_choices(root, words, offered):
     assert set(told.stdout.split()) >= offered
 
 
-def seconds(key: str) -> float:
-    found = re.search(rf"^{key}=(\d+)s$", (UNITS / "tormagd.service").read_text(), re.MULTILINE)
-    assert found is not None, f"{key} is not in whole seconds"
-    return float(found[1])
-
-
 def test_timeouts_are_in_order():
-    config = Config()
-    assert config.device.command_timeout_ms < config.realtime.watchdog_ms < seconds("WatchdogSec") * 1e3
-    assert seconds("TimeoutStopSec") > 12.0  # the daemon waits up to 10 s for the gap to open
+    config, unit = Config(), (UNITS / "tormagd.service").read_text()
+    seconds = {key: float(value) for key, value in re.findall(r"^(\w+)=(\d+)s$", unit, re.MULTILINE)}
+    assert config.device.command_timeout_ms < config.realtime.watchdog_ms < seconds["WatchdogSec"] * 1e3
+    assert seconds["TimeoutStopSec"] > 12.0  # the daemon waits up to 10 s for the gap to open
 
 
 def test_what_real_time_needs_is_not_taken_away():
