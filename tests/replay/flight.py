@@ -21,9 +21,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd.record.black_box import write_black_box
 from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP
-from tormagd.record.rerun import Rerun, rerun
 from tormagd.record.telemetry import Moment
-from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
 
@@ -145,16 +143,11 @@ class Flight:
         return path
 
 
-def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
-    return rerun(core, entries, from_s)
-
-
 def frames(path: Path) -> list[dict[str, Any]]:
     with path.open("rb") as file:
         return [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics="/frames")]
 
 
-def planted(box_entries: list[Any], tick: int, column: int, value: Any) -> list[Any]:
-    place = [place for place, entry in enumerate(box_entries) if is_tick(entry)][tick - 1]
-    changed = [*box_entries[place][:column], value, *box_entries[place][column + 1 :]]
-    return [*box_entries[:place], changed, *box_entries[place + 1 :]]
+def altered(entries: list[Any], place: int, column: int, value: Any) -> list[Any]:
+    entry = entries[place]
+    return [*entries[:place], [*entry[:column], value, *entry[column + 1 :]], *entries[place + 1 :]]

@@ -415,13 +415,12 @@ def test_a_step_creeps_with_the_logarithm_of_time_and_comes_to_an_end() -> None:
 
 
 def test_friction_grows_with_the_logarithm_of_speed_and_with_rest() -> None:
-    quiet = changed(SECOND, "second", creeping_share=0.0)
-    slow_N, middle_N, fast_N = (slid(60.0, quiet, 12.0 / speed, speed).force_N for speed in (1.0, 10.0, 100.0))
+    slow_N, middle_N, fast_N = (slid(60.0, CREEPLESS, 12.0 / speed, speed).force_N for speed in (1.0, 10.0, 100.0))
     assert middle_N / slow_N == pytest.approx(fast_N / middle_N, rel=0.03)
     assert 1.02 < middle_N / slow_N < 1.06
     peaks_N = []
     for rests_s in (0.0, 30.0):
-        element = slid(60.0, quiet)
+        element = slid(60.0, CREEPLESS)
         for _ in range(round(rests_s / STEP_S)):
             element.advance(0.0, 60.0, 0.0)
         peaks_N.append(0.0)
