@@ -54,7 +54,7 @@ from tormagd.simulation.firmware import Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-PAGE = Path(__file__).parents[2] / "firmware_protocol" / "README.md"
+PAGE = (Path(__file__).parents[2] / "firmware_protocol" / "README.md").read_text(encoding="utf-8")
 Measured = tuple[State, Sense]
 SAMPLE = load_plant("sample_1")
 NEAR_HOME = msgspec.structs.replace(
@@ -1414,10 +1414,9 @@ def test_every_check_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_every_check_cites_the_page() -> None:
-    text = PAGE.read_text(encoding="utf-8")
     for one in CHECKS:
         heading, _, number = one.page.partition(", ")
-        section = re.search(rf"^##+ {re.escape(heading)}$(.*?)(?=^##? |\Z)", text, re.MULTILINE | re.DOTALL)
+        section = re.search(rf"^##+ {re.escape(heading)}$(.*?)(?=^##? |\Z)", PAGE, re.MULTILINE | re.DOTALL)
         assert section is not None, f"{one.name}: {heading!r} is no heading of the page"
         assert not number or re.search(rf"^{number}\. ", section[1], re.MULTILINE), (
             f"{one.name}: no {number}, {heading!r}"
@@ -1425,12 +1424,11 @@ def test_every_check_cites_the_page() -> None:
 
 
 def test_the_rules_are_the_pages() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    flat = " ".join(re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text).split())
+    flat = " ".join(re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", PAGE).split())
     assert [rule for rule in RULES if rule not in flat.replace("**", "")] == []
     held = " ".join(finds for finds in RULES.values() if not finds.startswith("-")).split()
     assert set(held) == {one.name for one in CHECKS}
-    rows = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("| ")]
+    rows = [re.split(r" *\| *", line.strip("| ")) for line in PAGE.splitlines() if line.startswith("| ")]
     assert {name: tuple(cells) for name, *cells in rows if name in TAKES} == TAKES
     assert ["", *MODES] in [["", *cells] for cells in rows] or list(MODES) in rows
 

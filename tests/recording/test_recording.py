@@ -262,6 +262,12 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+def altered(folder: Path, data: bytes) -> RecordingFile:
+    path = folder / "altered.mcap"
+    path.write_bytes(data)
+    return RecordingFile(path)
+
+
 def chunks_in(path: Path) -> list[ChunkIndex]:
     with path.open("rb") as file:
         return make_reader(file).get_summary().chunk_indexes
@@ -269,11 +275,10 @@ def chunks_in(path: Path) -> list[ChunkIndex]:
 
 @pytest.mark.parametrize("hole_at", [0.2, 0.45, 0.7, 0.9])
 def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path: Path, hole_at: float) -> None:
-    data, chunks, spoilt = bytearray(path.read_bytes()), chunks_in(path), tmp_path / "spoilt.mcap"
+    data, chunks = bytearray(path.read_bytes()), chunks_in(path)
     first = int(hole_at * chunks[-1].chunk_start_offset)
     data[first : first + 4096] = bytes(4096)
-    spoilt.write_bytes(data)
-    known = RecordingFile(spoilt)
+    known = altered(tmp_path, data)
     begins = {each.chunk_start_offset: each.chunk_start_offset + each.chunk_length for each in chunks}
     assert set(known.lost) == {begin for begin, end in begins.items() if begin < first + 4096 and end > first}
     assert ("damaged" in known.notes[0], f"left out: {len(known.lost)}" in known.notes[1]) == (True, True)
@@ -284,11 +289,10 @@ def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path
 
 @pytest.mark.parametrize("tail", [b"", bytes(1_000_000)], ids=["nothing", "zeros"])
 def test_a_damaged_chunk_of_a_file_that_was_not_ended_costs_no_other(path: Path, tmp_path: Path, tail: bytes) -> None:
-    chunks, killed = chunks_in(path), tmp_path / "killed.mcap"
+    chunks = chunks_in(path)
     data = bytearray(path.read_bytes()[: chunks[20].chunk_start_offset] + tail)  # its recorder was killed there
     data[chunks[10].chunk_start_offset + 200] ^= 1
-    killed.write_bytes(data)
-    known = RecordingFile(killed)
+    known = altered(tmp_path, data)
     assert (known.is_complete, list(known.lost)) == (False, [chunks[10].chunk_start_offset])
     assert known.overview.end_ns == chunks[19].message_end_time
 
@@ -313,10 +317,7 @@ def test_a_step_of_the_clock_is_shown_and_stretches_nothing(tmp_path: Path, step
 
 
 def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path: Path) -> None:
-    known = RecordingFile(path)
-    killed = tmp_path / "killed.mcap"
-    killed.write_bytes(path.read_bytes()[:-1])
-    again = RecordingFile(killed)
+    known, again = RecordingFile(path), altered(tmp_path, path.read_bytes()[:-1])
     assert (known.is_complete, again.is_complete) == (True, False)
     assert known.overview == again.overview == unpacked(known.overview.packed())
     overview = known.overview
@@ -334,9 +335,7 @@ def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path:
     [(b"\xa4SKEW", b"\xa4SHOW", "the CRC of its data is wrong"), (b"tormagd.Tick", b"tormagd.Tack", "its summary")],
 )
 def test_what_no_crc_vouches_for_is_named_and_an_overview_not_shown(path, tmp_path, old, new, said) -> None:
-    spoilt = tmp_path / "spoilt.mcap"
-    spoilt.write_bytes(path.read_bytes().replace(old, new))
-    known = RecordingFile(spoilt)
+    known = altered(tmp_path, path.read_bytes().replace(old, new))
     assert said in known.damage in known.notes[0]
     assert (list(known.overview.codes["faults"]), known.overview) == (["SKEW"], RecordingFile(path).overview)
 

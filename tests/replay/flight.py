@@ -10,7 +10,6 @@ from mcap.reader import make_reader
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
-from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import RefusedError
@@ -50,7 +49,7 @@ class Flight:
         self.loop.connection.traffic = self
         self._inbox = SetpointInbox()
         period_ns = NS // config.rates.inference_hz
-        self._inference = InferenceLoop(
+        self.inference = InferenceLoop(
             self.planner,
             self._inbox,
             period_ns,
@@ -66,10 +65,10 @@ class Flight:
         due_ns = self._now_ns + NS // self.config.rates.control_hz
         self._now_ns, beat = due_ns, Beat(due_ns, due_ns, 0)
         stepper, is_asked = self.loop.stepper, self._drain(setpoint)
-        self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
+        self.inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
-        self._inference.foresee(beat)
+        self.inference.foresee(beat)
         moment = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, self._ticks)
         self._ticks += 1
         if (part := self._box.ticked(moment, self.loop.stepper, self.planner)) is not None:
@@ -119,9 +118,6 @@ class Flight:
         except RefusedError:
             is_refused = True
         self._journal.note(COMMAND, name, self.loop.now_s, is_refused, conditions)
-
-    def confirm(self, wrong: Disputed) -> None:
-        self._inference.confirm(wrong)
 
     def until(self, reached: Callable[[], bool]) -> None:
         for _ in range(10_000):

@@ -85,7 +85,7 @@ def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> Non
     forces[:] = [0.7 * force_N for force_N in forces]
     while not flown.planner.believe.sensor.is_disputed:
         flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
-    flown.confirm("device")
+    flown.inference.confirm("device")
     for _ in range(500):
         flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
     box = read_black_box(flown.write(tmp_path / "confirmed.mcap"))
