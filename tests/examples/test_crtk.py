@@ -11,8 +11,7 @@ import pytest
 from tormagd_client.messages import Motion, Setpoint, Telemetry, Tick, decode
 from tormagd_client.wire import Numbering
 
-names = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "ros2" / "translation.py"))
-translation = SimpleNamespace(**names)
+translation = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "examples" / "ros2" / "translation.py")))
 
 STATE = Telemetry(
     v=1,

@@ -37,8 +37,7 @@ def test_a_fault_and_silence_are_rung_for_every_two_seconds_until_they_are_over(
 # -- the trials --------------------------------------------------------------------------------------------------------
 
 
-names = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "python" / "trials.py"))
-trials = SimpleNamespace(**names)
+trials = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "examples" / "python" / "trials.py")))
 
 
 def test_each_pair_is_offered_as_often_as_the_others_in_an_order_of_the_seed() -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
-names = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "mujoco" / "guidewire.py"))
-guidewire = SimpleNamespace(**names)
+guidewire = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "examples" / "mujoco" / "guidewire.py")))
 ROUTE, LESION_MM = "30:0,20:30,32:0", 52.0
 PUSH_MM_S, SECONDS = 32.0, 2.0
 

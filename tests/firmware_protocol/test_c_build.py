@@ -17,27 +17,20 @@ ALLOWED_FROM_OUTSIDE = {"memcpy", "memset", "memcmp", "fabs", "rint", "fmod", "i
 BEYOND_STRICT = ("-Wconversion", "-Wshadow", "-Wvla", "-Wstrict-prototypes", "-Wmissing-prototypes", "-Wcast-qual")
 
 
-@pytest.fixture(scope="module")
-def objects(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Compile each firmware source by itself, under more warnings still."""
-    folder = tmp_path_factory.mktemp("objects")
-    built = []
-    for name in FIRMWARE:
-        target = folder / f"{name}.o"
-        # their symbols would be the host compiler's
-        flags = ["-O1", "-fno-stack-protector", "-U_FORTIFY_SOURCE", *STRICT, *BEYOND_STRICT]
-        command = [c_compiler, *flags, "-c", str(ROOM / f"{name}.c"), "-o", str(target)]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert result.returncode == 0, result.stderr
-        built.append(target)
-    return built
+def compiled(c_compiler: str, folder: Path, *flags: str) -> "subprocess.CompletedProcess[str]":
+    """Compile each firmware source by itself, without what a host's compiler adds."""
+    sources = [str(ROOM / f"{name}.c") for name in FIRMWARE]
+    command = [c_compiler, "-O1", "-fno-stack-protector", *flags, "-c", *sources]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_the_firmware_needs_no_heap_and_hardly_a_library(objects: list[Path]) -> None:
+def test_the_firmware_needs_no_heap_and_hardly_a_library(c_compiler: str, tmp_path: Path) -> None:
     nm = shutil.which("nm")
     if nm is None:
         pytest.skip("no nm to list symbols")
-    listing = subprocess.run([nm, *objects], capture_output=True, text=True, check=True).stdout
+    result = compiled(c_compiler, tmp_path, "-U_FORTIFY_SOURCE", *STRICT, *BEYOND_STRICT)
+    assert result.returncode == 0, result.stderr
+    listing = subprocess.run([nm, *tmp_path.glob("*.o")], capture_output=True, text=True, check=True).stdout
     symbols = [line.split() for line in listing.splitlines() if line and not line.endswith(":")]
     assert ["tormag_device_tick"] in [words[2:] for words in symbols]
     defined = {words[-1] for words in symbols if words[-2] != "U"}
@@ -47,10 +40,7 @@ def test_the_firmware_needs_no_heap_and_hardly_a_library(objects: list[Path]) ->
 
 
 def test_the_firmware_does_not_recurse_and_its_stack_is_bounded(c_compiler: str, tmp_path: Path) -> None:
-    flags = ["-std=c99", "-O1", "-fno-stack-protector", "-fcallgraph-info=su", "-c"]
-    sources = [str(ROOM / f"{name}.c") for name in FIRMWARE]
-    result = subprocess.run([c_compiler, *flags, *sources], cwd=tmp_path, capture_output=True, check=False)
-    if result.returncode != 0:
+    if compiled(c_compiler, tmp_path, "-std=c99", "-fcallgraph-info=su").returncode != 0:
         pytest.skip(f"{c_compiler} writes no call graph")
     graph = "".join(path.read_text(encoding="utf-8") for path in tmp_path.glob("*.ci"))
     stack = {

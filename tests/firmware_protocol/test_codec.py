@@ -59,10 +59,6 @@ US = Identity(SCHEMA_HASH, 1, 0, 77)
 IS_COMPILED = not str(codec.__file__).endswith(".py")
 
 
-def values_of(message: Message) -> dict[str, float]:
-    return {name: getattr(message, name) for name in message.__match_args__}
-
-
 def test_units_of_the_dbc_are_those_that_names_end_with() -> None:
     units = {signal.name: signal.unit for message in DATABASE.messages for signal in message.signals if signal.unit}
     assert units["force_N"] == "N"
@@ -118,11 +114,6 @@ def test_what_is_no_message_is_refused_by_name(function: int, payload: bytes, te
         decode(function, payload)
 
 
-def test_bytes_of_every_kind_are_read() -> None:
-    payload = encode(DRIVE)
-    assert decode(2, bytearray(payload)) == decode(2, payload)
-
-
 @pytest.mark.parametrize(
     ("message", "text"),
     [
@@ -132,8 +123,8 @@ def test_bytes_of_every_kind_are_read() -> None:
                 rf"{type(message).__name__}\.{name} = -?(nan|inf): allowed",
             )
             for message in (DRIVE, STATE, SENSE, STATUS)
-            for name, value in values_of(message).items()
-            if type(value) is float
+            for name in message.__match_args__
+            if type(getattr(message, name)) is float
             for bad in (math.nan, math.inf, -math.inf)
         ),
         (DRIVE.replaced(left_duty=1.0001), r"Drive\.left_duty = 1\.0001: allowed are values from -1 to 1"),
@@ -233,7 +224,8 @@ def test_valid_payloads_in_both_directions() -> None:
     for vector in MESSAGES["valid"]:
         payload = bytes.fromhex(vector["payload"])
         message = types[vector["message"]](**vector["values"])
-        assert (encode(message), decode(vector["function"], payload)) == (payload, message), vector
+        assert encode(message) == payload, vector
+        assert [decode(vector["function"], kind(payload)) for kind in (bytes, bytearray)] == [message] * 2, vector
         assert can_identifier(FUNCTION[type(message)]) == vector["can_identifier"]
 
 

@@ -54,7 +54,7 @@ from tormagd.simulation.firmware import Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-PAGE = Path(__file__).parents[2] / "firmware_protocol" / "README.md"
+PAGE = (Path(__file__).parents[2] / "firmware_protocol" / "README.md").read_text(encoding="utf-8")
 Measured = tuple[State, Sense]
 SAMPLE = load_plant("sample_1")
 NEAR_HOME = msgspec.structs.replace(
@@ -330,15 +330,11 @@ def opens_with(share: float) -> Callable[[Rogue, Output], Output]:
     )
 
 
-def is_over(device: Rogue, time_s: float, seconds: float, mode: DeviceMode) -> bool:
-    if device.real.mode is not mode:
-        device.since_s = time_s
-    return time_s - device.since_s > seconds
-
-
 def stops_after(seconds: float) -> Callable[[Rogue, float], None]:
     def ticked(device: Rogue, time_s: float) -> None:
-        if is_over(device, time_s, seconds, DeviceMode.RETRACTING):
+        if device.real.mode is not DeviceMode.RETRACTING:
+            device.since_s = time_s
+        if time_s - device.since_s > seconds:
             device.real._rest(time_s, DeviceMode.IDLE)
 
     return ticked
@@ -1262,23 +1258,6 @@ class Asleep(Wire):
         return super().read(until_s)
 
 
-def test_a_check_that_this_computer_spoiled_is_tried_again() -> None:
-    assert run(Host(serial_line(wire=Asleep)), [named("silence_is_noticed")])[0].passed
-    seen = run(Host(serial_line(wrong(Rogue, ticks=timeout_of(0.035)), Asleep)), [named("silence_is_noticed")])[0].seen
-    assert "ms late meanwhile" not in seen, "the last attempt was not late, and is the one that counts"
-
-
-def test_what_is_judged_by_all_that_was_heard_says_how_late_this_computer_ever_was() -> None:
-    names = ("silence_is_noticed", "every_drive_answered", "clock_runs_on")
-    result = run(Host(serial_line(wire=Asleep, faults=["clock=+2%"])), [named(name) for name in names])[-1]
-    assert "ms late meanwhile" in result.seen
-
-
-def test_a_handle_that_turns_one_way_only_is_not_judged() -> None:
-    host = Host(SerialLine(Wire(VirtualDevice(NEAR_HOME, SteadyHand()))))
-    assert run(host, [named("every_drive_answered"), named("handle_runs_on")])[-1].passed is None
-
-
 class Pausing(Wire):
     held = b""
 
@@ -1288,10 +1267,28 @@ class Pausing(Wire):
         return b"" if self.held else data
 
 
-def test_a_pause_does_not_move_the_clock() -> None:
-    names = ("every_drive_answered", "every_nonce", "every_drive_answered", "clock_runs_on")
-    result = run(Host(serial_line(wire=Pausing)), [named(name) for name in names])[-1]
-    assert result.passed, result.seen
+SILENCE, DRIVES, CLOCK = "silence_is_noticed", "every_drive_answered", "clock_runs_on"
+
+
+@pytest.mark.parametrize(
+    ("line", "names", "passed", "says_late"),
+    [
+        # a check that this computer spoiled is tried again, and the last attempt, which was not late, counts
+        (lambda: serial_line(wire=Asleep), (SILENCE,), True, False),
+        (lambda: serial_line(wrong(Rogue, ticks=timeout_of(0.035)), Asleep), (SILENCE,), False, False),
+        # what is judged by all that was heard says how late this computer ever was
+        (lambda: serial_line(wire=Asleep, faults=["clock=+2%"]), (SILENCE, DRIVES, CLOCK), False, True),
+        # a pause does not move the clock
+        (lambda: serial_line(wire=Pausing), (DRIVES, "every_nonce", DRIVES, CLOCK), True, False),
+        # a handle that turns one way only is not judged
+        (lambda: SerialLine(Wire(VirtualDevice(NEAR_HOME, SteadyHand()))), (DRIVES, "handle_runs_on"), None, False),
+    ],
+)
+def test_what_this_computer_or_the_hand_spoiled_is_not_the_devices(
+    line: Callable[[], Line], names: tuple[str, ...], passed: bool | None, says_late: bool
+) -> None:
+    result = run(Host(line()), [named(name) for name in names])[-1]
+    assert (result.passed, "ms late meanwhile" in result.seen) == (passed, says_late), result.seen
 
 
 # -- the command ---------------------------------------------------------------------------------------------------
@@ -1417,10 +1414,9 @@ def test_every_check_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_every_check_cites_the_page() -> None:
-    text = PAGE.read_text(encoding="utf-8")
     for one in CHECKS:
         heading, _, number = one.page.partition(", ")
-        section = re.search(rf"^##+ {re.escape(heading)}$(.*?)(?=^##? |\Z)", text, re.MULTILINE | re.DOTALL)
+        section = re.search(rf"^##+ {re.escape(heading)}$(.*?)(?=^##? |\Z)", PAGE, re.MULTILINE | re.DOTALL)
         assert section is not None, f"{one.name}: {heading!r} is no heading of the page"
         assert not number or re.search(rf"^{number}\. ", section[1], re.MULTILINE), (
             f"{one.name}: no {number}, {heading!r}"
@@ -1428,12 +1424,11 @@ def test_every_check_cites_the_page() -> None:
 
 
 def test_the_rules_are_the_pages() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    flat = " ".join(re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text).split())
+    flat = " ".join(re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", PAGE).split())
     assert [rule for rule in RULES if rule not in flat.replace("**", "")] == []
     held = " ".join(finds for finds in RULES.values() if not finds.startswith("-")).split()
     assert set(held) == {one.name for one in CHECKS}
-    rows = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("| ")]
+    rows = [re.split(r" *\| *", line.strip("| ")) for line in PAGE.splitlines() if line.startswith("| ")]
     assert {name: tuple(cells) for name, *cells in rows if name in TAKES} == TAKES
     assert ["", *MODES] in [["", *cells] for cells in rows] or list(MODES) in rows
 

@@ -3,7 +3,7 @@
 import io
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import msgpack
@@ -54,11 +54,6 @@ def ended(body: bytes, *summary, at: int | None = None) -> bytes:
     return data + record(*summary, Footer(len(data) if at is None else at, 0, 0)) + MAGIC
 
 
-def rows(count: int) -> Iterator[bytes]:
-    for number in range(count):
-        yield b'{"c%d":1}' % number
-
-
 MANY = 220_000_000
 CHANNEL = record(Channel(1, "/ticks", "json", {}, 0))
 FILES: dict[str, Callable[[], bytes]] = {
@@ -80,7 +75,7 @@ FILES: dict[str, Callable[[], bytes]] = {
         15_000_000,
     ),
     "a chunk that says less than nothing": lambda: chunk(b"", 2**63),
-    "ever new columns": lambda: messages(*rows(40_000)),
+    "ever new columns": lambda: messages(*(b'{"c%d":1}' % number for number in range(40_000))),
     "a million columns at once": lambda: messages(json.dumps(dict.fromkeys(map(str, range(400_000)), 1)).encode()),
     "a list of a million": lambda: messages(b'{"limits":[' + b",".join([b'"A"'] * 1_000_000) + b"]}"),
     "a word of 7 MB": lambda: messages(b'{"operating_state":"' + b"A" * 7_000_000 + b'"}'),

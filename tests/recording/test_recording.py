@@ -123,14 +123,6 @@ def test_no_row_of_any_daemon_breaks_the_schema_it_is_filed_under(tmp_path_facto
     assert obey(path) == 1 + len(rows)
 
 
-def fill(writer: RecordingWriter) -> None:
-    rng = np.random.default_rng(0)
-    with writer:
-        for k in range(400):
-            writer.ticks(batch(*((20 * k + i, *rng.random(5).tolist()) for i in range(20))))
-            tell(writer, telemetry(20 * k, k))
-
-
 @pytest.mark.parametrize("chunks", [0, 1, 2, 9])
 def test_before_a_disk_is_full_all_that_came_is_closed_in_order(tmp_path, monkeypatch, chunks):
     path = tmp_path / "full.mcap"
@@ -138,7 +130,7 @@ def test_before_a_disk_is_full_all_that_came_is_closed_in_order(tmp_path, monkey
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=next(free)))
     writer = RecordingWriter(path)
     with pytest.raises(OSError, match=r"No space left on device: 15\.9 MB are free, needed are 16\.0"):
-        fill(writer)
+        write(writer)
     recording = back(path)
     assert not recording.is_complete
     assert "15.9 MB" in recording.metadata["cut_by"]
@@ -254,19 +246,26 @@ def row(k: int) -> tuple[Any, ...]:
     return (k, asked_N, felt_N, 34.0, 36.0, "FAULT" if faults else "ENABLED", limits, faults, k)
 
 
-def write(path: Path, **settings: Any) -> Path:
-    with RecordingWriter(path, **settings) as writer:
+def write(writer: RecordingWriter) -> None:
+    with writer:
         for k in range(0, 30_000, 20):
             writer.ticks(batch(*(row(k + i) for i in range(20)), columns=ALL_COLUMNS))
             mark = Mark(t_ns=START_NS + 15_000_000_000, text="here") if k >= 15_000 else None
             tell(writer, telemetry(k, k // 20, mark=mark))
     assert writer.ticks_lost == 0
-    return path
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("overview") / "a.mcap")
+    made = tmp_path_factory.mktemp("overview") / "a.mcap"
+    write(RecordingWriter(made))
+    return made
+
+
+def altered(folder: Path, data: bytes) -> RecordingFile:
+    path = folder / "altered.mcap"
+    path.write_bytes(data)
+    return RecordingFile(path)
 
 
 def chunks_in(path: Path) -> list[ChunkIndex]:
@@ -276,11 +275,10 @@ def chunks_in(path: Path) -> list[ChunkIndex]:
 
 @pytest.mark.parametrize("hole_at", [0.2, 0.45, 0.7, 0.9])
 def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path: Path, hole_at: float) -> None:
-    data, chunks, spoilt = bytearray(path.read_bytes()), chunks_in(path), tmp_path / "spoilt.mcap"
+    data, chunks = bytearray(path.read_bytes()), chunks_in(path)
     first = int(hole_at * chunks[-1].chunk_start_offset)
     data[first : first + 4096] = bytes(4096)
-    spoilt.write_bytes(data)
-    known = RecordingFile(spoilt)
+    known = altered(tmp_path, data)
     begins = {each.chunk_start_offset: each.chunk_start_offset + each.chunk_length for each in chunks}
     assert set(known.lost) == {begin for begin, end in begins.items() if begin < first + 4096 and end > first}
     assert ("damaged" in known.notes[0], f"left out: {len(known.lost)}" in known.notes[1]) == (True, True)
@@ -289,21 +287,14 @@ def test_a_hole_costs_the_chunks_that_it_is_in_and_no_other(path: Path, tmp_path
     assert len(everything) == known.overview.ticks + known.overview.snapshots
 
 
-def test_a_damaged_chunk_of_a_file_that_was_not_ended_costs_no_other(path: Path, tmp_path: Path) -> None:
-    chunks, killed = chunks_in(path), tmp_path / "killed.mcap"
-    data = bytearray(path.read_bytes()[: chunks[20].chunk_start_offset])  # its recorder was killed there
+@pytest.mark.parametrize("tail", [b"", bytes(1_000_000)], ids=["nothing", "zeros"])
+def test_a_damaged_chunk_of_a_file_that_was_not_ended_costs_no_other(path: Path, tmp_path: Path, tail: bytes) -> None:
+    chunks = chunks_in(path)
+    data = bytearray(path.read_bytes()[: chunks[20].chunk_start_offset] + tail)  # its recorder was killed there
     data[chunks[10].chunk_start_offset + 200] ^= 1
-    killed.write_bytes(data)
-    known = RecordingFile(killed)
+    known = altered(tmp_path, data)
     assert (known.is_complete, list(known.lost)) == (False, [chunks[10].chunk_start_offset])
     assert known.overview.end_ns == chunks[19].message_end_time
-
-
-def test_zeros_where_a_tail_was_are_a_cut(path: Path, tmp_path: Path) -> None:
-    data, spoilt = path.read_bytes(), tmp_path / "zeros.mcap"
-    spoilt.write_bytes(data[: len(data) // 2] + bytes(len(data) // 2))
-    known = RecordingFile(spoilt)
-    assert (known.is_complete, known.overview.ticks > 10_000) == (False, True)
 
 
 @pytest.mark.parametrize("step_s", [-5.0, 3_600.0, START_NS * 1e-9])
@@ -326,10 +317,7 @@ def test_a_step_of_the_clock_is_shown_and_stretches_nothing(tmp_path: Path, step
 
 
 def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path: Path) -> None:
-    known = RecordingFile(path)
-    killed = tmp_path / "killed.mcap"
-    killed.write_bytes(path.read_bytes()[:-1])
-    again = RecordingFile(killed)
+    known, again = RecordingFile(path), altered(tmp_path, path.read_bytes()[:-1])
     assert (known.is_complete, again.is_complete) == (True, False)
     assert known.overview == again.overview == unpacked(known.overview.packed())
     overview = known.overview
@@ -347,9 +335,7 @@ def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path:
     [(b"\xa4SKEW", b"\xa4SHOW", "the CRC of its data is wrong"), (b"tormagd.Tick", b"tormagd.Tack", "its summary")],
 )
 def test_what_no_crc_vouches_for_is_named_and_an_overview_not_shown(path, tmp_path, old, new, said) -> None:
-    spoilt = tmp_path / "spoilt.mcap"
-    spoilt.write_bytes(path.read_bytes().replace(old, new))
-    known = RecordingFile(spoilt)
+    known = altered(tmp_path, path.read_bytes().replace(old, new))
     assert said in known.damage in known.notes[0]
     assert (list(known.overview.codes["faults"]), known.overview) == (["SKEW"], RecordingFile(path).overview)
 
@@ -391,7 +377,8 @@ def test_any_seconds_of_it_are_those_of_the_whole(path: Path) -> None:
 
 
 def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_path: Path) -> None:
-    path = write(tmp_path / "thin.mcap", every=50)
+    path = tmp_path / "thin.mcap"
+    write(RecordingWriter(path, every=50))
     recording = back(path)
     assert recording.metadata[THINNED].startswith("one tick of 50;")
     at_ms = np.array(recording.ms())

@@ -10,7 +10,6 @@ from mcap.reader import make_reader
 
 from tormagd.config import Config
 from tormagd.control.assembly.build import Core
-from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
 from tormagd.control.safety.operating_state import RefusedError
@@ -21,9 +20,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd.record.black_box import write_black_box
 from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP
-from tormagd.record.rerun import Rerun, rerun
 from tormagd.record.telemetry import Moment
-from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
 
@@ -52,7 +49,7 @@ class Flight:
         self.loop.connection.traffic = self
         self._inbox = SetpointInbox()
         period_ns = NS // config.rates.inference_hz
-        self._inference = InferenceLoop(
+        self.inference = InferenceLoop(
             self.planner,
             self._inbox,
             period_ns,
@@ -68,10 +65,10 @@ class Flight:
         due_ns = self._now_ns + NS // self.config.rates.control_hz
         self._now_ns, beat = due_ns, Beat(due_ns, due_ns, 0)
         stepper, is_asked = self.loop.stepper, self._drain(setpoint)
-        self._inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
+        self.inference.plan(beat, stepper.measured, is_asked=is_asked, is_followed=stepper.is_followed)
         sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
-        self._inference.foresee(beat)
+        self.inference.foresee(beat)
         moment = Moment(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0, self._ticks)
         self._ticks += 1
         if (part := self._box.ticked(moment, self.loop.stepper, self.planner)) is not None:
@@ -122,9 +119,6 @@ class Flight:
             is_refused = True
         self._journal.note(COMMAND, name, self.loop.now_s, is_refused, conditions)
 
-    def confirm(self, wrong: Disputed) -> None:
-        self._inference.confirm(wrong)
-
     def until(self, reached: Callable[[], bool]) -> None:
         for _ in range(10_000):
             self.tick()
@@ -145,16 +139,11 @@ class Flight:
         return path
 
 
-def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
-    return rerun(core, entries, from_s)
-
-
 def frames(path: Path) -> list[dict[str, Any]]:
     with path.open("rb") as file:
         return [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics="/frames")]
 
 
-def planted(box_entries: list[Any], tick: int, column: int, value: Any) -> list[Any]:
-    place = [place for place, entry in enumerate(box_entries) if is_tick(entry)][tick - 1]
-    changed = [*box_entries[place][:column], value, *box_entries[place][column + 1 :]]
-    return [*box_entries[:place], changed, *box_entries[place + 1 :]]
+def altered(entries: list[Any], place: int, column: int, value: Any) -> list[Any]:
+    entry = entries[place]
+    return [*entries[:place], [*entry[:column], value, *entry[column + 1 :]], *entries[place + 1 :]]

@@ -144,11 +144,16 @@ def test_a_stage_takes_its_own_fields_and_no_others(core: Core, change: dict[str
         restore(core.stepper(), {"Stepper": told}, KNOWN)
 
 
+ROUND_TRIP = plain(RoundTrip())["RoundTrip"]
+
+
 @pytest.mark.parametrize(
-    "data", [None, {}, {"RoundTrip": 1}, {"RoundTrip": {"_lead": 1}}, {"DeviceLink": {}}, "_recent", "_sent_s"]
+    "data",
+    [
+        *(None, {}, {"RoundTrip": 1}, {"RoundTrip": {"_lead": 1}}, {"DeviceLink": {}}),
+        *({"RoundTrip": ROUND_TRIP | {name: {"Unheard": {}}}} for name in ("_recent", "_sent_s")),
+    ],
 )
 def test_what_nobody_remembers_is_refused(data: Any) -> None:
-    if isinstance(data, str):
-        data = {"RoundTrip": plain(RoundTrip())["RoundTrip"] | {data: {"Unheard": {}}}}
     with pytest.raises(InexactError):
         restore(RoundTrip(), data, KNOWN_OF_LINK)

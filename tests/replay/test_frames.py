@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from flight import Flight, again, frames
+from flight import Flight, altered, frames
 from mcap.reader import make_reader
 
 from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier, decode
@@ -20,7 +20,7 @@ from tormagd.control.safety.codes import Fault
 from tormagd.ctl.main import main
 from tormagd.ctl.record import _instead
 from tormagd.record.black_box import BlackBoxFile, ReplayError, read_black_box, rebuilt, recorded
-from tormagd.record.rerun import ticks_of
+from tormagd.record.rerun import rerun, ticks_of
 from tormagd.simulation.rehearse import changed, main as run_changed, rehearse, script
 
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5
@@ -46,11 +46,6 @@ def box(request: pytest.FixtureRequest, path: Path, can_path: Path) -> BlackBoxF
 
 def place_of(entries: list[Any], name: str, tick: int) -> int:
     return next(place for place in range(list(ticks_of(entries))[tick - 1], 0, -1) if entries[place][0] == name)
-
-
-def with_raw(entries: list[Any], place: int, raw: Any) -> list[Any]:
-    direction, time_s, _, *rest = entries[place]
-    return [*entries[:place], [direction, time_s, raw, *rest], *entries[place + 1 :]]
 
 
 def damaged(raw: Any) -> Any:
@@ -82,20 +77,20 @@ def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -
 
 
 def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFile) -> None:
-    done = again(core, box.entries, 1.6)
+    done = rerun(core, box.entries, 1.6)
     assert (done.difference, done.from_s) == (None, pytest.approx(1.5, abs=1e-9))
     assert done.frames > 2 * done.ticks
 
 
 def test_what_came_damaged_is_measured_alike(core: Core, on_can: Flight, can_path: Path) -> None:
     assert on_can.loop.stepper.safety.faults[0] is Fault.MEASUREMENT_STALE
-    assert again(core, read_black_box(can_path).entries).difference is None
+    assert rerun(core, read_black_box(can_path).entries).difference is None
 
 
 def test_a_frame_that_is_damaged_or_missing_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "read", DAMAGED_TICK)
-    done = again(core, with_raw(box.entries, place, damaged(box.entries[place][2])), SNAPSHOT_S)
-    missing = again(core, [*box.entries[:place], *box.entries[place + 1 :]], SNAPSHOT_S)
+    done = rerun(core, altered(box.entries, place, 2, damaged(box.entries[place][2])), SNAPSHOT_S)
+    missing = rerun(core, [*box.entries[:place], *box.entries[place + 1 :]], SNAPSHOT_S)
     assert done.ticks == missing.ticks == DAMAGED_TICK - 1 - round(1e3 * SNAPSHOT_S)
     assert done.difference.frame == number_of(box.entries, place)
     found = [(each.difference.tick, each.difference.field) for each in (done, missing)]
@@ -104,7 +99,7 @@ def test_a_frame_that_is_damaged_or_missing_is_found_in_its_place(core: Core, bo
 
 def test_another_frame_that_was_written_is_found(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "wrote", DAMAGED_TICK)
-    found = again(core, with_raw(box.entries, place, []), SNAPSHOT_S).difference
+    found = rerun(core, altered(box.entries, place, 2, []), SNAPSHOT_S).difference
     assert (found.tick, found.field, found.recorded, found.frame) == (
         DAMAGED_TICK,
         "written",
@@ -124,10 +119,10 @@ def test_a_memory_that_differs_is_found_where_no_tick_shows_it(
     core: Core, box: BlackBoxFile, part: int, way: str, field: str
 ) -> None:
     place, (*outer, name) = place_of(box.entries, "state", DAMAGED_TICK), way.split(".")
-    altered = msgspec.msgpack.decode(msgspec.msgpack.encode(box.entries[place]))
-    reduce(getitem, outer, altered[part])[name] += 1e-9
-    entries = [*box.entries[:place], altered, *box.entries[place + 1 :]]
-    assert again(core, entries, SNAPSHOT_S - 0.5).difference.field == f"state.{field}.{name}"
+    memory = msgspec.msgpack.decode(msgspec.msgpack.encode(box.entries[place][part]))
+    reduce(getitem, outer, memory)[name] += 1e-9
+    entries = altered(box.entries, place, part, memory)
+    assert rerun(core, entries, SNAPSHOT_S - 0.5).difference.field == f"state.{field}.{name}"
 
 
 def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, tmp_path: Path) -> None:
@@ -135,7 +130,7 @@ def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, t
     assert (flight.loop.connection.losses, flight.loop.measurement is None) == (1, False)
     entries = read_black_box(flight.write(tmp_path / "frozen.mcap")).entries
     assert [entry[1] is None for entry in entries if entry[0] == "connected"] == [True, False]
-    done = again(core, entries)
+    done = rerun(core, entries)
     assert (done.difference, done.ticks, done.frames) == (None, 3_400, number_of(entries, len(entries) - 1))
 
 
@@ -144,8 +139,8 @@ def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(
     todo = script(read_black_box(path).entries)
     # another enable was refused
     assert ([name for _, name in todo.commands], list(todo.recorded.faults)) == (["home", "enable"], ["ENCODER"])
-    again = rehearse(rebuilt(known), known.config, todo, "sample_1", ["encoder_jump@3.5"])
-    assert (list(again.faults), again.refused, again.faults["ENCODER"]) == (
+    repeated = rehearse(rebuilt(known), known.config, todo, "sample_1", ["encoder_jump@3.5"])
+    assert (list(repeated.faults), repeated.refused, repeated.faults["ENCODER"]) == (
         ["ENCODER"],
         [],
         pytest.approx(todo.recorded.faults["ENCODER"], abs=0.01),
@@ -249,8 +244,5 @@ def test_what_cannot_be_run_again_is_refused_in_one_line(
 
 def test_a_setpoint_of_a_value_that_there_is_not_is_refused_for_a_rehearsal(box: BlackBoxFile) -> None:
     plan = next(place for place, entry in enumerate(box.entries) if entry[0] == "plan" and entry[2] is not None)
-    name, now_s, setpoint, *rest = box.entries[plan]
-    entries = [*box.entries]
-    entries[plan] = [name, now_s, [*setpoint[:-1], {"NoWall": {}}], *rest]
     with pytest.raises(ReplayError, match="NoWall"):
-        script(entries)
+        script(altered(box.entries, plan, 2, [*box.entries[plan][2][:-1], {"NoWall": {}}]))

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from flight import Flight, again, asked, frames, planted
+from flight import Flight, altered, asked, frames
 from hostile import messages
 
 from firmware_protocol.build import SWITCH, settle
@@ -69,12 +69,12 @@ def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fl
     box = read_black_box(flown.write(tmp_path / "thesis.mcap"))
     answers = [entry for entry in box.entries if entry[0] == ANSWER]
     assert len(answers) > 100
-    done = again(flown.core, box.entries)
+    done = rerun(flown.core, box.entries)
     assert (done.difference, done.gaps, done.ticks) == (None, 0, 3_000)
-    assert again(flown.core, box.entries, 2.7).difference is None
+    assert rerun(flown.core, box.entries, 2.7).difference is None
     # another field in one of them is found
     answers[-5][1]["Answer"]["solution"]["FieldSolution"]["field_mT"] += 0.5
-    assert again(flown.core, box.entries, 2.7).difference is not None
+    assert rerun(flown.core, box.entries, 2.7).difference is not None
 
 
 def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> None:
@@ -85,18 +85,18 @@ def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> Non
     forces[:] = [0.7 * force_N for force_N in forces]
     while not flown.planner.believe.sensor.is_disputed:
         flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
-    flown.confirm("device")
+    flown.inference.confirm("device")
     for _ in range(500):
         flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
     box = read_black_box(flown.write(tmp_path / "confirmed.mcap"))
-    assert again(flown.core, box.entries).difference is None
+    assert rerun(flown.core, box.entries).difference is None
     box.entries.remove([CONFIRM, "device"])
-    assert again(flown.core, box.entries, flown.loop.now_s - 0.5).difference is not None
+    assert rerun(flown.core, box.entries, flown.loop.now_s - 0.5).difference is not None
 
 
 @pytest.mark.parametrize(("from_s", "begins_s"), [(0.2, 0.0), (2.9, 2.5), (3.7, 3.5)])
 def test_it_is_from_the_middle_of_the_run(core: Core, box: BlackBoxFile, from_s: float, begins_s: float) -> None:
-    done = again(core, box.entries, from_s)
+    done = rerun(core, box.entries, from_s)
     assert (done.difference, done.from_s, done.ticks) == (
         None,
         pytest.approx(begins_s, abs=1e-9),
@@ -115,7 +115,7 @@ def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Pa
     flight = fly(*([fault] if fault else []), until_s=2.8, silent_s=silent_s)
     assert str(flight.loop.stepper.safety.faults[0]) == told
     box = read_black_box(flight.write(tmp_path / "planted.mcap"))
-    done = again(core, box.entries)
+    done = rerun(core, box.entries)
     assert done.difference is None
     ticks = ticks_of(box.entries)
     assert done.ticks == len(ticks) > 2_700
@@ -152,11 +152,11 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     tried, latched, afresh = box.entries[place - 2 : place + 1]
     assert (tried[0], tried[1], latched) == ("plan", afresh[1], ["latch", "PLAN_FAILED"])
     assert math.isnan(tried[2][0])
-    done = again(core, box.entries)
+    done = rerun(core, box.entries)
     assert (done.difference, done.ticks, done.snapshots) == (None, 3_600, 7)
     # a plan that fails only here is no such plan
     entries = [*box.entries[: place - 1], *box.entries[place + 1 :]]
-    found = again(core, entries, 3.0).difference
+    found = rerun(core, entries, 3.0).difference
     assert (found.tick, found.field, found.recorded, found.replayed) == (
         3_101,
         "plan",
@@ -170,7 +170,7 @@ def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxF
     parts = box.entries[: places[3_100] + 1], box.entries[places[3_120] + 1 :]
     write_black_box(tmp_path / "lost.mcap", box.header, map(msgspec.msgpack.encode, parts))
     for entries in ([*parts[0], [MISSING], *parts[1]], read_black_box(tmp_path / "lost.mcap").entries):
-        done = again(core, entries)
+        done = rerun(core, entries)
         assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
 
 
@@ -185,26 +185,24 @@ def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxF
     ],
 )
 def test_a_changed_number_is_found_in_its_tick(core: Core, box: BlackBoxFile, column, add, shows) -> None:
-    record = list(ticks_of(box.entries).values())[CHANGED_TICK - 1]
-    entries = planted(box.entries, CHANGED_TICK, COLUMNS.index(column), getattr(record, column) + add)
-    done = again(core, entries, 3.0)
+    place, record = list(ticks_of(box.entries).items())[CHANGED_TICK - 1]
+    entries = altered(box.entries, place, COLUMNS.index(column), getattr(record, column) + add)
+    done = rerun(core, entries, 3.0)
     assert (done.difference.tick, done.difference.field, done.ticks) == (CHANGED_TICK, shows, CHANGED_TICK - 1 - 3_000)
 
 
 def test_a_changed_setpoint_is_found_in_its_tick(core: Core, box: BlackBoxFile) -> None:
     places = list(ticks_of(box.entries))
     place = next(p for p in range(places[3_400], len(box.entries)) if box.entries[p][0] == "plan")
-    entries = list(box.entries)
-    _, now_s, setpoint = entries[place]
-    entries[place] = ["plan", now_s, [setpoint[0] + 1e-9, *setpoint[1:]]]
+    force_N, *others = box.entries[place][2]
     tick = 1 + next(number for number, p in enumerate(places) if p > place)
-    found = again(core, entries, 3.0).difference
+    found = rerun(core, altered(box.entries, place, 2, [force_N + 1e-9, *others]), 3.0).difference
     assert (found.tick, found.field) == (tick, "setpoint_cf")
 
 
 def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> None:
     entries = [it for it in box.entries if not (it[0] == "command" and it[1] == "home")]
-    assert again(core, entries).difference.field == "request"
+    assert rerun(core, entries).difference.field == "request"
 
 
 @pytest.mark.parametrize(
@@ -271,7 +269,7 @@ def test_one_that_breaks_off_late_is_replayed_so_far(core: Core, path: Path, tmp
     (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     box = read_black_box(tmp_path / "broken.mcap")
     assert not box.is_complete
-    done = again(core, box.entries)
+    done = rerun(core, box.entries)
     assert done.difference is None
     assert 1_000 < done.ticks < TICKS
 
@@ -290,7 +288,7 @@ def test_random_bytes_are_refused_and_of_damaged_ones_the_rest_is_replayed(
         with contextlib.suppress(RecordingError, ReplayError):
             box = read_black_box(broken)
             assert box.odd
-            assert again(core, box.entries).difference is None
+            assert rerun(core, box.entries).difference is None
 
 
 def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
@@ -324,4 +322,4 @@ def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
             spoilt = [*entries[place][:inner], spoilt, *entries[place][inner + 1 :]]
         entries[place] = spoilt
         with contextlib.suppress(ReplayError):
-            assert again(core, entries).ticks <= 61
+            assert rerun(core, entries).ticks <= 61

@@ -21,8 +21,8 @@ SAMPLE_1_TEXT, SECOND_TEXT = (
 )
 
 
-def written(folder: Path, text: str) -> Path:
-    path = folder / "bench.toml"
+def written(folder: Path, text: str, name: str = "bench.toml") -> Path:
+    path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
 
@@ -151,9 +151,7 @@ def test_the_reversing_hand_stops_reverses_and_repeats_without_a_jump() -> None:
 
 
 def test_a_recording_is_interpolated_and_held_at_its_ends(tmp_path) -> None:
-    path = tmp_path / "hand.csv"
-    path.write_text("t_s,position_mm\n1.0,0\n2.0,10\n4.0,-10\n")
-    hand = parse_hand(str(path))
+    hand = parse_hand(str(written(tmp_path, "t_s,position_mm\n1.0,0\n2.0,10\n4.0,-10\n", "hand.csv")))
     found_mm = {t: hand.position_mm(t) for t in (0.0, 1.0, 1.5, 2.0, 3.0, 4.0, 9.0)}
     assert found_mm == {0.0: 0.0, 1.0: 0.0, 1.5: 5.0, 2.0: 10.0, 3.0: 0.0, 4.0: -10.0, 9.0: -10.0}
 
@@ -170,10 +168,8 @@ def test_a_recording_is_interpolated_and_held_at_its_ends(tmp_path) -> None:
     ],
 )
 def test_a_bad_recording_is_refused_with_its_line(tmp_path, text: str, said: str) -> None:
-    path = tmp_path / "hand.csv"
-    path.write_text(text)
     with pytest.raises(TableError, match=said):
-        parse_hand(str(path))
+        parse_hand(str(written(tmp_path, text, "hand.csv")))
 
 
 BAD_HANDS = ("", "fast", "steady=x", "steady=nan", "steady=1e9", "reversing=0", "missing.csv", "felt=mass_kg")

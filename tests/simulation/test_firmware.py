@@ -15,7 +15,7 @@ from firmware_protocol.codec import (
     State,
     Switches,
 )
-from firmware_protocol.conformance.host import Beat, Host
+from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import SerialLine
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
@@ -45,9 +45,6 @@ class Bench(Host):
     def run_until(self, time_s: float, duty: float = 0.0) -> None:
         while self.now_s < time_s:
             self.beat(DriveMode.RUN, duty, duty)
-
-    def reaches(self, mode: DeviceMode, beat: Beat = None, limit_s: float = 10.0) -> None:
-        assert self.until(lambda: self.status.mode is mode, limit_s, beat), self.status
 
 
 def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "sample_1") -> Bench:
@@ -173,7 +170,7 @@ def test_how_a_run_ends(
     truth = host.device.truth
     assert abs(truth.left_mm - truth.right_mm) < 4.0
     assert truth.gap_mm > 44.0 - 1e-6
-    host.reaches(DeviceMode.LATCHED)
+    assert host.until(lambda: host.status.mode is DeviceMode.LATCHED, 10.0), host.status
     host.pass_time(1.0)
     truth = host.device.truth
     assert (host.status.faults, truth.left_A, truth.right_A) == (latched, 0.0, 0.0)

@@ -45,10 +45,6 @@ IDENTITY = can_identifier(FUNCTION[Identity])
 STATUS = can_identifier(FUNCTION[Status])
 
 
-def descriptor(backend) -> int:
-    return int(backend._fd)
-
-
 def meet(device: Device) -> None:
     seen: set[type[Message]] = set()
     deadline_s = time.monotonic() + LIMIT_S
@@ -56,28 +52,21 @@ def meet(device: Device) -> None:
         while not {Identity, Status} <= seen:
             assert time.monotonic() < deadline_s, f"only {seen} in {LIMIT_S} s"
             backend.send(HELLO)
-            select.select([descriptor(backend)], [], [], 0.1)
+            select.select([backend._fd], [], [], 0.1)  # type: ignore[attr-defined]
             seen |= {type(message) for message in backend.receive()}
 
 
-@pytest.fixture
-def stack() -> Iterator[contextlib.ExitStack]:
-    with contextlib.ExitStack() as made:
-        yield made
-
-
-def test_hosts_come_and_go_on_the_simulators_bus_and_the_truth_is_kept(
-    stack: contextlib.ExitStack, tmp_path: Path
-) -> None:
+def test_hosts_come_and_go_on_the_simulators_bus_and_the_truth_is_kept(tmp_path: Path) -> None:
     truth, simulator = tmp_path / "truth.csv", ("-m", "tormagd.simulation", "--can", "--seed", "3", "--truth")
-    process = begun(stack, tmp_path / "log", *simulator, str(truth))
-    path = first_line(process)
     is_granted = subprocess.run(["chrt", "--fifo", "1", "true"], capture_output=True).returncode == 0
-    assert os.sched_getscheduler(process.pid) & os.SCHED_FIFO == is_granted * os.SCHED_FIFO
-    assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
-    for _ in range(2):
-        meet(Device(backend="can", options={"interface": "tormagsim"}, port=path))
-    assert (end(process), process.stdout.read(), Path(path).exists()) == (0, "", False)
+    with contextlib.ExitStack() as stack:
+        process = begun(stack, tmp_path / "log", *simulator, str(truth))
+        path = first_line(process)
+        assert os.sched_getscheduler(process.pid) & os.SCHED_FIFO == is_granted * os.SCHED_FIFO
+        assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
+        for _ in range(2):
+            meet(Device(backend="can", options={"interface": "tormagsim"}, port=path))
+        assert (end(process), process.stdout.read(), Path(path).exists()) == (0, "", False)
     with truth.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [
