@@ -1,6 +1,6 @@
 """Imports go one way, between rooms and between files; a start of another process is an arrow of its own kind.
 
-`pytest -s tests/test_rooms.py` prints the arrows between rooms.
+`pytest -s tests/test_rooms.py` prints rooms, floors and arrows.
 """
 
 import ast
@@ -150,10 +150,14 @@ def test_no_arrow_comes_back():
             if (other := room(each.name)) != room(name):
                 rooms[room(name)].add(other)
                 kinds[each.kind].add((room(name), other))
-    for graph in (files, rooms):
-        TopologicalSorter(graph).prepare()
-    for kind, between in kinds.items():
-        print(f"{kind}:", ", ".join(f"{here} -> {there}" for here, there in sorted(between)))
+    list(TopologicalSorter(files).static_order())
+    floor: dict[str, int] = {}
+    for name in TopologicalSorter(rooms).static_order():
+        floor[name] = 1 + max((floor[there] for here, there in kinds["imports"] if here == name), default=0)
+    for level in range(1, max(floor.values()) + 1):
+        print(f"floor {level}: {', '.join(sorted(name for name in floor if floor[name] == level))}")
+    print(f"{len(rooms)} rooms, {max(floor.values())} floors, {len(kinds['imports'])} arrows")
+    print("starts:", ", ".join(f"{here} -> {there}" for here, there in sorted(kinds["starts"])))
 
 
 def test_what_draws_takes_matplotlib_from_one_place():
