@@ -219,9 +219,6 @@ def test_what_is_deeper_or_no_number_is_refused_with_its_place(text: str, said: 
         toml_tables(text)
 
 
-FORCE_READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_forces)
-
-
 @pytest.mark.parametrize("text", ["t_s,force_N\n0,1\n1,2\n3,1\n", "rate_mm_s,force_N,t_s\n5,1,7\n5,2,8\n-5,0,9.5\n"])
 def test_all_read_the_same_files(tmp_path: Path, text: str) -> None:
     path = tmp_path / "task.csv"
@@ -251,7 +248,7 @@ def test_the_same_mistake_is_told_in_the_same_words(tmp_path: Path, text: str | 
     if text is not None:
         path.write_text(text)
     said = set()
-    for read in FORCE_READERS:
+    for read in (read_csv, recorded, read_forces):
         with pytest.raises(ValueError, match=str(path)) as refused:
             read(path)
         said.add(str(refused.value).removeprefix("signal.file = "))
