@@ -48,7 +48,6 @@ from tormagd_client.messages import (
 )
 
 OURSELVES = f"process {os.getpid()} of user {os.getuid()}"
-TELEMETRY = telemetry(0, 2)
 
 
 class Rig(Served):
@@ -71,7 +70,7 @@ class Rig(Served):
 
     def tell(self) -> None:
         """Publishes on both sockets."""
-        self.endpoint.publish(TELEMETRY)
+        self.endpoint.publish(telemetry(0, 2))
         self.work()
 
     def is_answered(self) -> bool:

@@ -352,7 +352,11 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     last = samples[-1]
     if last.safety.faults:
         assert last.safety.faults[0] in case.faults
-        check_safe(moving, last)
+        opening = ticks(moving, OPENING_S, lambda sample: sample.truth.gap_mm > OPEN_MM - 2.0)
+        assert all(sample.output.mode is DriveMode.OFF for sample in (last, *opening))
+        assert all(sample.safety.operating_state is OperatingState.FAULT for sample in opening)
+        assert opening[-1].truth.gap_mm > OPEN_MM - 2.0
+        assert min(sample.truth.gap_mm for sample in opening) > last.truth.gap_mm - COASTING_MM
     else:
         assert last.truth.force_N == pytest.approx(FORCE_N, abs=case.tolerance_N)
         assert case.tolerance_N > 0.05 or Limit.SATURATED not in last.output.limits
@@ -363,14 +367,6 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     assert [name for name in case.counted if getattr(line.backend.stream.statistics, name) == 0] == []
     # at most what is on its way at the end
     assert [name for name in case.uncounted if getattr(line.backend.stream.statistics, name) > 1] == []
-
-
-def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
-    samples = ticks(loop, OPENING_S, lambda sample: sample.truth.gap_mm > OPEN_MM - 2.0)
-    assert all(sample.output.mode is DriveMode.OFF for sample in (faulted, *samples))
-    assert all(sample.safety.operating_state is OperatingState.FAULT for sample in samples)
-    assert samples[-1].truth.gap_mm > OPEN_MM - 2.0
-    assert min(sample.truth.gap_mm for sample in samples) > faulted.truth.gap_mm - COASTING_MM
 
 
 @pytest.mark.parametrize(("transport", "said"), [("serial", ": unplugged"), ("slcan", ""), ("tormagsim", "")])
