@@ -109,7 +109,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "key": _key,
     "profile": _profile,
 }
-REFUSALS = (ConfigError, PlantError, ModelFileError, TableError, ProfileError)
 
 
 def make(name: str, folder: Path) -> Path:
@@ -124,7 +123,7 @@ def refusal(name: str, kind: str, folder: Path) -> str:
     before_kB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
         READERS[kind](path)
-    except REFUSALS as error:
+    except (ConfigError, PlantError, ModelFileError, TableError, ProfileError) as error:
         said = printable(str(error))
         if not said.isprintable() or len(said) >= MAX_CHARACTERS:
             return f"{name} as {kind}: {said[:MAX_CHARACTERS]!r}"
