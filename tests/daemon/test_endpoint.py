@@ -48,7 +48,6 @@ from tormagd_client.messages import (
 )
 
 OURSELVES = f"process {os.getpid()} of user {os.getuid()}"
-TELEMETRY = telemetry(0, 2)
 
 
 class Rig(Served):
@@ -64,11 +63,6 @@ class Rig(Served):
         assert socket.recv() == b"\x01"
         return socket
 
-    def reply(self, socket: "zmq.Socket[bytes]") -> Reply:
-        """Serves until this client has its reply."""
-        self.until(lambda: socket.poll(0), self.serve)
-        return decode(socket.recv_multipart()[-1], Reply)
-
     def take_until(self, reached: Callable[[], bool]) -> list[str]:
         """Takes requests, as the daemon does each tick, and serves none of those that wait."""
         self.until(reached, lambda: self.endpoint.take_requests(self.answer))
@@ -76,7 +70,7 @@ class Rig(Served):
 
     def tell(self) -> None:
         """Publishes on both sockets."""
-        self.endpoint.publish(TELEMETRY)
+        self.endpoint.publish(telemetry(0, 2))
         self.work()
 
     def is_answered(self) -> bool:
@@ -170,12 +164,8 @@ def test_a_topic_has_listeners_only_where_it_was_asked_for_by_its_name(rig: Rig)
     assert not listeners.has(VERDICT_TOPIC)
     topic, data = motions.recv_multipart()
     assert (topic, decode(data, Motion)) == (MOTION_TOPIC, motion)
-    motions.unsubscribe(MOTION_TOPIC)
-    rig.until(lambda: not listeners.has(MOTION_TOPIC), tell)
-    motions.subscribe(VERDICT_TOPIC)
-    rig.until(lambda: listeners.has(VERDICT_TOPIC), tell)
     motions.close()
-    rig.until(lambda: not listeners.has(VERDICT_TOPIC), tell)
+    rig.until(lambda: not listeners.has(MOTION_TOPIC), tell)
 
 
 # -- commands ------------------------------------------------------------------------------------------------------
@@ -417,9 +407,6 @@ def test_an_address_that_cannot_be_bound_is_named(tmp_path: Path) -> None:
 
 
 def test_a_second_daemon_takes_nothing_from_the_first_and_names_it(rig: Rig, tmp_path: Path) -> None:
-    for _ in range(2):
-        with pytest.raises(OSError, match=f"^endpoints.setpoint = .*: already running, pid {os.getpid()}; end it, or "):
-            Endpoint(Endpoints(**rig.addresses))
     config = tmp_path / "tormagd.toml"
     config.write_text("[endpoints]\n" + "".join(f'{name} = "{address}"\n' for name, address in rig.addresses.items()))
     second = [sys.executable, "-m", "tormagd.daemon.main", "--config", str(config)]
@@ -438,12 +425,23 @@ def test_one_that_shares_a_single_address_is_refused_and_leaves_none_of_its_own(
     assert (tmp_path / "control").is_socket()
 
 
-def test_closing_leaves_nothing_and_what_a_killed_daemon_left_is_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("kind", "pid"),
+    [(socket.SOCK_STREAM, os.getpid()), (socket.SOCK_DGRAM, "not known")],
+    ids=["a daemon's", "another's"],
+)
+def test_closing_leaves_nothing_and_a_socket_is_replaced_once_its_program_was_killed(
+    tmp_path: Path, kind: socket.SocketKind, pid: object
+) -> None:
     folder = tmp_path / "deep" / "folder"
     Rig(folder).close()
     assert list(folder.iterdir()) == []
-    with socket.socket(socket.AF_UNIX) as left:
+    with socket.socket(socket.AF_UNIX, kind) as left:
         left.bind(str(folder / "control"))
+        if kind == socket.SOCK_STREAM:
+            left.listen()
+        with pytest.raises(OSError, match=f"already running, pid {pid}"):
+            Rig(folder)
     with contextlib.closing(Rig(folder)) as made:
         assert made.is_answered()
     assert list(folder.iterdir()) == []
@@ -491,14 +489,6 @@ def test_where_no_socket_can_be_it_is_said_why_and_files_are_left_alone(
         Rig(folder).close()
     assert {path: path.read_text() for path in before} == before
     assert {*tmp_path.glob("*/*")} == {*before}
-
-
-def test_a_socket_is_replaced_once_its_program_has_ended(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
-        other.bind(str(tmp_path / "control"))
-        with pytest.raises(OSError, match="already running, pid not known"):
-            Rig(tmp_path)
-    Rig(tmp_path).close()
 
 
 def test_a_folder_as_tmp_is_may_be_written_to_by_others(tmp_path: Path) -> None:

@@ -188,10 +188,12 @@ def test_the_process_answers_what_the_search_would_and_one_question_at_a_time(
     assert answered(process) is not None
 
 
-def answered(process: SearchProcess, until: int = -1) -> Answer | None:
+def answered(process: SearchProcess, until: int = -1, again: Question | None = None) -> Answer | None:
     until_s = time.monotonic() + PATIENCE_S
     while (answer := process.answer()) is None and process.timing.runs != until:
         assert time.monotonic() < until_s
+        if again is not None:
+            process.ask(again)
         time.sleep(0.001)
     return answer
 
@@ -205,9 +207,5 @@ def test_a_search_that_is_gone_is_replaced_and_one_that_cannot_start_is_refused(
     process._beside.process.kill()
     process._beside.process.wait()
     question = Question(7.0, 2.0, 42.0, 1.5, 300.0)
-    until_s = time.monotonic() + PATIENCE_S
-    while (answer := process.answer()) is None and time.monotonic() < until_s:
-        process.ask(question)
-        time.sleep(0.001)
-    assert answer == thesis.planner().aim.answer_to(question)
+    assert answered(process, again=question) == thesis.planner().aim.answer_to(question)
     assert caplog.messages == ["the search beside the plans has ended; another one starts"]

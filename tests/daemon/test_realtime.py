@@ -14,10 +14,6 @@ pytestmark = pytest.mark.usefixtures("usual_slices")
 REFUSED = PermissionError(1, "Operation not permitted")
 
 
-def test_nothing_asked_for_is_nothing_refused() -> None:
-    assert realtime.prepare(RealTime()) == []
-
-
 def test_each_refusal_names_its_setting_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("sched_setscheduler", "sched_setaffinity"):
         monkeypatch.setattr(os, name, Mock(side_effect=REFUSED))
@@ -53,12 +49,13 @@ def test_as_many_files_as_the_kernel_allows_may_be_open_or_nothing_starts(
     assert 100 + len(admission.MAY) * (admission.CONNECTIONS + admission.CLOSING + 1) < realtime.OPEN_FILES
 
 
-def test_processors_are_kept_awake_for_as_long_as_the_file_is_open(
+def test_processors_are_kept_awake_where_it_is_asked_for_as_long_as_the_file_is_open(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     latency = tmp_path / "cpu_dma_latency"
-    latency.touch()
     monkeypatch.setattr(realtime, "_LATENCY", latency)
+    assert realtime.prepare(RealTime()) == [], "nothing that was not asked for is refused"
+    latency.touch()
     assert realtime.prepare(RealTime(keep_awake=True)) == []
     assert latency.read_bytes() == bytes(4)
     (opened,) = (link for link in Path("/proc/self/fd").iterdir() if os.path.realpath(link) == str(latency))

@@ -250,21 +250,20 @@ def test_a_drifting_clock_is_followed_for_an_hour_and_its_drift_told(drift_ppm: 
     assert (clock.steps, clock.line.fit().drift_ppm) == (0, pytest.approx(drift_ppm, abs=40.0))
 
 
-def test_until_it_is_settled_a_message_is_as_old_as_it_says() -> None:
-    for lateness_s in (1.0, -1.0):
-        clock = SourceClock()
-        heard = [(clock.hear(at_s, lateness_s), clock.is_settled) for at_s in (0.0, SETTLED_S - 0.01, SETTLED_S)]
-        assert heard == [(lateness_s, False), (lateness_s, False), (0.0, True)]
-
-
 @pytest.mark.parametrize(
-    ("lateness_s", "is_settled"),
-    [(-AHEAD_S, True), (MAX_WAY_S, True), (-1.01 * AHEAD_S, False), (1.01 * MAX_WAY_S, False)],
+    ("lateness_s", "is_right", "first_s", "settled_s"),
+    [
+        (-AHEAD_S, True, 0.0, 0.0),
+        (MAX_WAY_S, True, MAX_WAY_S, MAX_WAY_S),
+        *((lateness_s, False, lateness_s, 0.0) for lateness_s in (-1.0, -1.01 * AHEAD_S, 1.01 * MAX_WAY_S, 1.0)),
+    ],
 )
-def test_a_first_message_that_may_be_right_is_believed_at_once(lateness_s: float, is_settled: bool) -> None:
+def test_until_it_is_settled_a_message_is_as_old_as_it_says_and_one_that_may_be_right_settles_it(
+    lateness_s: float, is_right: bool, first_s: float, settled_s: float
+) -> None:
     clock = SourceClock()
-    clock.hear(0.0, lateness_s)
-    assert clock.is_settled == is_settled
+    heard = [(clock.hear(at_s, lateness_s), clock.is_settled) for at_s in (0.0, SETTLED_S - 0.01, SETTLED_S)]
+    assert heard == [(first_s, is_right), (first_s, is_right), (settled_s, True)]
 
 
 def test_a_reader_that_is_held_up_blames_no_clock() -> None:

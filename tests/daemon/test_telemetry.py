@@ -228,18 +228,14 @@ def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(presen
 # -- the way of a setpoint ---------------------------------------------------------------------------------------------
 
 
-def planned(stamp_s: float) -> Plan:
-    return Plan(1, 0.0, 1.0, 0.0, 1.0, None, 400.0, 70.0, 0.0, 1.0, (), stamp_s=stamp_s)
-
-
 def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -> None:
     way = ForceDelay()
-    way.ticked(0.5, planned(-math.inf), 0.0)
+    way.ticked(0.5, PLAN, 0.0)  # it follows no setpoint
     found = way.report(400.0, 0.013, Budget())
     assert (found.to_duty_us.max, found.total_ms) == (0.0, None)
     for tick in range(1_000):
         # a new one every 10 ms, first followed at 20 ms
-        way.ticked(1.0 + tick * 1e-3, planned(1.0 + tick // 10 * 0.01 - 0.015), 0.005)
+        way.ticked(1.0 + tick * 1e-3, PLAN.replaced(stamp_s=1.0 + tick // 10 * 0.01 - 0.015), 0.005)
     found = way.report(400.0, 0.013, Budget())
     assert (found.to_duty_us.max, found.to_duty_us.p50) == (
         pytest.approx(20_000.0, abs=1.0),
@@ -251,7 +247,7 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it() -
         pytest.approx(20.0 + 0.4 + 13.0, abs=0.7),
     )
     # a stale one ends no way
-    way.ticked(9.0, planned(-math.inf), 0.0)
+    way.ticked(9.0, PLAN, 0.0)
     found = way.report(None, 0.013, Budget())
     assert (found.to_duty_us.max, found.total_ms) == (pytest.approx(20_000.0, abs=1.0), None)
 
@@ -268,10 +264,9 @@ def test_the_ways_budget_is_the_scenes_where_it_states_one() -> None:
 
 CARRIAGES = {"gap_speed_mm_s": 40.0, "lag_s": 0.01, "tolerance_N": 0.05, "release_N_s": 2.0}
 STRONG = DeviceFit(scale=1.25)
-NOTHING: tuple[Limit, ...] = ()
 
 
-def plan(asked_N: float | None = 1.5, limits: tuple[Limit, ...] = NOTHING, **fields: Any) -> Plan:
+def plan(asked_N: float | None = 1.5, limits: tuple[Limit, ...] = (), **fields: Any) -> Plan:
     known: dict[str, Any] = {"predicted_N": None, "field_mT": 90.0, "gap_mm": math.nan, "gap_speed_mm_s": 0.0}
     return Plan(1, 1.0, asked_N, 0.01, asked_N or 0.5, confidence=1.0, limits=limits, **known | fields)
 

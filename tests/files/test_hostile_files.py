@@ -109,7 +109,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "key": _key,
     "profile": _profile,
 }
-REFUSALS = (ConfigError, PlantError, ModelFileError, TableError, ProfileError)
 
 
 def make(name: str, folder: Path) -> Path:
@@ -124,7 +123,7 @@ def refusal(name: str, kind: str, folder: Path) -> str:
     before_kB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
         READERS[kind](path)
-    except REFUSALS as error:
+    except (ConfigError, PlantError, ModelFileError, TableError, ProfileError) as error:
         said = printable(str(error))
         if not said.isprintable() or len(said) >= MAX_CHARACTERS:
             return f"{name} as {kind}: {said[:MAX_CHARACTERS]!r}"
@@ -219,9 +218,6 @@ def test_what_is_deeper_or_no_number_is_refused_with_its_place(text: str, said: 
         toml_tables(text)
 
 
-FORCE_READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_forces)
-
-
 @pytest.mark.parametrize("text", ["t_s,force_N\n0,1\n1,2\n3,1\n", "rate_mm_s,force_N,t_s\n5,1,7\n5,2,8\n-5,0,9.5\n"])
 def test_all_read_the_same_files(tmp_path: Path, text: str) -> None:
     path = tmp_path / "task.csv"
@@ -251,7 +247,7 @@ def test_the_same_mistake_is_told_in_the_same_words(tmp_path: Path, text: str | 
     if text is not None:
         path.write_text(text)
     said = set()
-    for read in FORCE_READERS:
+    for read in (read_csv, recorded, read_forces):
         with pytest.raises(ValueError, match=str(path)) as refused:
             read(path)
         said.add(str(refused.value).removeprefix("signal.file = "))

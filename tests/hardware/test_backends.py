@@ -60,10 +60,6 @@ def opened(device: Device) -> CanBackend:
 STATUS_FRAME = bus_frame(STATUS)
 
 
-def wait_readable(backend: SerialPort | CanBackend) -> None:
-    assert select.select([backend._fd], [], [], 5.0)[0]
-
-
 # -- on a serial line -------------------------------------------------------------------------------------------------
 
 
@@ -96,7 +92,7 @@ def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
     os.write(line.far, b"half a frame of an earlier life")
     port = open_serial(line.device, SerialOptions())
     os.write(line.far, FrameStream().pack(STATUS))
-    wait_readable(port)
+    assert select.select([port._fd], [], [], 5.0)[0]
     assert (port.receive(), port.stream.statistics.corrupt) == ([STATUS], 0)
     port.close()
 

@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 from bad_lines import (
     MakeTransfer,
-    Transfer,
     damaging,
     delaying,
     doubling,
     frame_of,
+    in_bursts,
     losing,
     reordering,
     unit_of,
@@ -69,21 +69,6 @@ COASTING_MM = 8.0
 
 def descriptor(backend: Any) -> int:
     return int(backend._fd)
-
-
-def in_bursts(period_s: float) -> Transfer:
-    waiting: list[bytes] = []
-    periods = 0
-
-    def carry(now_s: float, units: list[bytes]) -> list[bytes]:
-        nonlocal waiting, periods
-        waiting += units
-        if math.floor(now_s / period_s) == periods:
-            return []
-        out, waiting, periods = waiting, [], math.floor(now_s / period_s)
-        return out
-
-    return carry
 
 
 class Case(NamedTuple):
@@ -285,7 +270,7 @@ class Line:
         self._up, self._down = case.way(), case.way()
         self._to_host, self._from_host = FrameStream(), FrameStream()
 
-    def exchange(self, now_s: float) -> list[Message]:
+    def transmit(self, now_s: float) -> bytes:
         units = self._up(now_s, self.far.units(now_s))
         for unit in self._down(now_s, []):
             self.far.take(now_s, unit)
@@ -295,20 +280,14 @@ class Line:
                 self.far.say(piece, self.backend)
                 if self._bytewise or isinstance(self.far, BusEnd):
                     messages += self.backend.receive()
-        return [*messages, *self.backend.receive()]
-
-    def send(self, now_s: float, message: Message) -> None:
-        self.backend.send(message)
-        for unit in self._down(now_s, [self.far.hear()]):
-            for piece in self._pieces(unit):
-                self.far.take(now_s, piece)
-
-    def transmit(self, now_s: float) -> bytes:
-        return b"".join(self._to_host.pack(message) for message in self.exchange(now_s))
+        return b"".join(self._to_host.pack(message) for message in (*messages, *self.backend.receive()))
 
     def receive(self, now_s: float, data: bytes) -> None:
         for message in self._from_host.unpack(data):
-            self.send(now_s, message)
+            self.backend.send(message)
+            for unit in self._down(now_s, [self.far.hear()]):
+                for piece in self._pieces(unit):
+                    self.far.take(now_s, piece)
 
     def close(self) -> None:
         self.backend.close()
@@ -346,8 +325,9 @@ def lines(tmp_path: Path) -> Iterator[Callable[..., Line]]:
         yield make
 
 
-def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
-    """Yield ticks, each checked for its duty, its numbers and the carriages' places."""
+def ticks(loop: ClosedLoop, seconds: float, is_last: Callable[[Sample], bool]) -> list[Sample]:
+    """Return ticks up to the last, each checked for its duty, its numbers and the carriages' places."""
+    samples = []
     for number, sample in enumerate(loop.run(seconds, publisher(loop.now_s))):
         assert max(abs(sample.output.left_duty), abs(sample.output.right_duty)) <= CONFIG.position.duty_limit
         assert CLOSED_MM < sample.truth.gap_mm < OPEN_MM
@@ -355,7 +335,10 @@ def ticks(loop: ClosedLoop, seconds: float) -> Iterator[Sample]:
             found = [number for _, number in leaves([sample, loop.stepper])]
             assert len(found) > MIN_NUMBERS
             assert not any(map(math.isnan, found))
-        yield sample
+        samples.append(sample)
+        if is_last(sample):
+            break
+    return samples
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -365,15 +348,15 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
 ) -> None:
     line = lines(transport, moving.port.device, case)
     moving.port.device = line  # type: ignore[assignment]
-    samples = []
-    for sample in ticks(moving, case.bad_s):
-        samples.append(sample)
-        if sample.safety.faults:
-            break
+    samples = ticks(moving, case.bad_s, lambda sample: sample.safety.faults != ())
     last = samples[-1]
     if last.safety.faults:
         assert last.safety.faults[0] in case.faults
-        check_safe(moving, last)
+        opening = ticks(moving, OPENING_S, lambda sample: sample.truth.gap_mm > OPEN_MM - 2.0)
+        assert all(sample.output.mode is DriveMode.OFF for sample in (last, *opening))
+        assert all(sample.safety.operating_state is OperatingState.FAULT for sample in opening)
+        assert opening[-1].truth.gap_mm > OPEN_MM - 2.0
+        assert min(sample.truth.gap_mm for sample in opening) > last.truth.gap_mm - COASTING_MM
     else:
         assert last.truth.force_N == pytest.approx(FORCE_N, abs=case.tolerance_N)
         assert case.tolerance_N > 0.05 or Limit.SATURATED not in last.output.limits
@@ -386,23 +369,16 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     assert [name for name in case.uncounted if getattr(line.backend.stream.statistics, name) > 1] == []
 
 
-def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
-    samples = []
-    for sample in ticks(loop, OPENING_S):
-        samples.append(sample)
-        if sample.truth.gap_mm > OPEN_MM - 2.0:
-            break
-    assert all(sample.output.mode is DriveMode.OFF for sample in (faulted, *samples))
-    assert all(sample.safety.operating_state is OperatingState.FAULT for sample in samples)
-    assert samples[-1].truth.gap_mm > OPEN_MM - 2.0
-    assert min(sample.truth.gap_mm for sample in samples) > faulted.truth.gap_mm - COASTING_MM
+def open_descriptors() -> list[Path]:
+    """Return all but regular files, which the watch of the host opens and closes meanwhile."""
+    return [path for path in Path("/proc/self/fd").iterdir() if not path.is_file() and path.exists()]
 
 
 @pytest.mark.parametrize(("transport", "said"), [("serial", ": unplugged"), ("slcan", ""), ("tormagsim", "")])
 def test_a_device_that_goes_is_said_by_reading_and_writing_and_leaves_nothing_open(
     transport: str, said: str, tmp_path: Path
 ) -> None:
-    before = len(list(Path("/proc/self/fd").iterdir()))
+    before = open_descriptors()
     far = TRANSPORTS[transport](a_device(), tmp_path)
     backend = choose(far.configured, CONFIG.rates).open()
     far.close()
@@ -412,7 +388,7 @@ def test_a_device_that_goes_is_said_by_reading_and_writing_and_leaves_nothing_op
         backend.send(Home(1))
     backend.close()
     backend.close()
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    assert open_descriptors() == before
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,6 @@ def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost:
 @given(frames=st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=50))
 def test_no_frame_raises_or_is_more_than_it_is(frames: list[tuple[int, bytes]]) -> None:
     stream = CanStream(1)
-    functions = set(FUNCTION.values())
     for identifier, data in frames:
         try:
             message = stream.unpack(identifier, data)
@@ -120,7 +119,7 @@ def test_no_frame_raises_or_is_more_than_it_is(frames: list[tuple[int, bytes]]) 
             continue
         if message is not None:
             assert identifier & 0xF == 1
-            assert identifier >> 4 in functions
+            assert identifier >> 4 in FUNCTION.values()
             assert len(encode(message)) == len(data)
     assert stream.statistics.frames + stream.statistics.corrupt <= len(frames)
 

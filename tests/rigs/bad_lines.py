@@ -1,5 +1,6 @@
 """Bad serial lines and CAN buses between a host and a simulated device."""
 
+import math
 import random
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -72,6 +73,10 @@ def _due(due_s: Callable[[float], float]) -> Transfer:
 
 def delaying(delay_s: float) -> Transfer:
     return _due(lambda now_s: now_s + delay_s)
+
+
+def in_bursts(period_s: float) -> Transfer:
+    return _due(lambda now_s: (math.floor(now_s / period_s) + 1) * period_s)
 
 
 def stopped_until(until_s: float) -> Transfer:

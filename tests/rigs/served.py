@@ -12,7 +12,7 @@ import zmq
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.record.ticks import encode_ticks
-from tormagd_client.messages import VERSION, Request, encode
+from tormagd_client.messages import VERSION, Reply, Request, decode, encode
 
 PATIENCE_S = 30.0
 MOST = 3
@@ -81,6 +81,11 @@ class Served:
             (work or self.work)()
             self.endpoint.admission.update()
             time.sleep(0.002)
+
+    def reply(self, socket: "zmq.Socket[bytes]") -> Reply:
+        """Serves until this client has its reply."""
+        self.until(lambda: socket.poll(0), self.serve)
+        return decode(socket.recv_multipart()[-1], Reply)
 
     def close(self) -> None:
         self.endpoint.close()
