@@ -150,7 +150,8 @@ DESIGN, SWEEP = ("optimise-design", "--region", "1", "1", "2", "2"), ("bench-swe
 @pytest.mark.parametrize(
     ("arguments", "allowed"),
     [
-        *(((*DESIGN, "--starts", text), "1..10000") for text in ("-1", "0", "1.5", "x")),
+        *(((*DESIGN, "--starts", text), "1..10000") for text in ("-1", "0", "1.5")),
+        ((*DESIGN, "--starts", "x"), "'x': allowed is a finite number"),
         *(
             ((*one, "--seed", "-1"), "0..2147483648")
             for one in (DESIGN, SWEEP, (*TRAIN, "x", "--out", "m"), ("reproduce-thesis",))

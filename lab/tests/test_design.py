@@ -174,7 +174,7 @@ def test_nothing_less_than_the_start_is_returned() -> None:
 
 @pytest.mark.usefixtures("few_generations")
 def test_a_soft_elastomer_keeps_clear_of_collapse() -> None:
-    soft = msgspec.structs.replace(PROBLEM, shear_modulus_Pa=20e3)
+    soft = msgspec.structs.replace(PROBLEM, elastomer=Elastomer(20e3, 3.8, 0.2))
     margins = [soft.load_margin(design) for design in grid(soft, 5)]
     assert min(margins) < 0.0 < max(margins)
     outcome = solve(Run(soft, Design(45.0, 50.0, 200.0)))
@@ -182,7 +182,7 @@ def test_a_soft_elastomer_keeps_clear_of_collapse() -> None:
     assert outcome["coverage"] > 0.9
 
 
-JELLY = msgspec.structs.replace(PROBLEM, shear_modulus_Pa=2e3, relative_permeability=6.0)
+JELLY = msgspec.structs.replace(PROBLEM, elastomer=Elastomer(2e3, 6.0, 0.2))
 
 
 @pytest.mark.usefixtures("few_generations")

@@ -13,10 +13,9 @@ from tormag_lab.errors import LabError
 from tormag_lab.main import main
 from tormag_lab.motor import command, fit
 from tormag_lab.motor.log import Log, read_log
-from tormag_lab.twin.command import figures_of
+from tormag_lab.twin.command import COMBINATIONS, figures_of, twin_of
 from tormag_lab.twin.estimate import keys_of, value_at
 from tormag_lab.twin.excerpt import Excerpt, excerpt_of
-from tormag_lab.twin.fit import COMBINATIONS, twin_of
 from tormag_lab.twin.force import STRENGTH
 from tormagd.commission.procedure import Columns
 from tormagd.config import Config, Rates, load_config

@@ -27,10 +27,9 @@ from tormag_lab.training.dataset import (
     read_csv,
     write_csv,
 )
-from tormag_lab.training.fitting import fit_network
+from tormag_lab.training.fitting import fit_network, jacobian, train
 from tormag_lab.training.grey_box import GreyBox, GreyBoxMemory, fit_series, relaxed_N
 from tormag_lab.training.law import Law, fit_bend, fit_law, fit_law_model
-from tormag_lab.training.levenberg_marquardt import jacobian, train
 from tormag_lab.training.unremembered import identify
 from tormagd.config import Config, Rates
 from tormagd.control.assembly.build import build_core

@@ -48,8 +48,7 @@ from tormagd.simulation.closed_loop import ClosedLoop, Sample, stream
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant, standing
-from tormagd.simulation.pty_port import Pty, PtyPort
-from tormagd.simulation.slcan_port import SlcanPort
+from tormagd.simulation.pty_port import Pty, PtyPort, SlcanPort
 
 CONFIG = Config()
 PATIENCE_S = 10.0

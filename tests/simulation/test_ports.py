@@ -37,7 +37,7 @@ from tormagd.simulation.can_port import MAX_HOSTS, SOCKET_FRAME, CanPort, from_s
 from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
-from tormagd.simulation.slcan_port import LONGEST_COMMAND, SlcanAdapter
+from tormagd.simulation.pty_port import LONGEST_COMMAND, SlcanAdapter
 
 LIMIT_S = 20.0
 HELLO = Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)

@@ -31,7 +31,7 @@ def test_nothing_grows_while_a_force_is_rendered_and_recorded() -> None:
     [
         (["nobody"], "invalid choice: 'nobody'"),
         (["endure", "nobody"], "invalid choice: 'nobody'"),
-        (["endure", "fuzz", "--count", "0"], "'0': allowed is a whole number 1.."),
+        (["endure", "fuzz", "--count", "0"], "0: allowed is a whole number 1.."),
     ],
 )
 def test_a_wrong_command_line_is_refused(wrong: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,8 +23,8 @@ from stand import FIFO_PRIORITY, PATIENCE_S, Figures, Stand, used
 from tqdm import tqdm
 
 from judge import fuzz
-from tormag_lab.main import whole
 from tormagd.ctl.processes import end
+from tormagd.ground.command_line import Within
 from tormagd.record.writer import TICKS_TOPIC
 from tormagd_client import Client
 
@@ -177,7 +177,7 @@ CASES = {
 OPTIONS = {
     "case": {"choices": CASES},
     "--count": {
-        "type": whole(1, 10**9),
+        "type": Within(1, 10**9, is_whole=True),
         "help": "default: " + ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items()),
     },
     "--seed": {"type": int, "default": 1, "help": "of what is drawn (1)"},

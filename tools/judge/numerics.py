@@ -26,11 +26,11 @@ from judge.frame import each
 from judge.stage_table import stages
 from judge.stages import tried
 from tormag_lab.arrays import Array, Json, Mask
-from tormag_lab.design.force_law import d_force_d_gap, d_force_d_moment, stretch_minus_one
-from tormag_lab.main import whole
+from tormag_lab.design.brake import d_force_d_gap, d_force_d_moment, stretch_minus_one
 from tormagd.element.physics.errors import FloatArray
 from tormagd.element.physics.field import ThesisFieldLaw
 from tormagd.element.physics.force import brake_force_N, max_radial_moment_Tm
+from tormagd.ground.command_line import Within
 
 BATCH = 500
 CHUNK = 20
@@ -203,7 +203,7 @@ def of_physics(options: argparse.Namespace) -> Json:
 
 
 OPTIONS = {
-    f"--{name}": {"type": whole(1, 10**9), "default": default, "help": f"{says} (%(default)s)"}
+    f"--{name}": {"type": Within(1, 10**9, is_whole=True), "default": default, "help": f"{says} (%(default)s)"}
     for name, default, says in (
         ("cases", 1_000_000, "inputs of the physics, as arrays"),
         ("reference", 12_000, "of them, computed in 50 digits"),

@@ -18,7 +18,6 @@ from tormagd.control.move.motor import margins
 MIN_GAIN_MARGIN_DB = 6.0
 MIN_PHASE_MARGIN_DEG = 45.0
 LARGEST_GAIN_PER_MM = 20.0
-PARAMETERS = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
 TICK_S = 1e-3
 
 
@@ -27,7 +26,7 @@ class Corners(NamedTuple):
 
     share: float = 0.3
     periods_s: Sequence[float] = (0.8 * TICK_S, TICK_S, 1.2 * TICK_S)
-    parameters: Sequence[str] = PARAMETERS
+    parameters: Sequence[str] = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
 
 
 class Tuning(NamedTuple):

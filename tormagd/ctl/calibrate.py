@@ -17,7 +17,7 @@ import numpy as np
 
 from tormagd.commission.finding import Array
 from tormagd.commission.force_findings import RAMPS_S, STEP_S, STEP_SHARES, force_over_gap, steps
-from tormagd.commission.procedure import Columns, Known, handle_moved
+from tormagd.commission.procedure import CLEAR_N, Columns, Known, handle_moved
 from tormagd.config import Config
 from tormagd.ctl.calibrate_run import SOURCE, Run, armed, known_of, reach
 from tormagd.ctl.operate import statuses
@@ -227,8 +227,6 @@ MOTOR_COLUMNS = (
 )
 LOG_COLUMNS = ("t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm")
 
-CLEAR_N = 0.1
-"At the open end the firmware holds back a duty that would push on."
 MOTOR_RAMPS_S = (12.0, 6.0, 3.0)
 "Up, then the same time down."
 JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.0)

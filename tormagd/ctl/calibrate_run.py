@@ -48,15 +48,6 @@ SILENT_S = 1.0
 RECENT_SETPOINT_MS = 1_000.0
 
 
-def interrupted_run() -> CommandError:
-    return CommandError(
-        Exit.REFUSED,
-        "interrupted",
-        "interrupted: a device that was armed is disabled and opens its gap; what was under way is not saved",
-        "run it again when you are ready",
-    )
-
-
 class Progress:
     """Shows on a terminal how far a part of known length is."""
 
@@ -125,7 +116,12 @@ class Run(Device):
     def exchange(self, asked: Asked) -> Heard:
         """Publish the force, and return the ticks until the next one is due."""
         if self._is_interrupted():
-            raise interrupted_run()
+            raise CommandError(
+                Exit.REFUSED,
+                "interrupted",
+                "interrupted: a device that was armed is disabled and opens its gap; what was under way is not saved",
+                "run it again when you are ready",
+            )
         due_s = time.monotonic() + 1.0 / RATE_HZ
         if asked.force_N is not None:
             ahead_N = asked.preview_N or None

@@ -26,14 +26,6 @@ class Command(NamedTuple):
     has_daemon: bool = True
 
 
-def port(text: str) -> int:
-    """Parse a TCP port; 0 takes one that is free."""
-    value = Within(0, 65_535)(text)
-    if not value.is_integer():
-        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number, 0..65535")
-    return int(value)
-
-
 def rates(text: str) -> tuple[float, ...]:
     """Parse 3 to 60 sweep rates of 0.02 to 10 N/s, separated by commas."""
     found = tuple(Within(0.02, 10.0, " N/s")(part) for part in text.split(","))
@@ -60,6 +52,7 @@ def origin(text: str) -> str:
 
 
 ABOVE_ZERO = Within(1e-3, 1e6)
+PORT = Within(0, 65_535, is_whole=True)
 
 SHARED = (
     option("--config", type=Path, metavar="FILE", help="the daemon's configuration"),
@@ -306,7 +299,7 @@ COMMANDS = {
         ("endpoints", "wait_s"),
         (
             option("path", type=Path, nargs="?", metavar="FILE.mcap", help="recording; default: live"),
-            option("--port", type=port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: a free one"),
+            option("--port", type=PORT, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: a free one"),
             option(
                 "--operate",
                 dest="is_operated",
@@ -325,13 +318,13 @@ COMMANDS = {
         "telemetry and control ticks live for Foxglove on this machine",
         "foxglove.foxglove",
         ("endpoints", "wait_s"),
-        (option("--port", type=port, default=8765, metavar="N", help="of 127.0.0.1 (8765); 0: a free one"),),
+        (option("--port", type=PORT, default=8765, metavar="N", help="of 127.0.0.1 (8765); 0: a free one"),),
     ),
     "metrics": Command(
         "status for Prometheus, printed once or served with --port",
         "metrics.metrics",
         ("endpoints", "wait_s"),
-        (option("--port", type=port, metavar="N", help="of 127.0.0.1"),),
+        (option("--port", type=PORT, metavar="N", help="of 127.0.0.1"),),
     ),
     "scene list": Command("the shipped scenes", "scene.list_scenes"),
     "scene show": Command("a scene as TOML, with its defaults", "scene.show_scene", ("config",), (SCENE,)),

@@ -195,10 +195,21 @@ def _in_force(known: Running) -> Config:
 
 def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
     held = {row.loop: row for row in rates(config, found) if row.configured}
+    step, plan = found.step_us, found.plan_us
     return (
         bare_timer(found),
-        steal(found),
-        core(found),
+        _finding(
+            "steal",
+            found.steal <= MAX_STOLEN,
+            f"a hypervisor took {found.steal:.1%} of the time",
+            "ask whoever runs the host for processors that are not shared",
+        ),
+        Finding(
+            "core",
+            Severity.OK,
+            f"{found.build}: a step p50 {step.p50:.0f} p99 {step.p99:.0f} us, a plan p50 {plan.p50:.0f} "
+            f"p99 {plan.p99:.0f} us; reference loop {found.machine_us:.0f} us",
+        ),
         *(configured_rate(held[loop]) for loop in ("control", "inference")),
     )
 
@@ -212,26 +223,6 @@ def bare_timer(found: Headroom) -> Finding:
         f"late p50 {late_us.p50:.0f} p99 {late_us.p99:.0f} p99.9 {late_us.p999:.0f} us, "
         f"{found.bare.missed_share:.2%} of the beats missed at {rate_hz} Hz",
         "heed the lines above; a virtual machine needs processors of its own",
-    )
-
-
-def steal(found: Headroom) -> Finding:
-    return _finding(
-        "steal",
-        found.steal <= MAX_STOLEN,
-        f"a hypervisor took {found.steal:.1%} of the time",
-        "ask whoever runs the host for processors that are not shared",
-    )
-
-
-def core(found: Headroom) -> Finding:
-    """Report the core's build, and what its step and plan take."""
-    step, plan = found.step_us, found.plan_us
-    return Finding(
-        "core",
-        Severity.OK,
-        f"{found.build}: a step p50 {step.p50:.0f} p99 {step.p99:.0f} us, a plan p50 {plan.p50:.0f} "
-        f"p99 {plan.p99:.0f} us; reference loop {found.machine_us:.0f} us",
     )
 
 

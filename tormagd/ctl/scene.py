@@ -4,8 +4,9 @@ With `--share` or `--tolerance` a check chooses how a scene is served: at a pric
 """
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec import UNSET
@@ -189,11 +190,8 @@ ALIKE = 0.1
 "Errors that differ by less than this share are alike: so do two runs of one way."
 
 
-class Priced(NamedTuple):
-    """A measured way to serve a scene: its share of a processor and worst RMS error."""
-
-    way: OperatingPoint
-    figures: tuple[float, float]
+Ways = Mapping[OperatingPoint, tuple[float, float]]
+"Measured ways to serve a scene, each with its share of a processor and its worst RMS error."
 
 
 def serve_scene(name: str, share: float | None, tolerance_N: float | None, out: Path | None, backend: str) -> Outcome:
@@ -205,11 +203,11 @@ def serve_scene(name: str, share: float | None, tolerance_N: float | None, out: 
         )
     scene = loaded(name)
     found, machine = measured_as(name, scene), machine_us()
-    ways = [
-        Priced(each.way, (found.share_here(each, machine, backend), each.worst_N))
-        for each in found.offered(scene.bandwidth)
-    ]
-    way, (daemon_share, rms_N) = _best(ways, share, tolerance_N or 0.0)
+    ways = {
+        each.way: (found.share_here(each, machine, backend), each.worst_N) for each in found.offered(scene.bandwidth)
+    }
+    way = _best(ways, share, tolerance_N or 0.0)
+    daemon_share, rms_N = ways[way]
     text = (
         f"{scene.name}: {way}: {1e3 * rms_N:.1f} mN RMS in the worst situation, "
         f"the daemon takes {daemon_share:.1%} of a processor of this machine"
@@ -221,22 +219,22 @@ def serve_scene(name: str, share: float | None, tolerance_N: float | None, out: 
     return Outcome(result | {"daemon_share": daemon_share, "file": None if out is None else str(out)}, text)
 
 
-def _best(ways: list[Priced], share: float | None, tolerance_N: float) -> Priced:
+def _best(ways: Ways, share: float | None, tolerance_N: float) -> OperatingPoint:
     """Return the most exact of `ways` within `share`, or without one the cheapest within `tolerance_N`."""
     bounds = ("--tolerance", 1, tolerance_N, "N") if share is None else ("--share", 0, share, "of a processor")
     asked, bounded, most, unit = bounds
-    fits = [way for way in ways if way.figures[bounded] <= most]
+    fits = [way for way, figures in ways.items() if figures[bounded] <= most]
     if not fits:
-        least = min(way.figures[bounded] for way in ways)
+        least = min(figures[bounded] for figures in ways.values())
         raise CommandError(
             Exit.REFUSED,
             "no_way",
             f"{asked} = {most:g}: allowed is at least {least:.3g} {unit}",
             "tormagctl scene explain shows every way; not offered is one that is worse than the usual one",
         )
-    least_N = min(way.figures[1] for way in fits)
-    alike = [way for way in fits if share is None or way.figures[1] <= (1.0 + ALIKE) * least_N]
-    return min(alike, key=lambda way: (len(way.way.given), way.figures[0]))
+    least_N = min(ways[way][1] for way in fits)
+    alike = [way for way in fits if share is None or ways[way][1] <= (1.0 + ALIKE) * least_N]
+    return min(alike, key=lambda way: (len(way.given), ways[way][0]))
 
 
 def write_scene(name: str, way: OperatingPoint, out: Path) -> None:

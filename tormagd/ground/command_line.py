@@ -72,9 +72,10 @@ class Within(NamedTuple):
     least: float
     most: float
     unit: str = ""
+    is_whole: bool = False
 
     def __call__(self, text: str) -> float:
-        value = number(text)
-        if not self.least <= value <= self.most:
-            raise argparse.ArgumentTypeError(f"{text}: allowed is {self.least:g}..{self.most:g}{self.unit}")
-        return value
+        value, kind = number(text), "a whole number " if self.is_whole else ""
+        if not self.least <= value <= self.most or (self.is_whole and not value.is_integer()):
+            raise argparse.ArgumentTypeError(f"{text}: allowed is {kind}{self.least:.10g}..{self.most:.10g}{self.unit}")
+        return int(value) if self.is_whole else value

@@ -20,8 +20,6 @@ MAX_FILE_BYTES: Final = 16_000_000
 "Over a quarter of an hour at 1 kHz."
 OPTIONS: Final = {"time_s": "--time-column ", "force_N": "--column "}
 
-Allowed = Mapping[str, tuple[float, float, str]]
-
 
 def stated_columns(force: str | None, time: str | None) -> dict[str, str]:
     """Return the columns that a person states, by quantity."""
@@ -62,7 +60,7 @@ def read_motion(path: Path) -> tuple["array[float]", "array[float]"]:
     return table.values["time_s"], table.values["displacement_mm"]
 
 
-def _require(path: Path, table: Table, allowed: Allowed) -> None:
+def _require(path: Path, table: Table, allowed: Mapping[str, tuple[float, float, str]]) -> None:
     """Refuse a row that lacks a value, is out of range or does not follow the row before."""
     if table.missing:
         raise TableError(f"{path}: row {table.missing[0]} lacks a value: fill it in, or delete the row")

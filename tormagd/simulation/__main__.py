@@ -12,13 +12,12 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TextIO
 
 from firmware_protocol.c.build import BuildError
 from tormagd.element.physics.errors import DomainError
-from tormagd.ground.command_line import add, option
+from tormagd.ground.command_line import Within, add, option
 from tormagd.ground.files import new_file
 from tormagd.ground.scheduling import ask_for_fifo, ask_for_slices
 from tormagd.ground.table import TableError
@@ -32,9 +31,8 @@ from tormagd.simulation.faults import FORMS as KNOWN_FAULTS, FaultError, parse_f
 from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
 from tormagd.simulation.parameters import PLANTS_INSERT, PlantError, load_plant, plant_names, with_insert
-from tormagd.simulation.pty_port import PtyPort
+from tormagd.simulation.pty_port import PtyPort, SlcanPort
 from tormagd.simulation.real_time import TRUTH_HEADER, Door, PacedDevice, serve
-from tormagd.simulation.slcan_port import SlcanPort
 from tormagd_client.printable import printable
 
 FIFO = 40
@@ -104,13 +102,6 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
     return device, door
 
 
-def _rate(least: int, most: int, text: str) -> int:
-    rate = int(text)
-    if not least <= rate <= most:
-        raise argparse.ArgumentTypeError(f"{rate}: allowed are {least} to {most}")
-    return rate
-
-
 DOORS = (
     option("--pty", action="store_true", help="serial line on a pseudo-terminal; prints its path"),
     option("--slcan", action="store_true", help="CAN adapter on a pseudo-terminal; prints its path"),
@@ -136,13 +127,17 @@ OPTIONS = (
     option("--seed", type=int, default=0, metavar="N", help="of noise and jitter"),
     option(
         "--baud",
-        type=partial(_rate, 1_200, 20_000_000),
+        type=Within(1_200, 20_000_000, is_whole=True),
         default=DEFAULT_BAUD,
         metavar="N",
         help=f"default {DEFAULT_BAUD}",
     ),
     option(
-        "--bitrate", type=partial(_rate, 10_000, 1_000_000), default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus"
+        "--bitrate",
+        type=Within(10_000, 1_000_000, is_whole=True),
+        default=DEFAULT_BITRATE,
+        metavar="N",
+        help="of the CAN bus",
     ),
     option("--node", type=int, choices=range(16), default=DEFAULT_NODE, metavar="N", help="on the CAN bus"),
     option(

@@ -20,7 +20,6 @@ from tormagd.ground.command_line import add, option
 from tormagd.ground.terminal import interrupted_by
 from tormagd_client import Client, ClientError
 from tormagd_client.contact import ContactEstimator
-from tormagd_client.messages import Contact
 
 T = TypeVar("T")
 PERIOD_S: Final = 2e-3
@@ -159,7 +158,6 @@ class Unit:
         self._there: NetworkDelay[float] = NetworkDelay(*network, seed=1)
         self._back: NetworkDelay[dict[str, Any]] = NetworkDelay(*network, seed=2)
         self._estimator = ContactEstimator()
-        self._wall: Contact | None = None
         self._handle, self._sent_s = (-math.inf, 0.0), -math.inf
 
     def update(self, now_s: float, handle_mm: Sequence[float]) -> list[tuple[float, dict[str, Any]]]:
@@ -180,9 +178,8 @@ class Unit:
         fields = setpoint_of(felt, self._mode)
         if self._mode == FOUND:
             self._estimator.update(felt.tip_mm, felt.force_N, felt.way_mm)
-            self._wall = self._estimator.contact
-            if self._wall is not None:
-                fields["contact"] = self._wall
+            if (wall := self._estimator.contact) is not None:
+                fields["contact"] = wall
         return fields
 
 

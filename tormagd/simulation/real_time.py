@@ -14,8 +14,7 @@ from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.can_port import CanPort
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.plant import Truth
-from tormagd.simulation.pty_port import PtyPort
-from tormagd.simulation.slcan_port import SlcanPort
+from tormagd.simulation.pty_port import PtyPort, SlcanPort
 
 LATE_S = 2e-3
 "From here on a wake-up is late: two firmware ticks."

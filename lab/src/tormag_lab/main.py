@@ -52,29 +52,9 @@ COMMANDS = {
 }
 
 
-def whole(least: int, most: int) -> Callable[[str], int]:
-    """Return an argparse type for whole numbers in this range."""
-
-    def number(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"{text[:40]!r}: allowed is a whole number {least}..{most}")
-        return value
-
-    return number
-
-
-def within(least: float, most: float, unit: str) -> Callable[[str], float]:
-    """Return an argparse type for finite numbers in this range."""
-    return Within(least, most, f" {unit}").__call__
-
-
-SEED = whole(0, 2**31)
-WORKERS = whole(1, 1024)
-GAP_SPEED = within(1e-6, 1e4, "mm/s")
+SEED = Within(0, 2**31, is_whole=True).__call__
+WORKERS = Within(1, 1024, is_whole=True).__call__
+GAP_SPEED = Within(1e-6, 1e4, " mm/s").__call__
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -14,6 +14,7 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any, Literal, TypeAlias
 
 import msgspec
@@ -21,14 +22,15 @@ import numpy as np
 from scipy.optimize import Bounds, NonlinearConstraint, differential_evolution, minimize
 
 from tormag_lab.arrays import Array, Json
-from tormag_lab.design.brake import Brake
+from tormag_lab.design.brake import CLOSED_MM, Brake
 from tormag_lab.design.phase_portrait import PhasePortrait, Region
 from tormag_lab.executors import add_options as add_executors, chosen, finished
-from tormag_lab.main import GAP_SPEED, SEED, Found, whole
+from tormag_lab.main import GAP_SPEED, SEED, Found
 from tormagd.config import Position
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import PowerFieldLaw
-from tormagd.element.physics.force import Elastomer, Geometry, max_radial_moment_Tm
+from tormagd.element.physics.force import TORMAG, Elastomer, Geometry, max_radial_moment_Tm
+from tormagd.ground.command_line import Within
 
 Measure: TypeAlias = Literal["trapezoid", "true"]
 "Boundary by which coverage counts."
@@ -56,36 +58,24 @@ class Problem(msgspec.Struct, frozen=True):
     gap_speed_mm_s: float
     lower: Design = Design(6.5, 0.5, 46.0)
     upper: Design = Design(45.0, 50.0, 200.0)
-    inner_radius_mm: float = 4.0
-    roller_radius_mm: float = 20.0
-    closed_mm: float = 45.0
-    shear_modulus_Pa: float = 300e3
-    relative_permeability: float = 3.8
-    friction_coefficient: float = 0.2
+    elastomer: Elastomer = Elastomer(300e3, 3.8, 0.2)
 
     def geometry(self, design: Design) -> Geometry:
-        return Geometry(
-            inner_radius_m=1e-3 * self.inner_radius_mm,
-            outer_radius_m=1e-3 * design.outer_radius_mm,
-            thickness_m=1e-3 * design.thickness_mm,
-            roller_radius_m=1e-3 * self.roller_radius_mm,
-        )
-
-    @property
-    def elastomer(self) -> Elastomer:
-        return Elastomer(self.shear_modulus_Pa, self.relative_permeability, self.friction_coefficient)
+        """Return the device's own geometry with this outer radius and thickness."""
+        return replace(TORMAG, outer_radius_m=1e-3 * design.outer_radius_mm, thickness_m=1e-3 * design.thickness_mm)
 
     def portrait(self, design: Design) -> PhasePortrait:
-        brake = Brake(PowerFieldLaw(), self.elastomer, self.geometry(design), self.closed_mm, design.open_mm)
+        brake = Brake(PowerFieldLaw(), self.elastomer, self.geometry(design), CLOSED_MM, design.open_mm)
         return PhasePortrait(brake, self.gap_speed_mm_s)
 
     def load_margin(self, design: Design) -> float:
         """Return 1 - the closed gap's field over the largest that the elastomer bears."""
-        moment_Tm = PowerFieldLaw().radial_moment_Tm(self.closed_mm)
+        moment_Tm = PowerFieldLaw().radial_moment_Tm(CLOSED_MM)
         return 1.0 - moment_Tm / max_radial_moment_Tm(self.elastomer, self.geometry(design))
 
     def volume_mm3(self, design: Design) -> float:
-        return math.pi * (design.outer_radius_mm**2 - self.inner_radius_mm**2) * design.thickness_mm
+        inner_radius_mm = 1e3 * TORMAG.inner_radius_m
+        return math.pi * (design.outer_radius_mm**2 - inner_radius_mm**2) * design.thickness_mm
 
 
 class Run(msgspec.Struct, frozen=True):
@@ -109,7 +99,9 @@ def solve(run: Run) -> Json:
     search = _Search(run.problem)
     design = search.design(search.smallest(search.minimum(search.miss, search.scaled(run.start), run.seed), run.seed))
     if run.problem.load_margin(design) < 0.0:
-        raise DomainError("shear_modulus_Pa", run.problem.shear_modulus_Pa, "an elastomer that bears the closed gap")
+        raise DomainError(
+            "shear_modulus_Pa", run.problem.elastomer.shear_modulus_Pa, "an elastomer that bears the closed gap"
+        )
     return {
         "design": design,
         "coverage": coverage(run.problem, design),
@@ -196,7 +188,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=Position().gap_speed_mm_s,
         help="mm/s (what the controller was measured at)",
     )
-    parser.add_argument("--starts", type=whole(1, 10_000), default=5, help="random ones")
+    parser.add_argument("--starts", type=Within(1, 10_000, is_whole=True).__call__, default=5, help="random ones")
     parser.add_argument("--seed", type=SEED, default=1)
     add_executors(parser, os.cpu_count() or 1, needed="tormag-lab")
 

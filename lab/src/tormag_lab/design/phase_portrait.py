@@ -58,13 +58,6 @@ class PhasePortrait:
     def __post_init__(self) -> None:
         require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
 
-    def outline(self) -> tuple[FloatArray, FloatArray]:
-        """Return the true boundary's upper half as two arrays of 201 elements: force, N, falling, and rate, N/s."""
-        gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, 201)
-        # a geometric series may end a rounding beyond its ends
-        gap_mm = np.clip(gap_mm, self.brake.closed_mm, self.brake.open_mm)
-        return self.brake.force_N(gap_mm), self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)
-
     def trapezoid(self) -> Region:
         """Return the thesis's portrait, a straight line between the end points."""
         speed, brake = self.gap_speed_mm_s, self.brake
@@ -107,8 +100,11 @@ class PhasePortrait:
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:
         """Return which points of a task, force and rate (n each), the true boundary covers."""
-        falling_N, limit_N_s = self.outline()
-        limit = np.interp(force_N, falling_N[::-1], limit_N_s[::-1], left=-1.0, right=-1.0)
+        gap_mm = np.geomspace(self.brake.open_mm, self.brake.closed_mm, 201)
+        # a geometric series may end a rounding beyond its ends
+        gap_mm = np.clip(gap_mm, self.brake.closed_mm, self.brake.open_mm)
+        limit_N_s = self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)
+        limit: FloatArray = np.interp(force_N, self.brake.force_N(gap_mm), limit_N_s, left=-1.0, right=-1.0)
         return np.abs(rate_N_s) <= limit
 
     def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:

@@ -7,9 +7,8 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from tormag_lab.arrays import Array
+from tormag_lab.arrays import MAX_TABLE_BYTES, Array, read_columns
 from tormag_lab.errors import LabError
-from tormag_lab.tables import MAX_TABLE_BYTES, read_columns
 from tormagd_client.regular_file import require_regular
 
 COLUMNS = ("t_s", "input_V", "position_mm")

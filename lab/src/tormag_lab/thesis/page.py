@@ -151,8 +151,10 @@ def _table_3_2(data: Json) -> str:
     speeds = ", ".join(f"{name} {speed:.2f}" for name, speed in data["gap_speed_mm_s"].items())
     rows = []
     for use_case, objective in product(USE_CASES, OBJECTIVES):
-        best = best_start(data["starts"], use_case, objective)
-        found = (f"{best['coverage']:.2%}", _dimensions(best["design"]), f"{best['volume_cm3']:.1f}")
+        starts = [each for each in data["starts"] if (each["use_case"], each["objective"]) == (use_case, objective)]
+        best = max(starts, key=lambda each: float(each["coverage"]))
+        dimensions = " ".join(f"{value:.4g}" for value in best["design"].values())
+        found = (f"{best['coverage']:.2%}", dimensions, f"{best['volume_cm3']:.1f}")
         rows.append((str(use_case), objective, *found))
     designs = []
     for key, of in groupby(data["thesis_designs"], lambda row: (row["use_case"], row["name"].partition(",")[0])):
@@ -175,15 +177,6 @@ def _table_3_2(data: Json) -> str:
     )
 
 
-def best_start(starts: list[Json], use_case: int, objective: str) -> Json:
-    found = [each for each in starts if (each["use_case"], each["objective"]) == (use_case, objective)]
-    return max(found, key=lambda each: float(each["coverage"]))
-
-
-def _dimensions(design: Json) -> str:
-    return " ".join(f"{value:.4g}" for value in design.values())
-
-
 def _span(values: Iterable[float], shown: Callable[[float], str]) -> str:
     known = sorted(values)
     return "..".join(dict.fromkeys((shown(known[0]), shown(known[-1]))))
@@ -192,13 +185,13 @@ def _span(values: Iterable[float], shown: Callable[[float], str]) -> str:
 def table_4_1(data: Json) -> str:
     rows = []
     for row in data["rows"]:
-        printed = TABLE_4_1[row["class"]]
+        mae_N, sd_N, r2 = TABLE_4_1[row["class"]]
         rows.append(
             (
                 row["class"],
-                f"{printed.mae_N:g} ± {printed.sd_N:g}",
+                f"{mae_N:g} ± {sd_N:g}",
                 f"{row['mae_N']:.3f} ± {row['sd_N']:.3f}",
-                f"{printed.r2:g}",
+                f"{r2:g}",
                 f"{row['r2']:.4f}",
             )
         )

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tormag_lab.arrays import Json
-from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake
-from tormag_lab.design.force_law import energy_at_shaft, stretch_minus_one
+from tormag_lab.design.brake import CLOSED_MM, OPEN_MM, Brake, energy_at_shaft, stretch_minus_one
 from tormag_lab.design.optimisation import Design, Problem, Run, coverage, sweep
 from tormag_lab.design.phase_portrait import PhasePortrait
 from tormag_lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
@@ -191,7 +190,7 @@ def figure_2_5() -> Json:
             "error_N": [at_point.least_N - FIGURE_2_5_N[0], at_point.most_N - FIGURE_2_5_N[1]],
             "closed": {
                 "stretch": stretch,
-                **energy_at_shaft(stretch, moment_Tm / TORMAG.inner_radius_m, elastomer)._asdict(),
+                **energy_at_shaft(stretch, moment_Tm / TORMAG.inner_radius_m, elastomer),
             },
             "least_N": [[brake.least_N for brake in row] for row in grid],
             "most_N": [[brake.most_N for brake in row] for row in grid],

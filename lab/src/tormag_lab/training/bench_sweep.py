@@ -35,7 +35,7 @@ from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.closed_loop import ClosedLoop, gap_plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand
-from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
+from tormagd.simulation.parameters import PlantParameters, changed, load_plant, with_insert
 
 SWEEPS = 4
 BEYOND_MM = 2.0
@@ -224,14 +224,10 @@ def bench_scene(scene: Scene, name: str) -> Scene:
 def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
     """Return `plant` with its switches at the gaps of a bench scene."""
     home_mm = scene.insert.gap_open_mm / 2.0
-    stops = msgspec.structs.replace(
-        plant.assumed,
-        home_mm=home_mm,
-        closed_mm=scene.insert.gap_closed_mm / 2.0 - 0.25,
-        start_left_mm=home_mm - 0.5,
-        start_right_mm=home_mm - 0.5,
+    closed_mm, start_mm = scene.insert.gap_closed_mm / 2.0 - 0.25, home_mm - 0.5
+    return changed(
+        plant, "assumed", home_mm=home_mm, closed_mm=closed_mm, start_left_mm=start_mm, start_right_mm=start_mm
     )
-    return msgspec.structs.replace(plant, assumed=stops)
 
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:

@@ -15,10 +15,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tormag_lab.arrays import Array
+from tormag_lab.arrays import Array, read_columns
 from tormag_lab.errors import LabError
 from tormag_lab.main import Found
-from tormag_lab.tables import read_columns
 from tormag_lab.training.dataset import ALLOWED, Dataset, fit_metrics
 from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.element.model.features import FEATURES, FIELD, Element

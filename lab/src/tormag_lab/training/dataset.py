@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tormag_lab.arrays import Array, Mask
+from tormag_lab.arrays import Array, Mask, read_columns
 from tormag_lab.errors import LabError
-from tormag_lab.tables import read_columns
 from tormagd.element.model.features import FEATURES, Scaling
 from tormagd.element.model.model_file import ForceModel
 from tormagd.element.physics.errors import DomainError

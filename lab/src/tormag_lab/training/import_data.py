@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from tormag_lab.arrays import Array, Mask
+from tormag_lab.arrays import MAX_TABLE_BYTES, Array, Mask
 from tormag_lab.errors import LabError
-from tormag_lab.main import Found, within
+from tormag_lab.main import Found
 from tormag_lab.pages import subplots
-from tormag_lab.tables import MAX_TABLE_BYTES
 from tormag_lab.training.dataset import ALLOWED, Dataset, records, write_csv
 from tormagd.element.model.displacement import MOBILISED_MM
+from tormagd.ground.command_line import Within
 from tormagd.ground.files import new_file
 from tormagd.ground.table import MIN_ROWS, QUANTITIES, Table, Wanted, read_table
 
@@ -55,7 +55,9 @@ class Imported(NamedTuple):
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE.csv", help="several are one cycle each")
     parser.add_argument("--out", type=Path, required=True, metavar="ROWS.csv", help="for train-model, a new file")
-    parser.add_argument("--cip", type=within(0.0, 100.0, "%"), metavar="PERCENT", help="iron, where no column has it")
+    parser.add_argument(
+        "--cip", type=Within(0.0, 100.0, " %").__call__, metavar="PERCENT", help="iron, where no column has it"
+    )
     parser.add_argument(
         "--column",
         action="append",

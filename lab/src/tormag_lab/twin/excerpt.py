@@ -76,10 +76,6 @@ class Excerpt(NamedTuple):
     clock_ppm: float
     moves: dict[str, Moves]
 
-    @property
-    def sensor_noise_N(self) -> float:
-        return float(np.median(self.noise_N))
-
     def first(self, lasts_s: float) -> "Excerpt":
         rows = {name: getattr(self, name)[: round(lasts_s * GRID_HZ)] for name in ROWS}
         return self._replace(**rows, moves={})

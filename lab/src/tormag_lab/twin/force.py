@@ -17,7 +17,7 @@ from tormag_lab.errors import LabError
 from tormag_lab.ideal_carriage import lag_of
 from tormag_lab.twin.estimate import Estimate, Prior, Values, estimated, named, value_at, with_values
 from tormag_lab.twin.excerpt import GRID_HZ, Excerpt
-from tormagd.element.physics.force import TORMAG, Elastomer as Rubber, reduced
+from tormagd.element.physics.force import TORMAG, reduced
 from tormagd.simulation.parameters import Elastomer, Field, PlantParameters, Thermal
 from tormagd.simulation.static_laws import radial_moment_Tm
 
@@ -52,9 +52,7 @@ class Fitted(NamedTuple):
 
 def fresh_N(plant: PlantParameters, moment_Tm: Array) -> Array:
     """Return the kinetic friction of the fresh, cool insert (n) at radial moments (n)."""
-    mre = plant.elastomer
-    law = reduced(Rubber(mre.shear_modulus_kPa * 1e3, mre.relative_permeability, mre.kinetic_friction), TORMAG)
-    return np.asarray(law.force(moment_Tm))
+    return np.asarray(reduced(plant.elastomer.law, TORMAG).force(moment_Tm))
 
 
 def moments_Tm(plant: PlantParameters, gap_mm: Array) -> Array:
@@ -168,7 +166,7 @@ def fit_force(prior: PlantParameters, ways: Sequence[Excerpt], only: Sequence[st
     noise_N = rms(
         np.concatenate(
             [
-                way.sensor_noise_N / np.sqrt(np.maximum(way.readings[mask], 1.0))
+                np.median(way.noise_N) / np.sqrt(np.maximum(way.readings[mask], 1.0))
                 for way, mask in zip(ways, kept, strict=True)
             ]
         )
