@@ -149,8 +149,7 @@ def test_the_readmes_sample_has_the_lines_that_are_printed(capsys):
     ("show_", "verdict", "exit_code"),
     [(shown(), MET, 0), (aborted("MEASUREMENT_STALE", STALLED), HOST, 3)],
 )
-def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_code, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
+def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_code, capsys):
     found, sentence = demo.judge(SCENE, show_)
     assert found is verdict
     ordered = {"torch": show_, "thesis": aborted("PLAN_FAILED", QUIET)}  # which decide nothing
@@ -167,8 +166,7 @@ def undrawn(monkeypatch) -> None:
     monkeypatch.setattr(pictures, "show_picture", Mock())
 
 
-def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, monkeypatch, tmp_path, undrawn):
-    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
+def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, undrawn):
     early = aborted("MEASUREMENT_STALE", QUIET)
     for verdict in (MET, HOST):
         assert demo.conclude(SCENE, early, shown(), dict(list(rehearsals().items())[1:]), {}, verdict, "") == 1
@@ -206,7 +204,9 @@ def touched(late_ms: int = 150) -> list[Touch]:
 
 
 @pytest.fixture(autouse=True)
-def _bounds(monkeypatch) -> None:
+def _bounds(monkeypatch, tmp_path) -> None:
+    """Bounds that are made up, and a folder of the test's own for what is written."""
+    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     for module in (demo, pictures):
         monkeypatch.setattr(module, "bounds", lambda: touched(100))
 
@@ -275,10 +275,9 @@ def test_a_wall_that_is_never_felt_is_told_as_that() -> None:
     ]
 
 
-def test_a_fault_of_the_hands_show_is_told_as_the_pulses_and_decides_nothing(monkeypatch, tmp_path, undrawn) -> None:
+def test_a_fault_of_the_hands_show_is_told_as_the_pulses_and_decides_nothing(tmp_path, undrawn) -> None:
     early = aborted("MEASUREMENT_STALE", STALLED)
     sentence = demo.judge(SCENE, early)[1]
     assert demo.touch_told(SCENE, early) == [sentence]
-    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     assert demo.conclude(SCENE, early, shown(), rehearsals(), {}, MET, "") == 0
     assert not (tmp_path / "touch.png").exists()
