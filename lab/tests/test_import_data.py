@@ -162,12 +162,6 @@ def test_what_cannot_be_told_is_refused_with_the_cause(case: str, tmp_path: Path
     assert not out.exists()
 
 
-def imported(tmp_path: Path, content: bytes) -> tuple[int, Path]:
-    (tmp_path / "given.csv").write_bytes(content)
-    out = tmp_path / "rows.csv"
-    return main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), "--json"]), out
-
-
 @pytest.mark.parametrize("has_rate", [True, False])
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 0.8])
 def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: float, tmp_path: Path, capsys) -> None:
@@ -176,8 +170,9 @@ def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: floa
     noise = np.random.default_rng(5).normal(0.0, 0.01, 4_000)
     columns = {"t_s": 0.01 * step, "force_N": -way * (1.0 + 0.001 * step), "field_mT": 100.0 + step % 7}
     columns |= {"v_mm_s": 25.0 * way + noise} if has_rate else {"x_mm": -10.0 * np.abs(step / 40.0 % 2.0 - 1.0)}
-    code, out = imported(tmp_path, text(columns).encode())
-    assert code == 0
+    (tmp_path / "given.csv").write_text(text(columns))
+    out = tmp_path / "rows.csv"
+    assert main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["left_out"] == {"missing": 0, "duplicate": 0, "outlier": 0}
     assert read_csv(out).force_N == pytest.approx(1.0 + 0.001 * step, rel=1e-4)
 

@@ -113,7 +113,8 @@ def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
     grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
     found: list[Array] = []
     for displacement, rate, force in along.rows():
-        is_over = _network(model, displacement, rate, grid) >= force
+        features = np.column_stack(np.broadcast_arrays(displacement, rate, grid, CIP_PERCENT))
+        is_over = model.predict(features) >= force
         begins = np.flatnonzero(is_over[1:] != is_over[:-1]).tolist()
         of_solve = model, displacement, rate, force
         roots = [brentq(_excess_N, grid[place], grid[place + 1], args=of_solve, xtol=1e-10) for place in begins]
@@ -123,11 +124,6 @@ def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
 
 def _excess_N(field_mT: float, model: ForceModel, displacement_mm: float, rate_mm_s: float, force_N: float) -> float:
     return model.predict_one(displacement_mm, rate_mm_s, field_mT, CIP_PERCENT) - force_N
-
-
-def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields_mT: Array) -> Array:
-    of_all = [np.full(len(fields_mT), value) for value in (displacement_mm, rate_mm_s, CIP_PERCENT)]
-    return model.predict(np.column_stack((*of_all[:2], fields_mT, of_all[2])))
 
 
 USUAL_HIDDEN = 50
