@@ -135,8 +135,9 @@ def _faults() -> str:
 
 
 def _limits() -> str:
-    limits = {limit: LIMITS[limit] for limit in Limit}
-    return "## Limits\n\nLimits come and go by themselves.\n\n" + _codes("limit", limits)
+    return "## Limits\n\nLimits come and go by themselves.\n\n" + _codes(
+        "limit", {limit: LIMITS[limit] for limit in Limit}
+    )
 
 
 def _codes(kind: str, codes: Mapping[Any, Explanation]) -> str:

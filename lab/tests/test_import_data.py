@@ -32,8 +32,6 @@ def renamed(names: dict[str, str], **factors: float) -> dict[str, np.ndarray]:
 
 
 USUAL = {"x": "position_mm", "rate": "rate_mm_s", "field": "field_mT", "force": "force_N"}
-SIGNED = measured() | {"force": measured()["force"] * np.sign(measured()["rate"])}
-WITH_OUTLIER = measured() | {"force": measured()["force"] + 4.0 * (np.arange(600) == 77)}
 GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
     "our own": (text(renamed(USUAL)), (), "force_N as it was"),
     "another order": (text(renamed(dict(reversed(USUAL.items())))), (), "as it was"),
@@ -59,7 +57,11 @@ GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
     "decimal commas": (text(renamed(USUAL), ";", ","), (), "as it was"),
     "tabs, comments, a preamble": ("# bench 3\nSpecimen\tA\tB\tC\n" + text(renamed(USUAL), "\t"), (), "as it was"),
     "pulled the other way": (text(renamed(USUAL, force=-1.0)), (), "turned round"),
-    "signed by the motion": (text({USUAL[name]: SIGNED[name] for name in USUAL}), (), "it had the rate's sign"),
+    "signed by the motion": (
+        text(renamed(USUAL) | {"force_N": measured()["force"] * np.sign(measured()["rate"])}),
+        (),
+        "it had the rate's sign",
+    ),
     "no rate": (
         text(renamed({"time": "t_s", "x": "x_mm", "field": "field_mT", "force": "force_N"})),
         (),
@@ -83,7 +85,11 @@ GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
         (),
         "over time_s",
     ),
-    "an outlier": (text({USUAL[name]: WITH_OUTLIER[name] for name in USUAL}), (), "as it was"),
+    "an outlier": (
+        text(renamed(USUAL) | {"force_N": measured()["force"] + 4.0 * (np.arange(600) == 77)}),
+        (),
+        "as it was",
+    ),
     "rows twice, and one with a hole": (
         text(renamed(USUAL)) + text(renamed(USUAL)).partition("\n")[2] + "1,1,,1\n",
         (),

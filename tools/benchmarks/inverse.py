@@ -95,19 +95,6 @@ def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
     return Dataset(np.column_stack((displacement, rate, field, np.full(rows, CIP_PERCENT))), force)
 
 
-def trained(data: Dataset, hidden: int, epochs: int) -> ForceModel:
-    model, _ = fit_model(
-        *data.split(0.3, 0),
-        element=Element.TORQUE,
-        inserts=(INSERT.name,),
-        data_sha256=data.sha256(),
-        created=datetime.date(2024, 1, 1),
-        hidden=hidden,
-        epochs=epochs,
-    )
-    return model
-
-
 def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
     """Return for each solve every field in range at which the network gives the force."""
     grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
@@ -214,7 +201,18 @@ class Bench:
         self.course = course(self.plant, effort.course)
         data = training_data(self.plant, effort.training_rows, seed=1)
         hidden = tqdm(effort.hidden, desc="networks", disable=None)
-        self.models = {size: trained(data, size, effort.epochs) for size in hidden}
+        self.models = {
+            size: fit_model(
+                *data.split(0.3, 0),
+                element=Element.TORQUE,
+                inserts=(INSERT.name,),
+                data_sha256=data.sha256(),
+                created=datetime.date(2024, 1, 1),
+                hidden=size,
+                epochs=effort.epochs,
+            )[0]
+            for size in hidden
+        }
         self.roots = {size: network_roots_mT(model, self.course) for size, model in self.models.items()}
 
     def sweep(self) -> tuple[list[dict[str, Any]], list[str]]:

@@ -96,12 +96,11 @@ class Link:
         if self._ticks % SETPOINT_TICKS == 0:
             self._there.send(now_s, handle_mm)
         for told in self._there.arrived(now_s):
-            self._tip = max(told, self._tip or told)
+            self._tip = told
         if self._tip is not None and self._ticks % SETPOINT_TICKS == 0:
             self._back.send(now_s, self._setpoint(now_s, self._tip[1]))
         for _, setpoint in self._back.arrived(now_s):
-            if self._newest is None or setpoint.stamp_s > self._newest.stamp_s:
-                self._newest = setpoint
+            self._newest = setpoint
         return self._newest
 
     def _setpoint(self, now_s: float, tip_mm: float) -> TimedSetpoint:
@@ -167,15 +166,12 @@ class Scenario:
 def rendered(case: Case, core: Core) -> Touch:
     scenario = Scenario(case, core)
     loop = armed(core, with_insert(device_of(case.device), core.scene.insert.name), scenario.felt)
-    truth = loop.simulated.truth
-    faults: tuple[str, ...] = ()
     for _ in scenario.begin(loop.now_s):
-        sample = loop.tick(scenario.setpoint(loop.now_s, truth))
-        truth, faults = sample.truth, tuple(map(str, sample.safety.faults))
-        scenario.see(truth, (*sample.plan.limits, *sample.output.limits))
-        if faults:
+        sample = loop.tick(scenario.setpoint(loop.now_s, loop.simulated.truth))
+        scenario.see(sample.truth, (*sample.plan.limits, *sample.output.limits))
+        if sample.safety.faults:
             break
-    return scenario.touch(faults)
+    return scenario.touch(tuple(map(str, loop.stepper.safety.faults)))
 
 
 def opened(case: Case, core: Core) -> Touch:
