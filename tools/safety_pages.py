@@ -15,7 +15,7 @@ from judge.risk import Row, judgement, named_tests, page, red_rows, rows
 
 from tormag_lab.pages import table
 from tormagd.control.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
-from tormagd.control.safety.operating_state import ROWS, Event, OperatingState, Refusal, Transition
+from tormagd.control.safety.operating_state import ROWS, Event, OperatingState, Transition
 from tormagd.hardware.measurement import DeviceRequest
 
 ROOT = Path(__file__).parents[1]
@@ -101,7 +101,8 @@ def _transitions() -> str:
     for event in Event:
         row = next(row for row in ROWS if row.event is event and isinstance(row, Transition))
         guards = ", ".join(dict.fromkeys(f"`{guard.code}`" for guard in row.guards)) or "-"
-        leads = [_lead(known[event, state]) for state in OperatingState]
+        leads_of = [known[event, state] for state in OperatingState]
+        leads = [str(each.target) if isinstance(each, Transition) else f"`{each.code}`" for each in leads_of]
         asked = "-" if row.request is DeviceRequest.NONE else str(row.request)
         rows.append((f"*{event}*" if event is Event.FAULT else f"`{event}`", *leads, guards, asked))
     return (
@@ -110,10 +111,6 @@ def _transitions() -> str:
         + table(("event", *OperatingState, "guards, in order", "request"), rows)
         + "\n"
     )
-
-
-def _lead(row: Transition | Refusal) -> str:
-    return str(row.target) if isinstance(row, Transition) else f"`{row.code}`"
 
 
 def _guards() -> str:
@@ -138,8 +135,9 @@ def _faults() -> str:
 
 
 def _limits() -> str:
-    limits = {limit: LIMITS[limit] for limit in Limit}
-    return "## Limits\n\nLimits come and go by themselves.\n\n" + _codes("limit", limits)
+    return "## Limits\n\nLimits come and go by themselves.\n\n" + _codes(
+        "limit", {limit: LIMITS[limit] for limit in Limit}
+    )
 
 
 def _codes(kind: str, codes: Mapping[Any, Explanation]) -> str:

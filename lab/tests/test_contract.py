@@ -177,22 +177,13 @@ def test_a_console_without_torch_has_the_light_commands():
     assert done.returncode == 0, done.stderr
 
 
-def test_a_missing_package_is_one_sentence_with_the_command_that_brings_it(tmp_path):
-    (tmp_path / "rows.csv").write_text(GOOD)
-    given = str(tmp_path / "rows.csv"), "--out", str(tmp_path / "m")
-    done = without_heavy(COMMAND, "train-model", *given, "--element", "torque", "--insert", "A")
-    assert (done.returncode, done.stderr) == (
-        2,
-        "tormag-lab train-model: torch is not installed: pip install 'tormag-lab[all]'\n",
-    )
-
-
-def test_the_law_trains_without_torch(tmp_path):
-    (tmp_path / "rows.csv").write_text(GOOD)
-    out = tmp_path / "m.safetensors"
-    given = str(tmp_path / "rows.csv"), "--out", str(out), "--hidden", "5", "--epochs", "5"
-    done = without_heavy(COMMAND, "train-model", *given, "--element", "torque", "--insert", "MRE-50-40", "--law")
-    assert (done.returncode, done.stderr) == (0, "")
+def test_without_torch_the_law_trains_and_a_network_is_refused_with_the_command_that_brings_it(tmp_path):
+    rows, out = tmp_path / "rows.csv", tmp_path / "m.safetensors"
+    rows.write_text(GOOD)
+    refused = "tormag-lab train-model: torch is not installed: pip install 'tormag-lab[all]'\n"
+    for more, ends in ((), (2, refused)), (("--law",), (0, "")):
+        done = without_heavy(COMMAND, *TRAIN, str(rows), "--out", str(out), *more)
+        assert (done.returncode, done.stderr) == ends
     assert "law_exponent" in load_model(out, element="torque", insert="MRE-50-40").metadata.metrics
 
 

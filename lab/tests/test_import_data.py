@@ -32,8 +32,6 @@ def renamed(names: dict[str, str], **factors: float) -> dict[str, np.ndarray]:
 
 
 USUAL = {"x": "position_mm", "rate": "rate_mm_s", "field": "field_mT", "force": "force_N"}
-SIGNED = measured() | {"force": measured()["force"] * np.sign(measured()["rate"])}
-WITH_OUTLIER = measured() | {"force": measured()["force"] + 4.0 * (np.arange(600) == 77)}
 GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
     "our own": (text(renamed(USUAL)), (), "force_N as it was"),
     "another order": (text(renamed(dict(reversed(USUAL.items())))), (), "as it was"),
@@ -59,7 +57,11 @@ GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
     "decimal commas": (text(renamed(USUAL), ";", ","), (), "as it was"),
     "tabs, comments, a preamble": ("# bench 3\nSpecimen\tA\tB\tC\n" + text(renamed(USUAL), "\t"), (), "as it was"),
     "pulled the other way": (text(renamed(USUAL, force=-1.0)), (), "turned round"),
-    "signed by the motion": (text({USUAL[name]: SIGNED[name] for name in USUAL}), (), "it had the rate's sign"),
+    "signed by the motion": (
+        text(renamed(USUAL) | {"force_N": measured()["force"] * np.sign(measured()["rate"])}),
+        (),
+        "it had the rate's sign",
+    ),
     "no rate": (
         text(renamed({"time": "t_s", "x": "x_mm", "field": "field_mT", "force": "force_N"})),
         (),
@@ -83,7 +85,11 @@ GOOD: dict[str, tuple[str, tuple[str, ...], str]] = {
         (),
         "over time_s",
     ),
-    "an outlier": (text({USUAL[name]: WITH_OUTLIER[name] for name in USUAL}), (), "as it was"),
+    "an outlier": (
+        text(renamed(USUAL) | {"force_N": measured()["force"] + 4.0 * (np.arange(600) == 77)}),
+        (),
+        "as it was",
+    ),
     "rows twice, and one with a hole": (
         text(renamed(USUAL)) + text(renamed(USUAL)).partition("\n")[2] + "1,1,,1\n",
         (),
@@ -162,12 +168,6 @@ def test_what_cannot_be_told_is_refused_with_the_cause(case: str, tmp_path: Path
     assert not out.exists()
 
 
-def imported(tmp_path: Path, content: bytes) -> tuple[int, Path]:
-    (tmp_path / "given.csv").write_bytes(content)
-    out = tmp_path / "rows.csv"
-    return main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), "--json"]), out
-
-
 @pytest.mark.parametrize("has_rate", [True, False])
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 0.8])
 def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: float, tmp_path: Path, capsys) -> None:
@@ -176,8 +176,9 @@ def test_no_row_changes_its_sign_at_a_hundred_turns(has_rate: bool, offset: floa
     noise = np.random.default_rng(5).normal(0.0, 0.01, 4_000)
     columns = {"t_s": 0.01 * step, "force_N": -way * (1.0 + 0.001 * step), "field_mT": 100.0 + step % 7}
     columns |= {"v_mm_s": 25.0 * way + noise} if has_rate else {"x_mm": -10.0 * np.abs(step / 40.0 % 2.0 - 1.0)}
-    code, out = imported(tmp_path, text(columns).encode())
-    assert code == 0
+    (tmp_path / "given.csv").write_text(text(columns))
+    out = tmp_path / "rows.csv"
+    assert main(["import-data", str(tmp_path / "given.csv"), "--cip", "40", "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["left_out"] == {"missing": 0, "duplicate": 0, "outlier": 0}
     assert read_csv(out).force_N == pytest.approx(1.0 + 0.001 * step, rel=1e-4)
 

@@ -1,8 +1,6 @@
 """The subcommands of `benchmark`: their keys, their arithmetic, figures of no machine in particular."""
 
 import argparse
-import contextlib
-import io
 import json
 import math
 import os
@@ -31,10 +29,7 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def result():
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        assert benchmark.main(["inverse", "--quick", "--json"]) == 0
-    return json.loads(printed.getvalue())
+    return inverse.measure(argparse.Namespace(quick=True))
 
 
 def rows(result, name, hidden=50):
@@ -72,15 +67,6 @@ def test_a_scene_gets_a_search_that_is_measured_and_exact_enough(result):
     for chosen in result["chosen"].values():
         assert chosen["solver_force_max_N"] <= 0.1 * chosen["tolerance_rms_N"]
         assert any(row["name"] == chosen["name"] for row in result["variants"])
-
-
-def test_the_roots_that_judge_are_roots():
-    plant = load_plant("sample_1")
-    model = inverse.trained(inverse.training_data(plant, 600, seed=1), hidden=8, epochs=5)
-    along = inverse.course(plant, 50)
-    for (displacement, rate, force), roots in zip(along.rows(), inverse.network_roots_mT(model, along), strict=True):
-        for root in roots.tolist():
-            assert model.predict_one(displacement, rate, root, inverse.CIP_PERCENT) == pytest.approx(force, abs=1e-9)
 
 
 def test_the_plant_of_the_workload_is_the_plant():
@@ -201,8 +187,9 @@ def test_stages_add_up_to_the_whole() -> None:
     assert (result["setpoints"], result["seen"], len(result["stages_us"])) == (3, 2, 2)
 
 
-def test_virtual_time_is_measured() -> None:
-    found = virtual_time.measure(argparse.Namespace(seconds=0.2))["interpreted"]
+def test_virtual_time_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark.main(["virtual-time", "--seconds", "0.2", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["interpreted"]
     assert found.keys() == virtual_time.LOOPS.keys()
     assert min(found.values()) > 0.0
     stretches = {"interpreted": {"whole_core": [90.0, 200.0, 900.0], "position_loop": [125.0]}}

@@ -149,8 +149,7 @@ def test_the_readmes_sample_has_the_lines_that_are_printed(capsys):
     ("show_", "verdict", "exit_code"),
     [(shown(), MET, 0), (aborted("MEASUREMENT_STALE", STALLED), HOST, 3)],
 )
-def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_code, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
+def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_code, capsys):
     found, sentence = demo.judge(SCENE, show_)
     assert found is verdict
     ordered = {"torch": show_, "thesis": aborted("PLAN_FAILED", QUIET)}  # which decide nothing
@@ -167,8 +166,7 @@ def undrawn(monkeypatch) -> None:
     monkeypatch.setattr(pictures, "show_picture", Mock())
 
 
-def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, monkeypatch, tmp_path, undrawn):
-    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
+def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, undrawn):
     early = aborted("MEASUREMENT_STALE", QUIET)
     for verdict in (MET, HOST):
         assert demo.conclude(SCENE, early, shown(), dict(list(rehearsals().items())[1:]), {}, verdict, "") == 1
@@ -183,10 +181,11 @@ def test_every_case_of_the_demo_is_played(case: Case) -> None:
     assert len(done.rendered_N) > 250
 
 
-def truth(late_ms: int = 150, most_mm: float = 4.0, waiting_N: float = 0.9) -> np.ndarray:
+def touched(late_ms: int = 150) -> list[Touch]:
+    waiting_N, columns = 0.9, ("handle_mm", "handle_mm_s", "kinetic_N", "force_N")
     lasts = round(1e3 * live_touch.begins_s(1)) - round(1e3 * live_touch.begins_s(0))
-    rows = np.zeros(round(1e3 * live_touch.begins_s(3)), [(name, float) for name in ROWS])
-    pushed_mm = np.minimum(0.02 * np.arange(lasts), live_touch.WALL_MM + most_mm)
+    rows = np.zeros(round(1e3 * live_touch.begins_s(3)), [(name, float) for name in columns])
+    pushed_mm = np.minimum(0.02 * np.arange(lasts), live_touch.WALL_MM + 4.0)
     wall_N = live_touch.WALL_N_MM * np.maximum(pushed_mm - live_touch.WALL_MM, 0.0)
     rows["handle_mm"], rows["kinetic_N"] = 1.5, waiting_N
     for push in range(3):
@@ -194,19 +193,13 @@ def truth(late_ms: int = 150, most_mm: float = 4.0, waiting_N: float = 0.9) -> n
         rows["handle_mm"][first : first + lasts] += pushed_mm
         rows["kinetic_N"][first + late_ms : first + lasts] = np.maximum(wall_N[: lasts - late_ms], waiting_N)
     rows["force_N"] = rows["kinetic_N"]
-    return rows
-
-
-ROWS = ("handle_mm", "handle_mm_s", "kinetic_N", "force_N")
-BOUNDS = live_touch.bounds
-
-
-def touched(late_ms: int = 150) -> list[Touch]:
-    return live_touch.touches(truth(late_ms), (0, 1, 2))
+    return live_touch.touches(rows, (0, 1, 2))
 
 
 @pytest.fixture(autouse=True)
-def _bounds(monkeypatch) -> None:
+def _bounds(monkeypatch, tmp_path) -> None:
+    """Bounds that are made up, and a folder of the test's own for what is written."""
+    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     for module in (demo, pictures):
         monkeypatch.setattr(module, "bounds", lambda: touched(100))
 
@@ -251,7 +244,7 @@ def test_the_hands_lines_are_those_of_the_readme_and_its_picture_is_drawn(tmp_pa
 
 
 def test_each_touch_of_the_wall_is_felt_near_its_own_bound_and_never_before_it() -> None:
-    runs, least = live_touch.in_virtual_time(live_touch.controller), BOUNDS()
+    runs, least = live_touch.in_virtual_time(live_touch.controller), live_touch.bounds()
     told = [live_touch.figures(*each) for each in zip(runs, least, strict=True)]
     for each in told:
         assert -3.0 <= each["felt_later_ms"] - each["bound_later_ms"] < 60.0
@@ -275,10 +268,9 @@ def test_a_wall_that_is_never_felt_is_told_as_that() -> None:
     ]
 
 
-def test_a_fault_of_the_hands_show_is_told_as_the_pulses_and_decides_nothing(monkeypatch, tmp_path, undrawn) -> None:
+def test_a_fault_of_the_hands_show_is_told_as_the_pulses_and_decides_nothing(tmp_path, undrawn) -> None:
     early = aborted("MEASUREMENT_STALE", STALLED)
     sentence = demo.judge(SCENE, early)[1]
     assert demo.touch_told(SCENE, early) == [sentence]
-    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     assert demo.conclude(SCENE, early, shown(), rehearsals(), {}, MET, "") == 0
     assert not (tmp_path / "touch.png").exists()

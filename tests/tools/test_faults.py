@@ -6,7 +6,7 @@ from judge.faults import OPEN_MM
 from judge.injections import CAN, MATRIX, OPENS, SERIAL, Injection
 
 from tormagd.scenes.scene import load_scene
-from tormagd.simulation.parameters import PlantParameters, load_plant, standing
+from tormagd.simulation.parameters import load_plant, standing
 
 NAMED = {item.name: item for item in MATRIX}
 LOSING = (
@@ -66,11 +66,7 @@ JUDGED_S = 1.5
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """The device was left open, and homes within 1.4 s; two seconds later it follows a force."""
-
-    def left_open(name: str) -> PlantParameters:
-        return standing(load_plant(name), 47.0, 46.5)
-
-    monkeypatch.setattr("judge.rig.load_plant", left_open)
+    monkeypatch.setattr("judge.rig.load_plant", lambda name: standing(load_plant(name), 47.0, 46.5))
     monkeypatch.setattr(faults, "INJECTED_S", 3.3)
     monkeypatch.setattr(faults, "USUAL_S", 0.6)
 

@@ -95,25 +95,13 @@ def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
     return Dataset(np.column_stack((displacement, rate, field, np.full(rows, CIP_PERCENT))), force)
 
 
-def trained(data: Dataset, hidden: int, epochs: int) -> ForceModel:
-    model, _ = fit_model(
-        *data.split(0.3, 0),
-        element=Element.TORQUE,
-        inserts=(INSERT.name,),
-        data_sha256=data.sha256(),
-        created=datetime.date(2024, 1, 1),
-        hidden=hidden,
-        epochs=epochs,
-    )
-    return model
-
-
 def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
     """Return for each solve every field in range at which the network gives the force."""
     grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
     found: list[Array] = []
     for displacement, rate, force in along.rows():
-        is_over = _network(model, displacement, rate, grid) >= force
+        features = np.column_stack(np.broadcast_arrays(displacement, rate, grid, CIP_PERCENT))
+        is_over = model.predict(features) >= force
         begins = np.flatnonzero(is_over[1:] != is_over[:-1]).tolist()
         of_solve = model, displacement, rate, force
         roots = [brentq(_excess_N, grid[place], grid[place + 1], args=of_solve, xtol=1e-10) for place in begins]
@@ -123,11 +111,6 @@ def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
 
 def _excess_N(field_mT: float, model: ForceModel, displacement_mm: float, rate_mm_s: float, force_N: float) -> float:
     return model.predict_one(displacement_mm, rate_mm_s, field_mT, CIP_PERCENT) - force_N
-
-
-def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields_mT: Array) -> Array:
-    of_all = [np.full(len(fields_mT), value) for value in (displacement_mm, rate_mm_s, CIP_PERCENT)]
-    return model.predict(np.column_stack((*of_all[:2], fields_mT, of_all[2])))
 
 
 USUAL_HIDDEN = 50
@@ -218,7 +201,18 @@ class Bench:
         self.course = course(self.plant, effort.course)
         data = training_data(self.plant, effort.training_rows, seed=1)
         hidden = tqdm(effort.hidden, desc="networks", disable=None)
-        self.models = {size: trained(data, size, effort.epochs) for size in hidden}
+        self.models = {
+            size: fit_model(
+                *data.split(0.3, 0),
+                element=Element.TORQUE,
+                inserts=(INSERT.name,),
+                data_sha256=data.sha256(),
+                created=datetime.date(2024, 1, 1),
+                hidden=size,
+                epochs=effort.epochs,
+            )[0]
+            for size in hidden
+        }
         self.roots = {size: network_roots_mT(model, self.course) for size, model in self.models.items()}
 
     def sweep(self) -> tuple[list[dict[str, Any]], list[str]]:

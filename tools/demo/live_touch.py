@@ -146,13 +146,10 @@ def bounds() -> list[Touch]:
 
 def in_virtual_time(begun: Callable[[Core], tuple[Plant, Callable[[TimedSetpoint | None], object]]]) -> list[Touch]:
     """Return the touches of what `begun` makes of a scene's core: a plant, and what a setpoint does for a tick."""
-    first, second = (played(*begun(core)) for core in cores())
-    return [*touches(first, (0, 1)), touches(second, (0, 1))[1]]
-
-
-def cores() -> list[Core]:
     name = str(SCENE)
-    return [core_with(name=name), core_with(load_scene(name).force.standby_N, name)]
+    cores = core_with(name=name), core_with(load_scene(name).force.standby_N, name)
+    first, second = (played(*begun(core)) for core in cores)
+    return [*touches(first, (0, 1)), touches(second, (0, 1))[1]]
 
 
 def played(plant: Plant, advance: Callable[[TimedSetpoint | None], object]) -> Any:

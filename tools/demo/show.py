@@ -213,12 +213,12 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
     watched.end()
     truth = told_truth()
     try:
-        spacings_s = np.diff(between(ticks(), start_s, end_s))
+        moments_s = [tick["monotonic_s"] for tick in ticks() if start_s <= tick["monotonic_s"] <= end_s]
     except RecordingError as error:
         raise unreadable(error) from error
     axis = (truth["t_ns"] - answer["result"]["start_ns"]) * 1e-9
     inside = (axis >= times_s[0]) & (axis <= times_s[-1])
-    if len(spacings_s) == 0 or not inside.any():
+    if len(moments_s) < 2 or not inside.any():
         raise ShowError("nothing was recorded", f"look at the logs in {RUN_DIR}", is_of_time=True)
     first, last = before["rates"]["control"], after["rates"]["control"]
     runs, merged = last["runs"] - first["runs"], last["merged"] - first["merged"]
@@ -231,7 +231,7 @@ def play(watched: HostWatch, times_s: Array, forces_N: Array, scene: str, plant:
         limits=limits,
         exit_codes=exit_codes,
         kept=runs / max(runs + merged, 1),
-        worst_stall_ms=float(spacings_s.max()) * 1e3,
+        worst_stall_ms=float(np.diff(moments_s).max()) * 1e3,
         host=watched.between(start_s, end_s),
         core_share=core_share,
         plant=Path(plant).stem.replace("_", " "),
@@ -258,11 +258,6 @@ def ticks() -> list[Tick]:
     seen: list[Seen] = []
     read_recording(RECORDING, Tick, seen.append)
     return [each.message for each in seen if each.is_tick and "monotonic_s" in each.message]
-
-
-def between(known: list[Tick], start_s: float, end_s: float) -> Array:
-    moments_s = np.array([tick["monotonic_s"] for tick in known])
-    return moments_s[(moments_s >= start_s) & (moments_s <= end_s)]
 
 
 def early_end(seen_s: float) -> float:

@@ -9,7 +9,7 @@ and 3 and draws from 40 on only judge. The second plant has another structure; i
 import argparse
 import math
 from collections.abc import Callable, Iterable, Iterator
-from itertools import product, starmap
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -190,7 +190,10 @@ def measure(options: argparse.Namespace) -> Json:
         "second": {name: figure for name, figure in worst(second).items() if name != "peak_N"},
         "low_holds": [f"{name} at {force} N: {', '.join(wrong)}" for name, force, wrong in faults if wrong],
         "draws": DRAWS,
-        "rows": list(starmap(row, every)),
+        "rows": [
+            case._asdict() | {name: of[name] for name in ("over_N", "under_N", "peak_N", "limits")}
+            for case, of in every
+        ],
     }
     if options.picture is not None:
         picture(options.picture, result, found)
@@ -217,10 +220,6 @@ def settled(found: list[tuple[Case, Json]]) -> list[tuple[float, float, float]]:
 
 def missed(result: Json) -> list[str]:
     return [f"{name} = {result[name]:.3f}: allowed is {most}" for name, most in BOUNDS.items() if result[name] > most]
-
-
-def row(case: Case, of: Json) -> Json:
-    return case._asdict() | {name: of[name] for name in ("over_N", "under_N", "peak_N", "limits")}
 
 
 def picture(path: Path, result: Json, found: list[tuple[Case, Json]]) -> None:

@@ -40,10 +40,6 @@ MAX_CLOSED_MM = 3.0
 REFUSED_MS = 100.0
 
 
-Cell = Json
-"One row of the matrix. A time is null if it did not come to that within 6 s."
-
-
 class Watch:
     def __init__(self, rig: Rig, usual: dict[str, None], *, is_driven: bool) -> None:
         loop = rig.loop
@@ -93,7 +89,8 @@ class Watch:
         self._refusal = f"{error.code}: {error.message.partition(': ')[2]}"
         self._note("noticed", True)
 
-    def cell(self, injection: Injection, bus: str) -> Cell:
+    def cell(self, injection: Injection, bus: str) -> Json:
+        """Return a row of the matrix. A time is null if it did not come to that within 6 s."""
         loop = self._loop
         state = loop.stepper.safety.operating_state
         mode = loop.simulated.firmware.mode.name
@@ -216,7 +213,7 @@ def shown(figures: Json) -> Iterator[str]:
 
 def inject(
     injection: Injection, plant: str, bus: str = SERIAL, watched_s: float = WATCHED_S, boot: FirmwareKind = Firmware
-) -> tuple[Rig, Cell]:
+) -> tuple[Rig, Json]:
     rig, watch = (spoiled if injection.is_driven else _begun)(injection, plant, bus, boot)
     for sample in rig.run(watched_s):
         watch.see(sample)
@@ -259,7 +256,7 @@ def _is_taken(rig: Rig, watch: Watch, command: str) -> bool:
     return True
 
 
-def recover(injection: Injection, rig: Rig, cell: Cell) -> Cell:
+def recover(injection: Injection, rig: Rig, cell: Json) -> Json:
     tried, is_held_back = "", True
     if not injection.passes and not rig.is_dead:
         tried, is_held_back = _before(rig, injection)

@@ -114,7 +114,6 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float,
     """Play what is published for so long, or until a fault; rows count from `lead_s` after `start_s`."""
     rows: list[tuple[float, ...]] = []
     held: Counter[str] = Counter()
-    faults: tuple[str, ...] = ()
     asked_N: list[float] = []
 
     def newest(now_s: float) -> TimedSetpoint | None:
@@ -128,10 +127,10 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float,
         if since_s >= 0.0:
             rows.append((since_s, asked_N[-1], truth.force_N, truth.handle_mm, truth.handle_mm_s))
             held.update({str(limit) for limit in (*sample.plan.limits, *sample.output.limits)})
-        faults = tuple(map(str, sample.safety.faults))
-        if faults:
+        if sample.safety.faults:
             break
     shares = {limit: count / len(rows) for limit, count in sorted(held.items())}
+    faults = tuple(map(str, loop.stepper.safety.faults))
     time_s, asked, rendered, handle, speed = np.array(rows).reshape(-1, 5).T
     return Followed(time_s, asked, rendered, handle, speed, shares, faults, taught(loop).learned())
 

@@ -266,14 +266,10 @@ def carriages() -> Carriages:
 
 
 def driving(stage: Carriages, draw: Draw) -> object:
-    seen, dt_s, planned = measured(draw), elapsed_s(draw), plan(draw)
+    # `Stepper` bounds the time between two ticks
+    seen, dt_s, planned = measured(draw), min(draw.positive(PERIOD_S), LONGEST_S), plan(draw)
     reading = measurement(usual(draw.now_s)).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
     return [stage.update(draw.now_s, dt_s, planned, reading, seen, False), stage.reference, stage.expected]
-
-
-def elapsed_s(draw: Draw) -> float:
-    """Return a time between two ticks, as `Stepper` bounds it."""
-    return min(draw.positive(PERIOD_S), LONGEST_S)
 
 
 def motor(_: object, draw: Draw) -> object:

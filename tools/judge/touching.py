@@ -50,9 +50,7 @@ MASS_KG = 0.15
 
 
 class Case(NamedTuple):
-    """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without.
-    If `is_known`, a law tells the wall before it was met.
-    """
+    """One touch. `hand_N_mm` is the hand's stiffness, `mode` one of force, way, law, with _standby or without."""
 
     device: str
     hand_N_mm: float
@@ -60,8 +58,6 @@ class Case(NamedTuple):
     push_mm_s: float
     round_trip_ms: float
     mode: str
-    is_known: bool = True
-    most_N: float = MAX_N
 
 
 class Touch(NamedTuple):
@@ -91,7 +87,6 @@ class Link:
         self._there: NetworkDelay[float] = NetworkDelay(one_way_s)
         self._back: NetworkDelay[TimedSetpoint] = NetworkDelay(one_way_s)
         self._wall, self._withdraw_N, self._mode = wall, withdraw_N, case.mode
-        self._is_known = case.is_known
         self._tip: tuple[float, float] | None = None
         self._newest: TimedSetpoint | None = None
         self._ticks = 0
@@ -101,18 +96,16 @@ class Link:
         if self._ticks % SETPOINT_TICKS == 0:
             self._there.send(now_s, handle_mm)
         for told in self._there.arrived(now_s):
-            self._tip = max(told, self._tip or told)
+            self._tip = told
         if self._tip is not None and self._ticks % SETPOINT_TICKS == 0:
             self._back.send(now_s, self._setpoint(now_s, self._tip[1]))
         for _, setpoint in self._back.arrived(now_s):
-            if self._newest is None or setpoint.stamp_s > self._newest.stamp_s:
-                self._newest = setpoint
+            self._newest = setpoint
         return self._newest
 
     def _setpoint(self, now_s: float, tip_mm: float) -> TimedSetpoint:
         withdraw_N = None if self._mode.startswith("force") else self._withdraw_N
-        self._is_known = self._is_known or tip_mm > self._wall.place_mm
-        wall = self._wall if self._mode.startswith("law") and self._is_known else None
+        wall = self._wall if self._mode.startswith("law") else None
         return TimedSetpoint(self._wall.force_N(tip_mm), now_s, VALID_S, withdraw_N=withdraw_N, wall=wall)
 
 
@@ -137,17 +130,17 @@ class Scenario:
         self.felt = FeltHand(self._hand, Impedance(MASS_KG, case.hand_N_mm, damping_N_s_mm))
         self.wall = Wall(sum(lasts_s * speed_mm_s for lasts_s, speed_mm_s in LEARNING) + FREE_MM, case.wall_N_mm)
         self._patient = Link(case, self.wall, core.scene.force.least_N)
-        self._start_s = self._turns_s = 0.0
+        self._start_s = self.turns_s = 0.0
         self._rows: list[tuple[float, ...]] = []
         self._limits: set[str] = set()
 
     def begin(self, now_s: float) -> range:
         case = self._case
-        push_s = (FREE_MM + case.most_N / case.wall_N_mm + case.most_N / case.hand_N_mm) / case.push_mm_s
+        push_s = (FREE_MM + MAX_N / case.wall_N_mm + MAX_N / case.hand_N_mm) / case.push_mm_s
         there: Legs = [(push_s, case.push_mm_s), (RESTS_S, 0.0)]
         legs = [*LEARNING, *there, (push_s, -case.push_mm_s), (RESTS_S, 0.0)]
         self._hand.begin(legs, now_s)
-        self._start_s, self._turns_s = now_s, now_s + LEARNT_S + push_s + RESTS_S
+        self._start_s, self.turns_s = now_s, now_s + LEARNT_S + push_s + RESTS_S
         return range(round(sum(lasts_s for lasts_s, _ in legs) / PERIOD_S))
 
     def setpoint(self, now_s: float, truth: Truth) -> TimedSetpoint | None:
@@ -155,10 +148,7 @@ class Scenario:
         sent = self._patient.update(now_s, truth.handle_mm)
         if since_s >= LEARNT_S:
             return sent
-        return TimedSetpoint(LEARNS * self._case.most_N if since_s < LEARNS_FOR_S else 0.0, now_s, VALID_S)
-
-    def pulls(self, truth: Truth) -> bool:
-        return truth.time_s > self._turns_s and truth.force_N < -PULLS_N
+        return TimedSetpoint(LEARNS * MAX_N if since_s < LEARNS_FOR_S else 0.0, now_s, VALID_S)
 
     def see(self, truth: Truth, limits: tuple[Limit, ...] = ()) -> None:
         time_s = truth.time_s - self._start_s - LEARNT_S
@@ -176,15 +166,12 @@ class Scenario:
 def rendered(case: Case, core: Core) -> Touch:
     scenario = Scenario(case, core)
     loop = armed(core, with_insert(device_of(case.device), core.scene.insert.name), scenario.felt)
-    truth = loop.simulated.truth
-    faults: tuple[str, ...] = ()
     for _ in scenario.begin(loop.now_s):
-        sample = loop.tick(scenario.setpoint(loop.now_s, truth))
-        truth, faults = sample.truth, tuple(map(str, sample.safety.faults))
-        scenario.see(truth, (*sample.plan.limits, *sample.output.limits))
-        if faults:
+        sample = loop.tick(scenario.setpoint(loop.now_s, loop.simulated.truth))
+        scenario.see(sample.truth, (*sample.plan.limits, *sample.output.limits))
+        if sample.safety.faults:
             break
-    return scenario.touch(faults)
+    return scenario.touch(tuple(map(str, loop.stepper.safety.faults)))
 
 
 def opened(case: Case, core: Core) -> Touch:
@@ -193,7 +180,7 @@ def opened(case: Case, core: Core) -> Touch:
     plant, has_pulled = loop.simulated.plant, False
     opening_V = min(core.config.motor.supply_V, parameters.electronics.supply_V)
     for _ in scenario.begin(loop.now_s):
-        has_pulled = has_pulled or scenario.pulls(plant.truth)
+        has_pulled = has_pulled or (plant.time_s > scenario.turns_s and plant.truth.force_N < -PULLS_N)
         if has_pulled:
             volts = opening_V if plant.gap_mm < core.scene.insert.gap_open_mm else 0.0
             plant.drive(volts, volts)
