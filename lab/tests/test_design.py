@@ -39,7 +39,7 @@ from tormag_lab.thesis.table_2_5 import judge, rank
 from tormag_lab.thesis.values import TABLE_2_5, ForceTask
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.element.physics.force import Elastomer
+from tormagd.element.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.element.physics.inserts import INSERTS
 
 BRAKE = Brake.as_built(Elastomer(300e3, 3.8, 0.2))
@@ -277,6 +277,13 @@ def test_the_registrys_friction_is_the_least_squares_of_the_relative_errors() ->
         ratios = np.array([frictionless_range_N(item, LAWS[0]) / item.force_range.measured_N for item in matrix])
         least = ratios.sum() / (ratios**2).sum()
         assert {item.elastomer.friction_coefficient for item in matrix} == {round(float(least), 3)}
+
+
+def test_exponent_one_is_the_force_law_itself() -> None:
+    item, law = INSERTS["MRE-50-20"], PowerFieldLaw()
+    forces = brake_force_N(law.radial_moment_Tm(np.array([45.0, 95.0])), item.elastomer, TORMAG)
+    friction = item.elastomer.friction_coefficient
+    assert friction * frictionless_range_N(item, law) == pytest.approx(forces[0] - forces[1], rel=1e-12)
 
 
 FOUND = table_2_5.table_2_5()
