@@ -58,10 +58,10 @@ def meet(device: Device) -> None:
 
 def test_hosts_come_and_go_on_the_simulators_bus_and_the_truth_is_kept(tmp_path: Path) -> None:
     truth, simulator = tmp_path / "truth.csv", ("-m", "tormagd.simulation", "--can", "--seed", "3", "--truth")
-    is_granted = subprocess.run(["chrt", "--fifo", "1", "true"], capture_output=True).returncode == 0
     with contextlib.ExitStack() as stack:
         process = begun(stack, tmp_path / "log", *simulator, str(truth))
         path = first_line(process)
+        is_granted = subprocess.run(["chrt", "--fifo", "1", "true"], capture_output=True).returncode == 0
         assert os.sched_getscheduler(process.pid) & os.SCHED_FIFO == is_granted * os.SCHED_FIFO
         assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
         for _ in range(2):
