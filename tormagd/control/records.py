@@ -103,7 +103,7 @@ class TimedSetpoint(Value):
             size += abs(wall.place_mm) + abs(wall.stiffness_N_mm) + abs(wall.friction_N)
             size += abs(wall.place_sd_mm) + abs(wall.stiffness_share)
         if preview_N:
-            size += abs(sum(preview_N))
+            size += sum(map(abs, preview_N))
             if not _LEAST_STEP_S <= self.preview_dt_s <= _LARGEST:
                 raise DomainError("preview_dt_s", self.preview_dt_s, f"at least {_LEAST_STEP_S:g} s")
         if not size <= _LARGEST:

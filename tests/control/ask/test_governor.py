@@ -297,10 +297,18 @@ def test_what_is_too_fast_is_missed_before_and_after() -> None:
     assert told(step_N, 0.88, ahead_s=0.05).force_N == pytest.approx(1.2)
 
 
-@pytest.mark.parametrize("spacing_s", [0.0, 5e-324, 9e-5, math.nan])
-def test_a_preview_without_a_measure_of_its_slope_is_refused(spacing_s: float) -> None:
-    with pytest.raises(DomainError, match=r"^preview_dt_s = .* is not allowed: at least 0\.0001 s$"):
-        TimedSetpoint(1.0, 1.0, VALID_S, preview_N=(1.6,), preview_dt_s=spacing_s).require_numbers()
+@pytest.mark.parametrize(
+    ("preview_N", "spacing_s", "named"),
+    [
+        *[((1.6,), spacing_s, "preview_dt_s = .*: at least 0.0001 s$") for spacing_s in (0.0, 5e-324, 9e-5, math.nan)],
+        ((1.6, 1e308, -1e308), 0.01, "preview_N = 1e.308"),
+    ],
+)
+def test_a_preview_without_a_measure_of_its_slope_is_refused(
+    preview_N: tuple[float, ...], spacing_s: float, named: str
+) -> None:
+    with pytest.raises(DomainError, match=named):
+        TimedSetpoint(1.0, 1.0, VALID_S, preview_N=preview_N, preview_dt_s=spacing_s).require_numbers()
 
 
 @given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=60), st.floats(1e-4, 1.0), st.floats(0.0, 0.03))
