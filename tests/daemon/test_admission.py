@@ -297,3 +297,11 @@ def test_those_that_say_nothing_keep_nobody_out_and_cut_nobody_off(
         assert rig.newest() == ("control", "too many connections", "")
     assert caplog.text.count("127.0.0.1 makes more connections to control than the 5") == 1
     rig.until(lambda: rig.endpoint.report().connections["control"] == len(consoles))
+
+
+def test_a_descriptor_that_is_no_connection_any_more_stays_as_it_is() -> None:
+    with Path(__file__).open(encoding="utf-8") as other:
+        before = sorted(Path("/proc/self/fd").iterdir())
+        assert admission._address(other.fileno()) == ""
+        admission._end(other.fileno(), "")
+        assert sorted(Path("/proc/self/fd").iterdir()) == before

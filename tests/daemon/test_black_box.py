@@ -161,6 +161,9 @@ def test_requests_take_no_place_of_a_fault(rig: Rig, monkeypatch: pytest.MonkeyP
         if number % 50 == 0:
             rig.box.write("SKEW", 2.0, {})
     assert [said.reason for said in rig.heard() if isinstance(said, Write)].count("SKEW") == 20
+    with pytest.raises(RefusedError, match="28 black boxes"):  # of a keeper that never answers
+        rig.box.write("SKEW", 2.0, {})
+    assert "28 black boxes" in rig.box.report().refusal
     rig.its.send(msgspec.msgpack.encode(Written("19700101T000000.000Z-REQUEST.mcap")))
     rig.box.look()
     rig.box.write("REQUEST", 0.0, {})

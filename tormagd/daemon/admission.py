@@ -13,7 +13,6 @@ connection is accepted each time that the door is opened. What epoll has to be t
 import contextlib
 import ctypes
 import logging
-import os
 import platform
 import re
 import select
@@ -21,7 +20,7 @@ import socket
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -271,7 +270,7 @@ class Admission:
 
 def _address(descriptor: int) -> str:
     """Return the peer of a connection as libzmq names it: its IP address, or `localhost:USER:GROUP:PROCESS`."""
-    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
         if connection.family == socket.AF_UNIX:
             made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size)
             process, user, group = CREDENTIALS.unpack(made)
@@ -282,10 +281,20 @@ def _address(descriptor: int) -> str:
 
 def _end(descriptor: int, address: str) -> None:
     """Shut down the connection `descriptor`, unless its peer is no longer `address`: descriptors are used again."""
-    with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
         if _address(descriptor) == address:
             connection.shutdown(socket.SHUT_RDWR)
             connection.recv(1_048_576, socket.MSG_DONTWAIT)
+
+
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """Yield `descriptor` as a socket, which stays open."""
+    connection = socket.socket(fileno=descriptor)
+    try:
+        yield connection
+    finally:
+        connection.detach()
 
 
 def door(listening: int) -> tuple[int, int, int]:

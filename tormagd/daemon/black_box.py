@@ -48,8 +48,8 @@ AFTER_FAULT_S = 2.0
 "How long a black box goes on after its fault: the gap opens."
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
-MAX_REQUESTED = 8
-"Boxes that somebody asked for and that are still to be written, at most."
+MAX_REQUESTED, MAX_UNWRITTEN = 8, 28
+"Boxes that somebody asked for and that are still to be written, at most; and all that are."
 
 log = logging.getLogger(__name__)
 
@@ -144,10 +144,14 @@ class BlackBox:
                 f"there is no black box: {self._refusal}",
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
-        if reason == REQUEST and [each.reason for each in self._unwritten.values()].count(REQUEST) >= MAX_REQUESTED:
+        waiting = [each.reason for each in self._unwritten.values()]
+        if reason == REQUEST and waiting.count(REQUEST) >= MAX_REQUESTED:
             raise RefusedError(
                 "busy", f"{MAX_REQUESTED} black boxes are still to be written", "ask again in a few seconds"
             )
+        if len(waiting) >= MAX_UNWRITTEN:
+            self._refusal = f"{MAX_UNWRITTEN} black boxes are still to be written"
+            raise RefusedError("busy", self._refusal, "ask again in a few seconds")
         path = box_path(str(self._folder), reason)
         self._refusal = ""
         self._unwritten[path.name] = asked = Write(str(path), reason, after_s, self.begun.header | details)
