@@ -17,7 +17,7 @@ from virtual_port import VirtualPort
 
 from firmware_protocol.c.build import BuildError, Target, build, debian_tool
 from firmware_protocol.conformance.check import run
-from firmware_protocol.conformance.examination import checks_on
+from firmware_protocol.conformance.examination import CHECKS
 from firmware_protocol.conformance.host import Host
 from firmware_protocol.conformance.line import SerialLine
 from tormag_lab.human_pulse import pulse_profile
@@ -90,7 +90,7 @@ def is_passed(boot: FirmwareKind) -> bool:
     port = VirtualPort(VirtualDevice(load_plant("sample_1"), SteadyHand(), boot=boot))
     line, messages = SerialLine(port), port.device.messages
     host = Host(line, reset=lambda how: messages._reset(port.now_s()))
-    results = run(host, checks_on(line), lambda result: print(f"{result.check.name}: {result.seen}", flush=True))
+    results = run(host, CHECKS, lambda result: print(f"{result.check.name}: {result.seen}", flush=True))
     failed = [result.check.name for result in results if result.passed is False]
     print(f"{len(results)} checks, {len(failed)} failed: {', '.join(failed) or 'none'}")
     return not failed

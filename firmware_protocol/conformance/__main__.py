@@ -13,7 +13,7 @@ from typing import Any, Final, TextIO
 
 from firmware_protocol.codec import Identity
 from firmware_protocol.conformance.check import Check, Result, run
-from firmware_protocol.conformance.examination import CHECKS, checks_on, left_open
+from firmware_protocol.conformance.examination import CHECKS, left_open
 from firmware_protocol.conformance.host import OPENING_MM_S, STROKE_MM, Host
 from firmware_protocol.conformance.line import Line
 from firmware_protocol.conformance.ports import open_line
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         command.exit(USAGE, f"{command.prog}: {error}\n")
     with contextlib.closing(line.port):
-        checks = [one for one in checks_on(line) if not options.only or one.name in options.only or one is left_open]
+        checks = [one for one in CHECKS if not options.only or one.name in options.only or one is left_open]
         return PASSED if _examined(line, checks, options) else FAILED
 
 

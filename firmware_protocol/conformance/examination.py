@@ -1,6 +1,5 @@
 """All checks in their order, first those that move nothing; and those that need a reset, or a bench."""
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
@@ -20,7 +19,6 @@ from firmware_protocol.conformance.host import (
     shown,
     unless,
 )
-from firmware_protocol.conformance.line import Line, SerialLine
 
 FAR_INSIDE_MM, ASKEW_MM, BOOT_S = 10.0, 1.5, 10.0
 
@@ -126,8 +124,3 @@ CHECKS: Final = (
     *BY_HAND,
     left_open,
 )
-
-
-def checks_on(line: Line) -> Sequence[Check]:
-    """Return all checks but that of a serial line's frames on a bus."""
-    return [one for one in CHECKS if isinstance(line, SerialLine) or one is not telling.frames_as_they_come]

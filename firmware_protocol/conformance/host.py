@@ -121,6 +121,8 @@ class Host:
         self.nonces: list[int] = []
         """The one Status showed last, and those sent since."""
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
+        self._ages_s = deque[float](maxlen=round(STATUS_S / PERIOD_S))
+        """How old the newest answers were."""
         self._opens = 0
         self.drives = self.states = self.senses = 0
         """How many Drives that must be answered were sent, and how many State came."""
@@ -305,6 +307,7 @@ class Host:
             )
             self.states += 1
             asked = self._asked.popleft() if self._asked else (self.drive_s, math.nan, math.nan)
+            self._ages_s.append(heard.time_s - asked[0])
             self._unpaired.append((*asked, heard.time_s, message.device_time_s, message.counter, *places(message)))
         self.senses += isinstance(message, Sense)
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
@@ -328,7 +331,8 @@ class Host:
             and not is_same
             and 0 < self._opens < BRAKED,
             "drive_counter not of the last Drive": len(self.counters) == LATE_DRIVES
-            and after.drive_counter not in recent,
+            and after.drive_counter not in recent
+            and max(self._ages_s, default=0.0) < STALLED_S,
             "nonce 0 again: a reset": before.command_nonce > after.command_nonce == 0,
             "a nonce not sent since the one before": Status in self.newest and after.command_nonce not in self.nonces,
             f"{before.mode.name} then {after.mode.name}": after.mode.name in NEVER_FOLLOWS.get(before.mode.name, ()),
