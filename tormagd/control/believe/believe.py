@@ -75,12 +75,6 @@ class Believe:
 
     fit: DeviceFit
     "Scale and offset of the device at speed, with nothing relaxed."
-    slow: SlowFriction
-    zero: SensorZero
-    sensor: SensorTrust
-    ripple: Ripple
-    carriages: CarriageLag
-    handle: HandleWatch
     read: int
     "Number of the newest measurement that taught; -1 before the first."
     read_s: float
@@ -104,7 +98,6 @@ class Believe:
         self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self._slides: Final = nominal.contact.slides
         self._has_creep: Final = scene.terms.creep and nominal.contact.slides
         self.forget()
 
@@ -142,7 +135,7 @@ class Believe:
             self.memory.update(now_s, measured)
             if measured.is_homed:
                 model_N = self.memory.force_N(self._nominal.now(measured))
-                slid_N = self.handle.update(measured, model_N) if self._slides else model_N
+                slid_N = self.handle.update(measured, model_N) if self._nominal.contact.slides else model_N
                 self._hear(now_s, measured, model_N, slid_N)
                 if self._nominal.contact.is_known(measured):
                     predicted_N = self.fit.force_N(slid_N) * self.slow.factor_at(abs(measured.handle.rate_mm_s))
@@ -196,7 +189,8 @@ class Believe:
         is_low = reading_N < self.fit.force_N(model_N) - STUCK_N
         is_stuck = is_low and abs(measured.handle.quick_mm_s) < STOPPING_MM_S
         if is_mobilised and not (
-            self._slides and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
+            self._nominal.contact.slides
+            and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
         ):
             self._hear_at_speed(now_s, measured, reading_N, slid_N * self.slow.factor_at(rate_mm_s), dt_s)
         else:
@@ -249,7 +243,7 @@ class Believe:
             return
         anchor_N = max(sensor.anchor.force_N(model_N), SLACK_N)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, anchor_N + sensor.off_N, dt_s)
-        if self._slides and Limit.TRIM not in self.limits:
+        if self._nominal.contact.slides and Limit.TRIM not in self.limits:
             self.ripple.update(angle, measured.handle.rate_mm_s, anchor_N, reading_N)
 
     def _unknown_N(self, zero_sd_N: float) -> float:

@@ -44,8 +44,7 @@ class ElementMemory:
         """Begin before the first known gap."""
         self._free: Final = memory.free
         self._added: Final = memory.added
-        self._width_mT: Final = memory.lag_mT
-        self._turn_mT: Final = memory.turn_mT
+        self._memory: Final = memory
         self._nominal: Final = nominal
         self._slides: Final = nominal.contact.slides
         self._field: Final = field
@@ -62,8 +61,8 @@ class ElementMemory:
         change_mT = field_mT - self.field_mT
         if change_mT == 0.0 or self.time_s == math.inf:
             return self.lag_mT
-        side_mT = math.copysign(self._width_mT, change_mT)
-        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
+        side_mT = math.copysign(self._memory.lag_mT, change_mT)
+        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._memory.turn_mT)
 
     def open_N(self) -> float:
         """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed."""

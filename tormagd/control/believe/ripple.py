@@ -33,13 +33,6 @@ STEADY_MM_S: Final = 8.0
 class Ripple:
     """Estimator of the friction's share over the handle's angle."""
 
-    shares: list[float]
-    "At each place, by which share friction is greater than its mean, as far as that is trusted."
-    slopes: list[float]
-    before: list[float]
-    "What the newest pass of each place had left to teach."
-    is_seen: list[bool]
-    "Whether it was passed twice."
     place: int = 0
     "Where the handle is."
     total: float = 0.0
@@ -58,8 +51,13 @@ class Ripple:
     "How many passes one after the other have taught; less than 0 while something settles."
 
     def __init__(self) -> None:
-        self.shares, self.slopes, self.before = [0.0] * PLACES, [0.0] * PLACES, [0.0] * PLACES
+        self.shares = [0.0] * PLACES
+        """At each place, by which share friction is greater than its mean, as far as that is trusted."""
+        self.slopes = [0.0] * PLACES
+        self.before = [0.0] * PLACES
+        """What the newest pass of each place had left to teach."""
         self.is_seen = [False] * PLACES
+        """Whether it was passed twice."""
 
     def share(self, angle: float) -> float:
         """Return by which share the friction at the handle's `angle` is greater than its mean over a turn."""

@@ -42,8 +42,6 @@ LOWEST_SUPPLY: Final = 0.5
 
 _HOMING: Final = DeviceMode.HOMING
 _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
-_RETRACTING: Final = DeviceMode.RETRACTING
-_RETRACT: Final = DeviceRequest.RETRACT
 _FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED)
 
 
@@ -188,7 +186,7 @@ class Opening:
             self.is_watching, self.reported_s = True, measurement.reported_s
             self.left_late_s = self.right_late_s = self.waits_s = 0.0
             self._place(measurement)
-        is_asked = safety.request is _RETRACT and number > self.unheard_request
+        is_asked = safety.request is DeviceRequest.RETRACT and number > self.unheard_request
         by_places = is_placed and not is_blind
         is_late = self._is_late(measurement) if by_places else self._says_so(measurement, is_asked, is_placed)
         self.faults = (Fault.NOT_OPENING,) if is_late else ()
@@ -214,7 +212,7 @@ class Opening:
             self._place(measurement)
         dt_s = min(measurement.reported_s - self.reported_s, STATUS_S)
         self.reported_s = measurement.reported_s
-        opens = measurement.mode is _RETRACTING
+        opens = measurement.mode is DeviceMode.RETRACTING
         shown: int = measurement.faults
         is_told = is_open(measurement, False) or shown & _FAILED != 0 or not (opens or is_asked)
         self.waits_s = 0.0 if is_told else self.waits_s + dt_s
