@@ -14,13 +14,19 @@ from typing import Any, Final, TextIO
 from firmware_protocol.codec import Identity
 from firmware_protocol.conformance.check import Check, Result, run
 from firmware_protocol.conformance.examination import CHECKS, left_open
-from firmware_protocol.conformance.host import OPENING_MM_S, STROKE_MM, Host
+from firmware_protocol.conformance.host import OPENING_MM_S, STROKE_MM, Host, Unmet
 from firmware_protocol.conformance.line import Line
 from firmware_protocol.conformance.ports import open_line
 from firmware_protocol.conformance.rules import RULES
 
 PASSED, FAILED, USAGE = 0, 1, 2
 RESET_S: Final = 30.0
+BOUNDS: Final = {
+    "baud": (300, 100_000_000),
+    "bitrate": (10_000, 8_000_000),
+    "opening_mm_s": (1.0, 1000.0),
+    "stroke_mm": (5.0, 1000.0),
+}
 PAGE: Final = "firmware_protocol/README.md"
 LISTED: Final = "\n".join(
     (
@@ -38,6 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Examine the device on a line, once the user has agreed that its motors move, and print the results."""
     command = parser()
     options = command.parse_args(arguments)
+    for name, (least, most) in BOUNDS.items():
+        if not least <= getattr(options, name) <= most:
+            command.error(f"{name} = {getattr(options, name):g}: allowed is {least:g}..{most:g}")
     if not (options.yes or _is_agreed(options.line)):
         command.exit(USAGE, f"{command.prog}: nothing was sent; say yes, or --yes where nobody can be asked\n")
     try:
@@ -125,8 +134,8 @@ def _reset(command: str, how: str) -> None:
     """Reset the device by the command of `--reset`."""
     try:
         subprocess.run([*shlex.split(command), how], check=True, timeout=RESET_S, stdin=subprocess.DEVNULL)
-    except subprocess.SubprocessError as error:
-        raise OSError(str(error)) from error
+    except (OSError, subprocess.SubprocessError, ValueError) as error:
+        raise Unmet(f"--reset: {error}") from error
 
 
 def _say(text: str, out: TextIO) -> None:
@@ -136,7 +145,7 @@ def _say(text: str, out: TextIO) -> None:
 
 def _is_agreed(line: str) -> bool:
     print(WARNING.format(line=line), "Type yes to go on: ", sep="\n", end="", file=sys.stderr, flush=True)
-    return sys.stdin.isatty() and sys.stdin.readline().strip().lower() == "yes"
+    return sys.stdin is not None and sys.stdin.isatty() and sys.stdin.readline().strip().lower() == "yes"
 
 
 OPTIONS: Final[dict[str, dict[str, Any]]] = {

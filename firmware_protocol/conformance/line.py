@@ -156,13 +156,11 @@ class CanLine:
 
     def receive(self, until_s: float) -> list[Arrival]:
         """Wait until `until_s`, and return the node's frames; note which other nodes are on the bus."""
-        arrivals = []
-        for time_s, identifier, data in self.port.read(until_s):
-            if identifier & 0xF == self._node:
-                arrivals.append((time_s, identifier >> 4, data))
-            else:
-                self._others.add(identifier & 0xF)
-        return arrivals
+        frames = self.port.read(until_s)
+        self._others |= {identifier & 0xF for _, identifier, _ in frames} - {self._node}
+        return [
+            (time_s, identifier >> 4, data) for time_s, identifier, data in frames if identifier & 0xF == self._node
+        ]
 
 
 Line: TypeAlias = SerialLine | CanLine

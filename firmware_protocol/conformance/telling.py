@@ -77,9 +77,10 @@ def columns(host: Host, first: int = 0) -> dict[str, Array]:
     middle_s = 0.5 * (table["asked_s"] + table["arrived_s"])
     table["device_s"] = middle_s - np.unwrap(middle_s - table["device_time_s"], period=TIME_SPAN_S)
     table["handle_mm"] = np.unwrap(table["handle_mm"], period=HANDLE_SPAN_MM)
-    at_s = table["device_s"]
     for name in ("left_mm", "right_mm", "handle_mm"):
-        ways_mm = [way * np.interp(at_s + way * BESIDE_S, at_s, table[name]) for way in (1.0, -1.0)]
+        ways_mm = [
+            way * np.interp(table["device_s"] + way * BESIDE_S, table["device_s"], table[name]) for way in (1.0, -1.0)
+        ]
         table[f"{name}_s"] = sum(ways_mm) / (2.0 * BESIDE_S)
     return table
 

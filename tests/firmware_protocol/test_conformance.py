@@ -1107,7 +1107,7 @@ PLANTED = (
     rogue(
         "currents without sign while homing",
         "plausible_in_each_mode",
-        "home_homes",
+        *(3 * ("home_homes",)),
         "run_drive_off",
         measures=sensed(lambda sense: sense.replaced(left_current_A=abs(sense.left_current_A)), DeviceMode.HOMING),
     ),
@@ -1348,6 +1348,16 @@ def test_a_failed_check_says_what_to_look_at_and_the_exit_code_is_1(
     assert "virtual: device 1, firmware 1.0: 1 of 2 checks passed" in out
 
 
+@pytest.mark.parametrize("reset", ["false", "/nonexistent/tool", "'"])
+def test_a_reset_that_fails_is_told_and_the_gap_is_opened(
+    ran: Callable[..., int], capsys: pytest.CaptureFixture[str], reset: str
+) -> None:
+    assert ran(serial_line(), "--yes", "--only", "warm_reset", "--reset", reset) == 1
+    out = capsys.readouterr().out
+    assert "seen      --reset: " in out
+    assert "ok    left_open" in out
+
+
 def test_nothing_is_sent_before_somebody_agrees(
     monkeypatch: pytest.MonkeyPatch, ran: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -1375,6 +1385,8 @@ def test_nothing_is_sent_before_somebody_agrees(
         ([], "PORT|CHANNEL"),
         (["x", "--node", "16"], "16"),
         (["x", "--only", "clock_runs_off"], "clock_runs_on"),
+        (["x", "--opening-mm-s", "nan"], "opening_mm_s = nan: allowed is 1..1000"),
+        (["x", "--baud", "-5"], "baud = -5: allowed is 300.."),
     ],
 )
 def test_a_wrong_call_says_why_and_exits_with_2(
