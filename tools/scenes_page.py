@@ -44,7 +44,7 @@ HEAD = (
     "| `[finger]` | for a pad instead of the handle: depth and speed of the press; refused alike |\n"
     "| `insert.gap_speed_mm_s` | the gap's greatest speed, if less than the configuration's |\n"
     "| `budget.core_share` | `tormagctl scene check` refuses a scene for which a daemon takes more |\n"
-    "| `budget.delay_ms` | budget from stamp to duty; older setpoints are `SOURCE_LATE` |\n"
+    "| `budget.delay_ms` | budget from stamp to force; older setpoints are `SOURCE_LATE` |\n"
     "| `bandwidth.control_hz`, `inference_hz` | the daemon's rates if its configuration states none, control at "
     "least 500 Hz; slower stated ones are refused |\n"
     "| `[solver]` | the search for the field ([which](guides/scene.md)) |\n"

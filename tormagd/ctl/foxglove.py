@@ -1,4 +1,4 @@
-"""`tormagctl foxglove`: telemetry live in Foxglove, in the two topics that a recording has, served by its own SDK."""
+"""`tormagctl foxglove`: telemetry live in Foxglove, in two topics that a recording has, served by its own SDK."""
 
 import asyncio
 import contextlib

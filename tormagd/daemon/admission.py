@@ -1,4 +1,4 @@
-"""Admission to the sockets: the CURVE keys of guarded endpoints, and the number of connections of an address.
+"""Admission to the sockets: the CURVE keys of guarded endpoints, and the number of connections of an endpoint.
 
 libzmq carries out the handshakes in its own thread. Through ZAP (RFC 27) it asks about every peer that has proved that
 it holds the secret of its key. Through socket monitors it tells of peers that got less far. Both are handled in a slice
@@ -104,7 +104,7 @@ class _Connections:
 
 
 class Admission:
-    """Decides who may connect to the daemon's sockets: by CURVE key, and by the number of connections of an address."""
+    """Decides who may connect to the daemon's sockets: by CURVE key, and by the number of connections there."""
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: KeyRing | None, arrivals: Arrivals) -> None:
         self._keys, self._arrivals = keys, arrivals

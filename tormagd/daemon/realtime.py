@@ -1,6 +1,6 @@
 """What the kernel is asked for: real-time policy, locked memory, processors, no sleep, and the timer of the beat.
 
-A refusal of the first is a warning. The timer is the kernel's, because asyncio's own round to a millisecond.
+All but the timer may be refused. The timer is the kernel's, because asyncio's own round to a millisecond.
 """
 
 import ctypes

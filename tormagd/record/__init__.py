@@ -1,1 +1,1 @@
-"""Recordings: MCAP files of what the daemon published, and pictures of them. Runs outside the daemon's process."""
+"""Recordings and black boxes: the daemon's journal, MCAP files of it, their reader and replay."""

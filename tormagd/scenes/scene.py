@@ -156,7 +156,7 @@ class Insert(Strict, frozen=True):
 
 
 class Solver(Strict, frozen=True):
-    """The field search. "auto" is none where the rate is no term, else Newton's method, the cheapest and most exact."""
+    """The field search. "auto" is none where the rate is no term, `nearest` where force falls, else Newton's method."""
 
     name: str = AUTO
     step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET

@@ -1,1 +1,1 @@
-"""The page of `tormagctl dashboard`: what the daemon does, live, or any moment of a recording."""
+"""What a person looks at: dashboard, report, picture, and the page of a commissioning."""

@@ -1,4 +1,4 @@
-"""Forecast of a force that repeats itself, as a pulse does, where the setpoints bring no preview.
+"""Forecast of a force that repeats itself, as a pulse does, past what the setpoints preview.
 
 The newest stretch of force, as a delay embedding, is compared with those remembered. What followed those tells what
 will follow the newest (analogue forecasting, Lorenz, J. Atmos. Sci. 26, 1969; locally weighted linear regression,

@@ -5,7 +5,7 @@
     update     Kalman filter of z with the error of that half sum; between reversals its variance grows
 
 Friction reverses with the handle and a zero does not. Between reversals nothing separates the zero from the device.
-Where the zero is too uncertain, nothing may be learned from readings.
+From readings that an uncertain zero may explain, nothing is learned.
 """
 
 import math
@@ -22,7 +22,7 @@ DRIFT_N2_S: Final = 0.05**2 / WANDERS_S
 MAX_SD_N: Final = 0.3
 "Greatest deviation of the zero, however long nothing was heard."
 UNKNOWN_SD_N: Final = 0.05
-"With more than this, and than the scene tolerates, readings teach nothing: ten minutes without a reversal."
+"With more than this, and than the scene tolerates, few readings teach: eight minutes without a reversal."
 WAY_VARIANCE: Final = 0.04 * 0.04
 "Spread of the share by which friction differs from its mean one way and the other, squared."
 MAX_WAY: Final = 0.06
