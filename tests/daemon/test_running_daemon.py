@@ -31,7 +31,7 @@ from tormagd.daemon.daemon import Daemon
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.link_statistics import LinkQuality
-from tormagd.record.telemetry import COLUMNS
+from tormagd.record.stream import COLUMNS
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import VirtualPort
