@@ -183,6 +183,7 @@ class RecordingWriter:
         if every > 1:
             self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
         self._last_tick: int | None = None
+        self._mark: Mark | None = None
         self.telemetry_count = self.tick_count = self.ticks_lost = self.restarts = 0
         self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
@@ -243,12 +244,13 @@ class RecordingWriter:
 
     def _snapshot(self, shown: Shown) -> None:
         mark = msgspec.convert(shown.message.get("mark"), Mark | None)
+        if mark not in (None, self._mark):  # every snapshot has the newest
+            self._thinning.happened(shown.t_ns)
+            self._mark = mark
         self._add(shown)
         self.telemetry_count += 1
-        if self._overview.add(shown.t_ns, False, {"mark": mark}):
-            self._thinning.happened(shown.t_ns)
-            if self._folder is not None:
-                self.path = self._folder.mark_around(self.path)
+        if self._overview.add(shown.t_ns, False, {"mark": mark}) and self._folder is not None:
+            self.path = self._folder.mark_around(self.path)
 
     def _tick(self, shown: Shown) -> None:
         if isinstance(number := shown.message.get(NUMBER_COLUMN), int):
