@@ -57,9 +57,11 @@ REPLAYED = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl r
 
 
 @contextlib.contextmanager
-def listening(endpoints: Endpoints) -> Iterator["zmq.Socket[bytes]"]:
+def listening(
+    endpoints: Endpoints, context: "zmq.Context[zmq.Socket[bytes]] | None" = None
+) -> Iterator["zmq.Socket[bytes]"]:
     """Yield a SUB socket that hears the daemon's ticks."""
-    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+    with context or zmq.Context() as own, own.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.RCVHWM, QUEUE)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
         socket.subscribe(b"")
