@@ -30,7 +30,7 @@ COMPILED = {
     "tormagd/control/safety": ("operating_state",),
     "tormagd/control": (*("interpolation", "records", "nominal", "measure", "core"),),
     "tormagd/control/assembly": ("conditions",),
-    "tormagd/record": ("journal", "telemetry"),
+    "tormagd/record": ("stream",),
     "tormagd/simulation": (
         *("curve", "axis", "element", "second_element", "tactile_pad"),
         *("hand", "plant", "motion", "firmware", "device", "closed_loop", "ideal_actuator"),

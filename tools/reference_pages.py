@@ -20,7 +20,7 @@ from tormagd.ctl import main as ctl
 from tormagd.ctl.completion import subparsers
 from tormagd.daemon import main as daemon
 from tormagd.hardware import can_backend, serial_backend
-from tormagd.record import telemetry
+from tormagd.record import stream
 from tormagd.simulation import __main__ as simulation
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
@@ -100,8 +100,8 @@ def ticks_page() -> str:
 """ + "".join(
         f"- {name}: {', '.join(f'`{each}`' for each in columns)}\n"
         for name, columns in (
-            *(("plan", telemetry.OF_PLAN), ("concluded", telemetry.CONCLUDED), ("duty", telemetry.OF_DUTY)),
-            *(("measurement", telemetry.OF_MEASUREMENT), ("link", telemetry.OF_LINK)),
+            *(("plan", stream.OF_PLAN), ("concluded", stream.CONCLUDED), ("duty", stream.OF_DUTY)),
+            *(("measurement", stream.OF_MEASUREMENT), ("link", stream.OF_LINK)),
         )
     )
 

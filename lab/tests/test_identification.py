@@ -23,7 +23,7 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.ctl.calibrate import MOTOR_COLUMNS, excitation, motor_log
 from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS
-from tormagd.record.telemetry import COLUMNS as OF_TICK, Moment
+from tormagd.record.stream import COLUMNS as OF_TICK, Moment
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd.simulation.closed_loop import ClosedLoop

@@ -9,7 +9,7 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.records import TimedSetpoint
-from tormagd.record.telemetry import beliefs
+from tormagd.record.stream import beliefs
 from tormagd.scenes.scene import EVERY_TERM, Terms, load_scene
 from tormagd.simulation.hand import ReversingHand
 

@@ -15,7 +15,7 @@ from tormagd.control.assembly.build import build_core
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.hardware.streams import FrameStream
-from tormagd.record.telemetry import COLUMNS as OF_TICK, Moment
+from tormagd.record.stream import COLUMNS as OF_TICK, Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault

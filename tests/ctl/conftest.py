@@ -23,7 +23,7 @@ import pytest
 import zmq
 
 from tormagd.ctl.main import main
-from tormagd.record.journal import TOLD
+from tormagd.record.stream import TOLD
 from tormagd.scenes.scene import load_scene
 from tormagd_client.messages import (
     MOTION_TOPIC,

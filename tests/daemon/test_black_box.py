@@ -21,9 +21,8 @@ from tormagd.daemon.profiles import state_folder
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.streams import FrameStream
-from tormagd.record.journal import MAX_ENTRIES, PLAN, STEP, TEACH, Journal
 from tormagd.record.keeper import Begin, End, Part, Ring, Write, Written, in_shared_memory
-from tormagd.record.telemetry import Moment
+from tormagd.record.stream import MAX_ENTRIES, PLAN, STEP, TEACH, Journal, Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand

@@ -17,7 +17,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.element.inverse.solution import Answer, Question
 from tormagd.element.physics.errors import DomainError
-from tormagd.record.journal import AFRESH, PLAN, Journal
+from tormagd.record.stream import AFRESH, PLAN, Journal
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand

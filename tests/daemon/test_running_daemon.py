@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 
 import msgspec
 import pytest
-import zmq
 from failing_search import FailingSearch
 
 from firmware_protocol.build import settle
@@ -31,7 +30,7 @@ from tormagd.daemon.daemon import Daemon
 from tormagd.element.physics.errors import DomainError
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.link_statistics import LinkQuality
-from tormagd.record.telemetry import COLUMNS
+from tormagd.record.stream import COLUMNS
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import is_tick
 from tormagd.simulation.closed_loop import VirtualPort
@@ -268,7 +267,7 @@ def test_requests_are_answered_with_the_newest_snapshot_however_few_ticks_it_sta
 def test_however_seldom_telemetry_is_told_every_tick_is_recorded(running: Running) -> None:
     running.start(Rates(telemetry_hz=5))
     at, numbers = COLUMNS.index("tick"), list[int]()
-    with zmq.Context() as context, listening(context, in_folder(running.folder).recording, None) as recorder:
+    with listening(in_folder(running.folder)) as recorder:
         running.until(lambda _: bool(recorder.poll(1)), "ticks come")
         running.tick(450)
         while recorder.poll(100):

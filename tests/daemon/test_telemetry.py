@@ -18,7 +18,7 @@ from tormagd.daemon.verdict import ARRIVES, CANNOT, RENDERED, ForceDelay, Judged
 from tormagd.element.model.features import FEATURES
 from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
-from tormagd.record.telemetry import Moment, limits_held, snapshot
+from tormagd.record.stream import Moment, limits_held, snapshot
 from tormagd.record.ticks import encode_ticks
 from tormagd.scenes.scene import Budget, load_scene
 from tormagd_client.messages import BeliefReport, Telemetry, decode, encode

@@ -21,7 +21,7 @@ from tormagd.ctl.scene import measured_as
 from tormagd.daemon import main as daemon
 from tormagd.ground.command_line import UsageError
 from tormagd.ground.toml_file import toml_tables
-from tormagd.record.telemetry import COLUMNS
+from tormagd.record.stream import COLUMNS
 from tormagd.scenes.scene import load_scene, shipped_scenes
 from tormagd.simulation import __main__ as simulation
 

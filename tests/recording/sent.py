@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from tormagd.record.journal import TOLD
 from tormagd.record.reader import Seen, read_recording
+from tormagd.record.stream import TOLD
 from tormagd.record.ticks import TickBatch
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.messages import Telemetry, Tick

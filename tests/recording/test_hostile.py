@@ -16,14 +16,13 @@ MAX_MB = 200
 READ = """
 import json, sys
 from pathlib import Path
-from tormagd.record.black_box import read_black_box
-from tormagd.record.reader import RecordingError, RecordingFile, read_recording as read, overview_of
+from tormagd.record.reader import BlackBoxFile, RecordingError, RecordingFile, read_recording as read, overview_of
 
 def read_recording(path):
     read(path, dict[str, object], lambda seen: None)
 said = {}
 for path in map(Path, sys.argv[1:]):
-    for look in (read_black_box,) if path.name.startswith("black") else (overview_of, RecordingFile, read_recording):
+    for look in (BlackBoxFile,) if path.name.startswith("black") else (overview_of, RecordingFile, read_recording):
         try:
             look(path)
         except RecordingError as error:

@@ -15,7 +15,6 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.daemon.black_box import KEEPER
 from tormagd.record import keeper
-from tormagd.record.black_box import read_black_box
 from tormagd.record.keeper import (
     DIED,
     KEPT_S,
@@ -29,6 +28,7 @@ from tormagd.record.keeper import (
     Written,
     in_shared_memory,
 )
+from tormagd.record.reader import BlackBoxFile
 from tormagd.record.writer import is_tick
 
 PATIENCE_S = 60.0
@@ -160,8 +160,8 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     process.say(Begin(str(folder), HEADER), ticks(1, 20), ticks(21, 20))
     process.say(written(folder, "20300101T000000.000Z-SKEW.mcap", firmware="1.2"))
     assert process.heard() == Written("20300101T000000.000Z-SKEW.mcap")
-    box = read_black_box(folder / "20300101T000000.000Z-SKEW.mcap")
-    assert (box.header["reason"], box.header["firmware"], box.is_complete) == ("SKEW", "1.2", True)
+    box = BlackBoxFile(folder / "20300101T000000.000Z-SKEW.mcap")
+    assert (box.metadata["reason"], box.metadata["firmware"], box.is_complete) == ("SKEW", "1.2", True)
     assert [entry[0] for entry in box.entries if entry != "step"] == list(range(1, 41))
     assert len(list(folder.iterdir())) == 2 * MAX_FILES + 3
     process.say(written(folder, "20300101T000000.000Z-REQUEST.mcap"))
@@ -187,7 +187,7 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     assert process.child.wait(PATIENCE_S) == 0
     (left,) = folder.glob(f"*{DIED}.mcap")
     for path, first in ((left, 61), (folder / "20300102T000000.000Z-DUE.mcap", 1), (folder / "2031Z-LATER.mcap", 61)):
-        assert next(entry[0] for entry in read_black_box(path).entries if entry != "step") == first, path
+        assert next(entry[0] for entry in BlackBoxFile(path).entries if entry != "step") == first, path
     assert not process.ring_path.exists()
 
 
@@ -209,7 +209,7 @@ def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: 
     assert after.child.wait(PATIENCE_S) == 0
     after.die()
     after.child.communicate()
-    boxes = {path.name.partition("Z-")[2]: read_black_box(path).entries for path in tmp_path.iterdir()}
+    boxes = {path.name.partition("Z-")[2]: BlackBoxFile(path).entries for path in tmp_path.iterdir()}
     firsts = {name: (entries[1][0], entries[-1][0]) for name, entries in boxes.items()}
     both = {"Y.mcap": (21, 40), f"{DIED}.mcap": (1, 20)}
     assert firsts == (both if is_daemon_killed else {"Y.mcap": (1, 40)})

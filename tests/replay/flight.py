@@ -18,9 +18,9 @@ from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.inbox import SetpointInbox, Taken
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.element.inverse.solution import Answer, Question
-from tormagd.record.black_box import write_black_box
-from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP
-from tormagd.record.telemetry import Moment
+from tormagd.hardware.connection import CONNECTED, WROTE
+from tormagd.record.stream import COMMAND, LATCH, LOSE_LINK, STEP, Moment
+from tormagd.record.writer import write_black_box
 from tormagd.simulation.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.simulation.device import VirtualDevice
 
@@ -46,7 +46,7 @@ class Flight:
         self._journal, self._box.is_heard = self._box.journal, True
         self._journal.is_kept, self._box._ticks = True, 0
         self._box.begin(self.loop.stepper, self.planner, self.loop.connection)
-        self.loop.connection.traffic = self
+        self.loop.connection.traffic = self._heard
         self._inbox = SetpointInbox()
         period_ns = NS // config.rates.inference_hz
         self.inference = InferenceLoop(
@@ -85,17 +85,12 @@ class Flight:
     def ask(self, question: Question) -> None:
         self._question = self._question or question
 
-    def read(self, now_s: float, raw: Any) -> None:
-        self._journal.read(now_s, raw)
-
-    def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
-        self._stepped()
-        self._journal.wrote(now_s, raw, unsent)
-
-    def connected(self, memory: Any) -> None:
-        if memory is None:
+    def _heard(self, name: str, *what: Any) -> None:
+        if name == WROTE:
+            self._stepped()
+        if name == CONNECTED and what == (None,):
             self._journal.note(LOSE_LINK)
-        self._journal.connected(memory)
+        self._journal.note(name, *what)
 
     def _stepped(self) -> None:
         if not self._is_stepped:

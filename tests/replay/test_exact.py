@@ -21,8 +21,8 @@ from tormagd.control.safety.operating_state import SafetyState
 from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import InexactError, first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link_statistics import RoundTrip
-from tormagd.record.journal import KNOWN
 from tormagd.record.rerun import KNOWN_OF_LINK
+from tormagd.record.stream import KNOWN
 
 ROOT = Path(__file__).parents[2]
 FLOATS = st.one_of(st.floats(), st.sampled_from([-0.0, math.nan, -math.inf, 5e-324]))

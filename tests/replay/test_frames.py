@@ -19,8 +19,8 @@ from tormagd.control.assembly.build import Core
 from tormagd.control.safety.codes import Fault
 from tormagd.ctl.main import main
 from tormagd.ctl.record import _instead
-from tormagd.record.black_box import BlackBoxFile, ReplayError, read_black_box, rebuilt, recorded
-from tormagd.record.rerun import rerun, ticks_of
+from tormagd.record.reader import BlackBoxFile
+from tormagd.record.rerun import ReplayError, rebuilt, recorded, rerun, ticks_of
 from tormagd.simulation.rehearse import changed, main as run_changed, rehearse, script
 
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5
@@ -41,7 +41,7 @@ def can_path(on_can: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module", params=["serial", "can"])
 def box(request: pytest.FixtureRequest, path: Path, can_path: Path) -> BlackBoxFile:
-    return read_black_box(path if request.param == "serial" else can_path)
+    return BlackBoxFile(path if request.param == "serial" else can_path)
 
 
 def place_of(entries: list[Any], name: str, tick: int) -> int:
@@ -84,7 +84,7 @@ def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFi
 
 def test_what_came_damaged_is_measured_alike(core: Core, on_can: Flight, can_path: Path) -> None:
     assert on_can.loop.stepper.safety.faults[0] is Fault.MEASUREMENT_STALE
-    assert rerun(core, read_black_box(can_path).entries).difference is None
+    assert rerun(core, BlackBoxFile(can_path).entries).difference is None
 
 
 def test_a_frame_that_is_damaged_or_missing_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
@@ -128,15 +128,15 @@ def test_a_memory_that_differs_is_found_where_no_tick_shows_it(
 def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, tmp_path: Path) -> None:
     flight = fly("frozen@2.9", until_s=3.4)
     assert (flight.loop.connection.losses, flight.loop.measurement is None) == (1, False)
-    entries = read_black_box(flight.write(tmp_path / "frozen.mcap")).entries
+    entries = BlackBoxFile(flight.write(tmp_path / "frozen.mcap")).entries
     assert [entry[1] is None for entry in entries if entry[0] == "connected"] == [True, False]
     done = rerun(core, entries)
     assert (done.difference, done.ticks, done.frames) == (None, 3_400, number_of(entries, len(entries) - 1))
 
 
 def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(path: Path) -> None:
-    known = recorded(read_black_box(path), path.parent)
-    todo = script(read_black_box(path).entries)
+    known = recorded(BlackBoxFile(path))
+    todo = script(BlackBoxFile(path).entries)
     # another enable was refused
     assert ([name for _, name in todo.commands], list(todo.recorded.faults)) == (["home", "enable"], ["ENCODER"])
     repeated = rehearse(rebuilt(known), known.config, todo, "sample_1", ["encoder_jump@3.5"])
@@ -171,8 +171,8 @@ def test_another_scene_is_run(path: Path, capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_one_that_begins_in_the_middle_begins_with_a_device_that_is_driven(path: Path) -> None:
-    box = read_black_box(path)
-    known = recorded(box, path.parent)
+    box = BlackBoxFile(path)
+    known = recorded(box)
     states = [place for place, entry in enumerate(box.entries) if entry[0] == "state"]
     todo = script(box.entries[states[6] :])
     assert (todo.is_driven, todo.commands) == (True, [])

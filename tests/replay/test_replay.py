@@ -21,20 +21,10 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import SOURCES, Core, sources_hash
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
-from tormagd.record.black_box import (
-    BlackBoxFile,
-    ReplayError,
-    differences,
-    read_black_box,
-    rebuilt,
-    recorded,
-    write_black_box,
-)
-from tormagd.record.journal import ANSWER, CONFIRM, FORMAT, MISSING
-from tormagd.record.reader import RecordingError, Seen, read_recording
-from tormagd.record.rerun import rerun, ticks_of
-from tormagd.record.telemetry import COLUMNS
-from tormagd.record.writer import Derived
+from tormagd.record.reader import BlackBoxFile, RecordingError, Seen, read_recording
+from tormagd.record.rerun import ReplayError, differences, rebuilt, recorded, rerun, ticks_of
+from tormagd.record.stream import ANSWER, COLUMNS, CONFIRM, FORMAT, MISSING
+from tormagd.record.writer import Derived, write_black_box
 
 CHANGED_TICK = 3_210
 TICKS = 4_000
@@ -48,16 +38,16 @@ NO_TICKS = [msgspec.msgpack.encode(["step"])]
 
 @pytest.fixture(scope="module")
 def box(path: Path) -> BlackBoxFile:
-    return read_black_box(path)
+    return BlackBoxFile(path)
 
 
 def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box: BlackBoxFile, path: Path) -> None:
     assert ended.loop.stepper.safety.faults == (Fault.ENCODER,)
-    known = recorded(box, path.parent)
+    known = recorded(box)
     assert known.config == ended.config
     done = rerun(rebuilt(known), box.entries)
     assert (done.difference, done.gaps, done.ticks, done.from_s, done.snapshots) == (None, 0, TICKS, 0.0, 7)
-    assert (done.frames, differences(known.box.header)) == (len(frames(path)), [])
+    assert (done.frames, differences(known.box.metadata)) == (len(frames(path)), [])
 
 
 def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fly: Any, tmp_path: Path) -> None:
@@ -66,7 +56,7 @@ def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fl
     scene = tmp_path / "thesis.toml"
     scene.write_text(shipped.replace("step_mT = 1.0", "step_mT = 50.0"), encoding="utf-8")
     flown = fly(until_s=3.0, config=Config(scene=str(scene)))
-    box = read_black_box(flown.write(tmp_path / "thesis.mcap"))
+    box = BlackBoxFile(flown.write(tmp_path / "thesis.mcap"))
     answers = [entry for entry in box.entries if entry[0] == ANSWER]
     assert len(answers) > 100
     done = rerun(flown.core, box.entries)
@@ -88,7 +78,7 @@ def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> Non
     flown.inference.confirm("device")
     for _ in range(500):
         flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
-    box = read_black_box(flown.write(tmp_path / "confirmed.mcap"))
+    box = BlackBoxFile(flown.write(tmp_path / "confirmed.mcap"))
     assert rerun(flown.core, box.entries).difference is None
     box.entries.remove([CONFIRM, "device"])
     assert rerun(flown.core, box.entries, flown.loop.now_s - 0.5).difference is not None
@@ -114,7 +104,7 @@ def test_it_is_from_the_middle_of_the_run(core: Core, box: BlackBoxFile, from_s:
 def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Path, fault, silent_s, told) -> None:
     flight = fly(*([fault] if fault else []), until_s=2.8, silent_s=silent_s)
     assert str(flight.loop.stepper.safety.faults[0]) == told
-    box = read_black_box(flight.write(tmp_path / "planted.mcap"))
+    box = BlackBoxFile(flight.write(tmp_path / "planted.mcap"))
     done = rerun(core, box.entries)
     assert done.difference is None
     ticks = ticks_of(box.entries)
@@ -147,7 +137,7 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     assert (flight.loop.stepper.safety.faults, flight.planner.planned.number) == ((Fault.PLAN_FAILED,), number + 1)
     for _ in range(499):
         flight.tick(asked(flight.loop.now_s))
-    box = read_black_box(flight.write(tmp_path / "failed.mcap"))
+    box = BlackBoxFile(flight.write(tmp_path / "failed.mcap"))
     (place,) = [place for place, entry in enumerate(box.entries) if entry[0] == "afresh"]
     tried, latched, afresh = box.entries[place - 2 : place + 1]
     assert (tried[0], tried[1], latched) == ("plan", afresh[1], ["latch", "PLAN_FAILED"])
@@ -168,8 +158,8 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
 def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile, tmp_path: Path) -> None:
     places = list(ticks_of(box.entries))
     parts = box.entries[: places[3_100] + 1], box.entries[places[3_120] + 1 :]
-    write_black_box(tmp_path / "lost.mcap", box.header, map(msgspec.msgpack.encode, parts))
-    for entries in ([*parts[0], [MISSING], *parts[1]], read_black_box(tmp_path / "lost.mcap").entries):
+    write_black_box(tmp_path / "lost.mcap", box.metadata, map(msgspec.msgpack.encode, parts))
+    for entries in ([*parts[0], [MISSING], *parts[1]], BlackBoxFile(tmp_path / "lost.mcap").entries):
         done = rerun(core, entries)
         assert (done.difference, done.gaps, done.ticks) == (None, 1, TICKS - 3_500 + 3_101)
 
@@ -219,7 +209,7 @@ def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> No
     ],
 )
 def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path, monkeypatch: Any, edit, said) -> None:
-    box = read_black_box(path)
+    box = BlackBoxFile(path)
     assert box.odd == ""
     head = [*box.entries[: list(ticks_of(box.entries))[600]], ["told", {"t_ns": 1, "seq": 0}]]
     derived = Derived.of
@@ -233,9 +223,9 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
                 yield edited
 
     monkeypatch.setattr(Derived, "of", other)
-    write_black_box(tmp_path / "edited.mcap", box.header, [msgspec.msgpack.encode(head)])
+    write_black_box(tmp_path / "edited.mcap", box.metadata, [msgspec.msgpack.encode(head)])
     monkeypatch.undo()
-    assert read_black_box(tmp_path / "edited.mcap").odd.startswith(said)
+    assert BlackBoxFile(tmp_path / "edited.mcap").odd.startswith(said)
 
 
 def test_the_sources_hash_is_of_every_room(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,13 +236,13 @@ def test_the_sources_hash_is_of_every_room(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_what_is_not_as_it_was_is_told(box: BlackBoxFile) -> None:
-    told = differences({**box.header, "sources_sha256": "0" * 64, "platform": "PDP-11"})
+    told = differences({**box.metadata, "sources_sha256": "0" * 64, "platform": "PDP-11"})
     assert [line.partition(":")[0] for line in told] == ["build", "platform"]
 
 
 def run(path: Path) -> None:
-    found = read_black_box(path)
-    known = recorded(found, path.parent)
+    found = BlackBoxFile(path)
+    known = recorded(found)
     rerun(rebuilt(known), found.entries)
 
 
@@ -267,7 +257,7 @@ def refusal(path: Path) -> str:
 
 def test_one_that_breaks_off_late_is_replayed_so_far(core: Core, path: Path, tmp_path: Path) -> None:
     (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-    box = read_black_box(tmp_path / "broken.mcap")
+    box = BlackBoxFile(tmp_path / "broken.mcap")
     assert not box.is_complete
     done = rerun(core, box.entries)
     assert done.difference is None
@@ -286,7 +276,7 @@ def test_random_bytes_are_refused_and_of_damaged_ones_the_rest_is_replayed(
             damaged[place] ^= 1 << rng.randrange(8)
         broken.write_bytes(damaged)
         with contextlib.suppress(RecordingError, ReplayError):
-            box = read_black_box(broken)
+            box = BlackBoxFile(broken)
             assert box.odd
             assert rerun(core, box.entries).difference is None
 
@@ -296,12 +286,12 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
     assert "no black box" in refusal(tmp_path / "other.mcap")
     for number, (header, said) in enumerate(
         (
-            (box.header | {"format": "4"}, FORMER),
-            (box.header | {"configuration": '{"rates": 1}'}, "its configuration is refused"),
-            (box.header | {"model": "f" * 64}, "the model with the hash 'ffffffffffff'"),
-            (box.header | {"columns": json.dumps(["t_ns"])}, "its ticks have other columns"),
-            ({name: text for name, text in box.header.items() if name != "scene"}, "its header has no 'scene'"),
-            (box.header, "no tick in it"),
+            (box.metadata | {"format": "4"}, FORMER),
+            (box.metadata | {"configuration": '{"rates": 1}'}, "its configuration is refused"),
+            (box.metadata | {"model": "f" * 64}, "the model with the hash 'ffffffffffff'"),
+            (box.metadata | {"columns": json.dumps(["t_ns"])}, "its ticks have other columns"),
+            ({name: text for name, text in box.metadata.items() if name != "scene"}, "its header has no 'scene'"),
+            (box.metadata, "no tick in it"),
         )
     ):
         write_black_box(tmp_path / f"{number}.mcap", header, NO_TICKS)

@@ -105,7 +105,7 @@ class Stand:
     @contextlib.contextmanager
     def ticks(self) -> Iterator[Callable[[], list[dict[str, Any]]]]:
         """Give a function that returns the control ticks since its last call."""
-        with zmq.Context() as context, listening(context, self.endpoints.recording, None) as recorder:
+        with listening(self.endpoints) as recorder:
 
             def read() -> list[dict[str, Any]]:
                 rows: list[dict[str, Any]] = []

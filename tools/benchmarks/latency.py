@@ -68,7 +68,7 @@ def summary(found_us: Stages, count: int, realtime: RealTime) -> dict[str, Any]:
 
 def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[str, Any]]]:
     """Publish and record; return when each force was sent, ns, and the ticks of that time."""
-    with context(priority_of_threads()) as ours, listening(ours, config.endpoints.recording, None) as recording:
+    with listening(config.endpoints, context(priority_of_threads())) as recording:
         sent = publish(config.endpoints.setpoint, count)
         # only now: reading would set the pace
         return sent, rows_until(recording, time.time_ns() + SETTLE_NS)

@@ -160,7 +160,7 @@ def block(started: Callable[[Path], contextlib.AbstractContextManager[Running]],
         time.sleep(WARM_UP_S)
         _, *alone = spent(pid, lambda: time.sleep(seconds))
         # while somebody listens, ticks are encoded and sent
-        with zmq.Context() as context, listening(context, config.endpoints.recording, None) as recorder:
+        with listening(config.endpoints) as recorder:
             stop = multiprocessing.Event()
             load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
             load.start()

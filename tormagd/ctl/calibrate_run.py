@@ -37,7 +37,6 @@ from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError, Status
-from tormagd_client.wire import keys_of
 
 SOURCE = "calibrate"
 RATE_HZ = 200.0
@@ -140,14 +139,11 @@ class Run(Device):
 
 def ticks_at_rest(endpoints: Endpoints) -> Columns:
     """Return a second of the daemon's control ticks; it is told nothing."""
-    context, rows = zmq.Context(), list[Row]()
-    try:
-        ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
+    rows = list[Row]()
+    with listening(endpoints) as ticks:
         until_s = time.monotonic() + SILENT_S
         while time.monotonic() < until_s:
             rows += _rows(ticks.recv_multipart()[-1], endpoints) if ticks.poll(20) else []
-    finally:
-        context.destroy(linger=0)
     return columns_of(rows)
 
 
@@ -197,9 +193,7 @@ def known_of(config: Config, status: Status, scene_most_N: float, weight_N: floa
 @contextmanager
 def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
     """Yield a `Run`; however it ends, the device is disabled and the gap opens."""
-    context = zmq.Context()
-    try:
-        ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
+    with listening(endpoints) as ticks:
         client.require_taken()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
             run = Run(endpoints, client, ticks, is_interrupted)
@@ -207,8 +201,6 @@ def connected(endpoints: Endpoints, client: Client) -> Iterator[Run]:
                 yield run
             finally:
                 run.command("disable")
-    finally:
-        context.destroy(linger=0)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,9 @@ from tormagd.ctl.outcome import (
 )
 from tormagd.ground.files import new_file
 from tormagd.ground.terminal import interrupted_by, write_line
-from tormagd.record.black_box import Recorded, ReplayError, rebuilt, told
 from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
 from tormagd.record.reader import RecordingError, damage_in, overview_of
-from tormagd.record.rerun import rerun
+from tormagd.record.rerun import ReplayError, rebuilt, reopened, rerun
 from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.record.writer import RecordingWriter
 from tormagd_client.blocking import Client
@@ -44,7 +43,7 @@ from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError
 from tormagd_client.printable import printable
-from tormagd_client.wire import Keys, connect, keys_of
+from tormagd_client.wire import connect, keys_of
 
 QUEUE = 10_000
 "Over three minutes for a slow listener."
@@ -57,53 +56,50 @@ LONGEST_REHEARSAL_S = 900.0
 REPLAYED = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
 
 
-def listening(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
-    """Connect a new SUB socket for ticks."""
-    socket = context.socket(zmq.SUB)
-    socket.setsockopt(zmq.RCVHWM, QUEUE)
-    socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
-    socket.subscribe(b"")
-    connect(socket, address, keys)
-    return socket
+@contextlib.contextmanager
+def listening(
+    endpoints: Endpoints, context: "zmq.Context[zmq.Socket[bytes]] | None" = None
+) -> Iterator["zmq.Socket[bytes]"]:
+    """Yield a SUB socket that hears the daemon's ticks."""
+    with context or zmq.Context() as own, own.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.RCVHWM, QUEUE)
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
+        socket.subscribe(b"")
+        connect(socket, endpoints.recording, keys_of(endpoints.curve))
+        yield socket
 
 
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
     """Record for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder."""
     if not (is_folder := path.is_dir()) and path.suffix != ".mcap":
         raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
-    keys = keys_of(endpoints.curve)
-    context = zmq.Context()
-    try:
-        ticks = listening(context, endpoints.recording, keys)
-        with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            if not _is_ready(ticks, wait_s, is_interrupted):
-                raise unreachable(endpoints.recording, f"nothing is published there within {wait_s:g} s")
-            about = _about(endpoints, wait_s)
-            try:
-                place = RecordingFolder(path, config.recordings) if is_folder else path
-                writer = RecordingWriter(place, about, config.recordings.one_tick_of)
-            except FileExistsError as error:
-                raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
-            except OSError as error:
-                error.filename = str(path)
-                raise refused(error, WRITABLE) from error
-            try:
-                with writer:
-                    outcome = _record(writer, ticks, duration_s, is_interrupted)
-                    with contextlib.suppress(ClientError):  # if the daemon has gone, what was true at the start remains
-                        writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
-                    return outcome
-            except OSError as error:
-                remedy = refused(error, f"see that {writer.path.parent} stays in place and takes files").hint
-                raise CommandError(
-                    Exit.REFUSED,
-                    "not_written",
-                    f"{writer.path}: {error.strerror}, after {writer.tick_count} ticks and {writer.telemetry_count} "
-                    "snapshots",
-                    f"{remedy}; what is in the file, all but about the last second, reads like any other recording",
-                ) from error
-    finally:
-        context.destroy(linger=0)
+    with listening(endpoints) as ticks, interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
+        if not _is_ready(ticks, wait_s, is_interrupted):
+            raise unreachable(endpoints.recording, f"nothing is published there within {wait_s:g} s")
+        about = _about(endpoints, wait_s)
+        try:
+            place = RecordingFolder(path, config.recordings) if is_folder else path
+            writer = RecordingWriter(place, about, config.recordings.one_tick_of)
+        except FileExistsError as error:
+            raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
+        except OSError as error:
+            error.filename = str(path)
+            raise refused(error, WRITABLE) from error
+        try:
+            with writer:
+                outcome = _record(writer, ticks, duration_s, is_interrupted)
+                with contextlib.suppress(ClientError):  # if the daemon has gone, what was true at the start remains
+                    writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
+                return outcome
+        except OSError as error:
+            remedy = refused(error, f"see that {writer.path.parent} stays in place and takes files").hint
+            raise CommandError(
+                Exit.REFUSED,
+                "not_written",
+                f"{writer.path}: {error.strerror}, after {writer.tick_count} ticks and {writer.telemetry_count} "
+                "snapshots",
+                f"{remedy}; what is in the file, all but about the last second, reads like any other recording",
+            ) from error
 
 
 def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
@@ -211,26 +207,21 @@ def _list(folder: RecordingFolder) -> Outcome:
 
 def _row(segment: Segment) -> dict[str, Any]:
     """Describe one segment by its overview; without one, `said` tells why."""
-    seconds, faults, marks = None, [], []
     try:
-        overview = overview_of(segment.path)
+        overview, said = overview_of(segment.path), "no overview: still written, not ended by its recorder, or older"
     except RecordingError as error:
-        said = [str(error).removeprefix(f"{segment.path}: ")]
-    else:
-        said = ["no overview: still written, not ended by its recorder, or older"]
-        if overview is not None:
-            seconds = round(overview.duration_s, 3)
-            faults, marks = list(overview.spans_s("faults")), [each.text for each in overview.marks]
-            said = [*faults, *(f"“{text}”" for text in marks)]
+        overview, said = None, str(error).removeprefix(f"{segment.path}: ")
+    faults = [] if overview is None else list(overview.spans_s("faults"))
+    marks = [] if overview is None else [each.text for each in overview.marks]
     return {
         "name": segment.path.name,
         "began_s": segment.began_s,
         "MB": round(segment.bytes / 1e6, 3),
         "is_marked": segment.is_marked,
-        "seconds": seconds,
+        "seconds": None if overview is None else round(overview.duration_s, 3),
         "faults": faults,
         "marks": marks,
-        "said": ", ".join(said),
+        "said": said if overview is None else ", ".join([*faults, *(f"“{text}”" for text in marks)]),
     }
 
 
@@ -275,9 +266,8 @@ def replay(
     head = f"altered: {result['odd']}\n" if result["odd"] else ""
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
     notes += "" if result["is_complete"] else "\nthe file is cut short"
-    if "rerun" not in result:
-        return Outcome(result, head + _instead(result) + notes, Exit.REFUSED if result["odd"] else Exit.DONE)
-    text, is_exact = _rerun(result["rerun"])
+    text = _instead(result) if changes else _rerun(result["rerun"])
+    is_exact = bool(changes) or result["rerun"]["difference"] is None
     return Outcome(result, head + text + notes, Exit.DONE if is_exact and not result["odd"] else Exit.REFUSED)
 
 
@@ -285,37 +275,33 @@ def _again(path: Path, from_s: float) -> dict[str, Any]:
     """Run the same core over the recorded inputs."""
     logging.getLogger("tormagd").addHandler(logging.NullHandler())  # a replayed connection has no news
 
-    def run(known: Recorded) -> dict[str, Any]:
-        return {"rerun": msgspec.to_builtins(rerun(rebuilt(known), known.box.entries, from_s))}
-
-    with as_usage_error(ConfigError, RecordingError, ReplayError, OSError, hint=REPLAYED):
-        return told(path, run)
+    with (
+        as_usage_error(ConfigError, RecordingError, ReplayError, OSError, hint=REPLAYED),
+        reopened(path) as (known, told),
+    ):
+        return told | {"rerun": msgspec.to_builtins(rerun(rebuilt(known), known.box.entries, from_s))}
 
 
 def _rehearsed(path: Path, arguments: list[str]) -> dict[str, Any]:
-    try:
+    with as_usage_error(TimeoutError, ChildProcessError, hint=REPLAYED):
         answer = answer_of("tormagd.simulation.rehearse", [*arguments, "--", str(path)], LONGEST_REHEARSAL_S)
-    except TimeoutError as error:
-        raise usage_error(f"{path}: {error}", "is it a black box?") from error
-    except ChildProcessError as error:
-        raise usage_error(str(error), REPLAYED) from error
     result: dict[str, Any] = json.loads(answer)  # names in it need not be UTF-8
     return result
 
 
-def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
-    """Return the text on the report's `rerun`, and whether it was bit-exact."""
+def _rerun(done: dict[str, Any]) -> str:
+    """Say whether the report's `rerun` was bit-exact."""
     notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     difference = done["difference"]
     span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
     if difference is None:
         frames = f"{done['frames']:,} frames give the measurements again" if done["frames"] else "no frames are in it"
-        return f"bit-exact, {span}; {done['snapshots']} snapshots of the state between them, too; {frames}{notes}", True
+        return f"bit-exact, {span}; {done['snapshots']} snapshots of the state between them, too; {frames}{notes}"
     frame = "" if difference["frame"] is None else f" at frame {difference['frame']:,}"
     return (
         f"tick {difference['tick']:,} at {difference['time_s']:.3f} s differs{frame}: {difference['field']} was "
         f"{difference['recorded']}, is {difference['replayed']}; before it bit-exact, {done['ticks']:,} ticks{notes}"
-    ), False
+    )
 
 
 def _instead(result: dict[str, Any]) -> str:

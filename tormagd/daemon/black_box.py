@@ -23,10 +23,10 @@ from tormagd.control.assembly.build import Core, platform_name, sources_hash
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import ChildProcess
+from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
-from tormagd.record.journal import FORMAT, MISSING, Journal, core_hash, packed
 from tormagd.record.keeper import REQUEST, Begin, End, Part, Ring, Write, Written, box_path, in_shared_memory
-from tormagd.record.telemetry import COLUMNS, Moment
+from tormagd.record.stream import COLUMNS, FORMAT, MISSING, STATE, Journal, Moment, core_hash, packed
 from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
@@ -99,7 +99,7 @@ class BlackBox:
 
     def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """Begin the journal with a snapshot of both states, which are those before the first tick."""
-        self._connection, connection.traffic = connection, self.journal
+        self._connection, connection.traffic = connection, self.journal.note
         self._snapshot(stepper, planner)
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
@@ -222,7 +222,8 @@ class BlackBox:
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
         if self.journal.is_kept:
             memory = None if self._connection is None else self._connection.memory()
-            self.journal.snapshot(stepper, planner, memory, self.begun.header.get("core_sha256", ""))
+            core = self.begun.header.get("core_sha256", "")
+            self.journal.note(STATE, plain(stepper), plain(planner), memory, core)
 
     def _wait(self, reason: str) -> None:
         """Have another keeper started soon."""

@@ -28,7 +28,7 @@ from tormagd.daemon.beat import Beat
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
-from tormagd.record.journal import COMMAND, LATCH, LOSE_LINK, STEP, Journal
+from tormagd.record.stream import COMMAND, LATCH, LOSE_LINK, STEP, Journal
 
 PATIENCE_S = 2.0
 "How long a device that neither homes nor opens may refuse the next command."

@@ -13,7 +13,7 @@ from tormagd.daemon.beat import Beat
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.search_process import SearchProcess
-from tormagd.record.journal import AFRESH, ANSWER, CONFIRM, FORESEE, PLAN, TEACH, Journal
+from tormagd.record.stream import AFRESH, ANSWER, CONFIRM, FORESEE, PLAN, TEACH, Journal
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.daemon.verdict import CANNOT, ForceDelay, Judged, judged
 from tormagd.record.force_following import Following
-from tormagd.record.journal import TOLD
-from tormagd.record.telemetry import Moment, beliefs, snapshot
+from tormagd.record.stream import TOLD, Moment, beliefs, snapshot
 from tormagd.record.ticks import encode_ticks
 from tormagd_client.messages import MOTION_TOPIC, VERDICT_TOPIC, VERSION, Motion, Telemetry, Verdict
 

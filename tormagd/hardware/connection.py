@@ -8,12 +8,12 @@ CLOSED --> IDENTIFYING <--> UNANSWERED             the port is opened: --> IDENT
 
 import logging
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Message
 from tormagd.config import Device
 from tormagd.ground.plain_values import Kinds, plain, restore
-from tormagd.hardware.backend import Backend, BackendError, Received, Sent
+from tormagd.hardware.backend import Backend, BackendError, Sent
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd_client.messages import ClockReport, LinkReport
@@ -31,20 +31,11 @@ _REMEDIES = {
 
 _REMEDY_OF_HOST = "run `tormagctl doctor`; look for load on this machine; it is tried again"
 
+READ, WROTE, CONNECTED = "read", "wrote", "connected"
+"""What `traffic` hears: `READ, now_s, raw`; the frames of one period as `WROTE, now_s, raw, unsent`, which counts all
+messages that the wire has not taken at once; `CONNECTED, memory` of a conversation that begins, None where it ends."""
+
 log = logging.getLogger(__name__)
-
-
-class Traffic(Protocol):
-    """Hears all that passes between daemon and device: the black box's journal."""
-
-    def read(self, now_s: float, raw: Received) -> None:
-        """Take what was read from the device."""
-
-    def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
-        """Take the frames of one period; `unsent` counts all messages that the wire has not taken at once."""
-
-    def connected(self, memory: Any) -> None:
-        """Take the memory of a conversation that begins, or None when it ends."""
 
 
 class Connection:
@@ -69,7 +60,8 @@ class Connection:
         self._seen = LinkState.CLOSED
         self.losses = 0
         self._last_loss = ""
-        self.traffic: Traffic | None = None
+        self.traffic: Callable[..., None] = lambda *what: None
+        "Hears what passes between daemon and device: the black box's journal."
 
     @property
     def state(self) -> LinkState:
@@ -125,8 +117,7 @@ class Connection:
         if self._unfinished is DeviceRequest.RETRACT:
             self._link.request(now_s, self._unfinished)
         self._unfinished = DeviceRequest.NONE
-        if self.traffic is not None:
-            self.traffic.connected(self.memory())
+        self.traffic(CONNECTED, self.memory())
         log.info("%s is open", self._device.port)
         self._notice()
 
@@ -140,8 +131,8 @@ class Connection:
         except BackendError as error:
             self._lose(now_s, str(error), error.remedy)
             return
-        if self.traffic is not None and backend.stream.received:
-            self.traffic.read(now_s, backend.stream.received)
+        if backend.stream.received:
+            self.traffic(READ, now_s, backend.stream.received)
         for message in messages:
             link.receive(now_s, message)
             self._notice()
@@ -169,8 +160,7 @@ class Connection:
             self._lose(now_s, str(error), error.remedy)
             return
         heard = backend.stream.statistics
-        if self.traffic is not None:
-            self.traffic.wrote(now_s, sent, heard.unsent)
+        self.traffic(WROTE, now_s, sent, heard.unsent)
         link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
         if link.state is LinkState.LOST:
             host = self._host(now_s)
@@ -234,8 +224,7 @@ class Connection:
     def _release(self) -> None:
         if self._backend is not None:
             self._backend.close()
-            if self.traffic is not None:
-                self.traffic.connected(None)
+            self.traffic(CONNECTED, None)
         self._backend = self._link = None
 
     def _wait(self, now_s: float, state: LinkState, cause: str, remedy: str) -> None:

@@ -115,9 +115,10 @@ class RecordingFolder:
         """Delete segments too old, and, where that helps, the oldest until `coming_bytes` more fit budget and
         disk; return those deleted."""
         left, gone = self.segments(), []
-        old, stay = set(self._too_old(left)), [each for each in left if not each.may_go]
-        helps = not self._over(stay, coming_bytes, sum(each.bytes for each in left if each.may_go))
-        for segment in list(left):
+        old, may_go = set(self._too_old(left)), [each for each in left if each.may_go]
+        stay = [each for each in left if not each.may_go]
+        helps = not self._over(stay, coming_bytes, sum(each.bytes for each in may_go))
+        for segment in may_go:
             if (segment in old or (helps and self._over(left, coming_bytes))) and self._delete(segment):
                 left.remove(segment)
                 gone.append(segment)
@@ -158,8 +159,6 @@ class RecordingFolder:
 
     def _delete(self, segment: Segment) -> bool:
         """Delete a segment; return True also where it is gone."""
-        if not segment.may_go:
-            return False
         with contextlib.suppress(FileNotFoundError), segment.path.open("rb") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

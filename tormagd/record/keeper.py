@@ -52,7 +52,7 @@ class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
-    """Some control periods, as entries of `journal.py`; the time is the last period's."""
+    """Some control periods, as entries of `stream.py`; the time is the last period's."""
 
     time_s: float
     entries: bytes
@@ -228,7 +228,7 @@ class Keeper:
 
     def _new_box(self, path: Path, write: Write, ring: Ring) -> None:
         """Write a black box, and delete the oldest of its kind beyond MAX_FILES."""
-        from tormagd.record.black_box import write_black_box
+        from tormagd.record.writer import write_black_box
 
         parts = [part.entries for begun, part in ring.kept() if begun.header.items() <= write.header.items()]
         if not parts:

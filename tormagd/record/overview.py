@@ -168,20 +168,22 @@ class OverviewBuilder:
         self._mark: Mark | None = None
         self._ahead_ns = 0
 
-    def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> None:
-        """Add a control tick or a snapshot, in the order of writing; `t_ns` is since 1970, as `Derived` places it."""
+    def add(self, t_ns: int, is_tick: bool, message: Mapping[str, Any]) -> bool:
+        """Add a control tick or a snapshot, in the order of writing, and return whether it has a new mark; `t_ns` is
+        since 1970, as `Derived` places it."""
         if self._start_ns is None:
             self._start_ns = t_ns
         self._end_ns = max(self._end_ns, t_ns)
         if is_tick:
             self._ticks += 1
             self._add_tick(t_ns - self._start_ns, t_ns, message)
-            return
+            return False
         self._snapshots += 1
         mark = message.get("mark")
-        if mark and mark != self._mark:  # every snapshot has the newest
-            self._mark = mark
-            self._add_mark(Mark(t_ns=mark.t_ns - self._ahead_ns, text=mark.text))
+        if not mark or mark == self._mark:  # every snapshot has the newest
+            return False
+        self._mark = mark
+        return self._add_mark(Mark(t_ns=mark.t_ns - self._ahead_ns, text=mark.text))
 
     def _add_tick(self, since_ns: int, t_ns: int, tick: Mapping[str, Any]) -> None:
         values = quantities(tick)
@@ -196,9 +198,12 @@ class OverviewBuilder:
             self._ahead_ns += step_ns
             self._add_mark(Mark(t_ns=t_ns, text=f"the clock stepped by {step_ns * 1e-9:+.6g} s"))
 
-    def _add_mark(self, mark: Mark) -> None:
-        if mark.t_ns >= (self._start_ns or 0) and len(self._marks) < MAX_MARKS:
+    def _add_mark(self, mark: Mark) -> bool:
+        """Add a mark, and return whether it is of this recording: the newest one may be from before."""
+        is_within = mark.t_ns >= (self._start_ns or 0) and len(self._marks) < MAX_MARKS
+        if is_within:
             self._marks.append(mark)
+        return is_within
 
     def made(self) -> Overview:
         stretches, sides = self._stretches.made()
@@ -258,13 +263,11 @@ class _Stretches:
         self._sides = np.full((2, MAX_STRETCHES, len(QUANTITIES)), np.nan)
 
     def add(self, since_ns: int, values: Iterable[float | None]) -> None:
+        while len(self._numbers) == MAX_STRETCHES:
+            self._widen()
         number = since_ns // self.width_ns
         # a clock that was set back must not set the curve back
         if not self._numbers or number > self._numbers[-1]:
-            if len(self._numbers) >= MAX_STRETCHES:
-                self._widen()
-                self.add(since_ns, values)
-                return
             self._numbers.append(number)
         known = np.array(values, np.float64)
         for side, of in zip(self._sides[:, len(self._numbers) - 1], (np.fmin, np.fmax), strict=True):

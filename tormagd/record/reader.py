@@ -9,6 +9,7 @@ file's bytes.
 import contextlib
 import struct
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -34,7 +35,19 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import CONTENTSIZE_UNKNOWN, ZstdError, get_frame_parameters
 
 from tormagd.record.overview import Glance, Overview, OverviewBuilder, unpacked
-from tormagd.record.writer import CUT, OVERVIEW, TELEMETRY_TOPIC, THINNED, TICKS_TOPIC
+from tormagd.record.stream import MISSING
+from tormagd.record.writer import (
+    CORE_TOPIC,
+    CUT,
+    FRAMES_TOPIC,
+    NUMBER_COLUMN,
+    OVERVIEW,
+    TELEMETRY_TOPIC,
+    THINNED,
+    TICKS_TOPIC,
+    Derived,
+    is_tick,
+)
 from tormagd_client.printable import printable
 from tormagd_client.regular_file import require_regular
 
@@ -51,6 +64,9 @@ MAX_INDEX = 1_000_000
 MAX_SEEN = 400_000
 "Messages read at once: at 4 kHz more than a minute."
 END_NS = 2**64 - 1
+MAX_CORE_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
+"Bounds on what is read of one file, a minute of 1 kHz; what comes after is passed over."
+NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
     McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
@@ -111,8 +127,12 @@ class _Bounded:
 def _records(file: BinaryIO, *, has_magic: bool = False) -> Iterator[McapRecord]:
     """Yield the records to the end, chunks packed."""
     stream = _Bounded(file)
-    limits: dict[str, Any] = {"emit_chunks": True, "record_size_limit": MAX_RECORD_BYTES}
-    reader = StreamReader(stream, skip_magic=not has_magic, **limits)  # type: ignore[arg-type]
+    reader = StreamReader(
+        stream,  # type: ignore[arg-type]
+        skip_magic=not has_magic,
+        emit_chunks=True,
+        record_size_limit=MAX_RECORD_BYTES,
+    )
     for record in reader.records:
         yield record
         stream.left = MAX_RECORD_BYTES
@@ -258,12 +278,12 @@ class Contents:
                 if isinstance(record, Message):
                     yield self.topics.get(record.channel_id, ""), record
 
-    def read(self, file: BinaryIO, wanted: Any, each: Callable[[Seen], None], *times_ns: int) -> None:
-        """Hand the ticks and snapshots of `messages` to `each`, decoded as `wanted`."""
+    def read(self, file: BinaryIO, wanted: Any, *times_ns: int) -> Iterator[Seen]:
+        """Yield the ticks and snapshots of `messages`, decoded as `wanted`."""
         decode = msgspec.json.Decoder(wanted).decode
         for topic, sent in self.messages(file, *times_ns):
             if topic in TOPICS:
-                each(Seen(sent.log_time, topic == TICKS_TOPIC, decode(sent.data)))
+                yield Seen(sent.log_time, topic == TICKS_TOPIC, decode(sent.data))
         if len(self.lost) == len(self.places) > 0:
             raise ValueError(next(iter(self.lost.values())))
         self._require_topics()
@@ -291,7 +311,8 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
     """Read an open recording: each tick and snapshot goes to `each`."""
     with readable(name):
         found = Contents(file, name)
-        found.read(file, wanted, each)
+        for seen in found.read(file, wanted):
+            each(seen)
     return found
 
 
@@ -312,7 +333,8 @@ class RecordingFile(Contents):
             overview = None if self.damage else self.read_overview(file)
             if overview is None:
                 builder = OverviewBuilder()
-                self.read(file, Glance, lambda seen: builder.add(*seen))
+                for seen in self.read(file, Glance):
+                    builder.add(*seen)
                 overview = builder.made()
         self.overview, lost, known = overview, list(self.lost.values()), self.metadata
         self.notes = [
@@ -326,16 +348,80 @@ class RecordingFile(Contents):
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, inclusive, in the file's order."""
         found: list[Seen] = []
-
-        def keep(seen: Seen) -> None:
-            if from_ns <= seen.t_ns <= to_ns:
-                found.append(seen)
+        with opened(self.path) as file:
+            for seen in self.read(file, wanted, from_ns, to_ns):
+                if from_ns <= seen.t_ns <= to_ns:
+                    found.append(seen)
                 if len(found) > MAX_SEEN:
                     raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
-
-        with opened(self.path) as file:
-            self.read(file, wanted, keep, from_ns, to_ns)
         return found
+
+
+class BlackBoxFile(Contents):
+    """The entries of all parts of `/core` in their order, as plain data, for a replay.
+
+    A file that was cut short, or is longer than what is read, has those up to there, and is not complete. A message of
+    another topic is compared with what `/core` gives.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.entries = path, list[Any]()
+        self.odd, self._is_over = "", False
+        "The first message of another topic that `/core` does not give, or why an entry of `/core` gives none."
+        topics = TICKS_TOPIC, FRAMES_TOPIC, TELEMETRY_TOPIC
+        self._expected: dict[str, deque[tuple[int, int, bytes]]] = {topic: deque() for topic in topics}
+        self._derived, self._size = Derived(), 0
+        self._tick: int | None = None
+        with opened(path) as file:
+            super().__init__(file, str(path))
+            self._read_core(file)
+            damage = damage_in(file)
+        if not self.entries:
+            raise RecordingError(f"{path}: {NO_BLACK_BOX}")
+        for topic, expected in self._expected.items() if self.is_complete else ():
+            if expected:
+                self._note(f"message {expected[0][0]} is missing in {topic}, and {CORE_TOPIC} has it")
+        self._note(damage)
+
+    @property
+    def is_complete(self) -> bool:
+        return super().is_complete and not self._is_over
+
+    def _note(self, odd: str) -> None:
+        self.odd = self.odd or odd
+
+    def _read_core(self, file: BinaryIO) -> None:
+        """Keep the entries of `/core`, and compare what is derived of them, as far as no chunk is lost."""
+        for topic, sent in self.messages(file):
+            if "format" not in self.metadata or self._is_over:
+                return  # before all of a long recording has been read
+            if self.lost:
+                self._expected.clear()
+            if topic == CORE_TOPIC:
+                self._part(msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...]), sent.data)
+            elif topic in self._expected and not self.odd:
+                expected = self._expected[topic]
+                if not expected or (sent.sequence, sent.log_time, sent.data) != expected.popleft():
+                    self._note(f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has")
+
+    def _part(self, columns: tuple[str, ...], data: bytes) -> None:
+        entries, self._size = msgspec.msgpack.decode(data, type=list[Any]), self._size + len(data)
+        self._is_over = self._size > MAX_CORE_BYTES or len(self.entries) + len(entries) > MAX_ENTRIES
+        if self._is_over:
+            return
+        try:
+            self._join([each[columns.index(NUMBER_COLUMN)] for each in entries if is_tick(each)])
+            for topic, t_ns, number, shown in self._derived.of(columns, entries) if self._expected else ():
+                self._expected[topic].append((number, t_ns, msgspec.json.encode(shown)))
+        except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
+            self._note(f"{CORE_TOPIC}: {str(error)[:100]}")
+        self.entries.extend(entries)
+
+    def _join(self, numbers: list[int]) -> None:
+        """Note that entries are missing before these, which were lost on the way or are another daemon's."""
+        if numbers and self._tick is not None and not self._tick <= numbers[0] <= self._tick + 1:
+            self.entries.append([MISSING])
+        self._tick = numbers[-1] if numbers else self._tick
 
 
 def overview_of(path: Path) -> Overview | None:

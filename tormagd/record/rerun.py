@@ -3,17 +3,21 @@
 The conversation with the device is run again, too: the same `Connection`, fed what was read at the recorded times.
 """
 
+import contextlib
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import zip_longest
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 
+from firmware_protocol.build import settle
 from firmware_protocol.codec import DeviceFault, DeviceMode, Identity, Message, Sense, State, Status, Switches
 from firmware_protocol.framing import Frame, FramingStatistics
-from tormagd.config import Device
-from tormagd.control.assembly.build import Core
+from tormagd import __version__
+from tormagd.config import Config, Device, checked
+from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import PLAN_ERRORS
@@ -22,17 +26,108 @@ from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.element.inverse.solution import Answer
 from tormagd.ground.plain_values import first_difference, kinds, packed, plain, restore, restored
+from tormagd.hardware import connection
 from tormagd.hardware.backend import BackendError, Sent, Stream
-from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
 from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.hardware.streams import CanStream, FrameStream, SecondHostError
-from tormagd.record import journal
-from tormagd.record.black_box import ReplayError
-from tormagd.record.journal import KNOWN, core_hash
-from tormagd.record.telemetry import COLUMNS, Moment, TickRecord, measurement_of
+from tormagd.record import stream
+from tormagd.record.reader import BlackBoxFile
 from tormagd.record.writer import frames_in, is_tick
+from tormagd.scenes.scene import Scene
+from tormagd_client.endpoints import ConfigError
+
+NEEDED = (
+    "format", "version", "sources_sha256", "platform", "configuration", "scene", "scene_folder", "model",
+    "core_sha256", "columns",
+)  # fmt: skip
+SHOWN = 12
+"Digits of a hash that messages show."
+
+
+class ReplayError(ValueError):
+    """A black box that cannot be run again here."""
+
+
+class Recorded(NamedTuple):
+    """A black box whose header has been checked."""
+
+    box: BlackBoxFile
+    config: Config
+    scene: Scene
+
+
+@contextlib.contextmanager
+def reopened(path: Path) -> Iterator[tuple[Recorded, dict[str, Any]]]:
+    """Yield a black box that may be run again, and what is told of it: what it is, and what differs here."""
+    box = BlackBoxFile(path)
+    try:
+        known = recorded(box)
+        told = {
+            "file": str(path),
+            "odd": box.odd,
+            "version": box.metadata["version"],
+            "reason": box.metadata.get("reason", ""),
+            "build": str(settle()),
+            "is_complete": box.is_complete,
+            "differences": differences(box.metadata),
+        }
+        yield known, told
+    except ReplayError as error:
+        other = box.metadata.get("sources_sha256", "") not in ("", sources_hash())
+        hint = "; another tormagd wrote it: replay it with that one" if other else ""
+        raise ReplayError(f"{path}: {error}{hint}") from error
+
+
+def recorded(box: BlackBoxFile) -> Recorded:
+    """Check a black box's header."""
+    header = box.metadata
+    missing = [name for name in NEEDED if name not in header]
+    if missing:
+        raise ReplayError(f"its header has no {missing[0]!r}: it is no black box of this version")
+    if header["format"] != str(stream.FORMAT):
+        raise ReplayError(
+            f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed is "
+            f"{stream.FORMAT}, which tormagd {__version__} writes; replay it with the version that wrote it"
+        )
+    if box.described("columns", tuple[str, ...]) != stream.COLUMNS:
+        raise ReplayError(f"its ticks have other columns: tormagd {header['version'][:20]!r} wrote it")
+    try:
+        config = checked(box.described("configuration", dict[str, Any]), Config)
+        return Recorded(box, config, checked(box.described("scene", dict[str, Any]), Scene))
+    except (ConfigError, RecursionError) as error:
+        raise ReplayError(f"its configuration is refused: {error}") from error
+
+
+def rebuilt(known: Recorded, config: Config | None = None) -> Core:
+    """Build the recorded core, or that of another configuration with the recorded scene."""
+    found, model = "", known.box.metadata["model"]
+    for folder in (Path(known.box.metadata["scene_folder"]), known.box.path.absolute().parent):
+        try:
+            core = build_core(config or known.config, known.scene, folder)
+        except (ConfigError, ValueError, OSError) as error:
+            found = found or str(error)
+            continue
+        if core.model == model:
+            return core
+        found = f"the model {known.scene.insert.model!r} that is here has the hash {core.model[:SHOWN]}"
+    raise ReplayError(f"the model with the hash {model[:SHOWN]!r} has to be beside the file: {found}")
+
+
+def differences(header: dict[str, str]) -> list[str]:
+    """List what differs since the file was written: build, platform."""
+    found = []
+    here, there = sources_hash(), header["sources_sha256"]
+    if here != there:
+        found.append(
+            f"build: tormagd {header['version'][:20]} with the sources {there[:SHOWN]} was recorded, here is "
+            f"tormagd {__version__} with {here[:SHOWN]}"
+        )
+    if header["platform"] != platform_name():
+        found.append(f"platform: {header['platform'][:80]} was recorded, here is {platform_name()}")
+    return found
+
 
 KNOWN_OF_LINK = kinds(
     *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
@@ -60,7 +155,7 @@ def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None
 
 class Conversation:
     def __init__(self, frame: int) -> None:
-        self._connection: Connection | None = None
+        self._connection: connection.Connection | None = None
         self.stream: Stream = FrameStream()
         self._unread: Sequence[Any] = ()
         self._written: list[Sent] = []
@@ -73,10 +168,9 @@ class Conversation:
             told = memory["stream"]
             is_serial = FrameStream.__name__ in told
             self.stream = FrameStream() if is_serial else CanStream(told[CanStream.__name__]["node"])
-            connection = Connection(Device(), lambda: self, lambda: None)
-            connection.open(0.0)
-            connection.remember(memory, KNOWN_OF_LINK)
-            self._connection = connection
+            self._connection = own = connection.Connection(Device(), lambda: self, lambda: None)
+            own.open(0.0)
+            own.remember(memory, KNOWN_OF_LINK)
 
     def compare_memory(self, recorded: Any) -> Found | None:
         """Return where the connection's memory differs from the `recorded` one."""
@@ -152,7 +246,7 @@ NOT_THE_CORES = 1
 def planned_for(entry: Any) -> tuple[float, TimedSetpoint | None]:
     """Return when a recorded plan began, and its setpoint."""
     now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
-    return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], KNOWN))
+    return now_s, None if fields is None else TimedSetpoint(*fields[:-1], restored(fields[-1], stream.KNOWN))
 
 
 class Rerun(msgspec.Struct, frozen=True):
@@ -173,7 +267,7 @@ def ticks_of(entries: list[Any]) -> dict[int, Any]:
     for place, entry in enumerate(entries):
         if is_tick(entry):
             try:
-                records[place] = msgspec.convert(entry, TickRecord)
+                records[place] = msgspec.convert(entry, stream.TickRecord)
             except msgspec.ValidationError as error:
                 raise ReplayError(f"tick {len(records) + 1}: {error}") from error
     if not records:
@@ -220,23 +314,17 @@ def rerun(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
 
 def _start(entries: list[Any], records: dict[int, Any], until_s: float) -> int:
     """Return the index of the newest snapshot that a tick follows by `until_s`, else of the first."""
-    found: list[int] = []
-    waiting: int | None = None
-    for place, entry in enumerate(entries):
-        if name_of(entry) == journal.STATE:
-            waiting = place
-        elif place in records and waiting is not None:
-            if not found or records[place].monotonic_s <= until_s:
-                found.append(waiting)
-            waiting = None
-    if not found:
+    places = list(records)
+    snapshots = [place for place, entry in enumerate(entries[: places[-1]]) if name_of(entry) == stream.STATE]
+    if not snapshots:
         raise ReplayError("there is no snapshot in it that is followed by a tick: under a second was kept")
-    return found[-1]
+    early = [each for each in snapshots if records[places[bisect_right(places, each)]].monotonic_s <= until_s]
+    return early[-1] if early else snapshots[0]
 
 
 class _Running:
     def __init__(self, core: Core, frame: int) -> None:
-        self.conversation, self._core = Conversation(frame), core_hash(core.config, core.scene, core.model)
+        self.conversation, self._core = Conversation(frame), stream.core_hash(core.config, core.scene, core.model)
         self._of_frames: Found | None = None
         self._stepper, self._planner = core.stepper(), core.planner()
         self._used = self._planner.planned
@@ -249,67 +337,65 @@ class _Running:
     def take(self, entry: Any, record: Any) -> Found | None:
         """Take one entry that is no tick, and return the first difference."""
         name = name_of(entry)
-        if name == journal.TOLD:
-            return None
         self.conversation.frame += len(frames_in(entry))
-        if name == journal.STATE:
+        if name == stream.STATE:
             return self._begin(entry)
-        if name == journal.MISSING:
+        if name == stream.MISSING:
             self.gaps += self.is_known
             self.is_known = False
             self.conversation.begin(None)
-        elif name == journal.READ:
+        elif name == connection.READ:
             self.conversation.read(entry)
-        elif name == journal.CONNECTED:
+        elif name == connection.CONNECTED:
             self.conversation.begin(entry[1])
-        elif self.is_known:
+        elif self.is_known and name != stream.TOLD:
             return self._run(name, entry, record)
         return None
 
     def _run(self, name: str, entry: Any, record: Any) -> Found | None:
         """Do what one entry tells: step, plan, learning, command or fault."""
         match name:
-            case journal.STEP:
-                self._measurement = measurement_of(record)
+            case stream.STEP:
+                self._measurement = stream.measurement_of(record)
                 self._of_frames = self.conversation.compare(self._measurement)
                 self._used = self._planner.planned
                 self._output = self._stepper.step(record.monotonic_s, self._measurement, self._used)
-            case journal.WROTE:
+            case connection.WROTE:
                 if self._output is None:
                     raise ValueError("something written without a step")
                 self._of_frames = self._of_frames or self.conversation.wrote(entry, self._output)
-            case journal.PLAN:
+            case stream.PLAN:
                 now_s, timed = planned_for(entry)
                 try:
                     self._planner.plan(now_s, timed, self._stepper.measured, self._stepper.is_followed)
                 except PLAN_ERRORS as error:
                     self._failure = error
-            case journal.FORESEE:
+            case stream.FORESEE:
                 self._planner.governor.foresee()
-            case journal.AFRESH:
+            case stream.AFRESH:
                 self._failure = None
                 self._planner.afresh(msgspec.convert(entry[1], float))
-            case journal.TEACH | journal.ANSWER:
-                match restored(entry[1], KNOWN):
+            case stream.TEACH | stream.ANSWER:
+                match restored(entry[1], stream.KNOWN):
                     case Learned() as learned:
                         self._planner.believe.teach(learned)
                     case Answer() as answer:
                         self._planner.aim.answer = answer
                     case other:
                         raise ValueError(f"{other!r}: allowed is what is learned of a device, or what a search found")
-            case journal.CONFIRM:
+            case stream.CONFIRM:
                 self._planner.believe.confirm(msgspec.convert(entry[1], Disputed))
-            case journal.COMMAND:
+            case stream.COMMAND:
                 command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
                 try:
-                    self._stepper.command(command, now_s, restored(given, KNOWN))
+                    self._stepper.command(command, now_s, restored(given, stream.KNOWN))
                 except RefusedError as error:
                     return None if was_refused else Found(command, "taken", f"refused: {error.message}")
                 if was_refused:
                     return Found(command, "refused", "taken")
-            case journal.LATCH:
+            case stream.LATCH:
                 self._stepper.latch(Fault(entry[1]))
-            case journal.LOSE_LINK:
+            case stream.LOSE_LINK:
                 self._stepper.lose_link()
             case _:
                 raise ValueError(f"{name[:40]!r}: no entry of a black box")
@@ -324,16 +410,16 @@ class _Running:
         timing = record.lateness_us, record.exec_us, record.tick
         if self._failure is not None:
             return Found("plan", "made", f"failed: {self._failure}")
-        given = Moment(self._stepper, self._output, self._used, self._measurement, *timing).row()
+        given = stream.Moment(self._stepper, self._output, self._used, self._measurement, *timing).row()
         left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
         if packed(left) == packed(right):
             return self._of_frames
-        rows = zip(COLUMNS[NOT_THE_CORES:], left, right, strict=True)
+        rows = zip(stream.COLUMNS[NOT_THE_CORES:], left, right, strict=True)
         return next(Found(*row) for row in rows if packed(row[1]) != packed(row[2]))
 
     def _begin(self, entry: Any) -> Found | None:
         """Compare the states with a snapshot's, if they are known, and then take them."""
-        _, step, plan, connection, core = entry
+        _, step, plan, memory, core = entry
         if core != self._core:
             return Found("core", core, self._core)
         differs = None
@@ -341,21 +427,18 @@ class _Running:
             self.snapshots += 1
             for what, recorded, own in (("step", step, self._stepper), ("plan", plan, self._planner)):
                 differs = differs or differing(f"state.{what}", recorded, plain(own))
-            differs = differs or self.conversation.compare_memory(connection)
-        self.conversation.begin(connection)
-        restore(self._stepper, step, KNOWN)
-        restore(self._planner, plan, KNOWN)
+            differs = differs or self.conversation.compare_memory(memory)
+        self.conversation.begin(memory)
+        restore(self._stepper, step, stream.KNOWN)
+        restore(self._planner, plan, stream.KNOWN)
         self._failure, self.is_known = None, True
         return differs
 
 
 def name_of(entry: Any) -> str:
-    """Return an entry's name, a word by itself or at the head of a list; empty for a tick."""
-    if isinstance(entry, str):
-        return entry
-    if isinstance(entry, list) and entry and isinstance(entry[0], str):
-        return entry[0]
-    return ""
+    """Return the word at the head of an entry; empty for a tick."""
+    is_named = isinstance(entry, list) and bool(entry) and isinstance(entry[0], str)
+    return entry[0] if is_named else ""
 
 
 def _short(thing: object) -> str:

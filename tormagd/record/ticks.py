@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 import msgspec
 
-from tormagd.record.telemetry import COLUMNS, TIME_COLUMN
+from tormagd.record.stream import COLUMNS, TIME_COLUMN
 from tormagd_client.messages import VERSION, MessageError
 from tormagd_client.printable import require
 
@@ -26,12 +26,9 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         require(self.v == VERSION, "v", self.v, f"{VERSION}")
-        if not 0 < len(self.columns) <= MAX_COLUMNS or self.columns[0] != TIME_COLUMN:
-            raise ValueError(
-                f"columns = {list(self.columns)[:4]!r}...: allowed are 1..{MAX_COLUMNS} names, {TIME_COLUMN} first"
-            )
-        if len(set(self.columns)) != len(self.columns):
-            raise ValueError(f"columns = {list(self.columns)!r}: allowed is each name once")
+        is_known = 0 < len(self.columns) <= MAX_COLUMNS and self.columns[0] == TIME_COLUMN
+        require(is_known, "columns", self.columns[:4], f"1..{MAX_COLUMNS} names, {TIME_COLUMN} first")
+        require(len(set(self.columns)) == len(self.columns), "columns", self.columns, "each name once")
         for number, row in enumerate(self.rows):
             if len(row) != len(self.columns):
                 raise ValueError(f"rows[{number}] has {len(row)} values: allowed is {len(self.columns)}")

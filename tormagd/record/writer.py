@@ -12,7 +12,7 @@ import math
 import os
 import shutil
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -22,11 +22,11 @@ import msgspec
 from mcap.writer import Writer
 
 from tormagd import __version__
-from tormagd.ground.files import new_file
+from tormagd.ground.files import in_place_of, new_file
+from tormagd.hardware.connection import READ, WROTE
 from tormagd.record.folder import RecordingFolder
-from tormagd.record.journal import READ, TOLD, WROTE
 from tormagd.record.overview import OverviewBuilder
-from tormagd.record.telemetry import COLUMNS, kind_of
+from tormagd.record.stream import COLUMNS, TOLD, kind_of
 from tormagd.record.ticks import TickBatch, Value
 from tormagd_client.messages import Mark, Telemetry
 
@@ -134,7 +134,7 @@ class Derived:
         self._numbers = {TELEMETRY_TOPIC: count(), TICKS_TOPIC: count(), FRAMES_TOPIC: count(1)}
         self._offset_ns: int | None = None
         self._newest_ns = self._monotonic_ns = 0
-        self.ahead_ns = 0
+        self._ahead_ns = 0
         "How far the wall clock has gone ahead."
 
     def of(self, columns: Sequence[str], entries: Sequence[Any]) -> Iterator[Shown]:
@@ -162,9 +162,9 @@ class Derived:
             return t_ns
         monotonic_ns = round(monotonic_s * 1e9)
         if self._offset_ns is None or monotonic_ns < self._monotonic_ns:  # the first, or of another machine
-            self._offset_ns = max(t_ns - self.ahead_ns, self._newest_ns) - monotonic_ns
+            self._offset_ns = max(t_ns - self._ahead_ns, self._newest_ns) - monotonic_ns
         self._monotonic_ns, self._newest_ns = monotonic_ns, monotonic_ns + self._offset_ns
-        self.ahead_ns = t_ns - self._newest_ns
+        self._ahead_ns = t_ns - self._newest_ns
         return self._newest_ns
 
 
@@ -244,18 +244,13 @@ class RecordingWriter:
 
     def _snapshot(self, shown: Shown) -> None:
         mark = msgspec.convert(shown.message.get("mark"), Mark | None)
-        is_new = mark is not None and mark != self._mark
-        if is_new:
+        if mark not in (None, self._mark):  # every snapshot has the newest
             self._thinning.happened(shown.t_ns)
-        self._add(shown)
-        self._overview.add(shown.t_ns, False, {"mark": mark})
-        self.telemetry_count += 1
-        if mark is not None:
             self._mark = mark
-            # every snapshot has the newest mark, even one from before
-            is_within = is_new and mark.t_ns - self._derived.ahead_ns >= self._begin_ns
-            if is_within and self._folder is not None:
-                self.path = self._folder.mark_around(self.path)
+        self._add(shown)
+        self.telemetry_count += 1
+        if self._overview.add(shown.t_ns, False, {"mark": mark}) and self._folder is not None:
+            self.path = self._folder.mark_around(self.path)
 
     def _tick(self, shown: Shown) -> None:
         if isinstance(number := shown.message.get(NUMBER_COLUMN), int):
@@ -317,6 +312,14 @@ class RecordingWriter:
             self._begin_ns, self._chunk_ns = self._begin_ns or t_ns, t_ns
         data = message if topic == CORE_TOPIC else msgspec.json.encode(message)
         self._mcap.add_message(self._channel_of(topic), t_ns, data, t_ns, sequence % 2**32)
+
+
+def write_black_box(path: Path, header: dict[str, str], parts: Iterable[bytes]) -> None:
+    """Write a black box of these entries, whole or not at all."""
+    columns = msgspec.json.decode(header["columns"], type=tuple[str, ...])
+    with in_place_of(path) as beside, RecordingWriter(beside, header) as writer:
+        for part in parts:
+            writer.entries(columns, msgspec.msgpack.decode(part, type=list[Any]), part)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:

@@ -23,10 +23,9 @@ from tormagd.control.safety.operating_state import OperatingState, RefusedError
 from tormagd.ground.command_line import add, option
 from tormagd.ground.plain_values import InexactError
 from tormagd.ground.terminal import write_line
-from tormagd.record import journal
-from tormagd.record.black_box import Recorded, ReplayError, rebuilt, told
+from tormagd.record import stream
 from tormagd.record.reader import RecordingError
-from tormagd.record.rerun import name_of, planned_for, ticks_of
+from tormagd.record.rerun import Recorded, ReplayError, name_of, planned_for, rebuilt, reopened, ticks_of
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
@@ -111,10 +110,10 @@ def script(entries: list[Any]) -> Script:
     commands: list[tuple[float, str]] = []
     try:
         for entry in entries:
-            if name_of(entry) == journal.PLAN:
+            if name_of(entry) == stream.PLAN:
                 now_s, setpoint = planned_for(entry)
                 setpoints.append((now_s - first_s, None if setpoint is None else _later(setpoint, -first_s)))
-            elif name_of(entry) == journal.COMMAND:
+            elif name_of(entry) == stream.COMMAND:
                 name, now_s, was_refused = msgspec.convert(entry[1:4], tuple[str, float, bool])
                 if not was_refused:
                     commands.append((now_s - first_s, name))
@@ -201,29 +200,31 @@ def _hand(ticks: list[Any]) -> RecordedHand:
     return RecordedHand(tuple(times_s), tuple(places.get(time_s, 0.0) for time_s in times_s))
 
 
+def _rehearsed(known: Recorded, options: argparse.Namespace) -> dict[str, Any]:
+    todo = script(known.box.entries)
+    config = changed(known.config, options.settings)
+    # a file keeps its own scene only: another one is this machine's
+    core = rebuilt(known, config) if config.scene == known.config.scene else build_core(config)
+    simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
+    instead = rehearse(core, config, todo, options.plant, options.faults) if options.settings else None
+    return {
+        "plant": options.plant,
+        "faults": options.faults,
+        "settings": options.settings,
+        "recorded": msgspec.to_builtins(todo.recorded),
+        "simulated": msgspec.to_builtins(simulated),
+        "instead": msgspec.to_builtins(instead),
+    }
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add(parser, OPTIONS)
     options = parser.parse_args(arguments)
 
-    def run(known: Recorded) -> dict[str, Any]:
-        todo = script(known.box.entries)
-        config = changed(known.config, options.settings)
-        # a file keeps its own scene only: another one is this machine's
-        core = rebuilt(known, config) if config.scene == known.config.scene else build_core(config)
-        simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
-        instead = rehearse(core, config, todo, options.plant, options.faults) if options.settings else None
-        return {
-            "plant": options.plant,
-            "faults": options.faults,
-            "settings": options.settings,
-            "recorded": msgspec.to_builtins(todo.recorded),
-            "simulated": msgspec.to_builtins(simulated),
-            "instead": msgspec.to_builtins(instead),
-        }
-
     try:
-        result = told(options.file, run)
+        with reopened(options.file) as (known, told):
+            result = told | _rehearsed(known, options)
     except (ConfigError, RecordingError, ReplayError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -27,7 +27,7 @@ from tormagd.control.ask.forecast import (
     Skill,
 )
 from tormagd.ground.plain_values import plain, restore
-from tormagd.record.journal import KNOWN
+from tormagd.record.stream import KNOWN
 
 Array = npt.NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from tormagd.control.records import Ask, GapSpeeds, TimedSetpoint, Travel
 from tormagd.control.safety.codes import Limit
 from tormagd.element.physics.errors import DomainError
 from tormagd.ground.plain_values import plain, restore
-from tormagd.record.journal import KNOWN
+from tormagd.record.stream import KNOWN
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
 PORTRAIT = Portrait(

@@ -16,7 +16,7 @@ from tormagd.control.safety.codes import Limit
 from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.element.physics.friction import Friction
 from tormagd.ground.plain_values import plain, restore
-from tormagd.record.journal import KNOWN
+from tormagd.record.stream import KNOWN
 
 PERIOD_S = 0.004
 TURN = Turn(1.0, 0.0, 100.0)

@@ -1,11 +1,15 @@
-"""A control tick: the core's own records as one row, and the telemetry message of the newest one.
+"""The stream: what the core got and made, tick by tick.
 
     row       what a step concluded, and then every field of plan, duty, measurement and link, in their own order
     COLUMNS   the fields' names: a field that a record gets is a column without another word
+    Journal   all inputs of the core, in their order: a replay runs the core again from them and a snapshot
 
-Black box, recording, replay and telemetry read these columns; docs/reference/ticks.md lists them.
+Black box, recording, replay and telemetry read these; docs/reference/ticks.md lists the columns. `plan` and `step` are
+deterministic, and so is the conversation with the device, given what was read and when. Their results stand in the
+journal for comparison only.
 """
 
+import hashlib
 import math
 import time
 from collections.abc import Mapping
@@ -17,15 +21,84 @@ import msgspec
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from firmware_protocol.value import Value
-from tormagd.control.believe.believe import MIN_FORESIGHT
+from tormagd.config import Config
+from tormagd.control.ask.forecast import Skill
+from tormagd.control.believe.believe import MIN_FORESIGHT, Learned
+from tormagd.control.believe.sensor_zero import Level
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner, Stepper
-from tormagd.control.records import Duty, Plan
-from tormagd.control.safety.operating_state import SafetyState
+from tormagd.control.measure import Leap
+from tormagd.control.move.actuator import Reference
+from tormagd.control.records import Duty, Handle, Measured, Outside, Plan, TimedSetpoint, Travel, Wall
+from tormagd.control.safety.codes import Fault, Limit
+from tormagd.control.safety.operating_state import Conditions, OperatingState, SafetyState
+from tormagd.element.inverse.solution import Answer, FieldSolution, Question, Reach
+from tormagd.element.model.displacement import Turn
+from tormagd.ground.plain_values import kinds, plain
 from tormagd.hardware.link_statistics import LinkQuality
-from tormagd.hardware.measurement import Measurement
-from tormagd.scenes.scene import Terms
+from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.scenes.scene import Scene, Terms
 from tormagd_client.messages import VERSION, BeliefReport, Telemetry, Tick
 
+FORMAT = 24
+"Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
+KNOWN = kinds(
+    *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
+    *(Measured, Handle, Travel, Turn, TimedSetpoint, Wall, Leap, Reference, Plan, Outside),
+    *(DeviceFit, Level, Learned, Skill, Question, Answer, FieldSolution, Reach),
+)
+"All types that `plain_values` reads back."
+STEP = "step"
+"A step is about to run; its inputs are in the tick that follows."
+PLAN, FORESEE, AFRESH = "plan", "foresee", "afresh"
+"`[PLAN, now_s, setpoint]`, `[FORESEE]`; `[AFRESH, now_s]` where one of them failed, and planning began anew."
+TEACH, CONFIRM, ANSWER = "teach", "confirm", "answer"
+"What is known from another day, an operator's word in a dispute, and what a search beside the plans found."
+COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
+"`[COMMAND, name, now_s, is_refused, conditions]`, `[LATCH, fault]`, `[LOSE_LINK]`."
+TOLD, MISSING = "told", "missing"
+"No inputs of the core, as what `Connection.traffic` hears: a snapshot as published, and that other entries were lost."
+STATE = "state"
+"`[STATE, stepper, planner, connection, core_hash]`: a replay may begin here."
+MAX_ENTRIES = 4_096
+"When this many entries were not taken, MISSING takes their place."
+
+
+def core_hash(config: Config, scene: Scene, model: str) -> str:
+    """Return what tells one core from another."""
+    return hashlib.sha256(msgspec.json.encode((config, scene, model))).hexdigest()
+
+
+class Journal:
+    """The core's inputs since the last `take`, as entries: a tick, or a name and what belongs to it."""
+
+    def __init__(self, *, is_kept: bool = True) -> None:
+        self.is_kept = is_kept
+        self._entries: list[Any] = []
+
+    def note(self, name: str, *what: Any) -> None:
+        self.add((name, *what))
+
+    def take(self) -> list[Any]:
+        """Return and remove all entries."""
+        entries, self._entries = self._entries, []
+        return entries
+
+    def add(self, entry: Any) -> None:
+        if not self.is_kept:
+            return
+        if len(self._entries) >= MAX_ENTRIES:
+            self._entries = [(MISSING,)]
+        self._entries.append(entry)
+
+
+def _of_value(thing: Any) -> Any:
+    if type(thing) is TimedSetpoint:
+        return [getattr(thing, name) for name in thing.__match_args__]
+    return plain(thing)
+
+
+packed = msgspec.msgpack.Encoder(enc_hook=_of_value).encode
 TIME_COLUMN = "t_ns"
 
 
@@ -177,20 +250,19 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
     fit, memory, zero_sd_N = believe.fit, believe.memory, believe.zero.sd_N(now_s)
     ripple = max(believe.ripple.shares)
     is_ahead, trust = plan.foresight >= MIN_FORESIGHT, planner.governor.forecast.trust
-    return {
-        "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),
-        "offset": _told(fit.offset_N, fit.deviation_N(0.0), "N", terms.offset),
-        "low_speed_factor": _told(believe.slow.factor_at(0.0), None, "", terms.creep),
-        "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", believe.knows_zero(now_s)),
-        "way": _told(believe.zero.way, math.sqrt(believe.zero.way_variance), "", believe.zero.way != 0.0),
-        "ripple": _told(ripple, None, "", ripple > 0.0),
-        "carriage_lag": _told(believe.carriages.lag_s, None, "s", terms.motor and is_ahead),
-        "acceleration_scale": _told(stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),
-        "forecast_trust": _told(trust, None, "", trust > 0.0 and plan.foresight > 0.0),
-        "relaxed": _told(memory.relaxed_N, None, "N", memory.relaxed_N != 0.0),
-        "field_lag": _told(memory.lag_mT, None, "mT", memory.lag_mT != 0.0),
+    told: dict[str, tuple[float, float | None, str, bool]] = {
+        "scale": (fit.scale, fit.scale_sd, "", terms.scale),
+        "offset": (fit.offset_N, fit.deviation_N(0.0), "N", terms.offset),
+        "low_speed_factor": (believe.slow.factor_at(0.0), None, "", terms.creep),
+        "sensor_zero": (believe.zero.zero_N, zero_sd_N, "N", believe.knows_zero(now_s)),
+        "way": (believe.zero.way, math.sqrt(believe.zero.way_variance), "", believe.zero.way != 0.0),
+        "ripple": (ripple, None, "", ripple > 0.0),
+        "carriage_lag": (believe.carriages.lag_s, None, "s", terms.motor and is_ahead),
+        "acceleration_scale": (stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),
+        "forecast_trust": (trust, None, "", trust > 0.0 and plan.foresight > 0.0),
+        "relaxed": (memory.relaxed_N, None, "N", memory.relaxed_N != 0.0),
+        "field_lag": (memory.lag_mT, None, "mT", memory.lag_mT != 0.0),
     }
-
-
-def _told(value: float, sd: float | None, unit: str, acts: bool) -> BeliefReport:
-    return BeliefReport(value=value, sd=sd, unit=unit, acts=acts)
+    return {
+        name: BeliefReport(value=value, sd=sd, unit=unit, acts=acts) for name, (value, sd, unit, acts) in told.items()
+    }
