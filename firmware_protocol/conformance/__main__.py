@@ -20,7 +20,6 @@ from firmware_protocol.conformance.ports import open_line
 from firmware_protocol.conformance.rules import RULES
 
 PASSED, FAILED, USAGE = 0, 1, 2
-RESET_S: Final = 30.0
 BOUNDS: Final = {
     "baud": (300, 100_000_000),
     "bitrate": (10_000, 8_000_000),
@@ -44,9 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Examine the device on a line, once the user has agreed that its motors move, and print the results."""
     command = parser()
     options = command.parse_args(arguments)
-    for name, (least, most) in BOUNDS.items():
-        if not least <= getattr(options, name) <= most:
-            command.error(f"{name} = {getattr(options, name):g}: allowed is {least:g}..{most:g}")
+    _require_bounds(command, options)
     if not (options.yes or _is_agreed(options.line)):
         command.exit(USAGE, f"{command.prog}: nothing was sent; say yes, or --yes where nobody can be asked\n")
     try:
@@ -56,6 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with contextlib.closing(line.port):
         checks = [one for one in CHECKS if not options.only or one.name in options.only or one is left_open]
         return PASSED if _examined(line, checks, options) else FAILED
+
+
+def _require_bounds(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    for name, (least, most) in BOUNDS.items():
+        if not least <= getattr(options, name) <= most:
+            command.error(f"{name} = {getattr(options, name):g}: allowed is {least:g}..{most:g}")
 
 
 def report(results: Sequence[Result]) -> dict[str, Any]:
@@ -133,7 +136,7 @@ def _summary(host: Host, results: Sequence[Result]) -> str:
 def _reset(command: str, how: str) -> None:
     """Reset the device by the command of `--reset`."""
     try:
-        subprocess.run([*shlex.split(command), how], check=True, timeout=RESET_S, stdin=subprocess.DEVNULL)
+        subprocess.run([*shlex.split(command), how], check=True, timeout=30.0, stdin=subprocess.DEVNULL)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         raise Unmet(f"--reset: {error}") from error
 

@@ -15,7 +15,6 @@ from can.interfaces import BACKENDS
 
 from firmware_protocol.conformance.line import CanLine, Line, SerialLine
 
-READ_BYTES: Final = 4096
 PATIENCE_S: Final = 1.0
 "A port that takes nothing for this time is gone."
 
@@ -60,7 +59,7 @@ class SerialPort(RealPort):
         self._port.write(data)
 
     def _received(self) -> list[tuple[bytes]]:
-        data = os.read(self._fd, READ_BYTES)
+        data = os.read(self._fd, 4096)
         if not data:
             raise OSError(errno.ENODEV, "the device was unplugged")
         return [(data,)]

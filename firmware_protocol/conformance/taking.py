@@ -317,10 +317,14 @@ def _begun(host: Host, place: Place, name: str, beat: Beat, period_s: float) -> 
     modes = [status.mode.name for _, status in host.all_of(Status) if status.mode is not place.mode]
     seen = f"{min(way_mm):+.2f} mm at the innermost, {min(way_mm[-2:]):+.2f} mm after {BEGUN_S:g} s, {modes[:1]}"
     return unless(
-        (to != DeviceMode.HOMING.name and min(way_mm) < -COASTED_MM.get((place.mode, period_s), MOVED_MM))
-        or (place.mode is DeviceMode.RUN and min(way_mm[-2:]) < BEGUN_MM)
-        or (name != SILENT and len(host.all_of(Identity)) != (name == MISFITS))
-        or modes[:1] != [to] * (to in MODES),
+        any(
+            (
+                to != DeviceMode.HOMING.name and min(way_mm) < -COASTED_MM.get((place.mode, period_s), MOVED_MM),
+                place.mode is DeviceMode.RUN and min(way_mm[-2:]) < BEGUN_MM,
+                name != SILENT and len(host.all_of(Identity)) != (name == MISFITS),
+                modes[:1] != [to] * (to in MODES),
+            )
+        ),
         seen,
     )
 

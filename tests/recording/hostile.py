@@ -68,6 +68,9 @@ FILES: dict[str, Callable[[], bytes]] = {
     "metadata of brackets": lambda: messages(b"{}", about={"scene": NESTED.decode(), "portrait": NESTED.decode()}),
     "a chunk that unpacks to 220 MB": lambda: chunk(zstandard.compress(bytes(MANY)), MANY),
     "a chunk that unpacks to more than it says": lambda: chunk(zstandard.compress(bytes(MANY)), 1_000),
+    "a thousand damaged chunks of 7.9 MB": lambda: (
+        MAGIC + CHANNEL + record(Chunk("zstd", zstandard.compress(bytes(7_900_000)), 1, 1, 7, 7_900_000)) * 1_000
+    ),
     "a chunk with a huge window": lambda: chunk(
         zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters(window_log=27)).compress(
             bytes(MANY)

@@ -135,6 +135,14 @@ def test_a_name_says_when_it_began_also_in_the_former_form(tmp_path: Path, fract
     assert mark(mark(path)) == tmp_path / f"2026-11-26T05-09-27{fraction}.marked.mcap"
 
 
+def test_a_segment_that_somebody_renamed_is_recorded_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RecordingWriter(RecordingFolder(tmp_path, SETTINGS, Clock())) as recorder:
+        recorder.path.rename(tmp_path / "mine.mcap")
+        tell(recorder, telemetry(0, 0, mark=Mark(t_ns=START_NS + 10, text="here")))
+    assert [each.text for each in RecordingFile(tmp_path / "mine.mcap").overview.marks] == ["here"]
+    assert "the mark keeps no segment" in capsys.readouterr().err
+
+
 def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Path) -> None:
     clock = Clock()
     recorder = RecordingWriter(RecordingFolder(tmp_path, SETTINGS, clock))

@@ -40,6 +40,8 @@ def test_hostile_files_are_refused_in_a_sentence_within_200_MB(tmp_path: Path) -
     assert peak_MB < MAX_MB
     assert [each for look, each in said.items() if look.split(" ", 1)[1] not in each or "\n" in each] == []
     assert max(map(len, said.values())) <= 400
+    bomb = next(path for path, name in files.items() if name.startswith("a thousand damaged"))
+    assert "unpacks to over" in said[f"read_recording {bomb}"]
     # at a glance, before all of it is read
     glanced = {files[each.split(" ", 1)[1]] for each in said if not each.startswith("read_recording")}
     assert set(files.values()) - glanced <= READABLE

@@ -157,15 +157,17 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     for number in range(MAX_FILES + 3):
         (folder / f"20400101T0000{number:02d}.000Z-OLD.mcap").touch()  # by a clock that was ahead
         (folder / f"20200101T0000{number:02d}.000Z-REQUEST.mcap").touch()
+    (folder / "20200101T000000.000Z-SKEW-to-keep.mcap").touch()
+    (folder / "20200101T000000.000Z-SKEW.mcap").mkdir()
     process.say(Begin(str(folder), HEADER), ticks(1, 20), ticks(21, 20))
     process.say(written(folder, "20300101T000000.000Z-SKEW.mcap", firmware="1.2"))
     assert process.heard() == Written("20300101T000000.000Z-SKEW.mcap")
     box = BlackBoxFile(folder / "20300101T000000.000Z-SKEW.mcap")
     assert (box.metadata["reason"], box.metadata["firmware"], box.is_complete) == ("SKEW", "1.2", True)
     assert [entry[0] for entry in box.entries if entry != "step"] == list(range(1, 41))
-    assert len(list(folder.iterdir())) == 2 * MAX_FILES + 3
+    assert len(list(folder.iterdir())) == 2 * MAX_FILES + 5
     process.say(written(folder, "20300101T000000.000Z-REQUEST.mcap"))
-    assert (process.heard().refusal, len(list(folder.iterdir()))) == ("", 2 * MAX_FILES)
+    assert (process.heard().refusal, len(list(folder.iterdir()))) == ("", 2 * MAX_FILES + 2)
     # what is there already is not written again
     data = (folder / "20300101T000000.000Z-SKEW.mcap").read_bytes()
     process.say(ticks(41, 20), written(folder, "20300101T000000.000Z-SKEW.mcap"))

@@ -158,7 +158,7 @@ def black_box(client: Client) -> Outcome:
     """Have the daemon write its black box, and wait until the file is on the disk."""
     written = Path(client.request("blackbox")["file"])
     boxes = (state.black_box for _, state in statuses(client, LONGEST_WRITE_S))
-    box = next((each for each in boxes if each.newest == written.name or each.refusal), None)
+    box = next((each for each in boxes if each.newest == written.name or written.name in each.refusal), None)
     if box is None or box.newest != written.name:
         raise CommandError(
             Exit.REFUSED,

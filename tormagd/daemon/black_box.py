@@ -25,7 +25,18 @@ from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.child_process import ChildProcess
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
-from tormagd.record.keeper import REQUEST, Begin, End, Part, Ring, Write, Written, box_path, in_shared_memory
+from tormagd.record.keeper import (
+    REQUEST,
+    SHARED_MEMORY,
+    Begin,
+    End,
+    Part,
+    Ring,
+    Write,
+    Written,
+    box_path,
+    in_shared_memory,
+)
 from tormagd.record.stream import COLUMNS, FORMAT, MISSING, STATE, Journal, Moment, core_hash, packed
 from tormagd_client.messages import BlackBoxReport
 
@@ -127,7 +138,9 @@ class BlackBox:
                     self._ring.put(Part(moment.time_s, part[0]))
         except (TypeError, ValueError, OverflowError, OSError) as error:  # control goes on, whatever is in it
             if not self._dropped:
-                log.error("some ticks are in no black box: %s; next: report that", error)
+                log.error(
+                    "some ticks are in no black box: %s; next: make room in %s, or report that", error, SHARED_MEMORY
+                )
             self._refusal, self._dropped = f"an entry that cannot be written: {error}", self._dropped + 1
             self.journal.take()
             self.journal.note(MISSING)

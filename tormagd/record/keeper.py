@@ -9,6 +9,7 @@ import fcntl
 import hashlib
 import math
 import os
+import re
 import select
 import signal
 import socket
@@ -32,6 +33,8 @@ MAX_BYTES = 48_000_000
 "The ring's bounds; half a minute at 1 kHz is 18 MB."
 HALVES = 0, 1 << 30
 "Where each half of a ring begins; what is between was never written and takes no memory."
+OWN_NAME = re.compile(r"\d{8}T\d{6}\.\d{3}Z-([A-Z_-]+)\.mcap")
+"What a keeper names a box; another name is somebody's own, and stays."
 MAX_FILES = 20
 "Of faults, and of requests; the oldest goes."
 MAX_PACKET = 1_000_000
@@ -237,10 +240,12 @@ class Keeper:
         write_black_box(path, {**write.header, "reason": write.reason}, parts)
         # a name is a clock's word: what this daemon has written is newer than the rest
         self._written.append(path.name)
-        known = sorted(path.parent.glob("*Z-*.mcap"), key=lambda each: (each.name in self._written, each.name))
-        alike = [each for each in known if each.match(f"*-{REQUEST}.mcap") is (write.reason == REQUEST)]
+        known = sorted(path.parent.iterdir(), key=lambda each: (each.name in self._written, each.name))
+        named = [(each, OWN_NAME.fullmatch(each.name)) for each in known if each.is_file()]
+        alike = [each for each, name in named if name and (name[1] == REQUEST) is (write.reason == REQUEST)]
         for old in alike[:-MAX_FILES]:
-            old.unlink()
+            with contextlib.suppress(OSError):  # the box is written, whoever holds an older one
+                old.unlink()
 
 
 def main() -> None:

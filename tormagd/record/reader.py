@@ -264,15 +264,15 @@ class Contents:
         for place in self.places:
             if place.from_ns > to_ns or place.to_ns < from_ns:
                 continue
+            if size > MAX_RATIO * file.tell() + FREE_BYTES:
+                raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
             try:
                 chunk = _at(file, place.at, Chunk)
+                size += max(min(chunk.uncompressed_size, MAX_RECORD_BYTES), len(chunk.data))
                 records = _within(chunk)
             except UNREADABLE as error:
                 self.lost[place.at] = f"byte {place.at}: {str(error)[:80] or repr(error)}"
                 continue
-            size += chunk.uncompressed_size
-            if size > MAX_RATIO * file.tell() + FREE_BYTES:
-                raise ValueError(f"it unpacks to over {MAX_RATIO} times its size")
             for record in records:
                 self._take(record, place.at)
                 if isinstance(record, Message):

@@ -11,6 +11,7 @@ import fcntl
 import math
 import os
 import shutil
+import sys
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count
@@ -23,6 +24,7 @@ from mcap.writer import Writer
 
 from tormagd import __version__
 from tormagd.ground.files import in_place_of, new_file
+from tormagd.ground.terminal import write_line
 from tormagd.hardware.connection import READ, WROTE
 from tormagd.record.folder import RecordingFolder
 from tormagd.record.overview import OverviewBuilder
@@ -250,7 +252,10 @@ class RecordingWriter:
         self._add(shown)
         self.telemetry_count += 1
         if self._overview.add(shown.t_ns, False, {"mark": mark}) and self._folder is not None:
-            self.path = self._folder.mark_around(self.path)
+            try:
+                self.path = self._folder.mark_around(self.path)
+            except (OSError, ValueError) as error:  # somebody has renamed it
+                write_line(f"the mark keeps no segment: {error}", sys.stderr)
 
     def _tick(self, shown: Shown) -> None:
         if isinstance(number := shown.message.get(NUMBER_COLUMN), int):
