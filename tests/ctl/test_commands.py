@@ -321,11 +321,16 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
             "belief": {
                 "scale": {"value": 0.75, "sd": 0.01, "unit": "", "acts": True},
                 "low_speed_factor": {"value": 1.12, "sd": None, "unit": "", "acts": True},
+                "way": {"value": -0.021, "sd": 0.004, "unit": "", "acts": True},
+                "ripple": {"value": 0.03, "sd": None, "unit": "", "acts": True},
                 "carriage_lag": {"value": 0.035, "sd": 0.002, "unit": "s", "acts": True},
                 "relaxed": {"value": 0.2, "sd": None, "unit": "N", "acts": False},
             }
         },
-        ("believed  force at a creep over that at speed 1.12, carriages' delay 35 ± 2 ms",),
+        (
+            "believed  force at a creep over that at speed 1.12, friction's excess in the positive direction "
+            "-2.1 ± 0.4 %, friction's greatest wave in a turn 3 %, carriages' delay 35 ± 2 ms",
+        ),
         (),
     ),
     "why a profile is not used where one was to be": (
