@@ -162,7 +162,7 @@ class Position(Strict, frozen=True):
     "Anti-windup time of the integral."
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
     "Gain on the skew between the carriages, as a multiple of `proportional_per_mm`."
-    gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
+    gap_speed_mm_s: Annotated[float, Meta(ge=0.1, le=500.0)] = 38.0
     "Greatest speed of the opening gap, both carriages together."
     closing_mm_s: Annotated[float, Meta(ge=0.0, le=500.0)] = 0.0
     "The same for closing; 0: the motors' own. A file that states `gap_speed_mm_s` alone sets both."
@@ -178,7 +178,7 @@ class Trim(Strict, frozen=True):
 
     time_s: Annotated[float, Meta(ge=0.05, le=1_000.0)] = 0.5
     "Time in which the offset is learned; a new device is learned sooner."
-    least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
+    least: Annotated[float, Meta(ge=0.1, le=1.0)] = 0.6
     "Least ratio of the device's force to the model's; beyond it the limit `TRIM` shows."
     most: Annotated[float, Meta(ge=1.0, le=5.0)] = 2.0
     "Greatest ratio. No device counts as stronger, so the force ceiling depends on it."

@@ -102,6 +102,8 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
         ("[realtime]\ncpus = [0, -1]", "$.realtime.cpus", "[0, -1]", ">= 0"),
         ("[position]\nduty_limit = 1.01", "$.position.duty_limit", "1.01", "<= 1.0"),
         ("[position]\nproportional_per_mm = -6.0", "$.position.proportional_per_mm", "-6.0", "> 0.0"),
+        ("[position]\ngap_speed_mm_s = 5e-324", "$.position.gap_speed_mm_s", "5e-324", ">= 0.1"),
+        ("[trim]\nleast = 5e-324", "$.trim.least", "5e-324", ">= 0.1"),
         ("rates = 1000", "$.rates", "1000", "a `[table]`"),
         ("[trim]\nmost = 0.9", "$.trim.most", "0.9", ">= 1.0"),
         ("[sources]\npriority = 'a'", "$.sources.priority", "'a'", "`array`"),

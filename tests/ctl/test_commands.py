@@ -321,11 +321,16 @@ STATUS_TEXTS: dict[str, tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]]
             "belief": {
                 "scale": {"value": 0.75, "sd": 0.01, "unit": "", "acts": True},
                 "low_speed_factor": {"value": 1.12, "sd": None, "unit": "", "acts": True},
+                "way": {"value": -0.021, "sd": 0.004, "unit": "", "acts": True},
+                "ripple": {"value": 0.03, "sd": None, "unit": "", "acts": True},
                 "carriage_lag": {"value": 0.035, "sd": 0.002, "unit": "s", "acts": True},
                 "relaxed": {"value": 0.2, "sd": None, "unit": "N", "acts": False},
             }
         },
-        ("believed  force at a creep over that at speed 1.12, carriages' delay 35 ± 2 ms",),
+        (
+            "believed  force at a creep over that at speed 1.12, friction's excess in the positive direction "
+            "-2.1 ± 0.4 %, friction's greatest wave in a turn 3 %, carriages' delay 35 ± 2 ms",
+        ),
         (),
     ),
     "why a profile is not used where one was to be": (
@@ -572,11 +577,13 @@ def test_what_is_not_met_is_met_by_the_tolerance_that_is_named(tmp_path, ctl, ch
 
 
 def test_another_quantity_becomes_a_force_by_scale_and_offset(tmp_path, ctl, checked_here):
-    (tmp_path / "f.csv").write_text("t_s,note,ABP_mmHg\n" + "".join(f"{n},a,{70 + 50 * (n % 2)}\n" for n in range(30)))
+    (tmp_path / "f.csv").write_text(
+        "t_s,note,ABP_mmHg\n-1e-7,a,70\n" + "".join(f"{n},a,{70 + 50 * (n % 2)}\n" for n in range(30))
+    )
     given = ("--force", str(tmp_path / "f.csv"), "--column", "ABP_mmHg", "--scale", "0.01", "--offset", "0.5")
     scene = load_scene(ctl("scene", "new", str(tmp_path / "mine.toml"), *given, "--json").ended(0).result["file"])
     assert (scene.force.least_N, scene.force.most_N, scene.signal.file) == (1.2, 1.7, "mine.csv")
-    assert (tmp_path / "mine.csv").read_text().splitlines()[:2] == ["t_s,force_N", "0.000000,1.2"]
+    assert (tmp_path / "mine.csv").read_text().splitlines()[:3] == ["t_s,force_N", "-1e-07,1.2", "0.0,1.2"]
 
 
 def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(

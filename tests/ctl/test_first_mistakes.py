@@ -123,6 +123,7 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl scene new", 2, "the following arguments are required: FILE.toml", {}),
     ("tormagctl scene new a.toml", 2, "allowed is a new file in a folder that exists", {"a.toml": ""}),
     (f"{NEW} --scale 0", 2, "has no range", FORCES),
+    (NEW, 2, "has no range", {"f.csv": "t_s,force_N\n0,0\n1,5e-324\n"}),
     (f"{NEW} --column torque_mNm", 2, "no column is called 'torque_mNm'", FORCES),
     (f"{NEW} --offset -2", 2, "force_N = -1: allowed is 0..1000 N", FORCES),
     (f"{NEW} --scale nan", 2, "--scale", FORCES),

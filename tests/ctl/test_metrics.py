@@ -29,6 +29,7 @@ from tormagd.ctl.main import main
 
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "examples/grafana.json"
+MESSAGES = (ROOT / "docs/messages.md").read_text(encoding="utf-8")
 BASE_UNITS = ("seconds", "newtons", "meters", "teslas", "hertz", "ratio")
 PROMTOOL = shutil.which("promtool")
 
@@ -85,6 +86,8 @@ def test_the_status_is_there_in_base_units(full: Any, ctl: Any) -> None:
     families = read(printed(ctl, full))
     found = [(name, labels, values(families, f"tormag_{name}", **labels)) for name, labels, _ in SHOWN]
     assert found == [(name, labels, [expected]) for name, labels, expected in SHOWN]
+    told = {name: families[f"tormag_setpoints_{name}"].documentation for name in ("refused", "dropped")}
+    assert all(f"- `{name}` (int): {text.removeprefix('Setpoints ')}\n" in MESSAGES for name, text in told.items())
 
 
 def test_names_and_types_keep_to_the_conventions(full: Any, ctl: Any) -> None:
@@ -152,6 +155,8 @@ def test_a_scrape_asks_anew_and_says_when_the_daemon_has_gone(full: Any, capsys:
     scraper.join()
     assert [values(families, "tormag_up") for families in scraped] == [[1.0], [1.0], [0.0]]
     assert (scraped[2].keys(), full.commands) == ({"tormag_up"}, ["status"] * 3)
+    assert main(["--endpoint", full.control, "--wait", "0.5", "metrics"]) == 3
+    assert values(read(capsys.readouterr().out.partition("the daemon goes on\n")[2]), "tormag_up") == [0.0]
 
 
 RULES = re.findall(

@@ -111,6 +111,10 @@ def test_a_file_is_sent(published, file, content, options, count, last):
         ("t_s,force_N,displacement_mm\n0,1,0\n1,1,1e10\n", "row 3, displacement_mm = 1e+10: allowed is 0..2 mm"),
         ("t_s,force_N,rate_mm_s\n0,1,0\n1,1,-1e5\n", "row 3, rate_mm_s = -100000: allowed is -300..300 mm/s"),
         ("t_s,force_N\n0,1\n0,2\n", "row 3, time_s = 0: allowed is above"),
+        (
+            "t_s,force_N\n0,1\n5e-324,2\n",
+            "row 3, time_s = 4.94066e-324: allowed is above the row before, 0, by 1e-09 s",
+        ),
         ("t_s,force_N\n1,1\n0,2\n", "row 3, time_s = 0: allowed is above"),
         ("t_s,force_N\n0,1\n1\n", "row 3 has 1 values: allowed is 2"),
         ("t_s,force_N\n0,1\n1,1,5\n", "row 3 has 3 values"),

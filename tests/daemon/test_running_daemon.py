@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -342,17 +343,19 @@ def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped_and_feeds_no_watchdog
             ],
             WATCHDOG_MS,
         ),
+        (Config(realtime=RealTime(watchdog_ms=WATCHDOG_MS)), ["configuration read again: no news"], WATCHDOG_MS),
     ],
-    ids=["what waits", "what is refused"],
+    ids=["what waits", "what is refused", "nothing new, beside a scene that was chosen"],
 )
 def test_sighup_takes_over_what_it_can_and_names_the_rest(
     alone: Running, caplog: pytest.LogCaptureFixture, read: Config, said: list[str], watchdog_ms: float
 ) -> None:
     endpoints = msgspec.structs.replace(in_folder(alone.folder), curve=read.endpoints.curve)
     alone.daemon._read_again = lambda: msgspec.structs.replace(read, endpoints=endpoints)
+    alone.scene("brain")
     with caplog.at_level(logging.INFO):
         signal.raise_signal(signal.SIGHUP)
-        while "restart" not in caplog.text:
+        while "configuration " not in caplog.text:
             alone.tick()
     found = [record.getMessage() for record in caplog.records][-1 - len(said) :]
     assert found == ["no list of keys to read again: there is no endpoints.curve", *said]
@@ -596,12 +599,15 @@ def test_a_scene_is_changed_while_disabled_and_the_device_stays_homed(armed: Run
     assert status["arm"] == {"given": ["clear-fault", "enable"], "is_over": True, "error": None}
 
 
-def test_a_scene_that_needs_higher_rates_is_refused_with_where_they_are_stated(running: Running) -> None:
+def test_a_scene_that_needs_higher_rates_or_fails_is_refused_with_why(running: Running) -> None:
     running.start(Rates(inference_hz=83))
     running.until(lambda status: not status["is_busy"], "at rest")
     error = running.scene("cardiovascular")["scene_change"]["error"]
     assert "rates.inference_hz = 83" in error["cause"]
     assert "state [rates], or start with that scene" in error["remedy"]
+    running.daemon._commands.scene_change._build = Mock(side_effect=OverflowError("nobody expects this"))
+    error = running.scene("pulse")["scene_change"]["error"]
+    assert (error["code"], error["cause"]) == ("failed", "OverflowError: nobody expects this")
 
 
 def test_a_device_runs_by_its_calibration_and_is_busy_until_then(

@@ -323,7 +323,7 @@ COMMANDS = {
     "metrics": Command(
         "status for Prometheus, printed once or served with --port",
         "metrics.metrics",
-        ("endpoints", "wait_s"),
+        ("endpoints", "wait_s", "as_json"),
         (option("--port", type=PORT, metavar="N", help="of 127.0.0.1"),),
     ),
     "scene list": Command("the shipped scenes", "scene.list_scenes"),

@@ -74,7 +74,12 @@ def _run(options: argparse.Namespace) -> Outcome:
     file = options.config
     if file is None and options.command == "doctor" and os.path.exists(SERVICE_CONFIG):  # noqa: PTH110  # False of what may not be seen
         file = SERVICE_CONFIG
-    known: dict[str, Any] = {"command": options.command, "config_file": file, "wait_s": options.wait}
+    known: dict[str, Any] = {
+        "command": options.command,
+        "config_file": file,
+        "wait_s": options.wait,
+        "as_json": options.json,
+    }
     with contextlib.ExitStack() as stack:
         if command.has_daemon:
             with as_usage_error(

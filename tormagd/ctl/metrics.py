@@ -33,10 +33,15 @@ COUNTER, GAUGE = CounterMetricFamily, GaugeMetricFamily
 UP = "Whether the daemon answers"
 
 
-def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
+def metrics(endpoints: Endpoints, port: int | None, wait_s: float, *, as_json: bool) -> Outcome:
     """Return the metrics as text, or serve them at `port` until Ctrl-C or SIGTERM."""
-    with Client(endpoints, wait_s) as client:
-        client.status()
+    try:
+        with Client(endpoints, wait_s) as client:
+            client.status()
+    except ClientError:
+        if port is None and not as_json:
+            write_line(f"# HELP tormag_up {UP}\n# TYPE tormag_up gauge\ntormag_up 0.0", sys.stdout)
+        raise
     registry = CollectorRegistry()
     registry.register(Scrape(endpoints, wait_s))
     if port is None:
@@ -123,8 +128,14 @@ def _families(status: Status) -> Iterator[Metric]:
         (GAUGE, "setpoint_age_seconds", "Of the newest setpoint", status.setpoint_age_ms, MILLI),
         (GAUGE, "link_running", "Whether the device answers", float(link.state == "RUNNING"), 1.0),
         (COUNTER, "setpoints_accepted", "Setpoints that were taken", setpoints.accepted, 1.0),
-        (COUNTER, "setpoints_refused", "Setpoints that were not valid", setpoints.refused, 1.0),
-        (COUNTER, "setpoints_dropped", "Setpoints that were not read", setpoints.dropped, 1.0),
+        (
+            COUNTER,
+            "setpoints_refused",
+            "Setpoints malformed, out of range, or not the holder's",
+            setpoints.refused,
+            1.0,
+        ),
+        (COUNTER, "setpoints_dropped", "Setpoints old, repeated, or of an ignored run", setpoints.dropped, 1.0),
         (COUNTER, "link_losses", "Times the link was lost", link.losses, 1.0),
         (COUNTER, "link_frames", "Frames received since the port was opened", link.frames, 1.0),
         (COUNTER, "link_corrupt_frames", "Of these, damaged", link.corrupt, 1.0),

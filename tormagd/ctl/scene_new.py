@@ -127,7 +127,7 @@ def _forces_of(out: Path, recorded: Recorded, files: contextlib.ExitStack) -> tu
         files.enter_context(new_file(converted))
     except FileExistsError as error:
         raise usage_error(f"{converted} exists, where the scene's forces go", "give another FILE.toml") from error
-    lines = (f"{time_s:.6f},{offset_N + scale * value:.6g}\n" for time_s, value in rows)
+    lines = (f"{time_s!r},{offset_N + scale * value:.6g}\n" for time_s, value in rows)
     converted.write_text(f"t_s,force_N\n{''.join(lines)}", encoding="utf-8")
     return converted, table.told
 
@@ -220,5 +220,5 @@ def _tables(
 
 
 def _rounded(value: float, direction: Callable[[float], int]) -> float:
-    unit = 10.0 ** (math.floor(math.log10(value or 1.0)) - 1)
+    unit = 10.0 ** (math.floor(math.log10(max(value, 1e-6))) - 1)
     return float(f"{direction(round(value / unit, 6)) * unit:.3g}")

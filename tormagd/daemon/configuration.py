@@ -147,8 +147,6 @@ class SceneChange:
         self._require()
         self.newest = SceneReport(scene=scene, is_over=False)
         self._changing = asyncio.get_running_loop().create_task(self._change(scene))
-        # an unexpected error is reported at once, not when the task is collected
-        self._changing.add_done_callback(asyncio.Task.result)
 
     async def _change(self, scene: str) -> None:
         error = None
@@ -160,6 +158,9 @@ class SceneChange:
             error = Explained("bad_scene", str(refused), NEXT)
         except RefusedError as refused:
             error = Explained(refused.code, refused.message, refused.hint)
+        except Exception as unexpected:  # who asked is answered, whatever it was
+            log.exception("another scene failed: report the trace")
+            error = Explained("failed", f"{type(unexpected).__name__}: {unexpected}", "report the trace in its log")
         if error is None:
             log.info("the scene is now %s", scene)
         else:

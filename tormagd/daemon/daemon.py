@@ -62,7 +62,7 @@ class Daemon:
         beside: SearchProcess | None = None,
         config_file: str | None = None,
     ) -> None:
-        self._config, self._core, self._read_again = config, core, read_again
+        self._config, self._core, self._read_again, self._of_file = config, core, read_again, config
         self._loop = asyncio.get_running_loop()
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, self._lose_link, self._causes.host)
@@ -277,12 +277,14 @@ class Daemon:
             log.error("the lists of keys stay as they were: %s; next: mend that and reload again", error)
         try:
             read = await asyncio.to_thread(self._read_again)
-            configured, taken, waiting = reread(self._calibrations.configured, read)
-            config, _, _ = reread(self._config, read)
+            # a scene that an operator chose since is no news of the file
+            known = {"scene": read.scene} if read.scene == self._config.scene else {}
+            of_file, taken, waiting = reread(msgspec.structs.replace(self._of_file, **known), read)
+            configured, config = [reread(each, read)[0] for each in (self._calibrations.configured, self._config)]
         except ValueError as error:
             log.error("the configuration stays as it was: %s; next: mend that and reload again", error)
             return
-        self._calibrations.configured, self._config = configured, config
+        self._of_file, self._calibrations.configured, self._config = of_file, configured, config
         self._calibrations.read_again()
         self._commands.config = self._config
         self._endpoint.inbox.sources = configured.sources

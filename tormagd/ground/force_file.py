@@ -16,6 +16,7 @@ ALLOWED = {
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
 }
 "Least, most and unit of each quantity."
+LEAST_STEP_S: Final = 1e-9
 MAX_FILE_BYTES: Final = 16_000_000
 "Over a quarter of an hour at 1 kHz."
 OPTIONS: Final = {"time_s": "--time-column ", "force_N": "--column "}
@@ -72,8 +73,8 @@ def _require(path: Path, table: Table, allowed: Mapping[str, tuple[float, float,
                 raise TableError(f"{path}: row {row}, {name} = {value:g}: allowed is {least:g}..{most:g} {unit}{why}")
     times_s, rows = table.values["time_s"], table.rows
     for place in range(1, len(rows)):
-        if not times_s[place] > times_s[place - 1]:
+        if times_s[place] - times_s[place - 1] < LEAST_STEP_S:
             raise TableError(
                 f"{path}: row {rows[place]}, time_s = {times_s[place]:g}: allowed is above the row before, "
-                f"{times_s[place - 1]:g}"
+                f"{times_s[place - 1]:g}, by {LEAST_STEP_S:g} s or more"
             )

@@ -35,7 +35,7 @@ _SHIPPED = resources.files(__package__)
 class Force(Strict, frozen=True):
     least_N: Annotated[float, Meta(ge=0.0, le=1_000.0)]
     "Below the device's F_min the task gets F_min."
-    most_N: Annotated[float, Meta(gt=0.0, le=1_000.0)]
+    most_N: Annotated[float, Meta(ge=0.001, le=1_000.0)]
     resolution_N: Annotated[float, Meta(gt=0.0, le=100.0)]
     "The smallest difference that matters."
     tolerance_rms_N: Annotated[float, Meta(gt=0.0, le=100.0)]
@@ -66,9 +66,9 @@ class Signal(Strict, frozen=True):
 
     file: str = ""
     "A CSV with the columns t_s,force_N, relative to the scene file; the force follows a smooth curve through its rows."
-    bandwidth_hz: Annotated[float, Meta(gt=0.0, le=100.0)] | UnsetType = UNSET
+    bandwidth_hz: Annotated[float, Meta(ge=0.0001, le=100.0)] | UnsetType = UNSET
     "Each rise and each fall is half a period of a cosine of this frequency."
-    step_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
+    step_N: Annotated[float, Meta(ge=0.001, le=1_000.0)] | UnsetType = UNSET
     "The height of each rise and fall; by default the whole range."
     hold_s: Annotated[float, Meta(ge=0.0, le=86_400.0)] | UnsetType = UNSET
     "The rest after each rise and fall."
@@ -151,7 +151,7 @@ class Insert(Strict, frozen=True):
     outer_radius_mm: Annotated[float, Meta(ge=0.01, le=100.0)] = 11.0
     thickness_mm: Annotated[float, Meta(ge=0.01, le=200.0)] = 20.0
     roller_radius_mm: Annotated[float, Meta(ge=0.01, le=200.0)] = 20.0
-    gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] | UnsetType = UNSET
+    gap_speed_mm_s: Annotated[float, Meta(ge=0.1, le=500.0)] | UnsetType = UNSET
     "The fastest that the task lets the gap move."
 
 
@@ -159,7 +159,7 @@ class Solver(Strict, frozen=True):
     """The field search. "auto" is none where the rate is no term, `nearest` where force falls, else Newton's method."""
 
     name: str = AUTO
-    step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET
+    step_mT: Annotated[float, Meta(ge=0.001, le=50.0)] | UnsetType = UNSET
     "The step of the grid over the field."
     neighbours: Annotated[int, Meta(ge=1, le=64)] | UnsetType = UNSET
     "Points of the grid that compete for the answer."

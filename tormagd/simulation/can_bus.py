@@ -5,7 +5,6 @@ hosts may be on the bus; each hears the others and the device, and itself with `
 """
 
 import errno
-import os
 import select
 import socket
 import tempfile
@@ -38,7 +37,7 @@ class SimulatorBus(can.BusABC):
             self._socket.connect(channel)
         except OSError as error:
             self._socket.close()
-            raise can.CanInitializationError(os.strerror(error.errno or 0), error.errno) from error
+            raise can.CanInitializationError(error.strerror or str(error), error.errno) from error
         super().__init__(channel=channel, can_filters=can_filters, **settings)
 
     @staticmethod

@@ -9,6 +9,8 @@ SAID: dict[str, tuple[str, str, float]] = {
     "offset": ("constant force", "mN", 1e3),
     "low_speed_factor": ("force at a creep over that at speed", "", 1.0),
     "sensor_zero": ("force sensor's zero", "mN", 1e3),
+    "way": ("friction's excess in the positive direction", "%", 100.0),
+    "ripple": ("friction's greatest wave in a turn", "%", 100.0),
     "carriage_lag": ("carriages' delay", "ms", 1e3),
     "acceleration_scale": ("carriages' acceleration over the configured one", "", 1.0),
     "forecast_trust": ("trust in the forecast", "%", 100.0),
