@@ -34,6 +34,7 @@ from tormagd.scenes.scene import Scene
 
 PLAN_ERRORS: Final = (ValueError, ArithmeticError, RuntimeError)
 "What a plan may raise: DomainError and the errors of NumPy."
+_ENABLED: Final = OperatingState.ENABLED
 
 
 @final
@@ -115,7 +116,7 @@ class Stepper:
 
     @property
     def is_followed(self) -> bool:
-        return self.safety.operating_state is OperatingState.ENABLED
+        return self.safety.operating_state is _ENABLED
 
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
         """Run one control period: measure, latch the faults that show, and return the duties that follow `plan`."""

@@ -75,6 +75,12 @@ class Believe:
 
     fit: DeviceFit
     "Scale and offset of the device at speed, with nothing relaxed."
+    slow: SlowFriction
+    zero: SensorZero
+    sensor: SensorTrust
+    ripple: Ripple
+    carriages: CarriageLag
+    handle: HandleWatch
     read: int
     "Number of the newest measurement that taught; -1 before the first."
     read_s: float

@@ -53,8 +53,9 @@ class ElementMemory:
         self._open_mT: Final = field.field_mT(gap_range_mm[1])
         self._without_field_N: Final = self._force_N(nominal.only, 0.0)
         self._open_N: Final = self._force_N(nominal.only, self._open_mT)
-        lagging_N = self._force_N(nominal.only, self._open_mT + memory.lag_mT)
-        self._open_N_mT: Final = (lagging_N - self._open_N) / max(memory.lag_mT, 1e-9)
+        self._open_N_mT: Final = (self._force_N(nominal.only, self._open_mT + memory.lag_mT) - self._open_N) / max(
+            memory.lag_mT, 1e-9
+        )
 
     def lag_at_mT(self, field_mT: float) -> float:
         """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`."""

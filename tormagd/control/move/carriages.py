@@ -98,6 +98,10 @@ class Carriages(Actuator):
         self.expected = Expected()
         self.left, self.right = Pid(position), Pid(position)
         self._position: Final = position
+        self._duty_limit: Final = position.duty_limit
+        self._derivative_filter_s: Final = position.derivative_filter_s
+        self._synchronisation: Final = position.synchronisation
+        self._gap_acceleration_mm_s2: Final = position.gap_acceleration_mm_s2
         self._gap_speeds: Final = gap_speeds(config)
         self._closed_mm: Final = scene.insert.gap_closed_mm
         self._open_mm: Final = scene.insert.gap_open_mm
@@ -131,7 +135,7 @@ class Carriages(Actuator):
         is_over: bool,
     ) -> Drive:
         assert self.reference is not None, "enabling begins one"
-        self.expected.update(self.reference, dt_s, self._lag_s, self._position.derivative_filter_s)
+        self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
         # a homed carriage may be found beyond the closed end
         nearest_mm = max(self.reference.gap_mm, self._closed_mm)
         pull = pull_V(self._pull_V, nearest_mm) / self._supply_V if self._has_motor else 0.0
@@ -140,7 +144,7 @@ class Carriages(Actuator):
         )
         self.reference = reference
         # each carriage also takes half of the skew as an error, so that the faster one waits
-        skew_mm = self._position.synchronisation * measured.skew_mm / 2.0
+        skew_mm = self._synchronisation * measured.skew_mm / 2.0
         half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
         left_mm, right_mm = half_mm - measured.left_mm - skew_mm, half_mm - measured.right_mm + skew_mm
         left_mm_s, right_mm_s = half_mm_s - measured.left_mm_s, half_mm_s - measured.right_mm_s
@@ -179,7 +183,7 @@ class Carriages(Actuator):
         is_wrong_way = reference.speed_mm_s * wanted_mm < 0.0
         if is_wrong_way and ahead_mm * wanted_mm < 0.0 and abs(ahead_mm) > LAGGING_MM:
             reference = self._begun_at(measured)
-        max_mm_s2 = self.acceleration_scale * self._position.gap_acceleration_mm_s2
+        max_mm_s2 = self.acceleration_scale * self._gap_acceleration_mm_s2
         reference, is_limited, is_slewed = follow(max_mm_s2, reference, target, dt_s, speeds, floor_mm)
         is_late = plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM
         self.acted.rate += is_limited
@@ -199,7 +203,7 @@ class Carriages(Actuator):
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
         # the pull helps to close, but a reserve of duty is worth more there than a little speed
-        opening_mm_s = most.no_load_mm_s * (self._position.duty_limit - self._coulomb - pull)
+        opening_mm_s = most.no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         # compiled, min() of three makes objects
         opening_mm_s = min(min(motors_mm_s, most.opening_mm_s), opening_mm_s)
         return GapSpeeds(most.closing_mm_s, opening_mm_s, min(motors_mm_s, most.sure_mm_s), motors_mm_s)
@@ -228,7 +232,7 @@ class Carriages(Actuator):
 
     def _drive(self, left: float, right: float, supply_V: float, held: tuple[Limit, ...]) -> Drive:
         is_saturated = self.left.is_saturated or self.right.is_saturated
-        scale, limit = self._supply_V / max(supply_V, 0.5 * self._supply_V), self._position.duty_limit
+        scale, limit = self._supply_V / max(supply_V, 0.5 * self._supply_V), self._duty_limit
         left_duty, right_duty = left * scale, right * scale
         self.acted.range += is_saturated or max(abs(left_duty), abs(right_duty)) > limit
         left_duty, right_duty = min(max(left_duty, -limit), limit), min(max(right_duty, -limit), limit)

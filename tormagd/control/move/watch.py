@@ -73,9 +73,14 @@ class Watch:
     right_duty: float = 0.0
 
     def __init__(self, config: Config, scene: Scene) -> None:
-        period_s = 1.0 / config.rates.control_hz
+        limits, period_s = config.limits, 1.0 / config.rates.control_hz
         bears_s = delay_margin_s(config.motor, config.position, period_s)
-        self._limits: Final = config.limits
+        self._skew_fault_mm: Final = limits.skew_fault_mm
+        self._skew_warning_mm: Final = limits.skew_warning_mm
+        self._following_error_mm: Final = limits.following_error_mm
+        self._following_time_s: Final = limits.following_time_s
+        self._no_motion_duty: Final = limits.no_motion_duty
+        self._no_motion_time_s: Final = limits.no_motion_time_s
         self._max_round_trip_s: Final = period_s + TOO_SLOW_SHARE * bears_s
         self._slow_s: Final = period_s + SLOW_SHARE * bears_s
         self._period_s: Final = period_s
@@ -95,7 +100,7 @@ class Watch:
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
-            most_apart_mm=self._limits.skew_fault_mm,
+            most_apart_mm=self._skew_fault_mm,
             most_round_trip_s=self._max_round_trip_s,
             most_clock_drift=CLOCK_FAULT,
         )
@@ -134,7 +139,7 @@ class Watch:
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> tuple[Limit, ...]:
         link = measurement.link
         return (
-            ((Limit.SKEW,) if abs(measured.skew_mm) > self._limits.skew_warning_mm else ())
+            ((Limit.SKEW,) if abs(measured.skew_mm) > self._skew_warning_mm else ())
             + ((Limit.HOST_STALL,) if sight.has_stalled(now_s) else ())
             + ((Limit.SENSE_STALE,) if now_s - measurement.sensed_s > self._unsensed_s else ())
             + ((Limit.LINK_DEGRADED,) if link.is_lossy or link.round_trip_s > self._slow_s else ())
@@ -146,7 +151,7 @@ class Watch:
     ) -> None:
         """Count one tick of driving with these duties towards `reference`."""
         off_mm = 0.0 if reference is None else abs(reference.gap_mm - measured.gap_mm)
-        self.straying_s = self.straying_s + dt_s if off_mm > self._limits.following_error_mm else 0.0
+        self.straying_s = self.straying_s + dt_s if off_mm > self._following_error_mm else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
         is_over = measured.force_N > self._ceiling_N and is_felt
         self.over_s = self.over_s + dt_s if is_over else max(self.over_s - OVER_FADES * dt_s, 0.0)
@@ -193,17 +198,14 @@ class Watch:
         )
 
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> tuple[Fault, ...]:
-        is_skewed, is_still = (
-            abs(measured.skew_mm) > self._limits.skew_fault_mm,
-            self.still_s > self._limits.no_motion_time_s,
-        )
+        is_skewed, is_still = abs(measured.skew_mm) > self._skew_fault_mm, self.still_s > self._no_motion_time_s
         opposed_s = WENT_AGAINST_S if is_skewed or is_still else OPPOSED_S
         # on a pad the finger itself may press hard
         over_s = self.over_s if self._slides else 0.0
         return (
             ((Fault.WRONG_DIRECTION,) if self.opposed_s > opposed_s else ())
             + ((Fault.SKEW,) if is_skewed else ())
-            + ((Fault.FOLLOWING_ERROR,) if self.straying_s > self._limits.following_time_s else ())
+            + ((Fault.FOLLOWING_ERROR,) if self.straying_s > self._following_time_s else ())
             + ((Fault.OVER_FORCE,) if over_s > OVER_FAULT_S else ())
             + ((Fault.SENSOR,) if sensor_doubted_s > self._sensor_fault_s else ())
             + ((Fault.NO_MOTION,) if is_still else ())
@@ -213,12 +215,12 @@ class Watch:
         """Tell whether a carriage stands still although it is driven the same way as a step before."""
         # a duty that reverses before the carriage could move drives it nowhere
         left, right = left_duty * math.copysign(1.0, self.left_duty), right_duty * math.copysign(1.0, self.right_duty)
-        least = self._limits.no_motion_duty
+        least = self._no_motion_duty
         is_left_still = left > least and abs(measured.left_mm_s) < STILL_MM_S
         return is_left_still or (right > least and abs(measured.right_mm_s) < STILL_MM_S)
 
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
-        least = self._limits.no_motion_duty
+        least = self._no_motion_duty
         left_mm_s = measured.left_mm_s * math.copysign(1.0, left_duty) if abs(left_duty) > least else 0.0
         right_mm_s = measured.right_mm_s * math.copysign(1.0, right_duty) if abs(right_duty) > least else 0.0
         if min(left_mm_s, right_mm_s) < -STILL_MM_S:
