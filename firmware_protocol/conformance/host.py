@@ -48,8 +48,8 @@ HELLO_NONCE, MAX_NONCE = 255, 254
 INSIDE_MM, ARRIVED_MM, DUTY_PER_MM, TRAVEL_MM_S = 2.0, 0.3, 3.0, 8.0
 OPENING_MM_S, STROKE_MM, SWITCH_MM = 15.0, 25.25, 0.35
 "A switch may close SWITCH_MM from its place, while a carriage passes it at any speed."
-BRAKED, LEAP_C, LATE_DRIVES, AHEAD = 3, 10.0, 100, 3
-"BRAKED Status come in 50 ms of braking; States may be AHEAD of a Status."
+BRAKED, LEAP_C, LATE_DRIVES, AHEAD_S = 3, 10.0, 100, 5e-3
+"BRAKED Status come in 50 ms of braking; a State may overtake a Status by AHEAD_S."
 ENDS: Final = Switches.LEFT_OPEN, Switches.RIGHT_OPEN, Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED
 OPEN, CLOSED = ENDS[0] | ENDS[1], ENDS[2] | ENDS[3]
 NO_FAULT: Final = DeviceFault(0)
@@ -121,8 +121,8 @@ class Host:
         self.nonces: list[int] = []
         """The one Status showed last, and those sent since."""
         self._unpaired = deque[tuple[float, ...]](maxlen=99)
-        self._ages_s = deque[float](maxlen=round(STATUS_S / PERIOD_S))
-        """How old the newest answers were."""
+        self._answers_s = deque[float](maxlen=LATE_DRIVES)
+        """When the newest States came."""
         self._opens = 0
         self.drives = self.states = self.senses = 0
         """How many Drives that must be answered were sent, and how many State came."""
@@ -307,7 +307,7 @@ class Host:
             )
             self.states += 1
             asked = self._asked.popleft() if self._asked else (self.drive_s, math.nan, math.nan)
-            self._ages_s.append(heard.time_s - asked[0])
+            self._answers_s.append(heard.time_s)
             self._unpaired.append((*asked, heard.time_s, message.device_time_s, message.counter, *places(message)))
         self.senses += isinstance(message, Sense)
         if isinstance(message, Sense) and self._unpaired:  # on a bus a later State may have overtaken it
@@ -316,23 +316,23 @@ class Host:
         if isinstance(message, Identity):
             self.contradictions["another Identity"] += message != self.newest.get(Identity, heard).message
         if isinstance(message, Status):
-            self._compare(self.newest.get(Status, heard).message, message)
+            self._compare(self.newest.get(Status, heard).message, message, heard.time_s)
             self.contradictions.update([*contradictions(message), *self._misplaced(heard.time_s, message)])
             self.marks.extend((len(self.rows) / len(COLUMNS), message.mode))
         self.heard.append(heard)
         self.newest[type(message)] = heard
 
-    def _compare(self, before: Any, after: Status) -> None:
+    def _compare(self, before: Any, after: Status, time_s: float) -> None:
         """Count what in a Status cannot follow the one before."""
         self._opens = (self._opens + 1) * is_open(after)
-        is_same, recent = before.mode is after.mode, [*self.counters][-len(self._asked) - AHEAD :]
+        ahead = sum(answer_s > time_s - AHEAD_S for answer_s in self._answers_s)
+        is_same, recent = before.mode is after.mode, [*self.counters][-len(self._asked) - ahead - 1 :]
         found = {
             "at rest without braking": before.mode is DeviceMode.RETRACTING
             and not is_same
             and 0 < self._opens < BRAKED,
             "drive_counter not of the last Drive": len(self.counters) == LATE_DRIVES
-            and after.drive_counter not in recent
-            and max(self._ages_s, default=0.0) < STALLED_S,
+            and after.drive_counter not in recent,
             "nonce 0 again: a reset": before.command_nonce > after.command_nonce == 0,
             "a nonce not sent since the one before": Status in self.newest and after.command_nonce not in self.nonces,
             f"{before.mode.name} then {after.mode.name}": after.mode.name in NEVER_FOLLOWS.get(before.mode.name, ()),

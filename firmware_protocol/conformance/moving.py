@@ -176,10 +176,11 @@ def _driven(rows: dict[str, Array], side: str) -> Array:
         at_s, at_mm, at_A = (rows[name][part] for name in ("device_s", f"{side}_mm", f"{side}_A"))
         seconds = at_s[-1] - at_s[0] if len(at_s) else 0.0
         if seconds > PART_S:
-            # means over time, whatever Drives a host left out
+            # means over time
             mean_A = np.sum((at_A[1:] + at_A[:-1]) * np.diff(at_s)) / 2.0 / seconds
             mm_s, rise_A_s = ((at[-1] - at[0]) / seconds for at in (at_mm, at_A))
-            found.append((rows[f"{side}_duty"][first], mm_s, rise_A_s, mean_A, PERIOD_S * (len(at_s) - 1) / seconds))
+            states = min(PERIOD_S * (len(at_s) - 1) / seconds, 1.0)
+            found.append((rows[f"{side}_duty"][first], mm_s, rise_A_s, mean_A, states))
     return np.array(found).reshape(-1, 5).T
 
 
@@ -257,8 +258,14 @@ def let_go_after_all(host: Host) -> str:
             host.until(lambda: host.status.mode in RESTING, OPENED_S, DriveMode.RUN)
         host.pass_time(2 * SPARSE_S, DriveMode.RUN, SPARSE_S, DUTY)
         most_A = max(host.last(Sense).left_current_A, host.last(Sense).right_current_A)
-        text = f"{lets_go.name} {most_A:+.2f} A at once"
-        seen.append(host.shows(DeviceMode.RUN, DriveMode.RUN, besides=text, wrong=most_A > -RESTING_A))
+        seen.append(
+            host.shows(
+                DeviceMode.RUN,
+                DriveMode.RUN,
+                besides=f"{lets_go.name} {most_A:+.2f} A at once",
+                wrong=most_A > -RESTING_A,
+            )
+        )
     return "; ".join(seen)
 
 
@@ -275,7 +282,7 @@ def keeps_still(host: Host, when: str) -> str:
 
 
 def _is_noticed(host: Host, silent_s: float) -> bool:
-    """Send no Drive in RUN for a time, then one; return whether RUN has ended, which its length must tell."""
+    """Send no Drive in RUN for a time; return whether RUN has ended, which that time must tell."""
     host.next_status(DriveMode.RUN)
     host.pass_time(host.random.randrange(20) * PERIOD_S, DriveMode.RUN)
     before = host.answered(DriveMode.RUN)
@@ -283,14 +290,20 @@ def _is_noticed(host: Host, silent_s: float) -> bool:
     silence_s = (host.answered(DriveMode.RUN).device_time_s - before.device_time_s) % TIME_SPAN_S
     status = host.next_status(DriveMode.RUN)
     has_ended = status.mode is not DeviceMode.RUN
-    seen = f"after {silence_s * 1e3:.2f} ms on the device's clock: {shown(status)}"
     unless(
         (silence_s < BORNE_S or status.faults != TIMED_OUT)
         if has_ended
         else (silence_s > NOTICED_S or status.faults != NO_FAULT),
-        seen,
+        f"after {silence_s * 1e3:.2f} ms on the device's clock: {shown(status)}",
     )
     return has_ended
+
+
+def _notices(host: Host, silent_s: float) -> str:
+    """Repeat a silence until it ends RUN: the device may have stood still in it."""
+    unless(not any(_is_noticed(host, silent_s) for _ in range(LONGS)), f"never ends: {shown(host.status)}")
+    host.until(host.is_resting, OPENED_S)
+    return host.shows(DeviceMode.LATCHED, homed=False, opened=True, fault=TIMED_OUT)
 
 
 @check(
@@ -306,9 +319,7 @@ def silence_is_noticed(host: Host) -> str:
     unless(any(_is_noticed(host, SHORT_S) for _ in range(SHORTS)), f"ends early: {shown(host.status)}")
     for at in range(LONGS):
         host.running(INSIDE_MM if at else 0.0)
-        _is_noticed(host, LONG_S)
-        host.until(host.is_resting, OPENED_S)
-        host.shows(DeviceMode.LATCHED, homed=False, opened=True, fault=TIMED_OUT)
+        _notices(host, LONG_S)
     host.homed()
     host.beat(DriveMode.RUN, period_s=4.0 * LONG_S)
     return host.shows(DeviceMode.LATCHED, None, fault=TIMED_OUT, besides=f"{LONGS} noticed; after one Drive RUN")
@@ -329,9 +340,7 @@ def any_uptime(host: Host) -> str:
         while host.now_s < began_s + at * HELD_S:
             _pulse(host, host.random.choice((PERIOD_S, SPARSE_S)))
         host.pass_time(SEEN_S, DriveMode.RUN)
-        _is_noticed(host, LONG_S + PERIOD_S)
-        host.until(host.is_resting, OPENED_S)
-        seen = host.shows(DeviceMode.LATCHED, fault=TIMED_OUT)
+        seen = _notices(host, LONG_S + PERIOD_S)
     return f"{HOLDS} times: {seen}"
 
 

@@ -1284,6 +1284,24 @@ class Uneven(Wire):
         return [(self.time_s, self.device.transmit(self.time_s - self.stood_s))]
 
 
+class Napping(Uneven):
+    """And for 3 ms in the first six long silences."""
+
+    chance = random.Random(7)
+    naps = 6
+    wrote_s = 0.0
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        self.wrote_s = self.time_s
+
+    def read(self, until_s: float) -> list[tuple[float, bytes]]:
+        naps = until_s > self.wrote_s + 0.05 and self.naps > 0
+        self.naps -= naps
+        self.stood_s += 3e-3 * naps
+        return super().read(until_s + 3e-3 * naps)
+
+
 SILENCE, DRIVES, CLOCK = "silence_is_noticed", "every_drive_answered", "clock_runs_on"
 MOVING = (*3 * ("home_homes",), "left_duty", "run_retract", "duties_make_currents")
 
@@ -1294,6 +1312,7 @@ MOVING = (*3 * ("home_homes",), "left_duty", "run_retract", "duties_make_current
         # a check that this computer spoiled is tried again, and the last attempt, which was not late, counts
         (lambda: serial_line(wire=Asleep), (SILENCE,), True, False),
         (lambda: serial_line(wrong(Rogue, ticks=timeout_of(0.035)), Asleep), (SILENCE,), False, False),
+        (lambda: serial_line(wire=Napping), (SILENCE,), True, False),
         # what is judged by all that was heard says how late this computer ever was
         (lambda: serial_line(wire=Asleep, faults=["clock=+2%"]), (SILENCE, DRIVES, CLOCK), False, True),
         # a pause does not move the clock
