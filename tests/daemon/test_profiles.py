@@ -232,10 +232,10 @@ def test_a_device_that_has_shown_itself_meanwhile_is_believed(rig: Rig, tmp_path
 
 
 def test_a_profile_that_the_first_slide_contradicts_is_dropped_by_name(known: Rig) -> None:
-    known.believe.is_contradicted = True
+    known.believe.is_prior = False
     known.look(7, True)
     report = known.profiles.report()
-    assert (report.is_used, report.refusal) == (False, "the device's first slide shows another one")
+    assert (report.is_used, report.refusal) == (False, "its first slide shows another device, or a plan failed")
 
 
 def test_what_a_disputed_sensor_taught_is_not_kept(rig: Rig, tmp_path: Path) -> None:

@@ -194,8 +194,8 @@ class Profiles:
                 asyncio.get_running_loop().run_in_executor(None, self._folder.read, serial_number).add_done_callback(
                     self._take
                 )
-        if self._is_used and self._believe.is_contradicted:
-            self._is_used, self._refusal = False, "the device's first slide shows another one"
+        if self._is_used and not self._believe.is_prior:
+            self._is_used, self._refusal = False, "its first slide shows another device, or a plan failed"
             log.warning("the device's profile is dropped: %s; next: tormagctl calibrate --device", self._refusal)
         if self._was_driven and not is_driven:
             self.keep()

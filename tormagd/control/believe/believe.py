@@ -89,8 +89,6 @@ class Believe:
     "What is wrong with the sensor or with the fit, as the newest reading at speed shows."
     is_prior: bool
     "Whether a fit from another day was taught, and no reading has contradicted it."
-    is_contradicted: bool
-    "Whether the first slide has shown another device than the one taught."
 
     def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
         """Begin with an unseen device."""
@@ -127,7 +125,7 @@ class Believe:
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.zero.way, self.carriages.lag_s = learned.sensor_zero_N, self._trim.way, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
-        self.is_prior, self.is_contradicted = learned.device is not UNSEEN, False
+        self.is_prior = learned.device is not UNSEEN
 
     def forget(self) -> None:
         """Forget the device, and begin the watch on the encoder anew."""
@@ -151,8 +149,7 @@ class Believe:
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan."""
         if self.learns and self._terms.motor and measured is not None:
-            is_ahead = measured.is_homed and foresight >= MIN_FORESIGHT
-            known_mm = planned_mm if is_ahead else None
+            known_mm = planned_mm if measured.is_homed and foresight >= MIN_FORESIGHT else None
             self.carriages.update(dt_s, known_mm, measured.gap_mm, measured.gap_speed_mm_s, self._top_speed_mm_s)
 
     def _belief(self, ripple: float, predicted_N: float | None) -> Belief:
@@ -177,8 +174,7 @@ class Believe:
 
     def _ripple(self, measured: Measured) -> float:
         """Return the friction at the handle's place and way, over its mean."""
-        share = self.ripple.share(measured.handle_mm / self._radius_mm)
-        share += self.zero.way * measured.handle.turn.direction
+        share = self.ripple.share(measured.handle_mm / self._radius_mm) + self.zero.way * measured.handle.turn.direction
         return 1.0 + min(max(share, -MOST_RIPPLE), MOST_RIPPLE)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float, slid_N: float) -> None:
@@ -192,8 +188,7 @@ class Believe:
         reading_N = (measured.force_N - measured.handle.turn.direction * self.zero.zero_N) / self._ripple(measured)
         is_mobilised = self._nominal.contact.is_known(measured)
         # a hand that meets a wall stops within 10 ms
-        is_low = reading_N < self.fit.force_N(model_N) - STUCK_N
-        is_stuck = is_low and abs(measured.handle.quick_mm_s) < STOPPING_MM_S
+        is_stuck = abs(measured.handle.quick_mm_s) < STOPPING_MM_S and reading_N < self.fit.force_N(model_N) - STUCK_N
         if is_mobilised and not (
             self._nominal.contact.slides
             and (rate_mm_s < MOVING_MM_S or is_stuck or self.handle.moved_gap_at_rest(model_N))
@@ -213,13 +208,13 @@ class Believe:
         is_mobilised: bool,
     ) -> None:
         """Learn slow friction from one reading of a handle that creeps."""
-        most_mm_s = min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
-        is_creep = SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and measured.handle.sliding_mm_s < most_mm_s
-        if not (is_creep and self._has_creep and self.learns and self.knows_zero(now_s)):
-            return
+        is_creep = SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and measured.handle.sliding_mm_s < min(
+            CREEPING_MM_S, COMES_TO_REST * rate_mm_s
+        )
         expected_N = self.fit.force_N(model_N)
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
-        if expected_N > SLACK_N and (is_mobilised or reading_N > expected_N):
+        is_told = expected_N > SLACK_N and (is_mobilised or reading_N > expected_N)
+        if is_creep and is_told and self._has_creep and self.learns and self.knows_zero(now_s):
             self.slow.update(self.fit, model_N, rate_mm_s, reading_N, dt_s)
 
     def _hear_at_speed(self, now_s: float, measured: Measured, reading_N: float, model_N: float, dt_s: float) -> None:
@@ -239,13 +234,19 @@ class Believe:
             learns=self.learns,
             is_disputed=sensor.wrong_s + sensor.outside_s > 2.0 * NAMED_S,
         )
-        learns = self.learns and zero_sd_N <= UNKNOWN_SD_N
         taught_N = sensor.update(
-            fit, model_N, rate_mm_s, reading_N, zero_sd_N, dt_s, learns=learns, is_prior=self.is_prior
+            fit,
+            model_N,
+            rate_mm_s,
+            reading_N,
+            zero_sd_N,
+            dt_s,
+            learns=self.learns and zero_sd_N <= UNKNOWN_SD_N,
+            is_prior=self.is_prior,
         )
         unknown_N = self._unknown_N(zero_sd_N)
-        least_N = fit.force_N(model_N) + unknown_N if sensor.has_slid else math.inf
-        if taught_N is None or not self.learns or (unknown_N > 0.0 and reading_N < least_N):
+        is_more = sensor.has_slid and reading_N >= fit.force_N(model_N) + unknown_N
+        if taught_N is None or not self.learns or (unknown_N > 0.0 and not is_more):
             return
         anchor_N = max(sensor.anchor.force_N(model_N), SLACK_N)
         self._fit(model_N, rate_mm_s, taught_N - unknown_N, anchor_N + sensor.off_N, dt_s)
@@ -266,8 +267,7 @@ class Believe:
         """Learn the fit's scale and offset from one reading, the sooner the more the readings' mean is off."""
         before_N = self.fit.force_N(model_N)
         if self.is_prior and not self.sensor.has_slid and abs(reading_N - before_N) > CONTRADICTED_N:
-            self.is_prior, self.is_contradicted = False, True
-            self.fit, self.sensor.anchor = UNSEEN, Anchor(UNSEEN)
+            self.is_prior, self.fit, self.sensor.anchor = False, UNSEEN, Anchor(UNSEEN)
         self.fit, is_held = observe(
             self.fit,
             model_N,
@@ -286,10 +286,9 @@ class Believe:
         """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
         if not self.sensor.is_disputed:
             return
-        scale, offset_N = self.fit.scale, self.fit.offset_N
+        scale, anchor_N = self.fit.scale, self.sensor.anchor.force_N(MIDDLE_N)
+        self.fit = DeviceFit(scale, self.fit.offset_N if wrong == "device" else anchor_N - scale * MIDDLE_N)
         if wrong == "device":
             self.sensor = SensorTrust(self._trim)
         else:
-            offset_N = self.sensor.anchor.force_N(MIDDLE_N) - scale * MIDDLE_N
             self.sensor.wrong_s = DOUBTED_S
-        self.fit = DeviceFit(scale, offset_N)

@@ -48,12 +48,10 @@ class CarriageLag:
             return
         dt_s = min(max(dt_s, 0.0), MAX_DT_S)
         before_mm = planned_mm if self.expected_mm is None else self.expected_mm
-        expected_mm = low_pass(before_mm, planned_mm, dt_s, self.lag_s) if dt_s > 0.0 else before_mm
-        self.expected_mm = expected_mm
+        expected_mm = self.expected_mm = low_pass(before_mm, planned_mm, dt_s, self.lag_s) if dt_s > 0.0 else before_mm
         error_mm = expected_mm - gap_mm - speed_mm_s * AGE_S
         self.is_settling = abs(error_mm) > (SETTLED_MM if self.is_settling else MAX_LAG_S * top_speed_mm_s)
-        if self.is_settling:
-            return
-        self.information_mm2_s += dt_s * (speed_mm_s * speed_mm_s - self.information_mm2_s / FORGETTING_S)
-        lag_s = self.lag_s + dt_s * error_mm * speed_mm_s / (PRIOR_MM2_S + self.information_mm2_s)
-        self.lag_s = min(max(lag_s, 0.0), MAX_LAG_S)
+        if not self.is_settling:
+            self.information_mm2_s += dt_s * (speed_mm_s * speed_mm_s - self.information_mm2_s / FORGETTING_S)
+            lag_s = self.lag_s + dt_s * error_mm * speed_mm_s / (PRIOR_MM2_S + self.information_mm2_s)
+            self.lag_s = min(max(lag_s, 0.0), MAX_LAG_S)

@@ -56,8 +56,12 @@ class Freshness:
                 self._take_run(reading_N - self.reading_N, self.still_s + dt_s)
             self.reading_N, self.still_s, self.stood_N = reading_N, 0.0, model_N
         changed_N, steps_N = scale * abs(model_N - self.stood_N), 2.0 * min(self.step_N, FROZEN_N)
-        is_resolved = self.alternates > ALTERNATES and self.run_s < RESOLVED * self.min_run_s
-        is_long = self.runs == HEARD and is_resolved and self.still_s > FROZEN_RUNS * self.run_s
+        is_long = (
+            self.runs == HEARD
+            and self.alternates > ALTERNATES
+            and self.run_s < RESOLVED * self.min_run_s
+            and self.still_s > FROZEN_RUNS * self.run_s
+        )
         is_frozen = self.still_s > FROZEN_S and (is_long or changed_N > FROZEN_N + steps_N)
         return changed_N > STALE_N + steps_N, is_frozen
 

@@ -92,5 +92,6 @@ class HandleWatch:
         forgets_s = 0.0 if self.still_s < SETTLES_S or self.force_N <= self.min_N else FORGETS_S
         self.min_N = low_pass(self.min_N, self.force_N, dt_s, forgets_s)
         self.min_model_N = low_pass(self.min_model_N, model_N, dt_s, forgets_s)
-        has_risen = self.force_N - self.min_N > RISES_N and model_N - self.min_model_N > MODEL_RISES_N
-        self.is_lost = self.is_lost or has_risen
+        self.is_lost = self.is_lost or (
+            self.force_N - self.min_N > RISES_N and model_N - self.min_model_N > MODEL_RISES_N
+        )

@@ -81,12 +81,11 @@ class ElementMemory:
             self.opened_mm = max(measured.gap_mm - self._open_mm, self.opened_mm)
             return
         gap_mm = max(measured.gap_mm, self._least_mm) if measured.is_homed else self._open_mm
-        field_mT = self._field.field_mT(gap_mm)
         curve = self._nominal.only if self._slides else self._nominal.now(measured)
         free_N = self._without_field_N if self._slides else self._force_N(curve, 0.0)
         if self.time_s == math.inf:
             self._begin(curve, gap_mm, free_N, now_s)
-        self._follow(curve, free_N, field_mT, now_s)
+        self._follow(curve, free_N, self._field.field_mT(gap_mm), now_s)
 
     def _begin(self, curve: ForceCurve, gap_mm: float, free_N: float, now_s: float) -> None:
         """Begin relaxed at the gap at which a brake was switched on, and with nothing relaxed on a pad."""
@@ -94,9 +93,8 @@ class ElementMemory:
         is_known = self._least_mm <= found_mm <= self._open_mm + BEYOND_MM
         self.field_mT = self._field.field_mT(found_mm if is_known else gap_mm)
         self.time_s = now_s
-        added_N = self._force_N(curve, self.field_mT) - free_N
         self.free = self._free.relaxed(free_N if self._slides else 0.0)
-        self.added = self._added.relaxed(added_N if self._slides else 0.0)
+        self.added = self._added.relaxed(self._force_N(curve, self.field_mT) - free_N if self._slides else 0.0)
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
         """Follow a straight change of the gap's field to `field_mT` at `now_s`."""

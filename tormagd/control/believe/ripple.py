@@ -70,15 +70,14 @@ class Ripple:
         """Take a reading at the handle's `angle`, the known ripple taken off, beside the anchor's `force_N` > 0."""
         place = math.floor(angle * PLACES / TURN)
         if place != self.place:
-            if self.readings > 0:
-                self._pass(rate_mm_s, force_N)
+            self._pass(rate_mm_s, force_N)
             self.place, self.total, self.readings = place, 0.0, 0
         self.total += reading_N / force_N * (1.0 + self.share(angle))
         self.readings += 1
 
     def _pass(self, rate_mm_s: float, force_N: float) -> None:
         """Compare the place that the handle leaves with the place before."""
-        mean, way, at = self.total / self.readings, self.place - self.last, min(self.place, self.last) % PLACES
+        mean, way, at = self.total / max(self.readings, 1), self.place - self.last, min(self.place, self.last) % PLACES
         rose = mean - self.mean
         is_even = max(abs(rose), abs(self.force_N / force_N - 1.0)) <= STEEPEST
         is_steady = abs(way) == 1 and abs(rate_mm_s - self.rate_mm_s) <= STEADY_MM_S

@@ -138,8 +138,7 @@ class SensorTrust:
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
         if self.has_slid:
             # what has fallen at the forces that are known has fallen here, too
-            within_N = SURE * deviation_N
-            taught_N = within(taught_N / self.fallen, (force_N - within_N, force_N + within_N))
+            taught_N = within(taught_N / self.fallen, (force_N - SURE * deviation_N, force_N + SURE * deviation_N))
         self.anchor.learn(model_N, taught_N, dt_s)
 
     def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:

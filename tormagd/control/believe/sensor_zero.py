@@ -126,21 +126,23 @@ class SensorZero:
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - fit.scale * by_model_N)
         if abs(found_N) > MAX_ZERO_N:
             return 0.0
-        by_scale_N = 0.5 * fit.scale_sd * by_model_N
-        by_speed_N = 0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s)
-        by_time_N = 0.5 * RELAXES_N_S * between_s
-        read_N2 = READ_SD_N * READ_SD_N + by_scale_N * by_scale_N + by_speed_N * by_speed_N + by_time_N * by_time_N
+        read_sd_N = math.hypot(
+            READ_SD_N,
+            0.5 * fit.scale_sd * by_model_N,
+            0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s),
+            0.5 * RELAXES_N_S * between_s,
+        )
         # at one force a friction that differs by the way looks like a zero
         force_N, zero_N2 = 0.5 * fit.scale * (level.model_N + before.model_N), self.sd_N(now_s) ** 2
         error_N, way_N2 = found_N - self.zero_N - force_N * self.way, force_N * force_N * self.way_variance
-        if error_N * error_N > SURE * SURE * (zero_N2 + way_N2 + read_N2):
+        if error_N * error_N > SURE * SURE * (zero_N2 + way_N2 + read_sd_N**2):
             zero_N2 = MAX_SD_N * MAX_SD_N  # neither a drift nor a way explains it
-        known_N2 = zero_N2 + read_N2
+        known_N2 = zero_N2 + read_sd_N**2
         share = error_N / (known_N2 + way_N2)
         is_first = self.way_variance == WAY_VARIANCE and not is_disputed
         self.zero_N += zero_N2 * share
         self.way = min(max(self.way + force_N * self.way_variance * share, -MAX_WAY), MAX_WAY)
         # halved: a way stays, and what drifts afterwards is the zero
         self.way_variance *= 0.5 * known_N2 / (known_N2 + way_N2)
-        self.variance_N2, self.told_s = zero_N2 * read_N2 / known_N2, now_s
+        self.variance_N2, self.told_s = zero_N2 * read_sd_N**2 / known_N2, now_s
         return self.direction * share * (zero_N2 + way_N2) if is_first else 0.0

@@ -114,10 +114,12 @@ class DeviceFit(Value):
         square = self.scale * self.scale - sure * self.scale_variance
         half = self.scale * room_N + sure * self.covariance_N
         rest = room_N * room_N - sure * self.offset_variance_N2
-        if square <= 0.0:  # so uncertain beside its scale that no force is surely within
+        if square <= 0.0:  # the scale is too uncertain
             return max_N / bounds.most
-        root_N = (half - math.sqrt(max(half * half - square * rest, 0.0))) / square
-        return within(root_N, (max_N / bounds.most, max_N / bounds.least))
+        return within(
+            (half - math.sqrt(max(half * half - square * rest, 0.0))) / square,
+            (max_N / bounds.most, max_N / bounds.least),
+        )
 
 
 UNSEEN: Final = DeviceFit()
