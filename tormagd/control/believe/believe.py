@@ -34,7 +34,9 @@ STUCK_N: Final = 0.08
 """A handle is stuck where its rate over the last 10 ms is under STOPPING_MM_S and its force so much less than friction.
 """
 COMES_TO_REST: Final = 3.0
-"A handle whose `sliding_mm_s` is at least this many times its rate only comes to rest: it does not creep."
+"A handle whose `sliding_mm_s` is at least this many times its rate only comes to rest."
+UNSTEADY_MM_S: Final = 1.0
+"One whose rate over 10 ms is this far off trembles."
 UNTARED_N: Final = 0.15
 "A zero that is further off gives the limit SENSOR_ZERO: half an hour's drift."
 CONTRADICTED_N: Final = 0.4
@@ -207,9 +209,11 @@ class Believe:
         dt_s: float,
         is_mobilised: bool,
     ) -> None:
-        """Learn slow friction from one reading of a handle that creeps."""
-        is_creep = SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and measured.handle.sliding_mm_s < min(
-            CREEPING_MM_S, COMES_TO_REST * rate_mm_s
+        """Learn slow friction from a reading at a creep."""
+        is_creep = (
+            SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S
+            and measured.handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
+            and abs(abs(measured.handle.quick_mm_s) - rate_mm_s) < UNSTEADY_MM_S
         )
         expected_N = self.fit.force_N(model_N)
         # friction not yet mobilised is less than the model's: only a greater reading teaches then
@@ -218,7 +222,7 @@ class Believe:
             self.slow.update(self.fit, model_N, rate_mm_s, reading_N, dt_s)
 
     def _hear_at_speed(self, now_s: float, measured: Measured, reading_N: float, model_N: float, dt_s: float) -> None:
-        """Take one reading of a handle that slides at speed: for the zero, the judgement of the sensor, the fit."""
+        """Take one reading of a handle that slides at speed."""
         rate_mm_s, angle = abs(measured.handle.rate_mm_s), measured.handle_mm / self._radius_mm
         zero, fit, sensor = self.zero, self.fit, self.sensor
         zero_sd_N = zero.sd_N(now_s)
@@ -242,7 +246,6 @@ class Believe:
             zero_sd_N,
             dt_s,
             learns=self.learns and zero_sd_N <= UNKNOWN_SD_N,
-            is_prior=self.is_prior,
         )
         unknown_N = self._unknown_N(zero_sd_N)
         is_more = sensor.has_slid and reading_N >= fit.force_N(model_N) + unknown_N
@@ -283,12 +286,10 @@ class Believe:
         self.slow.rescale(before_N, self.fit.force_N(model_N), rate_mm_s)
 
     def confirm(self, wrong: Disputed) -> None:
-        """Take the operator's word in a dispute of device and sensor; without a dispute do nothing."""
-        if not self.sensor.is_disputed:
-            return
-        scale, anchor_N = self.fit.scale, self.sensor.anchor.force_N(MIDDLE_N)
-        self.fit = DeviceFit(scale, self.fit.offset_N if wrong == "device" else anchor_N - scale * MIDDLE_N)
-        if wrong == "device":
-            self.sensor = SensorTrust(self._trim)
-        else:
-            self.sensor.wrong_s = DOUBTED_S
+        """Take the operator's word in a dispute of device and sensor."""
+        sensor, fit = self.sensor, self.fit
+        if sensor.is_disputed and wrong == "device":
+            self.fit, self.sensor = DeviceFit(fit.scale, fit.offset_N), SensorTrust(self._trim)
+        elif sensor.is_disputed:
+            self.fit = DeviceFit(fit.scale, sensor.anchor.force_N(MIDDLE_N) - fit.scale * MIDDLE_N)
+            sensor.wrong_s = DOUBTED_S

@@ -27,7 +27,7 @@ LEARNS_S: Final = 0.5
 "A device that has not slid for so long has shown nothing: it has no leash. What is over sooner moves no leash."
 KNOWN_N: Final = 0.02
 "An anchor that is known so well at a force, as a standard deviation, learns no more there."
-SLACK_N: Final = 0.05
+SLACK_N: Final = 0.04
 "Noise, hysteresis, a creep and a kelvin move a force by so much."
 FALLS_1_S: Final = 0.3
 "The leash gives way by this share of the anchor a second."
@@ -57,14 +57,16 @@ class SensorTrust:
     "Share of the anchor that the fit gave where the anchor was last known."
     share: float = 0.0
     "Share of the anchor to which the fit may fall; 0 until the device has slid."
+    below_s: float = 0.0
+    "How long readings have been below the anchor, 2 LEARNS_S at most; falls while they are not."
     low_s: float = 0.0
-    "How long the readings have been below that share."
+    "How long they have been below that share."
     outside_s: float = 0.0
-    "How long the readings have been outside the leash; falls while they are inside."
+    "How long they have been outside the leash; falls while they are inside."
     doubted_s: float = 0.0
     "How long the sensor has been doubted, in time of sliding."
     wrong_s: float = 0.0
-    "How long the readings have been such as no device gives; falls while they are not."
+    "How long they have been such as no device gives; falls while they are not."
 
     def __init__(self, trim: Trim, known: DeviceFit = UNSEEN) -> None:
         self._trim: Final = trim
@@ -93,19 +95,18 @@ class SensorTrust:
         dt_s: float,
         *,
         learns: bool,
-        is_prior: bool = False,
     ) -> float | None:
         """Take one reading, and return what of it may teach `fit`, N; None where it is old or wrong."""
         is_stale, is_frozen = self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
         self.rate_mm_s = self.rate_mm_s if self.has_slid else rate_mm_s
         force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
         self.off_N = low_pass(self.off_N, reading_N - force_N, dt_s, FILTER_S)
+        self.below_s = within(self.below_s + (dt_s if self.off_N < 0.0 else -dt_s), (0.0, 2.0 * LEARNS_S))
         unsure_N = SLACK_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
         least_N = self._trim.least * (1.0 - WEAKENED) * model_N - unsure_N
         most_N = self._trim.most * (1.0 + WEAKENED) * model_N + unsure_N
         is_strange = is_frozen or not least_N <= force_N + self.off_N <= most_N
-        surely_N = SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
-        unsure_N += SURE * VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
+        surely_N = SURE * (max(deviation_N - 2.0 * KNOWN_N, 0.0) + VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s))
         beyond_N = abs(self.off_N) - self._trim.leash * force_N - unsure_N - KNOWN_N - surely_N
         teaches = self._judge(is_strange, beyond_N <= 0.0, is_stale, dt_s)
         leapt_N = (1.0 - LEAPT) * force_N - unsure_N - surely_N if self.has_slid else least_N
@@ -114,7 +115,7 @@ class SensorTrust:
         taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
         if learns and beyond_N <= 0.0:
-            self._learn(model_N, rate_mm_s, force_N, deviation_N, believed, taught_N, dt_s, is_prior)
+            self._learn(model_N, rate_mm_s, force_N, deviation_N, believed, reading_N, dt_s)
         if self.has_slid:
             self._give_way(believed, force_N, dt_s)
         return taught_N
@@ -126,20 +127,19 @@ class SensorTrust:
         force_N: float,
         deviation_N: float,
         believed: float,
-        taught_N: float,
+        reading_N: float,
         dt_s: float,
-        is_prior: bool,
     ) -> None:
         """Teach the anchor, which gives `force_N` there, a force at which it is not known; else learn `fallen`."""
-        # where a calibration half knows it, a reading that is less is of a sensor that fades, or of a device
-        if deviation_N <= (2.0 * KNOWN_N if is_prior and self.off_N <= 0.0 else KNOWN_N):
+        # where it is half known, readings that stay below it are of a fading sensor or device
+        if deviation_N <= (2.0 * KNOWN_N if self.below_s > LEARNS_S else KNOWN_N):
             self.fallen = within(believed, (self._trim.least, 1.0))
             return
         self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
         if self.has_slid:
             # what has fallen at the forces that are known has fallen here, too
-            taught_N = within(taught_N / self.fallen, (force_N - SURE * deviation_N, force_N + SURE * deviation_N))
-        self.anchor.learn(model_N, taught_N, dt_s)
+            reading_N = within(reading_N / self.fallen, (force_N - SURE * deviation_N, force_N + SURE * deviation_N))
+        self.anchor.learn(model_N, reading_N, dt_s)
 
     def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share of the anchor's `force_N` that is `believed`."""
@@ -154,8 +154,9 @@ class SensorTrust:
             self.wrong_s = self.wrong_s + dt_s if self.wrong_s + dt_s <= WRONG_S else DOUBTED_S
         elif is_inside or not self.is_doubted:
             self.wrong_s = max(self.wrong_s - dt_s, 0.0)
-        is_outside = self.has_slid and not is_inside
-        self.outside_s = min(self.outside_s + dt_s, 3.0 * NAMED_S) if is_outside else max(self.outside_s - dt_s, 0.0)
+        self.outside_s = within(
+            self.outside_s + (dt_s if self.has_slid and not is_inside else -dt_s), (0.0, 3.0 * NAMED_S)
+        )
         self.doubted_s = self.doubted_s + dt_s if self.is_doubted else 0.0
         if self.wrong_s == 0.0:
             self.known_s = min(self.known_s + dt_s, LEARNS_S)
