@@ -141,9 +141,9 @@ def process(tmp_path: Path) -> Iterator[Process]:
     made.ring_path.unlink(missing_ok=True)
 
 
-def written(folder: Path, name: str, after_s: float = 0.0, **header: str) -> Write:
+def written(folder: Path, name: str, **header: str) -> Write:
     reason = name.removesuffix(".mcap").rpartition("-")[2]
-    return Write(str(folder / name), reason, after_s, HEADER | header)
+    return Write(str(folder / name), reason, HEADER | header)
 
 
 def ticks(first: int, count: int) -> Part:
@@ -176,15 +176,16 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     # a folder that is none says so
     process.say(written(folder / "20300101T000000.000Z-SKEW.mcap", "x-SKEW.mcap"))
     assert "x-SKEW.mcap" in process.heard().refusal
-    # what is due later is of the scene of which it was asked for
-    process.say(written(folder, "20300102T000000.000Z-DUE.mcap", after_s=3_600.0))
+    # what is asked for late is of the scene that its header names
     process.say(Begin(str(folder), HEADER | {"scene": "b"}), Part(0.05, b"\xc1"))
+    process.say(written(folder, "20300102T000000.000Z-DUE.mcap"))
+    assert process.heard().refusal == ""
     # so does a part that is none
     process.say(written(folder, "y-SKEW.mcap", scene="b"))
     assert process.heard().refusal.startswith(f"{folder}/y-SKEW.mcap: DecodeError")
     # no word, no daemon: it was killed. Each beginning is of another scene, and keeps nothing of the one before
     process.say(Begin(str(folder), HEADER | {"scene": "c"}), ticks(61, 20))
-    process.say(written(folder, "2031Z-LATER.mcap", 3_600.0, scene="c"))
+    process.say(written(folder, "2031Z-LATER.mcap", scene="c"))
     process.die()
     assert process.child.wait(PATIENCE_S) == 0
     (left,) = folder.glob(f"*{DIED}.mcap")

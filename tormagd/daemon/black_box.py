@@ -10,7 +10,6 @@ import importlib.util
 import logging
 import subprocess
 import time
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +58,8 @@ AFTER_FAULT_S = 2.0
 "How long a black box goes on after its fault: the gap opens."
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
-MAX_REQUESTED, MAX_UNWRITTEN = 8, 28
-"Boxes that somebody asked for and that are still to be written, at most; and all that are."
+MAX_REQUESTED, MAX_OF_FAULTS = 8, 20
+"Boxes that are still to be written, at most: those that somebody asked for, and those of faults."
 
 log = logging.getLogger(__name__)
 
@@ -91,9 +90,10 @@ class BlackBox:
         self._beside: ChildProcess | None = None
         self._ring: Ring | None = None
         self._due_s, self.is_heard = 0.0, False
-        self._unwritten: dict[str, Write] = {}
-        "By name: what the keeper has not answered. A new keeper is asked for all of it."
-        self._unsent: deque[Write] = deque()
+        self._unwritten: dict[str, tuple[float, Write]] = {}
+        "By name: when it is due, and what the keeper is to write. A new keeper is asked for all of it."
+        self._asked = ""
+        "The name of what the keeper was last asked for."
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
@@ -150,26 +150,23 @@ class BlackBox:
         return part
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
-        """Ask the keeper to write a black box, and return the path that it will have."""
+        """Have a black box written in `after_s`, and return the path that it will have."""
         if self._ring is None:
             raise RefusedError(
                 "no_black_box",
                 f"there is no black box: {self._refusal}",
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
-        waiting = [each.reason for each in self._unwritten.values()]
-        if reason == REQUEST and waiting.count(REQUEST) >= MAX_REQUESTED:
-            raise RefusedError(
-                "busy", f"{MAX_REQUESTED} black boxes are still to be written", "ask again in a few seconds"
-            )
-        if len(waiting) >= MAX_UNWRITTEN:
-            self._refusal = f"{MAX_UNWRITTEN} black boxes are still to be written"
+        is_requested = reason == REQUEST
+        alike = [asked for _, asked in self._unwritten.values() if (asked.reason == REQUEST) is is_requested]
+        most = MAX_REQUESTED if is_requested else MAX_OF_FAULTS
+        if len(alike) >= most:
+            self._refusal = f"{most} black boxes are still to be written"
             raise RefusedError("busy", self._refusal, "ask again in a few seconds")
         path = box_path(str(self._folder), reason)
         self._refusal = ""
-        self._unwritten[path.name] = asked = Write(str(path), reason, after_s, self.begun.header | details)
-        self._unsent.append(asked)
-        self._send_requests()
+        self._unwritten[path.name] = time.monotonic() + after_s, Write(str(path), reason, self.begun.header | details)
+        self._ask()
         return path
 
     @property
@@ -178,15 +175,14 @@ class BlackBox:
         return self._ring is not None and self._beside is None
 
     def look(self) -> None:
-        """Start a keeper where one is due, send it the requests that wait, and note its answers."""
+        """Start a keeper where one is due, note its answers, and ask it for what is due."""
         if self._ring is not None and self._beside is None and time.monotonic() >= self._due_s:
             try:
                 self._beside = ChildProcess(KEEPER, self._ring.file)
             except OSError as error:
                 self._wait(f"the process that writes it did not start: {error.strerror}")
             else:
-                self._refusal, self._unsent = "", deque(self._unwritten.values())
-        self._send_requests()
+                self._refusal = self._asked = ""
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
@@ -196,6 +192,7 @@ class BlackBox:
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
+        self._ask()
         if self._beside is not None and self._beside.is_gone:
             self._beside.close()
             self._beside = None
@@ -217,14 +214,23 @@ class BlackBox:
         if self._ring is not None:
             self._ring.path.unlink(missing_ok=True)
         if (beside := self._beside) is not None:
+            for name, (_, asked) in self._unwritten.items():
+                if name != self._asked:
+                    beside.send(msgspec.msgpack.encode(asked))
             beside.send(msgspec.msgpack.encode(End()))
             beside.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
 
-    def _send_requests(self) -> None:
-        while self._beside is not None and self._unsent and self._beside.send(msgspec.msgpack.encode(self._unsent[0])):
-            self._unsent.popleft()
+    def _ask(self) -> None:
+        """Ask the keeper for the next box that is due, a fault's first, once it has written the one before."""
+        if self._beside is None or self._asked in self._unwritten:
+            return
+        now_s = time.monotonic()
+        due = [asked for due_s, asked in self._unwritten.values() if due_s <= now_s]
+        due.sort(key=lambda asked: asked.reason == REQUEST)
+        if due and self._beside.send(msgspec.msgpack.encode(due[0])):
+            self._asked = Path(due[0].path).name
 
     def _begin_anew(self, stepper: Stepper, planner: Planner) -> None:
         """Forget what was not handed over."""

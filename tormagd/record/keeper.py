@@ -10,7 +10,6 @@ import hashlib
 import math
 import os
 import re
-import select
 import signal
 import socket
 import stat
@@ -38,7 +37,6 @@ OWN_NAME = re.compile(r"\d{8}T\d{6}\.\d{3}Z-([A-Z_-]+)\.mcap")
 MAX_FILES = 20
 "Of faults, and of requests; the oldest goes."
 MAX_PACKET = 1_000_000
-LOOK_S = 0.05
 DIED = "DAEMON-DIED"
 SHARED_MEMORY = "/dev/shm"
 LENGTH = struct.Struct("<I")
@@ -62,11 +60,10 @@ class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
 
 
 class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
-    """Request to write what the ring has in `after_s` to a file, which gets this header: more than its scene's."""
+    """Request to write what the ring has to a file, which gets this header: more than its scene's."""
 
     path: str
     reason: str
-    after_s: float
     header: dict[str, str]
 
 
@@ -174,46 +171,31 @@ class Keeper:
 
     def __init__(self, its: socket.socket, ring: Ring) -> None:
         self._socket, self._ring = its, ring
-        self._due: list[tuple[float, Write]] = []
         self._written: deque[str] = deque(maxlen=2 * MAX_FILES)
 
     def run(self) -> None:
-        """Write black boxes until the daemon ends, then all that are still due, and return."""
+        """Write black boxes until the daemon ends."""
         for left in self._ring.left():
             self._write_of_a_dead(left)
-        while self._hear():
-            due = next((each for each in self._due if each[0] <= time.monotonic()), None)
-            if due is not None:
-                self._due.remove(due)
-                self._write(due[1], self._ring)
-        for _, write in self._due:
-            self._write(write, self._ring)
+        while isinstance(said := self._heard(), Write):
+            self._write(said, self._ring)
+        if said is None:
+            self._write_of_a_dead(self._ring)
         self._ring.path.unlink(missing_ok=True)
 
-    def _hear(self) -> bool:
-        """Wait for a word of the daemon and take it; return whether the daemon goes on."""
-        ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
-        if not ready:
-            return True
+    def _heard(self) -> Write | End | None:
+        """Wait for a word of the daemon; None where it has died."""
         try:
             data = self._socket.recv(MAX_PACKET)
         except OSError:
             data = b""
-        if not data:
-            self._write_of_a_dead(self._ring)
-            return False
-        said = msgspec.msgpack.decode(data, type=Write | End)
-        if isinstance(said, End):
-            return False
-        self._due.append((time.monotonic() + said.after_s, said))
-        self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
-        return True
+        return msgspec.msgpack.decode(data, type=Write | End) if data else None
 
     def _write_of_a_dead(self, ring: Ring) -> None:
         """Write what the ring of a daemon has that did not say that it ends."""
         if kept := ring.kept():
             begun, _ = kept[-1]
-            self._write(Write(str(box_path(begun.folder, DIED)), DIED, 0.0, begun.header), ring)
+            self._write(Write(str(box_path(begun.folder, DIED)), DIED, begun.header), ring)
 
     def _write(self, write: Write, ring: Ring) -> None:
         """Write one black box, unless it is there, and answer the daemon."""
